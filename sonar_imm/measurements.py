@@ -1,0 +1,126 @@
+"""What a tracker takes in: frozen values in SI units and radians, stamps in integer nanoseconds.
+
+A measurement that cannot be used is never built: its class raises `Rejection`, which carries a reason code to count
+and one sentence to show. The classes know nothing of ROS; `msg_adapters` makes them from messages.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from attrs import field, frozen
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Rejection(ValueError):
+    """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence` tells the user."""
+
+    def __init__(self, reason: str, sentence: str):
+        self.reason = reason
+        self.sentence = sentence
+        super().__init__(sentence)
+
+
+def _floats(*shape: int | None) -> Any:
+    """Converter to a read-only float64 array; a None in `shape` matches any length."""
+    def convert(value: Any) -> FloatArray:
+        array = np.array(value, dtype=np.float64)
+        if len(shape) != array.ndim or any(want not in (None, got) for want, got in zip(shape, array.shape)):
+            raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
+        array.flags.writeable = False
+        return array
+    return convert
+
+
+def _ids(value: Any) -> NDArray[np.uint16]:
+    array = np.array(value, dtype=np.uint16)
+    array.flags.writeable = False
+    return array
+
+
+def check_stamp(stamp_ns: int) -> None:
+    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year 2262."""
+    if not 0 < stamp_ns < 2**63:
+        raise Rejection('bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in')
+
+
+def check_covariance(covariance: FloatArray, what: str) -> None:
+    """Raise `Rejection` unless `covariance` (n, n) is finite, symmetric and positive definite."""
+    if not np.isfinite(covariance).all():
+        raise Rejection('nan', f'the covariance of {what} is not finite')
+    scale = float(np.abs(covariance).max())
+    if not np.allclose(covariance, covariance.T, rtol=0.0, atol=1e-6 * scale):
+        raise Rejection('bad_covariance', f'the covariance of {what} is not symmetric')
+    if scale <= 0.0 or np.linalg.eigvalsh(covariance)[0] <= 1e-12 * scale:
+        raise Rejection('bad_covariance', f'the covariance of {what} is not positive definite')
+
+
+@frozen(eq=False, kw_only=True)
+class Fix:
+    """A position found elsewhere: multistatic fusion, USBL, GPS.
+
+    position: (3,) x, y, z in `frame_id`, metres (ENU by default; z may be 0).
+    covariance: (2, 2) of x and y in m^2, or None when the sender does not know it.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=_floats(3))
+    covariance: FloatArray | None = None
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if not np.isfinite(self.position[:2]).all():
+            raise Rejection('nan', 'the fix has a position that is not finite')
+        if np.abs(self.position[:2]).max() > 1e8:
+            raise Rejection('out_of_range', f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin')
+        if self.covariance is not None:
+            covariance = _floats(2, 2)(self.covariance)
+            check_covariance(covariance, 'a fix')
+            object.__setattr__(self, 'covariance', covariance)
+
+
+@frozen(eq=False, kw_only=True)
+class Arrivals:
+    """Arrival times of one ping, one row a transmitter-receiver pair.
+
+    toa: (n,) seconds after the stamp. With a known transmitter (`tx` finite) the stamp is the transmission and the path
+    is transmitter - target - receiver. With `tx` NaN the target itself emits at an unknown time near the stamp
+    (an acoustic tag) and only differences between receivers carry information.
+    tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where unknown; bearing: (n,) rad at the receiver,
+    counter-clockwise from +x, NaN where not measured; var_bearing: (n,) rad^2.
+    """
+
+    stamp_ns: int
+    tx_id: NDArray[np.uint16] = field(converter=_ids)
+    rx_id: NDArray[np.uint16] = field(converter=_ids)
+    tx: FloatArray = field(converter=_floats(None, 3))
+    rx: FloatArray = field(converter=_floats(None, 3))
+    toa: FloatArray = field(converter=_floats(None))
+    var_toa: FloatArray = field(converter=_floats(None))
+    bearing: FloatArray = field(converter=_floats(None))
+    var_bearing: FloatArray = field(converter=_floats(None))
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        n = len(self.toa)
+        for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing'):
+            if len(getattr(self, name)) != n:
+                raise Rejection('bad_shape', f'arrivals: {name} has {len(getattr(self, name))} rows, toa has {n}')
+        if not np.isfinite(self.rx).all():
+            raise Rejection('nan', 'arrivals: a receiver position is not finite')
+
+    def __len__(self) -> int:
+        return len(self.toa)
+
+    @property
+    def passive(self) -> bool:
+        """True when the target itself emits, at an unknown time."""
+        return len(self) > 0 and bool(np.isnan(self.tx).all())
+
+
+Measurement = Fix | Arrivals

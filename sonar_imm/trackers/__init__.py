@@ -1,0 +1,67 @@
+"""The trackers: one file a system. `SYSTEMS` says what exists; importing it does not load a tracker."""
+
+from __future__ import annotations
+
+from collections import Counter
+from importlib import import_module
+from typing import Any, Protocol
+
+from attrs import frozen
+
+from ..estimates import Estimate
+from ..parameters import Config
+
+
+class Tracker(Protocol):
+    """The only door to a tracker. `process` has no side effect outside the tracker: no log, no clock, no global state.
+
+    counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``, ``too_late``, ...).
+    """
+
+    config: Any
+    counts: Counter[str]
+
+    def process(self, measurement: Any) -> list[Estimate]:
+        """Take one measurement in. Gives the estimates it made or revised, oldest first; the last is the newest state.
+
+        Never raises for bad data: what cannot be used is counted in `counts`."""
+        ...
+
+    def reset(self) -> None:
+        """Forget everything: equals a fresh tracker."""
+        ...
+
+    def reconfigure(self, config: Any) -> None:
+        """Take over the parameters that may change while running; keeps the tracks."""
+        ...
+
+    def warm(self) -> None:
+        """Compile or load every kernel the first measurement would need."""
+        ...
+
+    def health(self) -> dict[str, float]:
+        """Numbers for diagnostics: NIS, effective sample size, covariance repairs, tracks, ..."""
+        ...
+
+
+@frozen
+class System:
+    """A tracker by name. Strings name the modules so that listing systems stays fast."""
+
+    name: str
+    module: str
+    config_class: str
+    tracker_class: str
+    summary: str
+
+    def config_type(self) -> type[Config]:
+        return getattr(import_module(self.module), self.config_class)
+
+    def build(self, config: Config) -> Tracker:
+        return getattr(import_module(self.module), self.tracker_class)(config)
+
+
+SYSTEMS = {
+    'diver': System('diver', 'sonar_imm.trackers.diver', 'DiverConfig', 'DiverTracker',
+                    'divers from multistatic fixes or raw arrival times, 16-direction IMM'),
+}
