@@ -33,7 +33,7 @@ class DiverConfig(Config):
                                                          kind='float[]', low=0.0, high=1.0)
     adaptation: str = parameter('counts', 'how the data correct the transition matrix: counts (Dirichlet), paper (guarded '
                                 'eq. 1) or fixed', choices=ADAPTATIONS)
-    adaptation_prior: float = parameter(1.0, 'counts: weight of the prior matrix, in transitions a row', low=1e-3, high=1e6)
+    adaptation_prior: float = parameter(2.0, 'counts: weight of the prior matrix, in transitions a row', low=1e-3, high=1e6)
     adaptation_guard: float = parameter(0.7, 'paper: share of the prior matrix kept at each step; below 0.3 it degenerates',
                                         low=0.0, high=1.0)
 

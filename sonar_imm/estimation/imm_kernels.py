@@ -1,0 +1,318 @@
+"""The verbs of `imm` compiled: the same mathematics over plain loops, some 300 times faster for one target.
+
+Signatures are those of `imm` with arrays only: ``B (M, n)`` is always given, and where `imm` broadcasts over targets
+(transition, H, R) an array of length one does. All arrays are float64 and C-contiguous. `warm` compiles or loads
+every kernel; call it before the first measurement.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .jit import kernel
+
+FloatArray = NDArray[np.float64]
+LOG_2PI = math.log(2.0 * math.pi)
+
+
+@kernel
+def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray,
+        ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M)."""
+    T, M, n = x.shape
+    x0 = np.zeros((T, M, n))
+    P0 = np.zeros((T, M, n, n))
+    c = np.zeros((T, M))
+    d = np.empty(n)
+    for t in range(T):
+        p = t % transition.shape[0]
+        for j in range(M):
+            total = 0.0
+            for i in range(M):
+                total += transition[p, i, j] * mu[t, i]
+            c[t, j] = total
+            for i in range(M):
+                w = transition[p, i, j] * mu[t, i] / total if total > 0.0 else mu[t, i]
+                if w == 0.0:
+                    continue
+                for a in range(n):
+                    x0[t, j, a] += w * x[t, i, a]
+            for i in range(M):
+                w = transition[p, i, j] * mu[t, i] / total if total > 0.0 else mu[t, i]
+                if w == 0.0:
+                    continue
+                for a in range(n):
+                    d[a] = x[t, i, a] - x0[t, j, a]
+                for a in range(n):
+                    for b in range(a + 1):
+                        P0[t, j, a, b] += w * (P[t, i, a, b] + d[a] * d[b])
+            for a in range(n):
+                for b in range(a):
+                    P0[t, j, b, a] = P0[t, j, a, b]
+    return x0, P0, c
+
+
+@kernel
+def predict(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """See `imm.predict`."""
+    T, M, n = x.shape
+    x1 = np.empty((T, M, n))
+    P1 = np.empty((T, M, n, n))
+    FP = np.empty((n, n))
+    for t in range(T):
+        for j in range(M):
+            for a in range(n):
+                total = B[j, a]
+                for b in range(n):
+                    total += F[j, a, b] * x[t, j, b]
+                    value = 0.0
+                    for k in range(n):
+                        value += F[j, a, k] * P[t, j, k, b]
+                    FP[a, b] = value
+                x1[t, j, a] = total
+            for a in range(n):
+                for b in range(a + 1):
+                    value = Q[j, a, b]
+                    for k in range(n):
+                        value += FP[a, k] * F[j, b, k]
+                    P1[t, j, a, b] = value
+                    P1[t, j, b, a] = value
+    return x1, P1
+
+
+@kernel
+def _cholesky(S: FloatArray, L: FloatArray) -> bool:
+    """Lower Cholesky factor of S into L; False when S is not positive definite (or not finite)."""
+    m = S.shape[0]
+    for a in range(m):
+        for b in range(a + 1):
+            value = S[a, b]
+            for k in range(b):
+                value -= L[a, k] * L[b, k]
+            if a == b:
+                if not value > 0.0:
+                    return False
+                L[a, a] = math.sqrt(value)
+            else:
+                L[a, b] = value / L[b, b]
+    return True
+
+
+@kernel
+def _innovation_covariance(P: FloatArray, H: FloatArray, R: FloatArray, PHt: FloatArray, S: FloatArray) -> None:
+    """P H^T into PHt (n, m) and H P H^T + R into S (m, m)."""
+    m, n = H.shape
+    for a in range(n):
+        for r in range(m):
+            value = 0.0
+            for k in range(n):
+                value += P[a, k] * H[r, k]
+            PHt[a, r] = value
+    for r in range(m):
+        for s in range(r + 1):
+            value = 0.5 * (R[r, s] + R[s, r])
+            for k in range(n):
+                value += H[r, k] * PHt[k, s]
+            S[r, s] = value
+            S[s, r] = value
+
+
+@kernel
+def _gain(PHt: FloatArray, L: FloatArray, K: FloatArray) -> None:
+    """K = PHt S^-1 from S = L L^T: two triangular solves a row."""
+    n, m = PHt.shape
+    for a in range(n):
+        for r in range(m):
+            value = PHt[a, r]
+            for k in range(r):
+                value -= L[r, k] * K[a, k]
+            K[a, r] = value / L[r, r]
+        for r in range(m - 1, -1, -1):
+            value = K[a, r]
+            for k in range(r + 1, m):
+                value -= L[k, r] * K[a, k]
+            K[a, r] = value / L[r, r]
+
+
+@kernel
+def _joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray, A: FloatArray, AP: FloatArray, KR: FloatArray,
+            out: FloatArray) -> None:
+    """(I - K H) P (I - K H)^T + K R K^T into `out`, exactly symmetric; A, AP (n, n) and KR (n, m) are scratch."""
+    m, n = H.shape
+    for a in range(n):
+        for b in range(n):
+            value = 1.0 if a == b else 0.0
+            for r in range(m):
+                value -= K[a, r] * H[r, b]
+            A[a, b] = value
+        for r in range(m):
+            value = 0.0
+            for s in range(m):
+                value += K[a, s] * R[s, r]
+            KR[a, r] = value
+    for a in range(n):
+        for b in range(n):
+            value = 0.0
+            for k in range(n):
+                value += A[a, k] * P[k, b]
+            AP[a, b] = value
+    for a in range(n):
+        for b in range(a + 1):
+            value = 0.0
+            for k in range(n):
+                value += AP[a, k] * A[b, k]
+            for r in range(m):
+                value += KR[a, r] * K[b, r]
+            out[a, b] = value
+            out[b, a] = value
+
+
+@kernel
+def _whitened_square(L: FloatArray, v: FloatArray, w: FloatArray) -> float:
+    """v^T S^-1 v with S = L L^T; w (m,) is scratch."""
+    total = 0.0
+    for r in range(len(v)):
+        value = v[r]
+        for k in range(r):
+            value -= L[r, k] * w[k]
+        w[r] = value / L[r, r]
+        total += w[r] * w[r]
+    return total
+
+
+@kernel
+def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray,
+           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """See `imm.update`: x, P, mu, log_likelihood, nis, ok."""
+    T, M, n = x.shape
+    m = innovation.shape[2]
+    x1, P1, mu = x.copy(), P.copy(), c.copy()
+    log_likelihood = np.full(T, -np.inf)
+    nis = np.full(T, np.nan)
+    ok = np.zeros(T, dtype=np.bool_)
+    PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
+    A, AP = np.empty((n, n)), np.empty((n, n))
+    S, L, S_mix = np.empty((m, m)), np.zeros((m, m)), np.empty((m, m))
+    scratch, mean = np.empty(m), np.empty(m)
+    log_weight = np.empty(M)
+    for t in range(T):
+        r_t, h_t = t % R.shape[0], t % H.shape[0]
+        mean[:] = 0.0
+        for j in range(M):
+            for r in range(m):
+                mean[r] += c[t, j] * innovation[t, j, r]
+        S_mix[:] = 0.0
+        best = -np.inf
+        for j in range(M):
+            log_weight[j] = -np.inf
+            _innovation_covariance(P[t, j], H[h_t, j], R[r_t], PHt, S)
+            for r in range(m):
+                for s in range(m):
+                    S_mix[r, s] += c[t, j] * (S[r, s] + (innovation[t, j, r] - mean[r]) * (innovation[t, j, s] - mean[s]))
+            if not _cholesky(S, L):
+                continue
+            _gain(PHt, L, K)
+            value = -0.5 * (_whitened_square(L, innovation[t, j], scratch) + m * LOG_2PI)
+            for r in range(m):
+                value -= math.log(L[r, r])
+            if c[t, j] > 0.0 and math.isfinite(value):
+                log_weight[j] = math.log(c[t, j]) + value
+                best = max(best, log_weight[j])
+            for a in range(n):
+                for r in range(m):
+                    x1[t, j, a] += K[a, r] * innovation[t, j, r]
+            _joseph(P[t, j], K, H[h_t, j], R[r_t], A, AP, KR, P1[t, j])
+        if not math.isfinite(best):
+            x1[t] = x[t]
+            P1[t] = P[t]
+            continue
+        ok[t] = True
+        total = 0.0
+        for j in range(M):
+            mu[t, j] = math.exp(log_weight[j] - best)
+            total += mu[t, j]
+        for j in range(M):
+            mu[t, j] /= total
+        log_likelihood[t] = best + math.log(total)
+        if _cholesky(S_mix, L):
+            nis[t] = _whitened_square(L, mean, scratch)
+    return x1, P1, mu, log_likelihood, nis, ok
+
+
+@kernel
+def combine(x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """See `imm.combine`."""
+    T, M, n = x.shape
+    q = E.shape[1]
+    mean = np.zeros((T, q))
+    covariance = np.zeros((T, q, q))
+    y = np.empty((M, q))
+    EP = np.empty((q, n))
+    for t in range(T):
+        for j in range(M):
+            for a in range(q):
+                value = 0.0
+                for k in range(n):
+                    value += E[j, a, k] * x[t, j, k]
+                y[j, a] = value
+                mean[t, a] += mu[t, j] * value
+        for j in range(M):
+            if mu[t, j] == 0.0:
+                continue
+            for a in range(q):
+                for b in range(n):
+                    value = 0.0
+                    for k in range(n):
+                        value += E[j, a, k] * P[t, j, k, b]
+                    EP[a, b] = value
+            for a in range(q):
+                for b in range(a + 1):
+                    value = (y[j, a] - mean[t, a]) * (y[j, b] - mean[t, b])
+                    for k in range(n):
+                        value += EP[a, k] * E[j, b, k]
+                    covariance[t, a, b] += mu[t, j] * value
+        for a in range(q):
+            for b in range(a):
+                covariance[t, b, a] = covariance[t, a, b]
+    return mean, covariance
+
+
+@kernel
+def linear_cycle(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray, F: FloatArray, Q: FloatArray,
+                 B: FloatArray, z: FloatArray, H: FloatArray, R: FloatArray, E: FloatArray,
+                 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
+                            NDArray[np.bool_]]:
+    """A whole cycle for targets whose measurements are already assigned: z (T, m), NaN where missed; H (M, m, n).
+
+    Gives x, P, mu, mean, covariance, log_likelihood, nis, ok.
+    """
+    T, M, n = x.shape
+    m = z.shape[1]
+    x0, P0, c = mix(x, P, mu, transition)
+    x1, P1 = predict(x0, P0, F, Q, B)
+    innovation = np.empty((T, M, m))
+    for t in range(T):
+        for j in range(M):
+            for r in range(m):
+                value = z[t, r]
+                for k in range(n):
+                    value -= H[j, r, k] * x1[t, j, k]
+                innovation[t, j, r] = value
+    x2, P2, mu2, log_likelihood, nis, ok = update(x1, P1, c, innovation, H.reshape(1, M, m, n), R)
+    mean, covariance = combine(x2, P2, mu2, E)
+    return x2, P2, mu2, mean, covariance, log_likelihood, nis, ok
+
+
+def warm() -> None:
+    """Run every kernel once on tiny input: compiled or loaded from the cache, ready for the first measurement."""
+    x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
+    F, B, E = np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1))
+    transition, z, R = np.full((1, 2, 2), 0.5), np.zeros((1, 2)), np.eye(2)[None]
+    mix(x, P, mu, transition)
+    predict(x, P, F, F, B)
+    update(x, P, mu, np.zeros((1, 2, 2)), E[None], R)
+    combine(x, P, mu, E)
+    linear_cycle(x, P, mu, transition, F, F, B, z, E, R, E)

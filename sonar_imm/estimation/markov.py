@@ -1,0 +1,174 @@
+"""Markov chains over models: checks, stationary law, irregular time steps, persistence, learning from data.
+
+Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
+
+A chain is stated at a reference step, but sonar is irregular. `RateChain` turns the matrix into a generator once,
+``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of 0.1 s equal one of 1 s. Learning
+from data (`adapt_counts`, `adapt_product`) does not touch the generator: it yields a *correction*, a factor for each
+transition, which `corrected` applies to the matrix of any step.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+_CACHED_STEPS = 256
+
+
+def check_transition_matrix(matrix: ArrayLike, *, atol: float = 1e-6) -> FloatArray:
+    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError when it is not a transition matrix."""
+    P = np.array(matrix, dtype=np.float64)
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or not len(P):
+        raise ValueError(f'a transition matrix is square, this one has shape {P.shape}')
+    if not np.isfinite(P).all() or (P < 0.0).any() or (P > 1.0 + atol).any():
+        raise ValueError('a transition matrix holds probabilities between 0 and 1')
+    sums = P.sum(axis=1)
+    worst = int(np.argmax(np.abs(sums - 1.0)))
+    if abs(sums[worst] - 1.0) > atol:
+        raise ValueError(f'row {worst} of the transition matrix sums to {sums[worst]:.6g}, not 1')
+    return P / sums[:, None]
+
+
+def stationary_law(P: FloatArray) -> FloatArray:
+    """The law (M,) that the chain keeps: pi P = pi. ValueError when there is more than one."""
+    M = len(P)
+    system = np.vstack([P.T - np.eye(M), np.ones(M)])
+    if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
+        raise ValueError('the chain has closed classes that never meet: its stationary law is not unique')
+    law = np.linalg.lstsq(system, np.append(np.zeros(M), 1.0), rcond=None)[0]
+    law = np.clip(law, 0.0, None)
+    return np.asarray(law / law.sum())
+
+
+class RateChain:
+    """A chain stated at `step` seconds, usable at any step.
+
+    The generator is the matrix logarithm. Some matrices have no valid one (negative rates); those rates are set to
+    zero, and `residual` says how far ``P(step)`` then is from the matrix given (0 when it is embeddable).
+    """
+
+    def __init__(self, matrix: ArrayLike, step: float):
+        if not step > 0.0:
+            raise ValueError(f'the reference step must be positive, got {step}')
+        self.matrix = check_transition_matrix(matrix)
+        self.step = float(step)
+        self.generator = _generator(self.matrix, self.step)
+        self.residual = float(np.abs(_expm(self.generator * self.step) - self.matrix).max())
+        self._cache: OrderedDict[float, FloatArray] = OrderedDict()
+
+    def transition(self, dt: float) -> FloatArray:
+        """P(dt), (M, M), read-only. The matrix as given when dt is the reference step and it is embeddable."""
+        if not dt >= 0.0:
+            raise ValueError(f'a time step cannot be negative, got {dt}')
+        found = self._cache.get(dt)
+        if found is None:
+            found = self._compute(dt)
+            found.flags.writeable = False
+            self._cache[dt] = found
+            if len(self._cache) > _CACHED_STEPS:
+                self._cache.popitem(last=False)
+        return found
+
+    def _compute(self, dt: float) -> FloatArray:
+        if dt == self.step and self.residual < 1e-9:
+            return self.matrix.copy()
+        P = np.clip(_expm(self.generator * dt), 0.0, None)
+        return np.asarray(P / P.sum(axis=1, keepdims=True))
+
+
+def _expm(matrix: FloatArray) -> FloatArray:
+    from scipy.linalg import expm  # late: scipy.linalg costs start-up time that fixed steps do not need
+    return np.asarray(expm(matrix), dtype=np.float64)
+
+
+def _generator(P: FloatArray, step: float) -> FloatArray:
+    if np.array_equal(P, np.eye(len(P))):
+        return np.zeros_like(P)
+    from scipy.linalg import logm
+    # A zero eigenvalue (identical rows) has no logarithm: the chain forgets everything at once. Mixing in a sliver of
+    # the identity stands for a very fast, finite rate; the residual tells how little that changes.
+    singular = np.abs(np.linalg.eigvals(P)).min() < 1e-9
+    base = (1.0 - 1e-8) * P + 1e-8 * np.eye(len(P)) if singular else P
+    G = np.real(np.asarray(logm(base), dtype=np.complex128)) / step
+    np.fill_diagonal(G, 0.0)
+    G = np.clip(G, 0.0, None)
+    np.fill_diagonal(G, -G.sum(axis=1))
+    return G
+
+
+def persistent_headings(directions: int, stay: float, concentration: float) -> FloatArray:
+    """Headings at 2 pi j / directions: stay with probability `stay`, else turn by a with weight exp(kappa cos a)."""
+    turns = 2.0 * np.pi * np.arange(1, directions) / directions
+    weights = np.exp(concentration * (np.cos(turns) - 1.0))
+    row = np.concatenate([[stay], (1.0 - stay) * weights / weights.sum()])
+    lag = np.arange(directions)
+    return np.asarray(row[(lag[None, :] - lag[:, None]) % directions])
+
+
+def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
+    """Append a model that is entered from each other with probability `enter`, kept with `stay`, left uniformly.
+
+    What `enter` takes away comes from the turns; the diagonal of `P` stays. ValueError when it does not fit.
+    """
+    M = len(P)
+    keep = np.diag(P)
+    if (keep + enter > 1.0 + 1e-12).any():
+        raise ValueError('the probabilities of staying and of stopping exceed 1 together')
+    turning = np.where(keep < 1.0, (1.0 - keep - enter) / np.where(keep < 1.0, 1.0 - keep, 1.0), 0.0)
+    out = np.zeros((M + 1, M + 1))
+    out[:M, :M] = P * np.clip(turning, 0.0, None)[:, None]
+    np.fill_diagonal(out[:M, :M], keep)
+    out[:M, M] = 1.0 - out[:M, :M].sum(axis=1)
+    out[M, :M] = (1.0 - stay) / M
+    out[M, M] = stay
+    return out
+
+
+def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatArray) -> FloatArray:
+    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights; (..., M, M) from (..., M, M), (..., M) twice."""
+    joint = P * mu_before[..., :, None]
+    c = joint.sum(axis=-2, keepdims=True)
+    return np.asarray(joint / np.where(c > 0.0, c, 1.0) * mu_after[..., None, :])
+
+
+def adapt_counts(counts: FloatArray, expected: FloatArray, posterior: FloatArray, nominal: FloatArray,
+                 ) -> tuple[FloatArray, FloatArray]:
+    """Dirichlet counts, n_ij += W_ij mu_j, beside what the nominal matrix of the same step would have had us count.
+
+    All (..., M, M); gives the new (counts, expected). See `counts_correction`.
+    """
+    return counts + posterior, expected + posterior.sum(axis=-1, keepdims=True) * nominal
+
+
+def counts_correction(counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float) -> FloatArray:
+    """Factor for each transition, (n + N0 P0) / (e + N0 P0), `prior` P0 being the matrix of the reference step.
+
+    At a constant step e_ij = n_i. P0_ij and the corrected matrix is the Dirichlet posterior mean, rownorm(n + N0 P0);
+    at irregular steps the factor compares like with like, which counting alone would not.
+    """
+    given = expected + weight * prior
+    return np.asarray(np.where(given > 0.0, (counts + weight * prior) / np.where(given > 0.0, given, 1.0), 1.0))
+
+
+def adapt_product(correction: FloatArray, mu_after: FloatArray, prior: FloatArray, guard: float) -> FloatArray:
+    """Eq. (1) of the diver paper, P_ij <- P_ij mu_j / sum, guarded by P <- (1 - guard) P + guard P0, as a factor on P0.
+
+    Unguarded the exponent of mu doubles each step and rows become one-hot within five.
+    """
+    P = corrected(prior, correction) * mu_after[..., None, :]
+    total = P.sum(axis=-1, keepdims=True)
+    P = np.where(total > 0.0, P / np.where(total > 0.0, total, 1.0), prior)
+    P = (1.0 - guard) * P + guard * prior
+    return np.asarray(np.where(prior > 0.0, P / np.where(prior > 0.0, prior, 1.0), 1.0))
+
+
+def corrected(P: FloatArray, correction: FloatArray) -> FloatArray:
+    """Apply a learnt factor to the matrix of any step and renormalise the rows. (..., M, M)."""
+    out = P * correction
+    total = out.sum(axis=-1, keepdims=True)
+    return np.asarray(np.where(total > 0.0, out / np.where(total > 0.0, total, 1.0), P))
