@@ -1,0 +1,13 @@
+"""ROS messages to measurements and estimates to ROS messages.
+
+The adapters only look at attributes, so that messages of rclpy (live) and of rosbags (recorded)
+take the same road; they import neither library. A message that cannot be used raises
+`sonar_imm.measurements.Rejection`. Messages are built through a factory `make(type_name,
+**fields)` that the caller brings, because the two libraries disagree about what the fields hold.
+
+This is a top-level module with a common name: another package in a merged ROS 2 workspace may ship
+one too and hide this one. `__owner__` and `__version__` let `sonar_imm` notice.
+"""
+
+__owner__ = 'sonar_imm'
+__version__ = '0.1.0'

@@ -1,0 +1,115 @@
+"""Arrival times of one ping as a table, one row a transmitter-receiver pair.
+
+Columns: ``tx_id``, ``rx_id`` u2; ``tx_x tx_y tx_z rx_x rx_y rx_z`` f8 [m]; ``toa`` f8 [s after the
+header stamp, which is the transmission]; optional ``var_toa`` f4 [s^2], ``bearing`` f8 [rad at the
+receiver, counter-clockwise from +x], ``var_bearing`` f4 [rad^2].
+
+Extension for acoustic tags: with NaN in ``tx_x tx_y tx_z`` of every row the target itself emits,
+at an unknown time near the stamp, and only the differences between receivers carry information.
+When some rows have a transmitter, rows without one are dropped.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.measurements import Arrivals, Rejection
+
+from .headers import Make, stamp_ns, to_enu, wrap
+from .table import decode_table, encode_table, require_columns, scalar_column
+
+_TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
+REQUIRED = ('tx_id', 'rx_id', *_TX, *_RX, 'toa')
+
+MAX_PAIRS = 10_000
+FARTHEST = 1e8
+"""Most metres from the origin, the limit that `Fix` has too."""
+LONGEST = 3600.0
+"""Most seconds from the stamp to an arrival."""
+LEAST_VAR_TOA, LEAST_VAR_BEARING = 1e-18, 1e-12
+"""A stated variance below (1 ns)^2 or (1 urad)^2 is a field that was not filled in."""
+
+
+def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
+    """Read an arrivals table; `world_frame` is ``'enu'`` or ``'ned'``.
+
+    Rows whose arrival time or positions cannot be used are dropped, so that
+    ``message.height * message.width - len(arrivals)`` counts them. Variances that are not positive
+    and finite become NaN (unknown). Raises `Rejection` when the table does not fit or no row is
+    left.
+    """
+    columns = decode_table(message)
+    require_columns(columns, REQUIRED, 'arrivals')
+    values = {name: scalar_column(columns, name) for name in REQUIRED}
+    rows = len(values['toa'])
+    if rows > MAX_PAIRS:
+        raise Rejection('too_large', f'arrivals of {rows} pairs; at most {MAX_PAIRS} are read')
+    if not rows:
+        raise Rejection('empty', 'the ping has no arrivals')
+    tx = np.column_stack([values[name] for name in _TX])
+    rx = np.column_stack([values[name] for name in _RX])
+    keep = _usable(values['toa'], tx, rx)
+    if not keep.any():
+        raise Rejection('nan', f'none of the {rows} arrivals has a usable time and positions')
+    arrivals = Arrivals(
+        stamp_ns=stamp_ns(message), frame_id=str(message.header.frame_id),
+        tx_id=_ids(values['tx_id'][keep], 'tx_id'), rx_id=_ids(values['rx_id'][keep], 'rx_id'),
+        tx=tx[keep], rx=rx[keep], toa=values['toa'][keep],
+        var_toa=_variances(columns, 'var_toa', rows, LEAST_VAR_TOA)[keep],
+        bearing=_bearings(columns, rows)[keep],
+        var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep])
+    return to_enu(arrivals, world_frame)
+
+
+def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
+    """Write an arrivals table; the bearing columns only when a bearing was measured."""
+    columns: dict[str, NDArray] = {'tx_id': arrivals.tx_id, 'rx_id': arrivals.rx_id}
+    columns.update(zip(_TX, arrivals.tx.T))
+    columns.update(zip(_RX, arrivals.rx.T))
+    columns['toa'] = arrivals.toa
+    columns['var_toa'] = arrivals.var_toa.astype(np.float32)
+    if not np.isnan(arrivals.bearing).all():
+        columns['bearing'] = arrivals.bearing
+        columns['var_bearing'] = arrivals.var_bearing.astype(np.float32)
+    return encode_table(columns, stamp_ns=arrivals.stamp_ns, frame_id=arrivals.frame_id, make=make)
+
+
+def _usable(toa: NDArray, tx: NDArray, rx: NDArray) -> NDArray[np.bool_]:
+    """Rows (n,) with a finite time and receiver and, where any row has one, a transmitter."""
+    heard = (np.abs(toa) <= LONGEST) & (np.abs(rx) <= FARTHEST).all(axis=1)
+    emitted = (np.abs(tx) <= FARTHEST).all(axis=1)
+    if (heard & emitted).any():
+        return heard & emitted & (toa > 0.0)
+    return heard & np.isnan(tx).all(axis=1)
+
+
+def _ids(values: NDArray, name: str) -> NDArray[np.uint16]:
+    """Check that identifiers are whole numbers of 16 bits."""
+    good = (values >= 0) & (values <= 65535) & (values == np.floor(values))
+    if not good.all():
+        raise Rejection('out_of_range', f'arrivals: {name} {values[~good][0]:g} is not a whole '
+                                        'number from 0 to 65535')
+    return values.astype(np.uint16)
+
+
+def _variances(columns: dict[str, NDArray], name: str, rows: int, least: float) -> NDArray:
+    """Variances (rows,), NaN where missing or not a variance."""
+    if name not in columns:
+        return np.full(rows, np.nan)
+    values = scalar_column(columns, name)
+    return np.where(np.isfinite(values) & (values >= least), values, np.nan)
+
+
+def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
+    """Bearings (rows,) wrapped into [-pi, pi), NaN where missing. Degrees are refused."""
+    if 'bearing' not in columns:
+        return np.full(rows, np.nan)
+    values = scalar_column(columns, 'bearing')
+    values = np.where(np.isfinite(values), values, np.nan)
+    if (np.abs(values) > 2.0 * np.pi + 1e-6).any():
+        raise Rejection('out_of_range', f'arrivals: a bearing of {np.nanmax(np.abs(values)):g} is '
+                                        'beyond 2 pi; bearings are in radians')
+    return np.where(np.abs(values) < np.pi, values, wrap(values))

@@ -1,0 +1,71 @@
+"""Position fixes: geometry_msgs PoseWithCovarianceStamped or PointStamped.
+
+Covariances in the wild follow no rule, so these hold here, for the x-y block that is used: a
+negative variance means unknown; all zeros mean that nobody filled it in, also unknown (and worth a
+warning, see `has_zero_covariance`); anything else has to be finite, symmetric and positive
+definite, or the fix is refused.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.measurements import Fix, Rejection
+
+from .headers import Make, make_header, stamp_ns, to_enu
+
+UNKNOWN_VARIANCE = 1e6
+"""Written for what is not estimated (m^2 or rad^2): zero would claim certainty."""
+
+
+def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
+    """Read a PoseWithCovarianceStamped or a PointStamped; `world_frame` is ``'enu'`` or ``'ned'``.
+
+    A z that is not finite is read as 0, because only x and y are tracked. Raises `Rejection`.
+    """
+    point = message.point if hasattr(message, 'point') else message.pose.pose.position
+    x, y, z = float(point.x), float(point.y), float(point.z)
+    block = _xy_covariance(message)
+    if block is not None and (not block.any() or (np.diag(block) < 0.0).any()):
+        block = None
+    fix = Fix(stamp_ns=stamp_ns(message), position=(x, y, z if np.isfinite(z) else 0.0),
+              covariance=block, frame_id=str(message.header.frame_id))
+    return to_enu(fix, world_frame)
+
+
+def has_zero_covariance(message: Any) -> bool:
+    """Say whether `message` has a covariance that was never filled in: all zero in x and y."""
+    block = _xy_covariance(message)
+    return block is not None and not block.any()
+
+
+def write_fix(fix: Fix, make: Make) -> Any:
+    """Write a PoseWithCovarianceStamped, whose covariance starts with -1 when the fix has none."""
+    covariance = np.zeros((6, 6))
+    if fix.covariance is None:
+        np.fill_diagonal(covariance, -1.0)
+    else:
+        np.fill_diagonal(covariance, UNKNOWN_VARIANCE)
+        covariance[:2, :2] = fix.covariance
+    x, y, z = (float(value) for value in fix.position)
+    pose = make('geometry_msgs/msg/Pose',
+                position=make('geometry_msgs/msg/Point', x=x, y=y, z=z),
+                orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0))
+    return make('geometry_msgs/msg/PoseWithCovarianceStamped',
+                header=make_header(fix.stamp_ns, fix.frame_id, make),
+                pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose,
+                          covariance=covariance.ravel()))
+
+
+def _xy_covariance(message: Any) -> NDArray[np.float64] | None:
+    """Cut the x-y block (2, 2) out of the 6 x 6 covariance; None for a message without one."""
+    if hasattr(message, 'point'):
+        return None
+    covariance = np.array(message.pose.covariance, np.float64)
+    if covariance.size != 36:
+        raise Rejection('bad_shape', f'the covariance of a pose has {covariance.size} numbers, '
+                                     '36 are needed')
+    return covariance.reshape(6, 6)[:2, :2].copy()

@@ -1,0 +1,41 @@
+"""Which topics each tracker hears, and how to read every message type it takes there.
+
+The nodes subscribe from this table and the recordings pick topics by it, so that live and recorded
+data are read by the same functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from attrs import frozen
+
+from .arrivals import read_arrivals
+from .fixes import read_fix
+
+
+@frozen
+class InputTopic:
+    """One input of a tracker.
+
+    name: relative topic name; readers: measurement readers by message type. A reader takes
+    ``(message, *, world_frame='enu')`` and raises `Rejection` for a message it cannot use.
+    """
+
+    name: str
+    description: str
+    readers: Mapping[str, Callable[..., Any]]
+
+
+INPUTS: dict[str, tuple[InputTopic, ...]] = {
+    'diver': (
+        InputTopic('fix', 'position fixes in a local metric frame', {
+            'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
+            'geometry_msgs/msg/PointStamped': read_fix,
+        }),
+        InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
+            'sensor_msgs/msg/PointCloud2': read_arrivals,
+        }),
+    ),
+}

@@ -1,0 +1,156 @@
+"""PointCloud2 as a table: one row a point, one named column a field.
+
+PointCloud2 is the only message of common_interfaces that has a header, describes its own layout
+and is not deprecated, so it carries every bulk input and output here. A field with ``count > 1``
+is a vector column. Decoding believes nothing: every size is checked against the bytes that are
+really there before a byte is touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.measurements import Rejection
+
+from .headers import Make, make_header
+
+# sensor_msgs/PointField datatypes
+DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+_CODES = {name: code for code, name in DATATYPES.items()}
+
+MAX_FIELDS = 1024
+MAX_BYTES = 1 << 28
+"""Most bytes of decoded columns: fields may overlap and unfold a small message hugely."""
+
+
+def decode_table(message: Any) -> dict[str, NDArray]:
+    """Decode a PointCloud2 into columns, in the order of its fields.
+
+    Each column is a fresh array in native byte order: (rows,), or (rows, count) for a vector
+    field; rows = height * width, row-major. Raises `Rejection` for anything that does not fit.
+    """
+    height, width = int(message.height), int(message.width)
+    point_step, row_step = int(message.point_step), int(message.row_step)
+    data = _bytes_of(message.data)
+    fields = _checked_fields(message.fields, point_step)
+    if row_step < width * point_step:
+        raise Rejection('bad_layout', f'row_step is {row_step} bytes, too short for '
+                                      f'{width} points of {point_step} bytes')
+    if len(data) < row_step * height:
+        raise Rejection('short_data', f'the table holds {len(data)} bytes, its layout needs '
+                                      f'{row_step * height}')
+    rows = height * width
+    if rows and not point_step:
+        raise Rejection('bad_layout', f'point_step is 0 for {rows} points')
+    if rows * sum(dtype.itemsize * count for _, _, dtype, count in fields) > MAX_BYTES:
+        raise Rejection('too_large', f'the table of {rows} rows exceeds {MAX_BYTES >> 20} MiB')
+    order = '>' if message.is_bigendian else '<'
+    columns = {}
+    for name, offset, dtype, count in fields:
+        shape = (rows,) if count == 1 else (rows, count)
+        if not rows:
+            columns[name] = np.empty(shape, dtype)
+            continue
+        view = np.ndarray((height, width, count), dtype.newbyteorder(order), buffer=data,
+                          offset=offset, strides=(row_step, point_step, dtype.itemsize))
+        columns[name] = view.astype(dtype).reshape(shape)
+    return columns
+
+
+def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, make: Make) -> Any:
+    """Encode columns of equal length into a PointCloud2 without padding, little-endian, height 1.
+
+    Columns are (rows,) or (rows, count) arrays of the eight PointField datatypes or bool (sent as
+    u1). x, y, z come first when present, the rest keeps its order. Raises ValueError for columns
+    that no PointCloud2 can hold: a programming error, not bad input.
+    """
+    order = [name for name in 'xyz' if name in columns]
+    order += [name for name in columns if name not in order]
+    arrays = {name: _encodable(name, columns[name]) for name in order}
+    rows = len(next(iter(arrays.values()))) if arrays else 0
+    if uneven := [name for name, array in arrays.items() if len(array) != rows]:
+        raise ValueError(f"column '{uneven[0]}' has {len(arrays[uneven[0]])} rows, "
+                         f"'{order[0]}' has {rows}")
+    packed = np.empty(rows, np.dtype([(name, array.dtype.newbyteorder('<'), array.shape[1:])
+                                      for name, array in arrays.items()]))
+    for name, array in arrays.items():
+        packed[name] = array
+    fields = [make('sensor_msgs/msg/PointField', name=name, offset=packed.dtype.fields[name][1],
+                   datatype=_CODES[array.dtype.str[1:]], count=math.prod(array.shape[1:]))
+              for name, array in arrays.items()]
+    step = packed.dtype.itemsize if arrays else 0
+    finite = all(np.isfinite(array).all() for array in arrays.values())
+    return make('sensor_msgs/msg/PointCloud2', header=make_header(stamp_ns, frame_id, make),
+                height=1, width=rows, fields=fields, is_bigendian=False, point_step=step,
+                row_step=step * rows, data=np.frombuffer(packed.tobytes(), np.uint8),
+                is_dense=bool(finite))
+
+
+def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float64]:
+    """Give the column `name` as (rows,) float64. Raises `Rejection` when it is a vector column."""
+    column = columns[name]
+    if column.ndim != 1:
+        raise Rejection('bad_field', f"column '{name}' holds {column.shape[1]} values a row, "
+                                     'one is needed')
+    return column.astype(np.float64)
+
+
+def require_columns(columns: Mapping[str, NDArray], names: tuple[str, ...], what: str) -> None:
+    """Raise `Rejection` naming the columns that are missing from a table of `what`."""
+    if missing := [name for name in names if name not in columns]:
+        raise Rejection('missing_column', f'a table of {what} needs the column '
+                                          f'{" and ".join(missing)}')
+
+
+def _bytes_of(data: Any) -> memoryview:
+    """View the payload: array.array from rclpy, a read-only ndarray from rosbags, or bytes."""
+    try:
+        return memoryview(data).cast('B')
+    except (TypeError, ValueError):
+        raise Rejection('bad_layout', f'the data of the table are a {type(data).__name__}, '
+                                      'not contiguous bytes') from None
+
+
+def _checked_fields(fields: Any, point_step: int) -> list[tuple[str, int, np.dtype, int]]:
+    """Check every PointField: (name, offset, native dtype, count). Overlapping fields are fine."""
+    if len(fields) > MAX_FIELDS:
+        raise Rejection('too_large', f'the table has {len(fields)} fields, at most {MAX_FIELDS} '
+                                     'are read')
+    checked: dict[str, tuple[str, int, np.dtype, int]] = {}
+    for field in fields:
+        name, offset, count = str(field.name), int(field.offset), int(field.count)
+        if not name:
+            raise Rejection('bad_field', 'the table has a field without a name')
+        if name in checked:
+            raise Rejection('bad_field', f"the table has two fields named '{name}'")
+        if int(field.datatype) not in DATATYPES:
+            raise Rejection('bad_field', f"field '{name}' has the unknown datatype "
+                                         f'{int(field.datatype)}')
+        if count < 1:
+            raise Rejection('bad_field', f"field '{name}' has a count of {count}")
+        dtype = np.dtype(DATATYPES[int(field.datatype)])
+        if offset < 0 or offset + dtype.itemsize * count > point_step:
+            raise Rejection('bad_field', f"field '{name}' ends at byte "
+                                         f'{offset + dtype.itemsize * count}, beyond the '
+                                         f'point_step of {point_step}')
+        checked[name] = (name, offset, dtype, count)
+    return list(checked.values())
+
+
+def _encodable(name: str, values: Any) -> NDArray:
+    """Bring one column into a dtype that a PointField can name."""
+    array = np.asarray(values)
+    if array.dtype == np.bool_:
+        array = array.astype(np.uint8)
+    if array.dtype.str[1:] not in _CODES:
+        raise ValueError(f"column '{name}' has the dtype {array.dtype}, "
+                         'which a PointField cannot name')
+    if array.ndim not in (1, 2) or 0 in array.shape[1:]:
+        raise ValueError(f"column '{name}' has the shape {array.shape}, (rows,) or "
+                         '(rows, count) is needed')
+    return array

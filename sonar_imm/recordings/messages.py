@@ -1,0 +1,68 @@
+"""Messages as rosbags sees them: the ROS 2 Jazzy types and the factory the adapters write with."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+_DTYPES = {'bool': np.bool_, 'octet': np.uint8, 'byte': np.uint8, 'char': np.uint8,
+           'int8': np.int8, 'uint8': np.uint8, 'int16': np.int16, 'uint16': np.uint16,
+           'int32': np.int32, 'uint32': np.uint32, 'int64': np.int64, 'uint64': np.uint64,
+           'float32': np.float32, 'float64': np.float64}
+
+
+@cache
+def typestore() -> Typestore:
+    """The message types of ROS 2 Jazzy."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def ros_message(type_name: str, **fields: Any) -> Any:
+    """Build a rosbags message; the `make` of the adapters for recordings.
+
+    Fields left out are zero or empty. Bulk data may be bytes, arrays or lists: they are copied
+    into the strict one-dimensional arrays that rosbags serializes. Raises TypeError for a field
+    the type does not have.
+    """
+    definition = typestore().fielddefs[type_name][1]
+    if unknown := fields.keys() - {name for name, _ in definition}:
+        raise TypeError(f'{type_name} has no field {", ".join(sorted(unknown))}')
+    return typestore().types[type_name](**{
+        name: _cast(kind, fields[name]) if name in fields else _default(kind)
+        for name, kind in definition})
+
+
+def _cast(kind: Any, value: Any) -> Any:
+    """Give `value` exactly the Python type that rosbags wants for a field."""
+    node, detail = kind
+    if node == Nodetype.BASE:
+        name = detail[0]
+        return str(value) if name in ('string', 'wstring') else _DTYPES[name](value).item()
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _is_numeric(detail[0]):
+        dtype = _DTYPES[detail[0][1][0]]
+        if isinstance(value, (bytes, bytearray, memoryview)):
+            return np.frombuffer(value, dtype).copy()
+        return np.array(value, dtype).ravel()
+    return value
+
+
+def _default(kind: Any) -> Any:
+    """Give the zero or empty value of a field."""
+    node, detail = kind
+    if node == Nodetype.NAME:
+        return ros_message(detail)
+    if node == Nodetype.BASE:
+        return '' if detail[0] in ('string', 'wstring') else _DTYPES[detail[0]](0).item()
+    element, length = detail
+    if _is_numeric(element):
+        return np.zeros(length if node == Nodetype.ARRAY else 0, _DTYPES[element[1][0]])
+    return [_default(element) for _ in range(length)] if node == Nodetype.ARRAY else []
+
+
+def _is_numeric(element: Any) -> bool:
+    return element[0] == Nodetype.BASE and element[1][0] in _DTYPES
