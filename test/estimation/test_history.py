@@ -1,0 +1,234 @@
+"""The stamp gate by cases, the replay history by properties with a step that cannot commute."""
+
+import hashlib
+
+from hypothesis import given
+from hypothesis import strategies as st
+import pytest
+
+from sonar_imm.estimation.history import ReplayHistory, StampGate
+
+S = 1_000_000_000
+
+
+def chain(state, stamp_ns, items):
+    """A step in which every byte and every order matters."""
+    return hashlib.sha256(state + stamp_ns.to_bytes(8, 'big') + b'|'.join(items)).digest()
+
+
+def run(history, arrivals, step=chain):
+    """Insert all; the last word on every stamp, and the verdicts."""
+    final, verdicts = {}, []
+    for stamp_ns, key in arrivals:
+        inserted = history.insert(stamp_ns, key, key, step)
+        final.update(inserted.revised)
+        verdicts.append(inserted.verdict)
+    return final, verdicts
+
+
+def sorted_truth(arrivals):
+    """The same chain, written without a history."""
+    state, truth = b'', {}
+    for stamp_ns in sorted({stamp for stamp, _ in arrivals}):
+        state = chain(
+            state, stamp_ns, sorted({key for stamp, key in arrivals if stamp == stamp_ns})
+        )
+        truth[stamp_ns] = state
+    return truth
+
+
+@st.composite
+def bounded_shuffles(draw):
+    """Items sent at their stamps that arrive at most `window` later: sorted by stamp + delay."""
+    window = draw(st.integers(0, 12))
+    stamps = draw(st.lists(st.integers(0, 60), min_size=1, max_size=40))
+    sent = [
+        (
+            stamp,
+            bytes([draw(st.integers(0, 5))]),
+            draw(st.integers(0, window)),
+            draw(st.integers(0, 99)),
+        )
+        for stamp in stamps
+    ]
+    sent.sort(key=lambda one: (one[0] + one[2], one[3]))
+    return window, [(stamp, key) for stamp, key, _, _ in sent]
+
+
+@given(bounded_shuffles())
+def test_shuffled_inside_the_window_equals_sorted(case):
+    window, arrivals = case
+    final, verdicts = run(ReplayHistory(b'', window), arrivals)
+    assert final == sorted_truth(arrivals)
+    assert verdicts.count('used') == len(set(arrivals))
+    assert verdicts.count('duplicate') == len(arrivals) - len(set(arrivals))
+
+
+@given(bounded_shuffles())
+def test_memory_is_bounded_by_the_window(case):
+    window, arrivals = case
+    history = ReplayHistory(b'', window)
+    for stamp_ns, key in arrivals:
+        history.insert(stamp_ns, key, key, chain)
+        assert len(history) <= window + 1
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 60), st.binary(max_size=1)), max_size=40), st.integers(0, 12)
+)
+def test_any_order_equals_the_accepted_items_sorted(arrivals, window):
+    """Even when some are too late, the answer is that of the accepted ones alone, in order."""
+    history = ReplayHistory(b'', window)
+    final, verdicts = run(history, arrivals)
+    used = [arrival for arrival, verdict in zip(arrivals, verdicts) if verdict == 'used']
+    assert final == sorted_truth(used)
+    assert history.state == (sorted_truth(used)[history.newest_ns] if used else b'')
+
+
+def test_revised_states_come_oldest_first_and_end_with_the_newest():
+    history = ReplayHistory(b'', 10)
+    run(history, [(1, b'a'), (5, b'b'), (9, b'c')])
+    revised = history.insert(3, b'd', b'd', chain).revised
+    assert [stamp for stamp, _ in revised] == [3, 5, 9]
+    assert revised[-1] == (9, history.state)
+
+
+def test_an_item_exactly_at_the_edge_of_the_window_is_used_with_the_right_base():
+    arrivals = [(0, b'a'), (4, b'b'), (14, b'c')]
+    history = ReplayHistory(b'', 10)
+    run(history, arrivals)
+    assert history.insert(3, b'late', b'late', chain).verdict == 'too_late'
+    edge = history.insert(4, b'edge', b'edge', chain)
+    assert edge.verdict == 'used'
+    assert dict(edge.revised)[14] == sorted_truth([*arrivals, (4, b'edge')])[14]
+
+
+def test_a_window_of_zero_still_merges_a_scan():
+    history = ReplayHistory(b'', 0)
+    final, verdicts = run(history, [(5, b'b'), (5, b'a'), (4, b'x'), (5, b'a'), (6, b'c')])
+    assert verdicts == ['used', 'used', 'too_late', 'duplicate', 'used']
+    assert final == sorted_truth([(5, b'a'), (5, b'b'), (6, b'c')])
+    assert len(history) == 1
+
+
+def test_a_clock_that_stands_still_cannot_eat_the_memory():
+    history = ReplayHistory(b'', 10, scan_limit=3)
+    _, verdicts = run(history, [(5, bytes([i])) for i in range(5)])
+    assert verdicts == ['used'] * 3 + ['full'] * 2
+    assert history.insert(6, b'', b'', chain).verdict == 'used'
+
+
+def test_a_step_that_raises_leaves_the_history_as_it_was():
+    history = ReplayHistory(b'', 10)
+    run(history, [(1, b'a'), (5, b'b')])
+    before = history.state
+
+    def broken(state, stamp_ns, items):
+        if stamp_ns == 5:
+            raise ArithmeticError
+        return chain(state, stamp_ns, items)
+
+    with pytest.raises(ArithmeticError):
+        history.insert(3, b'c', b'c', broken)
+    assert (history.state, len(history)) == (before, 2)
+    assert (
+        history.insert(3, b'c', b'c', chain).revised[-1][1]
+        == sorted_truth([(1, b'a'), (3, b'c'), (5, b'b')])[5]
+    )
+
+
+@pytest.mark.parametrize('arguments', [{'window_ns': -1}, {'window_ns': 0, 'scan_limit': 0}])
+def test_history_refuses_nonsense(arguments):
+    with pytest.raises(ValueError, match='window_ns >= 0'):
+        ReplayHistory(b'', **arguments)
+
+
+# -- the stamp gate -------------------------------------------------------------------------------
+# ---------------------
+
+
+def gate(restart_after=3):
+    return StampGate(window_ns=10 * S, max_gap_ns=100 * S, restart_after=restart_after)
+
+
+def judge(stamp_gate, *seconds):
+    return [stamp_gate.judge(int(s * S), s) for s in seconds]
+
+
+def test_stream_and_late_inside_the_window_are_used():
+    judgements = judge(gate(), 1000, 1010, 1000, 1110, 1100)
+    assert [j.verdict for j in judgements] == ['use'] * 5
+    assert [j.released for j in judgements] == [(1000,), (1010,), (1000,), (1110,), (1100,)]
+
+
+def test_older_than_the_window_is_too_late():
+    assert judge(gate(), 1000, 989.999)[-1].verdict == 'too_late'
+
+
+def test_one_wild_stamp_in_the_future_does_not_make_the_rest_late():
+    judgements = judge(gate(), 1000, 1001, 9_000_000, 1002, 1003)
+    assert [j.verdict for j in judgements] == ['use', 'use', 'doubtful', 'use', 'use']
+    assert [j.abandoned for j in judgements] == [0, 0, 0, 1, 0]
+
+
+@pytest.mark.parametrize('restarted', [(5, 6, 7), (5_000_000, 5_000_001, 5_000_002), (5, 7, 6)])
+def test_a_restarted_clock_hands_everything_out_again(restarted):
+    judgements = judge(gate(), 1000, 1001, *restarted, restarted[-1] + 1)
+    assert [j.verdict for j in judgements[-2:]] == ['restart', 'use']
+    assert judgements[-2].released == restarted
+    assert judgements[-2].reinstated == sum(j.verdict == 'too_late' for j in judgements)
+
+
+def test_a_wild_first_stamp_costs_nothing():
+    judgements = judge(gate(), 9_000_000, 1000, 1001, 1002)
+    assert judgements[-1].verdict == 'restart'
+    assert judgements[-1].released == (1000, 1001, 1002)
+
+
+def test_off_stream_stamps_that_disagree_never_restart():
+    judgements = judge(gate(), 1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001)
+    assert [j.verdict for j in judgements] == [
+        'use',
+        'doubtful',
+        'too_late',
+        'doubtful',
+        'too_late',
+        'doubtful',
+        'use',
+    ]
+    assert sum(j.abandoned for j in judgements) == 3
+
+
+def test_good_stamps_between_keep_a_second_wrong_clock_out():
+    judgements = judge(gate(), *[s for i in range(20) for s in (1000 + i, 5 + i)])
+    assert [j.verdict for j in judgements] == ['use', 'too_late'] * 20
+
+
+def test_a_scan_of_many_items_with_one_wild_stamp_is_no_restart():
+    judgements = judge(gate(), 1000, *[9_000_000] * 50, 1001)
+    assert [j.verdict for j in judgements] == ['use'] + ['doubtful'] * 50 + ['use']
+    assert judgements[-1].abandoned == 50
+
+
+def test_what_is_held_is_bounded():
+    stamp_gate = StampGate(window_ns=10, max_gap_ns=100, restart_after=3, hold=4)
+    judgements = [stamp_gate.judge(s, None) for s in (1, 900, 900, 900, 900, 900, 2)]
+    assert [j.abandoned for j in judgements] == [0, 0, 0, 0, 0, 1, 4]
+
+
+@given(st.lists(st.integers(1, 2**62), max_size=60), st.integers(0, 10**6), st.integers(1, 10**9))
+def test_every_item_has_exactly_one_fate(stamps, window, gap):
+    stamp_gate = StampGate(window_ns=window, max_gap_ns=gap, restart_after=3)
+    released = too_late = abandoned = 0
+    for stamp in stamps:
+        judgement = stamp_gate.judge(stamp, stamp)
+        released += len(judgement.released)
+        too_late += (judgement.verdict == 'too_late') - judgement.reinstated
+        abandoned += judgement.abandoned
+    assert released + too_late + abandoned + stamp_gate.holding == len(stamps)
+    assert min(released, too_late, abandoned) >= 0
+
+
+def test_gate_refuses_nonsense():
+    with pytest.raises(ValueError, match='restart_after'):
+        StampGate(window_ns=0, max_gap_ns=1, restart_after=0)
