@@ -1,0 +1,78 @@
+"""Check a colcon install of sonar_imm: what `ros2 run` needs is there, the command and the node run.
+
+Usage: python check_install.py PREFIX, after sourcing the workspace's local_setup.bash.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+START_LIMIT = 120.0  # an empty kernel cache makes the first start slow on a small machine
+STOP_LIMIT = 20.0
+
+
+def main(prefix: Path) -> None:
+    from ament_index_python.packages import get_package_prefix
+    import sonar_imm
+    from sonar_imm.resources import shared_file
+
+    expect(Path(get_package_prefix('sonar_imm')) == prefix, 'the ament index knows the package')
+    expect(prefix in Path(sonar_imm.__file__).parents, 'Python imports the installed package')
+    expect(prefix in shared_file('config/diver.yaml').parents, 'the shared files are installed')
+    command = prefix / 'lib' / 'sonar_imm' / 'sonar-imm'
+    said = subprocess.run([command, '--version'], capture_output=True, text=True, check=True)
+    expect(sonar_imm.__version__ in said.stdout, f'sonar-imm says {said.stdout.strip()!r}')
+    start_and_interrupt(prefix / 'lib' / 'sonar_imm' / 'diver_node')
+
+
+def start_and_interrupt(executable: Path) -> None:
+    """Start the node, wait until it says it is ready, press Ctrl-C: it has to leave with 0."""
+    node = subprocess.Popen([executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    lines: queue.Queue[str] = queue.Queue()
+    reader = threading.Thread(target=lambda: [lines.put(line) for line in node.stdout], daemon=True)
+    reader.start()
+    said = wait_for('ready', lines, node)
+    node.send_signal(signal.SIGINT)
+    try:
+        status = node.wait(STOP_LIMIT)
+    except subprocess.TimeoutExpired:
+        node.kill()
+        raise SystemExit(f'diver_node did not stop on SIGINT within {STOP_LIMIT} s') from None
+    reader.join(STOP_LIMIT)
+    while not lines.empty():
+        said += lines.get()
+    expect(status == 0 and 'Traceback' not in said, f'diver_node stops on SIGINT with {status}')
+
+
+def wait_for(word: str, lines: queue.Queue[str], node: subprocess.Popen[str]) -> str:
+    """Collect what the node says until a line holds `word`; fail when it does not come."""
+    said, end = '', time.monotonic() + START_LIMIT
+    while time.monotonic() < end:
+        try:
+            line = lines.get(timeout=0.5)
+        except queue.Empty:
+            if node.poll() is not None:
+                break
+            continue
+        print(f'  {line}', end='')
+        said += line
+        if word in line:
+            return said
+    node.kill()
+    raise SystemExit(f"diver_node never said '{word}'")
+
+
+def expect(fact: bool, what: str) -> None:
+    print(f'{"ok" if fact else "FAILED"}: {what}')
+    if not fact:
+        raise SystemExit(1)
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1]).resolve())

@@ -1,0 +1,69 @@
+# `make` prints what there is to make. What is built lies in .venv; `make clean` removes it.
+
+SHELL := bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+VENV ?= .venv
+# The first Python in the supported range; say `make PYTHON=/path/to/python3 ...` to choose another.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python3.10; do \
+    $$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' 2>/dev/null \
+    && echo $$p && break; done)
+
+BIN := $(abspath $(VENV))/bin
+STAMP := $(VENV)/.installed
+
+# Message setters check their types only when asked to before the first import. One thread for each
+# process: the tests run side by side. Compiled kernels and logs stay inside the environment.
+TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+    NUMBA_CACHE_DIR=$(abspath $(VENV))/numba ROS_LOG_DIR=$(abspath $(VENV))/log
+JOBS ?= auto
+
+# The environment stands alone: a sourced ROS 2 would mix its libraries with those of the wheels.
+unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
+
+.NOTPARALLEL:
+.PHONY: help venv demo test test-core test-system lint docs bench clean
+
+help: ## print this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
+
+venv: $(STAMP) ## build .venv from PyPI, ROS 2 included (PYTHON=... chooses the interpreter)
+
+$(STAMP): setup.py pyproject.toml
+	@test -n '$(PYTHON)' || { echo 'sonar_imm needs Python 3.10 to 3.13 and found none: install' \
+	    'one or say make PYTHON=/path/to/python3' >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' || { \
+	    echo '$(PYTHON) is no Python 3.10 to 3.13: say make PYTHON=/path/to/python3' >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo '$(PYTHON) lacks the module' \
+	    'venv: on Debian and Ubuntu, sudo apt install python3-venv' >&2; exit 1; }
+	@echo 'Building $(VENV) with '"$$($(PYTHON) --version)"'; the first time takes a minute or two.'
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test,lint]'
+	@touch $@
+
+demo: venv ## track a shipped bag with the live node and offline, score both, write a report
+	$(BIN)/sonar-imm demo --out demo
+
+test: test-core test-system ## run every test
+
+test-core: venv ## run the tests that need no processes of their own, side by side (JOBS=...)
+	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' -n $(JOBS)
+
+test-system: venv ## run the tests that start real nodes, one at a time
+	$(TEST_ENV) $(BIN)/python -m pytest -m system
+
+lint: venv ## check the style with ruff and the types with mypy
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+docs: venv ## write config/*.yaml and docs/parameters/*.md anew from the code
+	$(BIN)/python docs/generate.py
+
+bench: venv ## measure the speed against other libraries
+	$(BIN)/sonar-imm bench
+
+clean: ## remove everything that was built
+	@if test -e $(VENV)/pyvenv.cfg; then rm -rf $(VENV); fi
+	rm -rf build install log dist demo *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

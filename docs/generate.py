@@ -1,0 +1,82 @@
+"""Write what follows from the code: `config/<system>.yaml` and `docs/parameters/<system>.md`.
+
+Run it with ``make docs``; a test compares the files with what the code says now.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import textwrap
+
+import yaml
+
+from sonar_imm.nodes.parameters import NodeConfig
+from sonar_imm.parameters import Config, markdown_table, ParameterSpec
+from sonar_imm.trackers import System, SYSTEMS
+
+ROOT = Path(__file__).resolve().parents[1]
+
+YAML_HEAD = """\
+# Parameters of {name}_node with their defaults; every line may be left out.
+# Written by `make docs` from the configuration classes. Copy it, then change the copy:
+#   ros2 run sonar_imm {name}_node --ros-args --params-file my_{name}.yaml
+#   sonar-imm track BAG OUT_DIR --params my_{name}.yaml
+# Doubles need their decimal point (1500.0, not 1500), or ROS 2 refuses them.
+/**:
+  ros__parameters:
+"""
+
+MARKDOWN = """\
+# Parameters of the {name} tracker
+
+{summary}.
+Written by `make docs` from the configuration classes; `ros2 param describe` shows the same.
+`config/{name}.yaml` holds the defaults, ready to copy.
+
+A parameter that may change while running keeps the tracks; every other one is read at start.
+A wrong value is refused with one sentence that names it, a misspelt name is warned about.
+
+## Tracker
+
+{tracker}
+## Node
+
+The live node takes these besides; offline tracking ignores them.
+
+{node}"""
+
+
+def generated() -> dict[str, str]:
+    """Give every generated file: its text by its path below the project root."""
+    files = {}
+    for system in SYSTEMS.values():
+        files[f'config/{system.name}.yaml'] = parameter_file(system)
+        files[f'docs/parameters/{system.name}.md'] = MARKDOWN.format(
+            name=system.name, summary=system.summary[0].upper() + system.summary[1:],
+            tracker=markdown_table(system.config_type()), node=markdown_table(NodeConfig))
+    return files
+
+
+def parameter_file(system: System) -> str:
+    """Give the ROS 2 parameter file of `system`, every parameter with its description above."""
+    configs: tuple[type[Config], ...] = (system.config_type(), NodeConfig)
+    entries = [_entry(spec) for config in configs for spec in config.specs()]
+    return YAML_HEAD.format(name=system.name) + '\n'.join(entries)
+
+
+def _entry(spec: ParameterSpec) -> str:
+    facts = '; '.join(filter(None, (', '.join(spec.choices) or spec.range_text(), spec.unit)))
+    comment = textwrap.wrap(spec.description + (f' [{facts}]' if facts else ''), 92)
+    value = list(spec.default) if isinstance(spec.default, tuple) else spec.default
+    # One-line YAML; PyYAML ends a bare scalar with a document end mark.
+    text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix('...\n')
+    lines = [f'# {line}' for line in comment] + [f'{spec.name}: {text.strip()}']
+    return textwrap.indent('\n'.join(lines) + '\n', '    ')
+
+
+if __name__ == '__main__':
+    for name, text in generated().items():
+        path = ROOT / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding='utf-8')
+        print(name)

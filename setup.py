@@ -1,0 +1,77 @@
+"""Build description of sonar_imm, for colcon (ament_python) and pip alike."""
+
+from pathlib import Path
+import re
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'sonar_imm'
+# Resolved, because `colcon build --symlink-install` runs a link to this file.
+ROOT = Path(__file__).resolve().parent
+
+REQUIRES = [
+    'attrs>=23.1',
+    'click>=8.1',
+    'numba>=0.58',
+    'numpy>=1.26',
+    'plotly>=5.15',
+    'PyYAML>=6.0',
+    'rich>=13.0',
+    'rosbags>=0.11,<0.12',
+    'scipy>=1.11',
+]
+EXTRAS = {
+    'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+    'test': ['filterpy', 'hypothesis', 'pytest>=7.4', 'pytest-benchmark', 'pytest-xdist',
+             'stonesoup'],
+    'lint': ['mypy', 'ruff'],
+}
+
+
+def version() -> str:
+    """Read `__version__` without importing the package, whose dependencies may be missing yet."""
+    text = (ROOT / PACKAGE / '__init__.py').read_text(encoding='utf-8')
+    return re.search(r"^__version__ = '([^']+)'$", text, re.MULTILINE).group(1)
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """What goes below `share/`: the ament index marker, package.xml, all of config/ and bags/."""
+    files = {'share/ament_index/resource_index/packages': [f'resource/{PACKAGE}'],
+             f'share/{PACKAGE}': ['package.xml']}
+    for room in ('bags', 'config'):
+        for path in sorted((ROOT / room).rglob('*')):
+            if path.is_file():
+                name = path.relative_to(ROOT)
+                folder = f'share/{PACKAGE}/{name.parent.as_posix()}'
+                files.setdefault(folder, []).append(name.as_posix())
+    return list(files.items())
+
+
+setup(
+    name=PACKAGE,
+    version=version(),
+    description='Online multiple-model tracking for sonar: library, ROS 2 nodes and a command',
+    long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    maintainer='The sonar_imm developers',
+    maintainer_email='maintainers@example.org',
+    license='Apache-2.0',
+    classifiers=[
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Topic :: Scientific/Engineering',
+    ],
+    python_requires='>=3.10,<3.14',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_adapters', 'msg_adapters.*']),
+    data_files=shared_files(),
+    install_requires=REQUIRES,
+    extras_require=EXTRAS,
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'diver_node = sonar_imm.nodes.diver:main',
+            'sonar-imm = sonar_imm.cli:main',
+        ],
+    },
+)
