@@ -1,0 +1,299 @@
+"""Which detection belongs to which target, and which tracks are to be believed.
+
+A scan gives D detections; T targets are expected. Three steps, each a pure function on arrays:
+
+1. `gate` lists the pairs (target, detection) that are close enough to be one thing: those whose
+normalised innovation squared
+   lies below a chi-square quantile. Pairs are looked up in a KD-tree, because a dense table of a
+   million pairs for a thousand targets would cost more than everything else.
+2. `assign` picks, among those pairs, the most likely set in which no target and no detection is
+used twice (global nearest
+   neighbour). A pair is worth what it gains over calling the target missed and the detection
+   clutter,
+
+       cost = -ln( P_D N(nu; 0, S) / clutter density ) + ln(1 - P_D),
+
+   and pairs that gain nothing stay unassigned. Targets that share no detection do not touch each
+   other, so the problem falls apart into clusters, almost all of them tiny.
+3. `Tracks` counts hits and misses: a tentative track is confirmed by M hits in N scans, a
+confirmed one coasts through misses
+   until it has missed too often or too long. Identities are never used again.
+
+Reference: Blackman, Popoli, *Design and Analysis of Modern Tracking Systems* (1999), ch. 6.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import lru_cache
+import math
+from typing import NamedTuple
+
+from attrs import evolve, frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from .kalman import BoolArray, factorise, FloatArray, log_density
+
+IntArray = NDArray[np.int64]
+
+
+@lru_cache(maxsize=256)
+def gate_threshold(probability: float, dimension: int) -> float:
+    """Normalised innovation squared inside which a `dimension`-vector of the target itself lies
+    with `probability`."""
+    from scipy.stats import (
+        chi2,
+    )  # scipy.stats takes long to import, and trackers without gates do without
+
+    return float(chi2.ppf(probability, dimension))
+
+
+class Pairs(NamedTuple):
+    """Pairs inside the gate, sorted by target, then detection.
+
+    target, detection: (pairs,) indices; nis, log_likelihood: (pairs,) of the innovation.
+    """
+
+    target: IntArray
+    detection: IntArray
+    nis: FloatArray
+    log_likelihood: FloatArray
+
+
+def gate(
+    predicted: FloatArray,
+    covariance: FloatArray,
+    detections: FloatArray,
+    R: FloatArray,
+    threshold: float,
+) -> Pairs:
+    """Find the pairs whose normalised innovation squared is at most `threshold`.
+
+    predicted: (T, m) measurements expected of each target; covariance: (T, m, m) of them, ``H P
+    H'``; detections: (D, m); R: (D, m, m) or (m, m), covariance of the detections.
+
+    Raises CovarianceError when an innovation covariance ``S = covariance + R`` is not positive
+    definite.
+    """
+    R = np.broadcast_to(R, (len(detections), *R.shape[-2:]))
+    target, detection = _near(predicted, covariance, detections, R, threshold)
+    factor = factorise(covariance[target] + R[detection], 'innovation covariance')
+    nis, log_likelihood = log_density(detections[detection] - predicted[target], factor)
+    inside = nis <= threshold
+    return Pairs(target[inside], detection[inside], nis[inside], log_likelihood[inside])
+
+
+def _near(
+    predicted: FloatArray,
+    covariance: FloatArray,
+    detections: FloatArray,
+    R: FloatArray,
+    threshold: float,
+) -> tuple[IntArray, IntArray]:
+    """A superset of the pairs inside the gate, sorted: the ball around each gate's ellipse.
+
+    ``nis <= threshold`` implies ``|nu|^2 <= threshold * largest eigenvalue of S``, and the
+    eigenvalue of a sum is at most the sum of the eigenvalues."""
+    if not len(predicted) or not len(detections):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    from scipy.spatial import cKDTree
+
+    spread = np.linalg.eigvalsh(covariance)[:, -1] + np.linalg.eigvalsh(R)[:, -1].max()
+    radius = np.sqrt(threshold * np.maximum(spread, 0.0)) * (1.0 + 1e-9)
+    found = cKDTree(detections).query_ball_point(predicted, radius, return_sorted=True)
+    counts = np.fromiter(map(len, found), np.int64, len(found))
+    return np.repeat(np.arange(len(found)), counts), np.concatenate(found).astype(np.int64)
+
+
+def association_cost(
+    log_likelihood: FloatArray, detection_probability: float, clutter_density: float
+) -> FloatArray:
+    """Cost of each pair against calling the target missed and the detection clutter; negative when
+    the pair is better.
+
+    log_likelihood: of the innovations, ``ln N(nu; 0, S)``; clutter_density: false detections (and
+    new targets) per unit of the measurement space, > 0; detection_probability: of a target that is
+    there, inside (0, 1).
+    """
+    missed = math.log1p(-detection_probability)
+    return missed - math.log(detection_probability) - log_likelihood + math.log(clutter_density)
+
+
+def assign(
+    target: IntArray, detection: IntArray, cost: FloatArray, targets: int, detections: int
+) -> IntArray:
+    """Choose the pairs with the least total cost, no target and no detection twice.
+
+    target, detection, cost: (pairs,), each pair once; a pair that is not listed is forbidden, and
+    one whose cost is not negative is never chosen. Returns (targets,) the detection of each
+    target, -1 for none. The same input gives the same choice, ties included.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    chosen = np.full(targets, -1, np.int64)
+    worthwhile = cost < 0.0
+    target, detection, cost = target[worthwhile], detection[worthwhile], cost[worthwhile]
+    nodes = targets + detections
+    graph = coo_matrix((np.ones(len(cost)), (target, targets + detection)), shape=(nodes, nodes))
+    label = connected_components(graph, directed=False)[1][target]
+    order = np.argsort(label, kind='stable')
+    starts = np.flatnonzero(np.diff(label[order], prepend=-1))
+    sizes = np.diff(starts, append=len(order))
+    alone = order[starts[sizes == 1]]
+    chosen[target[alone]] = detection[alone]
+    for start, size in zip(starts[sizes > 1], sizes[sizes > 1]):
+        pairs = order[start : start + size]
+        _assign_cluster(chosen, target[pairs], detection[pairs], cost[pairs])
+    return chosen
+
+
+def _assign_cluster(
+    chosen: IntArray, target: IntArray, detection: IntArray, cost: FloatArray
+) -> None:
+    """Solve one cluster densely. A cell of cost zero stands for 'not assigned', so a full
+    assignment always exists."""
+    from scipy.optimize import linear_sum_assignment
+
+    rows, row = np.unique(target, return_inverse=True)
+    columns, column = np.unique(detection, return_inverse=True)
+    table = np.zeros((len(rows), len(columns)))
+    table[row, column] = cost
+    for i, j in zip(*linear_sum_assignment(table)):
+        if table[i, j] < 0.0:
+            chosen[rows[i]] = columns[j]
+
+
+class TrackStatus(IntEnum):
+    """What a track is worth. The numbers are the column ``track_state``."""
+
+    TENTATIVE = 0
+    CONFIRMED = 1
+    COASTING = 2
+
+
+@frozen
+class TrackRules:
+    """When a track is confirmed and when it ends.
+
+    confirm_hits of confirm_window scans confirm (the first detection counts); delete_misses misses
+    in a row end a confirmed track; max_coast_ns without a hit ends any track. A tentative track
+    ends as soon as the last confirm_window scans hold too many misses to confirm it.
+    """
+
+    confirm_hits: int
+    confirm_window: int
+    delete_misses: int
+    max_coast_ns: int
+
+    def __attrs_post_init__(self) -> None:
+        if (
+            not 1 <= self.confirm_hits <= self.confirm_window
+            or self.delete_misses < 1
+            or self.max_coast_ns < 0
+        ):
+            raise ValueError(
+                'track rules need 1 <= confirm_hits <= confirm_window, delete_misses >= 1, '
+                'max_coast_ns >= 0'
+            )
+
+
+@frozen(eq=False)
+class Tracks:
+    """The life of T tracks, as a value: `scan` and `born` return the next one.
+
+    track_id: (T,) rising, never used again; status: (T,) TrackStatus; seen: (T, confirm_window)
+    True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,); next_id: of the next
+    track.
+    """
+
+    track_id: NDArray[np.uint32]
+    status: NDArray[np.uint8]
+    age: IntArray
+    seen: BoolArray
+    misses: IntArray
+    last_hit_ns: IntArray
+    next_id: int = 1
+
+    @classmethod
+    def none(cls, rules: TrackRules) -> Tracks:
+        """No tracks yet."""
+        return cls(
+            np.empty(0, np.uint32),
+            np.empty(0, np.uint8),
+            np.empty(0, np.int64),
+            np.empty((0, rules.confirm_window), np.bool_),
+            np.empty(0, np.int64),
+            np.empty(0, np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self.track_id)
+
+    def born(self, count: int, stamp_ns: int, rules: TrackRules) -> Tracks:
+        """Append `count` tracks, each with its first hit."""
+        seen = np.zeros((count, rules.confirm_window), np.bool_)
+        seen[:, -1] = True
+        status = TrackStatus.CONFIRMED if rules.confirm_hits == 1 else TrackStatus.TENTATIVE
+        return Tracks(
+            np.append(
+                self.track_id, np.arange(self.next_id, self.next_id + count, dtype=np.uint32)
+            ),
+            np.append(self.status, np.full(count, status, np.uint8)),
+            np.append(self.age, np.ones(count, np.int64)),
+            np.concatenate([_window(self.seen, rules.confirm_window), seen]),
+            np.append(self.misses, np.zeros(count, np.int64)),
+            np.append(self.last_hit_ns, np.full(count, stamp_ns, np.int64)),
+            self.next_id + count,
+        )
+
+    def scan(self, hit: BoolArray, stamp_ns: int, rules: TrackRules) -> tuple[Tracks, BoolArray]:
+        """Take in one scan: `hit` (T,) says which tracks got a detection.
+
+        Returns the tracks that live on and ``kept`` (T,), True for those, with which to thin the
+        states kept beside them.
+        """
+        age = self.age + 1
+        seen = np.column_stack([_window(self.seen, rules.confirm_window)[:, 1:], hit])
+        misses = np.where(hit, 0, self.misses + 1)
+        last_hit_ns = np.where(hit, stamp_ns, self.last_hit_ns)
+        hits = seen.sum(axis=1)
+        confirmed = (self.status != TrackStatus.TENTATIVE) | (hits >= rules.confirm_hits)
+        status = np.where(
+            confirmed,
+            np.where(hit, TrackStatus.CONFIRMED, TrackStatus.COASTING),
+            TrackStatus.TENTATIVE,
+        )
+        missed_in_window = np.minimum(age, rules.confirm_window) - hits
+        hopeless = missed_in_window > rules.confirm_window - rules.confirm_hits
+        ended = np.where(confirmed, misses >= rules.delete_misses, hopeless)
+        kept = ~ended & (stamp_ns - last_hit_ns <= rules.max_coast_ns)
+        return Tracks(
+            self.track_id[kept],
+            status[kept].astype(np.uint8),
+            age[kept],
+            seen[kept],
+            misses[kept],
+            last_hit_ns[kept],
+            self.next_id,
+        ), kept
+
+    def only(self, kept: BoolArray) -> Tracks:
+        """The tracks where `kept` (T,) is True, for callers that end some for reasons of their
+        own."""
+        return evolve(
+            self,
+            track_id=self.track_id[kept],
+            status=self.status[kept],
+            age=self.age[kept],
+            seen=self.seen[kept],
+            misses=self.misses[kept],
+            last_hit_ns=self.last_hit_ns[kept],
+        )
+
+
+def _window(seen: BoolArray, length: int) -> BoolArray:
+    """The newest `length` columns; the rules may change while tracks live."""
+    missing = max(length - seen.shape[1], 0)
+    return np.pad(seen[:, seen.shape[1] - length + missing :], ((0, 0), (missing, 0)))

@@ -1,0 +1,236 @@
+"""Gating and assignment against brute force, track life against the definition."""
+
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2, multivariate_normal
+
+from sonar_imm.estimation.association import (
+    assign,
+    association_cost,
+    gate,
+    gate_threshold,
+    TrackRules,
+    Tracks,
+    TrackStatus,
+)
+from sonar_imm.estimation.kalman import CovarianceError
+
+RULES = TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
+
+
+def covariances(rng, count, n=2):
+    root = rng.normal(size=(count, n, n + 1))
+    return root @ np.swapaxes(root, 1, 2)
+
+
+@pytest.mark.parametrize('dimension', [1, 2, 3])
+def test_gate_threshold_is_the_quantile(dimension):
+    assert chi2.cdf(gate_threshold(0.99, dimension), dimension) == pytest.approx(0.99, abs=1e-12)
+
+
+@pytest.mark.parametrize('spread', [3.0, 30.0, 300.0])
+@pytest.mark.parametrize('n', [1, 2, 3])
+def test_gate_finds_exactly_the_pairs_a_dense_table_finds(spread, n):
+    rng = np.random.default_rng(int(spread) + n)
+    predicted, detections = rng.normal(size=(30, n)) * spread, rng.normal(size=(40, n)) * spread
+    covariance, R = covariances(rng, 30, n), covariances(rng, 40, n)
+    pairs = gate(predicted, covariance, detections, R, gate_threshold(0.99, n))
+    expected = []
+    for t, d in itertools.product(range(30), range(40)):
+        S, nu = covariance[t] + R[d], detections[d] - predicted[t]
+        if nu @ np.linalg.inv(S) @ nu <= gate_threshold(0.99, n):
+            expected.append((t, d, multivariate_normal(cov=S).logpdf(nu)))
+    assert list(zip(pairs.target, pairs.detection)) == [(t, d) for t, d, _ in expected]
+    np.testing.assert_allclose(pairs.log_likelihood, [log for *_, log in expected], rtol=1e-9)
+
+
+@pytest.mark.parametrize('targets, detections', [(0, 0), (3, 0), (0, 3)])
+def test_gate_of_nothing_is_nothing(targets, detections):
+    pairs = gate(
+        np.zeros((targets, 2)),
+        np.tile(np.eye(2), (targets, 1, 1)),
+        np.zeros((detections, 2)),
+        np.eye(2),
+        9.0,
+    )
+    assert [len(part) for part in pairs] == [0] * 4
+    assert (
+        list(assign(pairs.target, pairs.detection, pairs.nis, targets, detections))
+        == [-1] * targets
+    )
+
+
+def test_gate_names_a_singular_innovation():
+    with pytest.raises(CovarianceError):
+        gate(np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2)), np.zeros((2, 2)), 9.0)
+
+
+def brute_force(table):
+    """Least cost over all partial assignments of a (T, D) table."""
+    targets, detections = table.shape
+    choices = itertools.product(range(-1, detections), repeat=targets)
+    return min(
+        sum(table[t, d] for t, d in enumerate(choice) if d >= 0)
+        for choice in choices
+        if len({d for d in choice if d >= 0}) == sum(d >= 0 for d in choice)
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 4), st.floats(0.1, 1.0))
+def test_assign_reaches_the_least_cost_of_all(seed, targets, detections, density):
+    rng = np.random.default_rng(seed)
+    table = np.where(
+        rng.random((targets, detections)) < density,
+        rng.integers(-4, 3, (targets, detections)),
+        np.inf,
+    )
+    t, d = np.nonzero(np.isfinite(table))
+    chosen = assign(t, d, table[t, d], targets, detections)
+    used = chosen[chosen >= 0]
+    assert len(set(used)) == len(used)
+    assert sum(table[t, d] for t, d in enumerate(chosen) if d >= 0) == brute_force(table)
+
+
+def test_clusters_give_the_cost_of_one_big_assignment():
+    rng = np.random.default_rng(3)
+    cost = rng.normal(size=500) - 0.5
+    cells = rng.choice(200 * 150, 500, replace=False)
+    t, d = cells // 150, cells % 150
+    chosen = assign(t, d, cost, 200, 150)
+    table = np.zeros((200, 150))
+    table[t, d] = np.minimum(cost, 0.0)
+    hits = np.flatnonzero(chosen >= 0)
+    assert table[hits, chosen[hits]].sum() == pytest.approx(
+        table[linear_sum_assignment(table)].sum(), abs=1e-9
+    )
+    assert (table[hits, chosen[hits]] < 0.0).all()
+
+
+def test_the_order_of_the_pairs_does_not_matter():
+    rng = np.random.default_rng(4)
+    cells = rng.choice(400, 120, replace=False)
+    t, d, cost = cells // 20, cells % 20, rng.integers(-3, 1, 120).astype(float)  # many ties
+    expected = assign(*sorted_pairs(t, d, cost), 20, 20)
+    shuffle = rng.permutation(120)
+    np.testing.assert_array_equal(
+        assign(*sorted_pairs(t[shuffle], d[shuffle], cost[shuffle]), 20, 20), expected
+    )
+    np.testing.assert_array_equal(assign(t[shuffle], d[shuffle], cost[shuffle], 20, 20), expected)
+
+
+def sorted_pairs(t, d, cost):
+    order = np.lexsort((d, t))
+    return t[order], d[order], cost[order]
+
+
+def test_association_cost_is_the_log_of_the_ratio_of_the_two_explanations():
+    likelihood, pd, clutter = 0.02, 0.9, 1e-3
+    joined, apart = pd * likelihood, (1 - pd) * clutter
+    assert association_cost(np.log(likelihood), pd, clutter) == pytest.approx(
+        -np.log(joined / apart), rel=1e-12
+    )
+
+
+def test_nearest_in_all_beats_nearest_for_each():
+    """Two targets, the left detection near both: greedy leaves one target without, global does
+    not."""
+    predicted, detections = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.9, 0.0], [2.0, 0.0]])
+    pairs = gate(predicted, np.tile(np.eye(2), (2, 1, 1)), detections, 0.1 * np.eye(2), 9.0)
+    cost = association_cost(pairs.log_likelihood, 0.9, 1e-6)
+    assert list(assign(pairs.target, pairs.detection, cost, 2, 2)) == [0, 1]
+
+
+# -- life of tracks -------------------------------------------------------------------------------
+# ---------------------
+
+
+def live(pattern, rules=RULES, dt=1):
+    """Statuses after each scan of a 1-and-0 pattern; None once ended."""
+    tracks, statuses = Tracks.none(rules).born(1, 0, rules), []
+    statuses.append(int(tracks.status[0]))
+    for k, symbol in enumerate(pattern[1:], start=1):
+        tracks, kept = tracks.scan(np.array([symbol == '1']), k * dt, rules)
+        if not kept[0]:
+            return [*statuses, None]
+        statuses.append(int(tracks.status[0]))
+    return statuses
+
+
+@pytest.mark.parametrize(
+    'pattern, expected',
+    [
+        ('111', [0, 0, 1]),
+        ('10101', [0, 0, 0, 0, 1]),
+        ('1000', [0, 0, 0, None]),
+        ('101001', [0, 0, 0, 0, None]),
+        ('111011', [0, 0, 1, 2, 1, 1]),
+        ('11100', [0, 0, 1, 2, None]),
+    ],
+)
+def test_life_of_a_track(pattern, expected):
+    assert live(pattern) == expected
+
+
+@given(
+    st.lists(st.booleans(), max_size=40), st.integers(1, 6), st.integers(1, 6), st.integers(1, 4)
+)
+def test_life_equals_the_definition(hits, m, n, delete):
+    if m > n:
+        return
+    rules = TrackRules(m, n, delete, 10**9)
+    pattern = '1' + ''.join('01'[hit] for hit in hits)
+    confirmed, expected = False, []
+    for k in range(1, len(pattern) + 1):
+        window = pattern[:k][-n:]
+        confirmed = confirmed or window.count('1') >= m
+        ended = pattern[:k].endswith('0' * delete) if confirmed else window.count('0') > n - m
+        if ended:
+            expected.append(None)
+            break
+        expected.append((1 if pattern[k - 1] == '1' else 2) if confirmed else 0)
+    assert live(pattern, rules) == expected
+
+
+def test_one_hit_can_be_enough():
+    assert live('1', TrackRules(1, 1, 3, 100)) == [TrackStatus.CONFIRMED]
+
+
+def test_time_ends_a_track_too():
+    assert live('1110', RULES, dt=50) == [0, 0, 1, 2]
+    assert live('1110', RULES, dt=101) == [0, 0, 1, None]
+
+
+def test_identities_are_never_used_again():
+    tracks = Tracks.none(RULES).born(3, 0, RULES)
+    tracks, kept = tracks.scan(np.array([True, False, True]), 101, RULES)
+    assert list(kept) == [True, False, True]
+    assert list(tracks.born(2, 102, RULES).track_id) == [1, 3, 4, 5]
+    assert list(tracks.only(np.array([False, True])).track_id) == [3]
+
+
+def test_scan_is_pure():
+    tracks = Tracks.none(RULES).born(2, 0, RULES)
+    before = tracks.seen.copy()
+    first, second = (tracks.scan(np.array([True, False]), 1, RULES)[0] for _ in range(2))
+    np.testing.assert_array_equal(tracks.seen, before)
+    np.testing.assert_array_equal(first.seen, second.seen)
+
+
+@pytest.mark.parametrize('window', [3, 9])
+def test_rules_may_change_while_tracks_live(window):
+    tracks = Tracks.none(RULES).born(1, 0, RULES)
+    rules = TrackRules(2, window, 2, 100)
+    tracks, _ = tracks.scan(np.array([True]), 1, rules)
+    assert list(tracks.status) == [TrackStatus.CONFIRMED]
+    assert len(tracks.born(1, 2, RULES)) == 2
+
+
+@pytest.mark.parametrize('arguments', [(0, 5, 2, 1), (6, 5, 2, 1), (1, 1, 0, 1), (1, 1, 1, -1)])
+def test_rules_refuse_nonsense(arguments):
+    with pytest.raises(ValueError, match='track rules need'):
+        TrackRules(*arguments)
