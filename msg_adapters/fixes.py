@@ -2,7 +2,7 @@
 
 Covariances in the wild follow no rule, so these hold here, for the x-y block that is used: a
 negative variance means unknown; all zeros mean that nobody filled it in, also unknown (and worth a
-warning, see `has_zero_covariance`); anything else has to be finite, symmetric and positive
+warning, see `doubt_fix`); anything else has to be finite, symmetric and positive
 definite, or the fix is refused.
 """
 
@@ -36,10 +36,10 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
     return to_enu(fix, world_frame)
 
 
-def has_zero_covariance(message: Any) -> bool:
-    """Say whether `message` has a covariance that was never filled in: all zero in x and y."""
+def doubt_fix(message: Any) -> str | None:
+    """Give ``'zero_covariance'`` for a covariance that nobody filled in: all zero in x and y."""
     block = _xy_covariance(message)
-    return block is not None and not block.any()
+    return 'zero_covariance' if block is not None and not block.any() else None
 
 
 def write_fix(fix: Fix, make: Make) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 from attrs import frozen
 
 from .arrivals import read_arrivals
-from .fixes import read_fix
+from .fixes import doubt_fix, read_fix
 
 
 @frozen
@@ -21,11 +21,13 @@ class InputTopic:
 
     name: relative topic name; readers: measurement readers by message type. A reader takes
     ``(message, *, world_frame='enu')`` and raises `Rejection` for a message it cannot use.
+    doubt: gives a reason code to count when a message can be used but deserves a warning.
     """
 
     name: str
     description: str
     readers: Mapping[str, Callable[..., Any]]
+    doubt: Callable[[Any], str | None] = lambda message: None
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
@@ -33,7 +35,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         InputTopic('fix', 'position fixes in a local metric frame', {
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
             'geometry_msgs/msg/PointStamped': read_fix,
-        }),
+        }, doubt=doubt_fix),
         InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
         }),

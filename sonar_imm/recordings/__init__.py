@@ -1,0 +1,1 @@
+"""Recordings: bags in and out, conversion of other formats, replay order."""

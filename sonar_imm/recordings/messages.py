@@ -14,6 +14,8 @@ _DTYPES = {'bool': np.bool_, 'octet': np.uint8, 'byte': np.uint8, 'char': np.uin
            'int8': np.int8, 'uint8': np.uint8, 'int16': np.int16, 'uint16': np.uint16,
            'int32': np.int32, 'uint32': np.uint32, 'int64': np.int64, 'uint64': np.uint64,
            'float32': np.float32, 'float64': np.float64}
+_SCALARS = {name: bool if name == 'bool' else float if name.startswith('float') else int
+            for name in _DTYPES}
 
 
 @cache
@@ -29,12 +31,17 @@ def ros_message(type_name: str, **fields: Any) -> Any:
     into the strict one-dimensional arrays that rosbags serializes. Raises TypeError for a field
     the type does not have.
     """
-    definition = typestore().fielddefs[type_name][1]
-    if unknown := fields.keys() - {name for name, _ in definition}:
+    message_class, kinds = _layout(type_name)
+    if unknown := fields.keys() - kinds.keys():
         raise TypeError(f'{type_name} has no field {", ".join(sorted(unknown))}')
-    return typestore().types[type_name](**{
-        name: _cast(kind, fields[name]) if name in fields else _default(kind)
-        for name, kind in definition})
+    return message_class(*(_cast(kind, fields[name]) if name in fields else _default(kind)
+                           for name, kind in kinds.items()))
+
+
+@cache
+def _layout(type_name: str) -> tuple[Any, dict[str, Any]]:
+    """Look up the class of a message and the kinds of its fields, in order."""
+    return typestore().types[type_name], dict(typestore().fielddefs[type_name][1])
 
 
 def _cast(kind: Any, value: Any) -> Any:
@@ -42,7 +49,7 @@ def _cast(kind: Any, value: Any) -> Any:
     node, detail = kind
     if node == Nodetype.BASE:
         name = detail[0]
-        return str(value) if name in ('string', 'wstring') else _DTYPES[name](value).item()
+        return str(value) if name in ('string', 'wstring') else _SCALARS[name](value)
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and _is_numeric(detail[0]):
         dtype = _DTYPES[detail[0][1][0]]
         if isinstance(value, (bytes, bytearray, memoryview)):
@@ -57,7 +64,7 @@ def _default(kind: Any) -> Any:
     if node == Nodetype.NAME:
         return ros_message(detail)
     if node == Nodetype.BASE:
-        return '' if detail[0] in ('string', 'wstring') else _DTYPES[detail[0]](0).item()
+        return '' if detail[0] in ('string', 'wstring') else _SCALARS[detail[0]]()
     element, length = detail
     if _is_numeric(element):
         return np.zeros(length if node == Nodetype.ARRAY else 0, _DTYPES[element[1][0]])

@@ -1,0 +1,102 @@
+"""From a recording to what a tracker takes in, by the same readers that the live nodes use."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from msg_adapters.inputs import INPUTS, InputTopic
+from sonar_imm.measurements import Rejection
+from sonar_imm.parameters import did_you_mean
+
+from .reader import BagReader
+from .sources import BagError, TopicInfo
+
+DOUBTS = {'zero_covariance': 'have a covariance of zeros, which is taken as unknown'}
+
+
+class Heard(NamedTuple):
+    """What one message brought: a measurement, or the `Rejection` that says why not."""
+
+    topic: str
+    measurement: Any
+    log_ns: int
+
+
+def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None = None
+                   ) -> dict[str, InputTopic]:
+    """Say which topics of `bag` feed the tracker `system`: input by topic name.
+
+    A topic fits when its type can be read and its last name component is the input's name; topics
+    below ``/truth`` never do. `topics` maps topic names to input names instead, e.g.
+    ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is there, when nothing fits.
+    """
+    if topics is not None:
+        return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
+    fitting = {topic.name: entry for topic in bag.topics for entry in INPUTS[system]
+               if _can_read(topic, entry) and topic.name.split('/')[-1] == entry.name
+               and 'truth' not in topic.name.split('/')[:-1]}
+    if not fitting:
+        raise BagError(_nothing_fits(bag, system))
+    return fitting
+
+
+def measurements_of(bag: BagReader, system: str, topics: Mapping[str, str] | None = None, *,
+                    world_frame: str = 'enu', order: str = 'recorded') -> Iterator[Heard]:
+    """Yield what the tracker `system` hears in an open recording, in replay order.
+
+    `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
+    recording uses, `order` is as in `BagReader.messages`. Messages that deserve a warning are
+    counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
+    """
+    chosen = fitting_topics(bag, system, topics)
+    doubts: Counter[tuple[str, str]] = Counter()
+    for item in bag.messages(list(chosen), order=order):
+        entry = chosen[item.topic]
+        if item.type_name not in entry.readers:  # one topic name recorded with two types
+            sentence = f'{item.topic} carries {item.type_name}, not readable as {entry.name}'
+            yield Heard(item.topic, Rejection('bad_type', sentence), item.log_ns)
+            continue
+        try:
+            measurement = entry.readers[item.type_name](item.message, world_frame=world_frame)
+            if (code := entry.doubt(item.message)) is not None:
+                doubts[item.topic, code] += 1
+        except Rejection as rejection:
+            measurement = rejection
+        yield Heard(item.topic, measurement, item.log_ns)
+    for (topic, code), count in doubts.items():
+        bag.add_problem(f'topic {topic}: {count} messages {DOUBTS.get(code, code)}')
+
+
+def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
+    """Check one entry of a topic map."""
+    entries = {entry.name: entry for entry in INPUTS[system]}
+    if wanted not in entries:
+        raise BagError(f"the {system} tracker has no input '{wanted}'"
+                       f'{did_you_mean(wanted, entries)}; it has {", ".join(entries)}')
+    found = [topic for topic in bag.topics if topic.name == name]
+    if not found:
+        names = sorted({topic.name for topic in bag.topics})
+        raise BagError(f"{bag.path} has no topic '{name}'{did_you_mean(name, names)}")
+    if not any(_can_read(topic, entries[wanted]) for topic in found):
+        raise BagError(f'{name} is of type {found[0].type_name}; the input {wanted} takes '
+                       f'{", ".join(entries[wanted].readers)}')
+    return entries[wanted]
+
+
+def _can_read(topic: TopicInfo, entry: InputTopic) -> bool:
+    return topic.type_name in entry.readers
+
+
+def _nothing_fits(bag: BagReader, system: str) -> str:
+    """Say what was looked for, what is there, and what could be meant."""
+    wanted = ' or '.join(f"'{entry.name}'" for entry in INPUTS[system])
+    if not bag.topics:
+        return f'{bag.path} is empty: it has no topics'
+    there = ', '.join(f'{topic.name} ({topic.type_name})' for topic in bag.topics)
+    maybe = [f'{topic.name} as {entry.name}' for topic in bag.topics for entry in INPUTS[system]
+             if _can_read(topic, entry) and 'truth' not in topic.name.split('/')]
+    hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''
+    return (f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
+            f'there are {there}{hint}')

@@ -1,0 +1,252 @@
+"""Where recorded messages come from: rosbags for whole files, a record scan for damaged ones.
+
+rosbags answers damage with many kinds of exception, some of them meant for programmers. Everything
+it raises becomes a `BagError` or a problem of one sentence here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+
+from .mcap_scan import McapScan, zstd
+from .messages import typestore
+
+SUFFIXES = ('.mcap', '.db3', '.bag')
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+
+
+class BagError(Exception):
+    """A recording that cannot be used, in one sentence for the user."""
+
+    def __init__(self, sentence: str):
+        self.sentence = sentence
+        super().__init__(sentence)
+
+
+class TopicInfo(NamedTuple):
+    """One topic of a recording.
+
+    `decodable` is False when the message definition is neither in the bag nor known;
+    `offered_qos` holds the profiles (rosbags `Qos`) the recorder saw, empty when unknown.
+    """
+
+    name: str
+    type_name: str
+    count: int
+    decodable: bool = True
+    offered_qos: tuple[Any, ...] = ()
+
+
+class RawMessage(NamedTuple):
+    """A recorded message before decoding. `raw` is CDR (ROS 1 serialization in a ROS 1 bag)."""
+
+    topic: str
+    type_name: str
+    log_ns: int
+    raw: bytes
+
+
+class Source(Protocol):
+    """One storage that yields its messages by log time."""
+
+    def topics(self) -> list[TopicInfo]: ...
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]: ...
+
+    def decode(self, type_name: str, raw: bytes) -> Any: ...
+
+    def close(self) -> None: ...
+
+
+class RosbagsSource:
+    """A bag directory or storage file read by rosbags."""
+
+    def __init__(self, path: Path):
+        self._reader = AnyReader([path], default_typestore=typestore())
+        self._reader.open()
+        try:
+            # rosbags ignores its default types as soon as the bag defines a single one
+            _add_known_types(self._reader.typestore)
+        except BaseException:
+            self._reader.close()
+            raise
+
+    @property
+    def custom_data(self) -> dict[str, str]:
+        """What the recorder noted beside the messages."""
+        metadata = getattr(getattr(self._reader.readers[0], 'storage', None), 'metadata', None)
+        return dict(getattr(metadata, 'custom', None) or {})
+
+    @property
+    def unordered(self) -> bool:
+        """True for MCAP without chunks: rosbags refuses it when log times are not sorted."""
+        storage = getattr(self._reader.readers[0], 'storage', None)
+        files = getattr(storage, 'storages', [storage])
+        return any(hasattr(file, 'chunks') and not file.chunks and file.metadata.message_count
+                   for file in files)
+
+    def topics(self) -> list[TopicInfo]:
+        return [TopicInfo(link.topic, link.msgtype, link.msgcount,
+                          link.msgtype in self._reader.typestore.fielddefs,
+                          tuple(getattr(link.ext, 'offered_qos_profiles', ())))
+                for link in self._reader.connections]
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
+        chosen = [link for link in self._reader.connections
+                  if topics is None or link.topic in topics]
+        if chosen:
+            for link, log_ns, raw in self._reader.messages(connections=chosen):
+                yield RawMessage(link.topic, link.msgtype, log_ns, _unpacked(raw))
+
+    def decode(self, type_name: str, raw: bytes) -> Any:
+        return self._reader.deserialize(raw, type_name)
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+class ScanSource:
+    """An MCAP file without a usable index."""
+
+    def __init__(self, path: Path):
+        self._scan = McapScan(path)
+        self.lost = self._scan.lost
+        self._types = get_typestore(Stores.EMPTY)
+        for channel in self._scan.channels.values():
+            if channel.definition and 'idl' in channel.definition_encoding:
+                self._types.register(get_types_from_idl(channel.definition))
+            elif channel.definition:
+                self._types.register(get_types_from_msg(channel.definition, channel.type_name))
+        _add_known_types(self._types)
+
+    def topics(self) -> list[TopicInfo]:
+        return [TopicInfo(channel.topic, channel.type_name, self._scan.counts[number],
+                          channel.type_name in self._types.fielddefs)
+                for number, channel in self._scan.channels.items()]
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
+        chosen = {number: channel for number, channel in self._scan.channels.items()
+                  if topics is None or channel.topic in topics}
+        for number, log_ns, raw in self._scan.messages(chosen):
+            yield RawMessage(chosen[number].topic, chosen[number].type_name, log_ns, raw)
+
+    def decode(self, type_name: str, raw: bytes) -> Any:
+        return self._types.deserialize_cdr(raw, type_name)
+
+    def close(self) -> None:
+        self._scan.close()
+
+
+def open_sources(path: Path) -> tuple[list[Source], list[str]]:
+    """Open what lies at `path`: a bag directory, a storage file or a ROS 1 bag.
+
+    Gives the sources and sentences about what is wrong with them. Raises `BagError` when nothing
+    can be read at all.
+    """
+    if not path.exists():
+        raise BagError(f'{path} does not exist')
+    if path.is_file():
+        if path.name == 'metadata.yaml':
+            return open_sources(path.parent)
+        if path.suffix not in SUFFIXES:
+            hint = '; unpack it with zstd first' if path.suffix == '.zstd' else ''
+            raise BagError(f'{path} is no recording: the file names of recordings end in '
+                           f'{", ".join(SUFFIXES)}{hint}')
+        return _open_files([path], [])
+    return _open_directory(path)
+
+
+def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
+    """Open a bag directory through its metadata.yaml or, when that fails, file by file."""
+    problems = []
+    if (path / 'metadata.yaml').exists():
+        try:
+            source = RosbagsSource(path)
+        except Exception as error:  # see the module docstring
+            problems.append(f'{path}: the bag as a whole cannot be read ({one_line(error)}), '
+                            'its files are read one by one')
+        else:
+            if not source.unordered:
+                return [source], _leftovers(path)
+            source.close()
+    files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
+    if not files:
+        raise BagError(problems[0] if problems else
+                       f'{path} is no recording: it holds neither metadata.yaml nor a file that '
+                       f'ends in {", ".join(SUFFIXES)}')
+    if not problems and not (path / 'metadata.yaml').exists():
+        problems.append(f'{path} has no metadata.yaml, its files are read one by one')
+    return _open_files(files, problems)
+
+
+def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], list[str]]:
+    """Open storage files one by one; those that cannot be read become problems."""
+    sources: list[Source] = []
+    failures = []
+    for file in files:
+        try:
+            source = _open_file(file)
+        except Exception as error:  # see the module docstring
+            failures.append(f'{file} cannot be read: {one_line(error)}{_advice(file)}')
+            continue
+        sources.append(source)
+        if lost := getattr(source, 'lost', ''):
+            problems.append(f'{file} {lost}; {sum(topic.count for topic in source.topics())} '
+                            'messages were recovered, the rest is lost')
+        problems += _leftovers(file)
+    if not sources:
+        raise BagError('; '.join(failures))
+    return sources, problems + failures
+
+
+def _open_file(file: Path) -> Source:
+    """Open one storage file by rosbags or, for MCAP that it refuses, by a scan."""
+    try:
+        source = RosbagsSource(file)
+    except Exception:
+        if file.suffix != '.mcap' or not file.stat().st_size:
+            raise
+        return ScanSource(file)
+    if source.unordered:
+        source.close()
+        return ScanSource(file)
+    return source
+
+
+def _unpacked(raw: bytes) -> bytes:
+    """Undo message compression, which only a missing metadata.yaml would have told about."""
+    return zstd.decompress(raw) if raw[:4] == _ZSTD_MAGIC else bytes(raw)
+
+
+def _leftovers(path: Path) -> list[str]:
+    """Sentences about write-ahead logs that a crashed recorder left: SQLite rows nobody reads."""
+    logs = path.glob('*.db3-wal') if path.is_dir() else [path.with_name(path.name + '-wal')]
+    return [f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
+            f"the messages in it are not read (sqlite3 {log.name[:-4]} 'pragma wal_checkpoint' "
+            'merges them)' for log in logs if log.exists() and log.stat().st_size]
+
+
+def _advice(file: Path) -> str:
+    return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
+
+
+def _split_order(file: Path) -> tuple[int, str]:
+    """Order the files of a split bag: name_2 comes before name_10."""
+    return len(file.name), file.name
+
+
+def _add_known_types(types: Any) -> None:
+    """Let `types` fall back on the Jazzy definitions for what the recording does not define."""
+    known = typestore().fielddefs
+    types.register({name: known[name] for name in known if name not in types.fielddefs})
+
+
+def one_line(error: Exception) -> str:
+    """Put an exception of any kind into one line without a full stop."""
+    text = ' '.join(str(error).split()).rstrip('.')
+    return text if text and not isinstance(error, KeyError) else f'{type(error).__name__} {text}'

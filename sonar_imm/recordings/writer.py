@@ -1,0 +1,82 @@
+"""Writing recordings: rosbag2 version 8, which Humble reads too; same input, same bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+
+from .messages import ros_message, typestore
+from .sources import BagError
+
+__all__ = ['BagWriter', 'ros_message', 'STORAGES']
+
+STORAGES = ('mcap', 'sqlite3')
+
+_RELIABLE = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
+                QosTime(0, 0), QosTime(0, 0), QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False)
+
+
+class BagWriter:
+    """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
+
+    custom_data: notes kept in the bag's metadata, e.g. where the data come from. When an exception
+    leaves the ``with`` block, what was written so far is still a whole bag.
+    Raises `BagError` when the bag cannot be made.
+    """
+
+    def __init__(self, path: str | Path, *, storage: str = 'mcap',
+                 custom_data: Mapping[str, str] | None = None):
+        if storage not in STORAGES:
+            raise ValueError(f"storage must be one of {', '.join(STORAGES)}, got '{storage}'")
+        self.path = Path(path)
+        self.count = 0
+        self._links: dict[tuple[str, str], Connection] = {}
+        try:
+            self._writer = Writer(self.path, version=8,
+                                  storage_plugin=StoragePlugin[storage.upper()])
+            for key in sorted(custom_data or {}):
+                self._writer.set_custom_data(key, str(custom_data[key]))
+            self._writer.open()
+        except WriterError:
+            raise BagError(f'{path} exists already; remove it or choose another name') from None
+        except OSError as error:
+            raise BagError(f'{path} cannot be written: {error.strerror}') from None
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Finish the bag: index and metadata."""
+        self._writer.close()
+
+    def write(self, topic: str, message: Any, log_ns: int) -> None:
+        """Append a message made by `ros_message` or read by `BagReader`."""
+        name = message.__msgtype__
+        self.write_raw(topic, name, typestore().serialize_cdr(message, name), log_ns)
+
+    def write_raw(self, topic: str, type_name: str, raw: bytes | memoryview, log_ns: int) -> None:
+        """Append a message that is CDR already. Raises ValueError for a log time before 1970."""
+        if log_ns < 0:
+            raise ValueError(f'a recording cannot hold the log time {log_ns} ns')
+        link = self._links.get((topic, type_name))
+        if link is None:
+            link = self._writer.add_connection(topic, type_name, typestore=typestore(),
+                                               offered_qos_profiles=[_RELIABLE])
+            self._links[topic, type_name] = link
+        self._writer.write(link, log_ns, raw)
+        self.count += 1
