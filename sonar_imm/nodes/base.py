@@ -1,0 +1,279 @@
+"""The node around a tracker: everything that is the same for all systems.
+
+A message becomes a measurement (`msg_adapters`), the tracker makes estimates of it, estimates
+become messages. The only clock the tracker knows is ``header.stamp``; a /clock that jumps back (a
+looped bag, a restarted simulation) resets it. One node, one process, one thread: a queue, not
+threads, takes up bursts.
+
+Every message is answered: after its estimates, however many, comes one row on ``~/processed``
+(latched) with the number of messages taken, refused and of estimates published since the start.
+This is what lock-step replay waits for, since a message that is refused, gated or late may rightly
+have no estimate.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+import contextlib
+import functools
+import sys
+import threading
+import time
+import traceback
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import InvalidQoSProfileException
+from std_srvs.srv import SetBool, Trigger
+
+from msg_adapters.estimates import write_estimate
+from msg_adapters.frames import FrameGuard
+from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.table import encode_table
+
+from ..estimates import Estimate
+from ..measurements import Rejection
+from ..parameters import ConfigError, ParameterSpec
+from ..trackers import SYSTEMS
+from .diagnostics import Meter, Reporter
+from .messages import make, message_class
+from .parameters import NodeConfig, NodeParameters
+from .qos import Endpoints, input_qos, latched_qos, output_qos
+
+TABLE = 'sensor_msgs/msg/PointCloud2'
+_PATIENCE = 1.5
+
+
+class TrackerNode(Node):
+    """One tracker as a ROS 2 node. A system's own node adds its displays by `show`."""
+
+    def __init__(self, system: str, **options: Any):
+        """Declare, compile, then subscribe: the first message meets a warm tracker.
+
+        `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
+        """
+        super().__init__(system, **options)
+        self._topics = INPUTS[system]
+        config_type = SYSTEMS[system].config_type()
+        self._settings = NodeParameters(self, (config_type, NodeConfig),
+                                        [s for t in self._topics if (s := _type_spec(t))])
+        self.tracker = SYSTEMS[system].build(self._settings[config_type])
+        self._guard = FrameGuard(self._node_config.frame_id)
+        self._warm()
+
+        self._enabled = True
+        self._ignored = self._published = 0
+        self._errors: Counter[str] = Counter()
+        self._meter = Meter()
+        self._endpoints = Endpoints(self)
+        with _explained_overrides(self):
+            self._advertise()
+            hears = {topic.name: self._listen(topic) for topic in self._topics}
+        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_service(SetBool, '~/enable', self._on_enable)
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
+                          on_clock_change=False), post_callback=self._on_clock_back)
+        self._reporter = Reporter(self.get_fully_qualified_name().lstrip('/'), hears, self._meter)
+        self.create_timer(self._node_config.diagnostics_period, self._report,
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._settings.on_change(
+            lambda: self.tracker.reconfigure(self._settings[config_type]))
+        self._settings.warn_of_unknown()
+        self._acknowledge(None)
+        self.get_logger().info(f"ready, hears {', '.join(hears.values())}")
+
+    def advertise(self, type_name: str, topic: str) -> Any:
+        """Offer an output; to be used by `advertise_displays`."""
+        return self._endpoints.advertise(message_class(type_name), topic, output_qos())
+
+    def advertise_displays(self) -> None:
+        """Offer the topics that `show` publishes."""
+
+    def show(self, newest: Estimate) -> None:
+        """Publish the newest state for displays."""
+
+    @property
+    def _node_config(self) -> NodeConfig:
+        return self._settings[NodeConfig]
+
+    def _warm(self) -> None:
+        """Compile or load the kernels, with a word to the user when that takes long."""
+        notice = threading.Timer(_PATIENCE, self.get_logger().info, [
+            'compiling numerical kernels, which takes up to 20 s at the very first start; '
+            'later starts load them from the cache'])
+        notice.start()
+        try:
+            self.tracker.warm()
+        finally:
+            notice.cancel()
+
+    def _advertise(self) -> None:
+        self._estimates = self.advertise(TABLE, '~/estimate')
+        self._processed = self._endpoints.advertise(message_class(TABLE), '~/processed',
+                                                    latched_qos())
+        self._diagnostics = self._endpoints.advertise(
+            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos())
+        self.advertise_displays()
+
+    def _listen(self, topic: InputTopic) -> str:
+        """Subscribe to one input and give the resolved name of its topic."""
+        spec = _type_spec(topic)
+        type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
+        reader = functools.partial(topic.readers[type_name],
+                                   world_frame=self._node_config.world_frame_convention)
+        subscription = self._endpoints.subscribe(
+            message_class(type_name), topic.name,
+            functools.partial(self._receive, topic.name, reader),
+            input_qos(self._node_config.queue_depth))
+        return subscription.topic_name
+
+    def _receive(self, name: str, reader: Callable[[Any], Any], message: Any) -> None:
+        """Take one message all the way; whatever it holds, the node goes on."""
+        start = time.monotonic()
+        self._meter.arrived(name, start)
+        try:
+            if self._enabled:
+                measurement = reader(message)
+                self._guard.check(measurement)
+                self._publish(self.tracker.process(measurement))
+            else:
+                self._ignored += 1
+        except Rejection as rejection:
+            self._refuse(name, rejection)
+        except Exception:
+            if not self.context.ok():
+                raise  # the middleware went away under our feet: `run` knows
+            self._recover(name)
+        self._acknowledge(message.header.stamp)
+        self._meter.spent(time.monotonic() - start)
+
+    def _publish(self, estimates: list[Estimate]) -> None:
+        if not estimates:
+            return
+        for estimate in estimates if self._node_config.publish_revisions else estimates[-1:]:
+            self._estimates.publish(write_estimate(estimate, make))
+            self._published += 1
+        self.show(estimates[-1])
+
+    def _refuse(self, name: str, rejection: Rejection) -> None:
+        if rejection.reason not in self._meter.refused:
+            self.get_logger().warning(
+                f"a message on '{name}' is refused: {rejection.sentence} "
+                f"(said once; '{rejection.reason}' is counted in /diagnostics)")
+        self._meter.refused[rejection.reason] += 1
+
+    def _recover(self, name: str) -> None:
+        """Outlive a bug: a node at sea must not end because of one message."""
+        self._errors['internal_error'] += 1
+        self.get_logger().error(f"internal error on a message on '{name}', the tracker starts "
+                                f'afresh; please report this:\n{traceback.format_exc()}')
+        self._start_afresh()
+
+    def _acknowledge(self, stamp: Any) -> None:
+        """Say on ~/processed that everything so far is answered; `stamp` is the message's."""
+        row = {'messages': self._meter.received.total(), 'refused': self._meter.refused.total(),
+               'estimates': self._published}
+        table = encode_table({name: np.array([value], np.uint32) for name, value in row.items()},
+                             stamp_ns=0, frame_id='', make=make)
+        if stamp is not None:
+            table.header.stamp = stamp
+        self._processed.publish(table)
+
+    def _start_afresh(self) -> None:
+        self.tracker.reset()
+        self._guard.reset()
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        self._start_afresh()
+        self.get_logger().info('reset on request')
+        response.success, response.message = True, 'all tracks are forgotten'
+        return response
+
+    def _on_enable(self, request: Any, response: Any) -> Any:
+        self._enabled = bool(request.data)
+        response.success = True
+        response.message = 'tracking' if self._enabled else 'input is ignored'
+        self.get_logger().info(f'{response.message} on request')
+        return response
+
+    def _on_clock_back(self, jump: Any) -> None:
+        self.get_logger().warning(
+            f'/clock is back by {-jump.delta.nanoseconds / 1e9:.3f} s: the tracker starts afresh')
+        self._start_afresh()
+
+    def _report(self) -> None:
+        counts = Counter(self.tracker.counts) + self._errors
+        if self._ignored:
+            counts['ignored_while_disabled'] = self._ignored
+        self._diagnostics.publish(self._reporter.report(
+            self.get_clock().now().to_msg(), time.monotonic(), enabled=self._enabled,
+            stale_after=self._node_config.stale_after, counts=counts,
+            health=self.tracker.health(), lost=self._endpoints.lost,
+            incompatible=self._endpoints.incompatible))
+
+
+def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
+    """Spin a node until SIGINT or SIGTERM. Gives the exit code: 0 done, 2 unusable parameters.
+
+    The order of things matters: the textbook version fails on every tenth signal, because the
+    context can vanish inside any call, the constructor included.
+    """
+    node = None
+    try:
+        _init(args)
+        node = make_node()
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except RuntimeError:  # RCLError, when the context vanished in the middle of a call
+        if rclpy.ok():
+            raise
+    finally:
+        with contextlib.suppress(KeyboardInterrupt):
+            if node is not None:
+                node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _init(args: list[str] | None) -> None:
+    try:
+        rclpy.init(args=args)
+    except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
+        raise ConfigError(' '.join(str(error).split())) from None
+
+
+def _type_spec(topic: InputTopic) -> ParameterSpec | None:
+    """Declare ``<input>_type``, needed where an input can be one of several message types.
+
+    In ROS one topic name has one type, so the user has to say which.
+    """
+    if len(topic.readers) == 1:
+        return None
+    return ParameterSpec(name=f'{topic.name}_type', kind='str', default=next(iter(topic.readers)),
+                         description=f"message type of the input '{topic.name}'",
+                         choices=tuple(topic.readers))
+
+
+@contextlib.contextmanager
+def _explained_overrides(node: Node) -> Iterator[None]:
+    """Turn what rclpy raises for a bad qos_overrides parameter into a `ConfigError`."""
+    try:
+        yield
+    except (InvalidParameterTypeException, InvalidQoSProfileException) as error:
+        raise ConfigError(str(error)) from None
+    except RuntimeError as error:
+        if not node.context.ok():
+            raise
+        raise ConfigError(str(error)) from None

@@ -1,0 +1,134 @@
+"""What /diagnostics says of a node, in the shape of diagnostic_updater.
+
+Two entries a node: ``<node>: input`` (rates, silence, refused and lost messages) and
+``<node>: tracker`` (what the tracker says of itself, and how long it takes). Everything here is
+measured with the steady clock of the machine: under simulated time, paused or looped, silence
+still shows.
+
+The class knows nothing of subscriptions and clocks; the node tells it what happened and when.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
+
+_WINDOW = 1000
+
+
+class Meter:
+    """Arrivals of messages and time spent on them; times in seconds of the steady clock."""
+
+    def __init__(self) -> None:
+        self.received: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self.last: dict[str, float] = {}
+        self._durations: deque[float] = deque(maxlen=_WINDOW)
+
+    def arrived(self, topic: str, now: float) -> None:
+        """Note a message on `topic`."""
+        self.received[topic] += 1
+        self.last[topic] = now
+
+    def spent(self, seconds: float) -> None:
+        """Note how long one message took from the middleware to its last output."""
+        self._durations.append(seconds)
+
+    def compute_ms(self) -> tuple[float, float]:
+        """Median and 99th percentile of the last messages, ms; NaN without any."""
+        if not self._durations:
+            return np.nan, np.nan
+        p50, p99 = np.percentile(np.fromiter(self._durations, float), (50, 99))
+        return 1e3 * float(p50), 1e3 * float(p99)
+
+
+class Reporter:
+    """Turns a `Meter` and the tracker's own numbers into a DiagnosticArray, once a period."""
+
+    def __init__(self, name: str, topics: Mapping[str, str], meter: Meter):
+        """Report as `name`; `topics` maps input names to resolved topic names."""
+        self._name = name
+        self._topics = dict(topics)
+        self._meter = meter
+        self._before = (None, Counter(), Counter())
+
+    def report(self, stamp: Any, now: float, *, enabled: bool, stale_after: float,
+               counts: Mapping[str, int], health: Mapping[str, float], lost: Mapping[str, int],
+               incompatible: Mapping[str, str]) -> DiagnosticArray:
+        """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds."""
+        then, received_before, refused_before = self._before
+        meter = self._meter
+        elapsed = np.nan if then is None else max(now - then, 1e-9)
+        fresh = meter.received - received_before
+        refused = meter.refused - refused_before
+        self._before = (now, meter.received.copy(), meter.refused.copy())
+
+        message = DiagnosticArray()
+        message.header.stamp = stamp
+        message.status = [
+            self._input_status(now, elapsed, fresh, refused, enabled, stale_after, lost,
+                               incompatible),
+            self._tracker_status(fresh.total() / elapsed, enabled, counts, health),
+        ]
+        return message
+
+    def _input_status(self, now: float, elapsed: float, fresh: Counter[str],
+                      refused: Counter[str], enabled: bool, stale_after: float,
+                      lost: Mapping[str, int],
+                      incompatible: Mapping[str, str]) -> DiagnosticStatus:
+        meter = self._meter
+        values: dict[str, Any] = {}
+        for name, topic in self._topics.items():
+            values[f'{name} topic'] = topic
+            values[f'{name} received'] = meter.received[name]
+            values[f'{name} rate [Hz]'] = fresh[name] / elapsed
+            values[f'{name} silent for [s]'] = now - meter.last.get(name, np.nan)
+        values |= {f'refused: {reason}': n for reason, n in sorted(meter.refused.items())}
+        values |= {f'lost on {topic}': n for topic, n in sorted(lost.items())}
+        values |= {f'incompatible peer on {topic}': policy
+                   for topic, policy in sorted(incompatible.items())}
+        silence = now - max(meter.last.values(), default=-np.inf)
+        level, text = DiagnosticStatus.OK, 'receiving'
+        if not meter.last:
+            level, text = DiagnosticStatus.STALE, 'no message yet'
+        elif silence > stale_after:
+            level, text = DiagnosticStatus.STALE, f'no message for {silence:.1f} s'
+        elif refused and refused.total() >= fresh.total():
+            level, text = DiagnosticStatus.ERROR, f'every message is refused: {_most(refused)}'
+        elif refused:
+            level, text = DiagnosticStatus.WARN, f'messages are refused: {_most(refused)}'
+        elif incompatible:
+            level, text = DiagnosticStatus.WARN, 'a peer has an incompatible quality of service'
+        elif lost:
+            level, text = DiagnosticStatus.WARN, 'messages were lost before they could be read'
+        if not enabled:
+            text += ' (disabled, input is not used)'
+        return self._status('input', level, text, values)
+
+    def _tracker_status(self, rate: float, enabled: bool, counts: Mapping[str, int],
+                        health: Mapping[str, float]) -> DiagnosticStatus:
+        p50, p99 = self._meter.compute_ms()
+        values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
+        values |= dict(health)
+        values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
+        level, text = DiagnosticStatus.OK, 'tracking' if enabled else 'disabled'
+        if rate * p50 > 1000.0:
+            level, text = DiagnosticStatus.WARN, 'input comes faster than it can be processed'
+        if counts.get('internal_error'):
+            level, text = DiagnosticStatus.ERROR, 'an internal error was caught, see the log'
+        return self._status('tracker', level, text, values)
+
+    def _status(self, part: str, level: bytes, text: str,
+                values: Mapping[str, Any]) -> DiagnosticStatus:
+        pairs = [KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else
+                          str(value)) for key, value in values.items()]
+        return DiagnosticStatus(level=level, name=f'{self._name}: {part}', message=text,
+                                hardware_id='sonar_imm', values=pairs)
+
+
+def _most(refused: Counter[str]) -> str:
+    return ', '.join(reason for reason, _ in refused.most_common(3))

@@ -1,0 +1,59 @@
+"""The diver node: ``ros2 run sonar_imm diver_node``, or ``python -m sonar_imm.nodes.diver``.
+
+Hears ``fix`` and ``arrivals``. Besides ``~/estimate`` it publishes, for the newest state only:
+
+- ``~/odometry``: one message a confirmed diver (coasting ones too), told apart by
+  ``child_frame_id`` = ``diver_<track_id>``;
+- ``~/model_probabilities``: those of the diver that has been tracked longest (the smallest
+  ``track_id`` among the confirmed). One diver, because a plotting tool draws one curve a name:
+  several divers in turn on one topic would be a zigzag between them. Those of all divers are
+  columns of ``~/estimate``.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+from msg_adapters.estimates import write_model_probabilities, write_odometry
+
+from ..estimates import Estimate
+from .base import run, TrackerNode
+from .messages import make
+
+CONFIRMED = 1
+"""Least `track_state` of a confirmed track: 0 tentative, 1 confirmed, 2 coasting."""
+
+
+class DiverNode(TrackerNode):
+    """Tracks divers from position fixes or raw arrival times."""
+
+    def __init__(self, **options: Any):
+        super().__init__('diver', **options)
+
+    def advertise_displays(self) -> None:
+        self._odometry = self.advertise('nav_msgs/msg/Odometry', '~/odometry')
+        self._probabilities = self.advertise('sensor_msgs/msg/JointState',
+                                             '~/model_probabilities')
+
+    def show(self, newest: Estimate) -> None:
+        confirmed = np.flatnonzero(newest.extras['track_state'] >= CONFIRMED)
+        if not len(confirmed):
+            return
+        if self._odometry.get_subscription_count():
+            for row in confirmed:
+                self._odometry.publish(write_odometry(newest, row, make))
+        if self._probabilities.get_subscription_count():
+            oldest = confirmed[np.argmin(newest.extras['track_id'][confirmed])]
+            self._probabilities.publish(write_model_probabilities(newest, oldest, make))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is told to stop; gives the exit code."""
+    return run(DiverNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,96 @@
+"""Qualities of service, and noticing when they lose data.
+
+Inputs ask for little (best effort), so that they match any driver; outputs offer much (reliable),
+so that they match any listener. Every endpoint can be overridden by the standard parameters, e.g.
+``-p qos_overrides./fix.subscription.reliability:=reliable``. ``BEST_AVAILABLE`` is avoided: it is
+settled when the endpoint is created, becomes reliable when the driver is not up yet, and then
+refuses a best-effort driver.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    qos_policy_name_from_kind,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+
+def input_qos(depth: int) -> QoSProfile:
+    """Best effort, the last `depth` messages: what a listener to a sensor should ask for."""
+    return QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT,
+                      history=HistoryPolicy.KEEP_LAST, depth=depth)
+
+
+def output_qos(depth: int = 10) -> QoSProfile:
+    """Reliable, the last `depth` messages."""
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE,
+                      history=HistoryPolicy.KEEP_LAST, depth=depth)
+
+
+def latched_qos() -> QoSProfile:
+    """Reliable, and the last message waits for listeners that come later."""
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST,
+                      durability=DurabilityPolicy.TRANSIENT_LOCAL, depth=1)
+
+
+def lockstep_qos() -> QoSProfile:
+    """Reliable, nothing dropped: keep-last would lose most of a fast burst without a word."""
+    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_ALL)
+
+
+class Endpoints:
+    """Makes the publishers and subscriptions of a node and remembers what they lost.
+
+    lost: messages the middleware dropped before the node could read them, by topic.
+    incompatible: the policy in question, by topic, of peers that cannot talk to this node.
+    """
+
+    def __init__(self, node: Node):
+        self._node = node
+        self.lost: Counter[str] = Counter()
+        self.incompatible: dict[str, str] = {}
+
+    def subscribe(self, message_type: type, topic: str, callback: Callable[[Any], None],
+                  qos: QoSProfile) -> Subscription:
+        """Subscribe, counting what is lost and naming peers that cannot be heard."""
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be heard'),
+            message_lost=lambda event: self._lost(topic, event))
+        return self._node.create_subscription(
+            message_type, topic, callback, qos, event_callbacks=events,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def advertise(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
+        """Offer a topic, naming listeners that cannot be reached."""
+        events = PublisherEventCallbacks(
+            incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be reached'))
+        return self._node.create_publisher(
+            message_type, topic, qos, event_callbacks=events,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def _mismatch(self, topic: str, event: Any, effect: str) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        if topic not in self.incompatible:
+            self._node.get_logger().warning(
+                f"a peer on '{topic}' {effect}: its {policy} quality of service does not fit; "
+                'change it there, or here with the qos_overrides parameters')
+        self.incompatible[topic] = policy
+
+    def _lost(self, topic: str, event: Any) -> None:
+        if topic not in self.lost:
+            self._node.get_logger().warning(
+                f"messages on '{topic}' are lost before the node can read them: raise queue_depth "
+                'or slow the sender down (said once, counted in /diagnostics)')
+        self.lost[topic] = event.total_count

@@ -1,0 +1,261 @@
+"""The node around a tracker, with real publishers and subscriptions in one process."""
+
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool, Trigger
+
+from msg_adapters.estimates import read_estimate
+from msg_adapters.fixes import write_fix
+from msg_adapters.table import decode_table
+from sonar_imm.measurements import Fix
+from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.qos import latched_qos, lockstep_qos
+
+FIX = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+POINT = 'geometry_msgs/msg/PointStamped'
+SECOND = 10**9
+
+pytestmark = pytest.mark.usefixtures('walker')
+
+
+def a_fix(seconds, x=1.0, y=2.0, frame_id='map'):
+    return write_fix(Fix(stamp_ns=round(seconds * SECOND), position=(x, y, 0.0),
+                         covariance=np.diag([4.0, 9.0]), frame_id=frame_id), make)
+
+
+def a_point(seconds, x=1.0, y=2.0):
+    fix = a_fix(seconds, x, y)
+    return make(POINT, header=fix.header, point=fix.pose.pose.position)
+
+
+class Rig:
+    """A walker node with everything connected to it."""
+
+    def __init__(self, bench, *, publish=FIX, qos=10, prefix='', name='walker'):
+        self.bench = bench
+        self.node = bench.add(TrackerNode('walker', context=bench.context))
+        self.name = f'{prefix}/{name}'
+        self.estimates = bench.listen(PointCloud2, f'{self.name}/estimate', lockstep_qos())
+        self.answers = bench.listen(PointCloud2, f'{self.name}/processed', latched_qos())
+        self.fix = bench.peer.create_publisher(message_class(publish), f'{prefix}/fix', qos)
+        bench.spin_until(lambda: self.answers and self.fix.get_subscription_count())
+
+    @property
+    def answer(self):
+        """The last row of ~/processed: messages, refused, estimates."""
+        columns = decode_table(self.answers[-1])
+        return tuple(int(columns[name][0]) for name in ('messages', 'refused', 'estimates'))
+
+    def send(self, *messages):
+        """Publish one after another, each when the one before has been answered."""
+        for message in messages:
+            answered = self.answer[0]
+            self.fix.publish(message)
+            self.bench.spin_until(lambda before=answered: self.answer[0] > before)
+        self.bench.spin_until(lambda: len(self.estimates) >= self.answer[2])
+
+    def means(self):
+        return [(e.stamp_ns / SECOND, *e.state[0, :2]) for e in map(read_estimate, self.estimates)]
+
+
+@pytest.fixture
+def rig(make_bench):
+    return Rig(make_bench())
+
+
+def test_a_fix_becomes_an_estimate_with_its_stamp(rig):
+    rig.send(a_fix(10.25, 1.0, 2.0), a_fix(11.5, 3.0, 6.0))
+    assert rig.means() == [(10.25, 1.0, 2.0), (11.5, 2.0, 4.0)]
+    estimate = read_estimate(rig.estimates[-1])
+    assert estimate.frame_id == 'map'
+    assert estimate.model_names == ('slow', 'fast')
+    assert estimate.probabilities[0].tolist() == [0.75, 0.25]
+    assert rig.answer == (2, 0, 2)
+    assert rig.answers[-1].header.stamp == a_fix(11.5).header.stamp
+
+
+def test_every_message_is_answered_also_without_an_estimate(rig):
+    rig.send(a_fix(1.0), a_fix(1.0), nan_fix(2.0), a_fix(3.0))
+    assert rig.answer == (4, 1, 2)
+
+
+def nan_fix(seconds):
+    message = a_fix(seconds)
+    message.pose.pose.position.x = float('nan')
+    return message
+
+
+def test_late_input_revises_and_the_newest_comes_last(rig):
+    rig.send(a_fix(1.0, 0.0, 0.0), a_fix(3.0, 4.0, 4.0), a_fix(2.0, 2.0, 8.0))
+    assert rig.means()[2:] == [(2.0, 1.0, 4.0), (3.0, 2.0, 4.0)]
+
+
+def test_revisions_can_be_left_out(rig):
+    rig.node.set_parameters([Parameter('publish_revisions', value=False)])
+    rig.send(a_fix(1.0, 0.0, 0.0), a_fix(3.0, 4.0, 4.0), a_fix(2.0, 2.0, 8.0))
+    assert rig.means()[2:] == [(3.0, 2.0, 4.0)]
+
+
+def hostile():
+    """Messages that a listener to a live topic meets sooner or later."""
+    yield 'not a number', nan_fix(5.0)
+    unstamped = a_fix(5.0)
+    unstamped.header.stamp.sec = unstamped.header.stamp.nanosec = 0
+    yield 'no stamp', unstamped
+    early = a_fix(5.0)
+    early.header.stamp.sec = -5
+    yield 'negative stamp', early
+    overfull = a_fix(5.0)
+    overfull.header.stamp.nanosec = 2**32 - 1
+    yield 'too many nanoseconds', overfull
+    indefinite = a_fix(5.0)
+    indefinite.pose.covariance[1] = indefinite.pose.covariance[6] = 1e3
+    yield 'indefinite covariance', indefinite
+    yield 'far away', a_fix_at(1e12)
+    yield 'other frame', a_fix(5.0, frame_id='odom')
+
+
+def a_fix_at(x):
+    message = a_fix(5.0)
+    message.pose.pose.position.x = x
+    return message
+
+
+def test_hostile_messages_are_refused_counted_and_survived(rig, capfd):
+    cases = list(hostile())
+    rig.send(a_fix(1.0), *(message for _, message in cases), a_fix(6.0, 3.0, 4.0))
+    assert rig.answer == (len(cases) + 2, len(cases), 2)
+    assert rig.means()[-1] == (6.0, 2.0, 3.0)
+    assert sum(rig.node._meter.refused.values()) == len(cases)
+    assert 'Traceback' not in capfd.readouterr().err
+
+
+def test_a_refusal_is_said_once_a_reason(rig, capfd):
+    rig.send(nan_fix(1.0), nan_fix(2.0), a_fix(3.0), a_fix(4.0, frame_id='odom'))
+    said = [line for line in capfd.readouterr().err.splitlines() if 'is refused' in line]
+    assert len(said) == 2
+    assert "the frame 'odom' is not the frame 'map' of the tracks" in said[1]
+
+
+def test_a_bug_in_the_tracker_does_not_end_the_node(rig, capfd):
+    rig.send(a_fix(1.0, 9.0, 9.0))
+    rig.node.tracker.explode = True
+    rig.send(a_fix(2.0))
+    rig.node.tracker.explode = False
+    rig.send(a_fix(3.0, 1.0, 2.0))
+    assert rig.means()[-1] == (3.0, 1.0, 2.0)  # the tracker started afresh
+    assert 'ZeroDivisionError' in capfd.readouterr().err
+
+
+def test_reset_forgets_the_tracks_and_the_frame(rig):
+    rig.send(a_fix(1.0, 9.0, 9.0))
+    assert rig.bench.call(Trigger, '/walker/reset', Trigger.Request()).success
+    rig.send(a_fix(2.0, 1.0, 2.0, frame_id='odom'))
+    assert rig.means()[-1] == (2.0, 1.0, 2.0)
+
+
+def test_disabled_input_is_answered_but_not_used(rig):
+    assert rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=False)).success
+    rig.send(a_fix(1.0, 9.0, 9.0))
+    assert rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=True)).success
+    rig.send(a_fix(2.0, 1.0, 2.0))
+    assert rig.means() == [(2.0, 1.0, 2.0)]
+    assert rig.answer == (2, 0, 1)
+
+
+def test_best_effort_publishers_are_heard(make_bench):
+    rig = Rig(make_bench(), qos=qos_profile_sensor_data)
+    rig.send(a_fix(1.0))
+    assert rig.answer == (1, 0, 1)
+
+
+def test_points_are_heard_when_asked_for(make_bench):
+    rig = Rig(make_bench('-p', f'fix_type:={POINT}'), publish=POINT)
+    rig.send(a_point(1.0, 1.0, 2.0))
+    assert rig.means() == [(1.0, 1.0, 2.0)]
+
+
+def test_north_east_down_input_comes_out_as_east_north_up(make_bench):
+    rig = Rig(make_bench('-p', 'world_frame_convention:=ned'))
+    rig.send(a_fix(1.0, 1.0, 2.0, frame_id='map_ned'))
+    assert rig.means() == [(1.0, 2.0, 1.0)]
+    assert rig.estimates[0].header.frame_id == 'map'
+
+
+def test_a_frame_that_was_told_refuses_the_others(make_bench):
+    rig = Rig(make_bench('-p', 'frame_id:=harbour'))
+    rig.send(a_fix(1.0), a_fix(2.0, frame_id='harbour'))
+    assert rig.answer == (2, 1, 1)
+
+
+def test_namespaces_and_names_move_everything(make_bench):
+    rig = Rig(make_bench('-r', '__ns:=/auv1', '-r', '__node:=bow'), prefix='/auv1', name='bow')
+    rig.send(a_fix(1.0))
+    assert rig.answer == (1, 0, 1)
+
+
+def test_inputs_can_be_remapped(make_bench):
+    bench = make_bench('-r', 'fix:=/usbl/position')
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    publisher = bench.peer.create_publisher(message_class(FIX), '/usbl/position', 10)
+    bench.spin_until(publisher.get_subscription_count)
+    publisher.publish(a_fix(1.0))
+    bench.spin_until(lambda: node.tracker.counts['used'] == 1)
+
+
+def test_qos_overrides_reach_the_endpoints(make_bench):
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable',
+                       '-p', 'qos_overrides./fix.subscription.history:=keep_all',
+                       '-p', 'qos_overrides./walker/estimate.publisher.depth:=3')
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    inputs = {s.topic_name: s.qos_profile for s in node.subscriptions}
+    outputs = {p.topic_name: p.qos_profile for p in node.publishers}
+    assert inputs['/fix'].reliability.name == 'RELIABLE'
+    assert inputs['/fix'].history.name == 'KEEP_ALL'
+    assert inputs['/arrivals'].reliability.name == 'BEST_EFFORT'
+    assert inputs['/arrivals'].depth == 50
+    assert outputs['/walker/estimate'].depth == 3
+
+
+def test_an_incompatible_publisher_is_named(make_bench, capfd):
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable')
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)
+    bench.spin_until(lambda: node._endpoints.incompatible)
+    assert node._endpoints.incompatible == {'fix': 'RELIABILITY'}
+    assert "a peer on 'fix' cannot be heard: its RELIABILITY" in capfd.readouterr().err
+
+
+def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):
+    rig = Rig(make_bench('-p', 'use_sim_time:=true'))
+    clock = rig.bench.peer.create_publisher(Clock, '/clock', QoSProfile(depth=10))
+    rig.bench.spin_until(clock.get_subscription_count)
+
+    def tick(seconds):
+        clock.publish(Clock(clock=a_fix(seconds).header.stamp))
+        rig.bench.spin_until(
+            lambda: rig.node.get_clock().now().nanoseconds == round(seconds * SECOND))
+
+    rig.send(a_fix(100.0, 1.0, 2.0))
+    tick(100.0)
+    rig.send(a_fix(101.0, 3.0, 2.0))
+    assert rig.means()[-1] == (101.0, 2.0, 2.0)
+    tick(50.0)
+    rig.send(a_fix(51.0, 7.0, 7.0))
+    assert rig.means()[-1] == (51.0, 7.0, 7.0)
+
+
+def test_two_nodes_of_one_name_space_do_not_meddle(make_bench):
+    bench = make_bench()
+    left = bench.add(TrackerNode('walker', context=bench.context, namespace='left'))
+    right = bench.add(TrackerNode('walker', context=bench.context, namespace='right'))
+    publisher = bench.peer.create_publisher(message_class(FIX), '/left/fix', 10)
+    bench.spin_until(publisher.get_subscription_count)
+    publisher.publish(a_fix(1.0))
+    bench.spin_until(lambda: left.tracker.counts['used'])
+    assert not right.tracker.counts
