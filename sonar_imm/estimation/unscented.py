@@ -1,0 +1,178 @@
+"""The unscented transform: a Gaussian through a curved function, by a handful of points.
+
+A Gaussian is replaced by points on its principal axes, the points go through the function, and
+mean and covariance are read off the other side. Exact for linear functions, and for quadratic ones
+in the mean.
+
+Three choices make it safe:
+
+- **No negative weights.** ``kappa = max(0, 3 - n)``: up to three dimensions the fourth moment of
+the Gaussian is matched, above
+  that the centre has no weight and the rule is the cubature rule. Every covariance is a sum of
+  squares with weights that are not negative, so it cannot lose its definiteness, and the
+  measurement update is in the matching (Joseph) form.
+- **Angles are averaged as offsets.** Components marked as angles are compared with the image of
+the centre point, wrapped
+  once into [-pi, pi] by rounding (never by a loop), averaged, and added back. Turning the scene
+  turns the answer and changes nothing else, because the points lie on principal axes, which turn
+  with the scene, and singular covariances need no special care.
+- **What is not finite is refused** by `CovarianceError`, at the step where it appears.
+
+Functions are vectorised: they take points (..., s, n) and give (..., s, m).
+
+Reference: Julier, Uhlmann, *Unscented Filtering and Nonlinear Estimation*, Proc. IEEE 92(3), 2004;
+Arasaratnam, Haykin, *Cubature Kalman Filters*, IEEE TAC 54(6), 2009.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from .kalman import (
+    apply,
+    BoolArray,
+    CovarianceError,
+    factorise,
+    FloatArray,
+    log_density,
+    symmetrise,
+    transpose,
+    Updated,
+)
+
+Function = Callable[[FloatArray], FloatArray]
+TWO_PI = 2.0 * np.pi
+
+
+def wrap_angle(angle: FloatArray) -> FloatArray:
+    """The same direction in [-pi, pi]; angles already inside keep their bits."""
+    return angle - TWO_PI * np.round(angle / TWO_PI)
+
+
+class Transformed(NamedTuple):
+    """A Gaussian after a function: mean (..., m), covariance (..., m, m), and its cross covariance
+    (..., n, m) with the argument."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    cross_covariance: FloatArray
+
+
+class _Cloud(NamedTuple):
+    """Offsets from the mean before (..., s, n) and after (..., s, m) the function, weights (s,),
+    mean after (..., m)."""
+
+    before: FloatArray
+    after: FloatArray
+    weights: FloatArray
+    mean: FloatArray
+
+
+def sigma_offsets(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Offsets (..., 2n + 1, n) of the sigma points from their mean, the centre first, and their
+    weights (2n + 1,).
+
+    Raises CovarianceError when `P` (..., n, n) is not finite. Eigenvalues below zero count as
+    zero.
+    """
+    finite = np.isfinite(P).all(axis=(-1, -2))
+    if not finite.all():
+        raise CovarianceError('covariance is not finite', np.asarray(~finite))
+    n = P.shape[-1]
+    kappa = max(0.0, 3.0 - n)
+    values, vectors = np.linalg.eigh(P)
+    axes = transpose(vectors) * np.sqrt((n + kappa) * np.maximum(values, 0.0))[..., None]
+    weights = np.full(2 * n + 1, 0.5 / (n + kappa))
+    weights[0] = kappa / (n + kappa)
+    return np.concatenate([np.zeros_like(axes[..., :1, :]), axes, -axes], axis=-2), weights
+
+
+def unscented_transform(
+    function: Function, x: FloatArray, P: FloatArray, *, angles: BoolArray | None = None
+) -> Transformed:
+    """Mean and covariance of ``function(X)``, ``X ~ N(x, P)``.
+
+    function: (..., s, n) to (..., s, m); x: (..., n); P: (..., n, n); angles: (m,), True for
+    components of the result that are angles in radians (the mean of those is in [-pi, pi]).
+
+    Raises CovarianceError when P or the result is not finite.
+    """
+    cloud = _transform(function, x, P, angles)
+    weighted = cloud.after * cloud.weights[:, None]
+    return Transformed(
+        cloud.mean,
+        symmetrise(transpose(weighted) @ cloud.after),
+        transpose(cloud.before) @ weighted,
+    )
+
+
+def predict(
+    x: FloatArray, P: FloatArray, f: Function, Q: FloatArray, *, angles: BoolArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Time update ``x <- f(x) + w``, ``w ~ N(0, Q)``; `angles` (n,) marks angles of the state."""
+    moved = unscented_transform(f, x, P, angles=angles)
+    return moved.mean, symmetrise(moved.covariance + Q)
+
+
+def update(
+    x: FloatArray,
+    P: FloatArray,
+    z: FloatArray,
+    h: Function,
+    R: FloatArray,
+    *,
+    angles: BoolArray | None = None,
+    state_angles: BoolArray | None = None,
+) -> Updated:
+    """Measurement update with ``z = h(x) + v``, ``v ~ N(0, R)``.
+
+    z: (..., m); h: (..., s, n) to (..., s, m); R: (..., m, m); angles: (m,), angles of the
+    measurement; state_angles: (n,), angles of the state, which are wrapped into [-pi, pi].
+
+    The covariance is ``sum w (dx - K dz)(.)' + K R K'``: squares only, equal to ``P - K S K'`` in
+    exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or the innovation
+    covariance is not positive definite.
+    """
+    cloud = _transform(h, x, P, angles)
+    weighted = cloud.after * cloud.weights[:, None]
+    S = symmetrise(transpose(weighted) @ cloud.after + R)
+    factor = factorise(S, 'innovation covariance')
+    cross = transpose(weighted) @ cloud.before
+    gain = transpose(np.linalg.solve(transpose(factor), np.linalg.solve(factor, cross)))
+    innovation = _wrap(z - cloud.mean, angles)
+    rest = cloud.before - cloud.after @ transpose(gain)
+    covariance = transpose(rest * cloud.weights[:, None]) @ rest + gain @ R @ transpose(gain)
+    nis, log_likelihood = log_density(innovation, factor)
+    return Updated(
+        _wrap(x + apply(gain, innovation), state_angles),
+        symmetrise(covariance),
+        S,
+        nis,
+        log_likelihood,
+    )
+
+
+def _transform(
+    function: Function, x: FloatArray, P: FloatArray, angles: BoolArray | None
+) -> _Cloud:
+    before, weights = sigma_offsets(P)
+    images = function(x[..., None, :] + before)
+    finite = np.isfinite(images).all(axis=(-1, -2))
+    if not finite.all():
+        raise CovarianceError('the function is not finite at a sigma point', np.asarray(~finite))
+    reference = images[..., :1, :]
+    offsets = _wrap(images - reference, angles)
+    mean_offset = np.einsum('s,...sm->...m', weights, offsets)
+    return _Cloud(
+        before,
+        offsets - mean_offset[..., None, :],
+        weights,
+        _wrap(reference[..., 0, :] + mean_offset, angles),
+    )
+
+
+def _wrap(vector: FloatArray, angles: BoolArray | None) -> FloatArray:
+    return vector if angles is None else np.where(angles, wrap_angle(vector), vector)
