@@ -10,7 +10,7 @@ import textwrap
 
 import yaml
 
-from sonar_imm.nodes.parameters import NodeConfig
+from sonar_imm.nodes.config import NodeConfig
 from sonar_imm.parameters import Config, markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 

@@ -42,9 +42,10 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..parameters import ConfigError, ParameterSpec
 from ..trackers import SYSTEMS
+from .config import NodeConfig
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
-from .parameters import NodeConfig, NodeParameters
+from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
 
 TABLE = 'sensor_msgs/msg/PointCloud2'

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping
 import sys
 from typing import Any, TypeVar
 
-from attrs import frozen
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -22,7 +21,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from ..parameters import Config, ConfigError, did_you_mean, parameter, ParameterSpec
+from ..parameters import Config, ConfigError, did_you_mean, ParameterSpec
 
 C = TypeVar('C', bound=Config)
 
@@ -31,27 +30,6 @@ _TYPES = {
     'str': Parameter.Type.STRING, 'float[]': Parameter.Type.DOUBLE_ARRAY,
     'int[]': Parameter.Type.INTEGER_ARRAY, 'str[]': Parameter.Type.STRING_ARRAY,
 }
-
-
-@frozen(kw_only=True)
-class NodeConfig(Config):
-    """What every node can be told besides the parameters of its tracker."""
-
-    queue_depth: int = parameter(
-        50, 'messages an input holds while the tracker is busy', low=1, high=100000)
-    frame_id: str = parameter(
-        '', 'frame the input must be in; empty: that of the first message accepted')
-    world_frame_convention: str = parameter(
-        'enu', 'axes of the input: enu (x east, y north, z up) or ned (x north, y east, z down); '
-        'the output is always enu', choices=('enu', 'ned'))
-    publish_revisions: bool = parameter(
-        True, 'late input changes estimates already made: publish those again too, oldest first; '
-        'false: only the newest', read_only=False)
-    diagnostics_period: float = parameter(
-        1.0, 'time between two messages on /diagnostics', unit='s', low=0.05, high=3600.0)
-    stale_after: float = parameter(
-        10.0, 'silence after which diagnostics call the input stale', unit='s', low=0.01, high=1e6,
-        read_only=False)
 
 
 class NodeParameters:

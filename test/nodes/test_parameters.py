@@ -5,7 +5,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
 from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.parameters import NodeConfig
+from sonar_imm.nodes.config import NodeConfig
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 
