@@ -1,0 +1,280 @@
+"""A position from one ping: maximum likelihood, with every doubt said out loud.
+
+`localise` takes the arrivals of one ping (range sums from known transmitters, bearings, or one-way
+arrivals from a tag whose time of emission is unknown) and gives a `Localisation` or a `Refusal`
+with a short reason. What guards it:
+
+* **Ghosts.** Two ellipses cross at two points or more. Every minimum of the sum of squares within
+  a likelihood ratio of about 100 to 1 of the best one is reported in `alternatives`, and the fix
+  is called ambiguous.
+* **Singular baseline.** Between transmitter and receiver the gradient of the range sum vanishes. A
+  fix is refused when its largest standard deviation or the condition number of its covariance
+  passes the limit, or when one standard deviation away the likelihood is not what the covariance
+  says: the covariance would be a fiction.
+* **Late reflections.** When the chi-square test fails, the row whose removal helps most is left
+  out, one at a time, while a degree of freedom remains to test the rest with.
+* **Plausibility.** A fix further than `max_range` from the instruments is refused.
+
+The covariance is the inverse of the Fisher information at the solution. An error of the sound
+speed is common to all arrivals and is not in it: `multistatic.crlb` with `sound_speed_std` tells
+how much it adds.
+"""
+
+from __future__ import annotations
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import chdtrc
+
+from .arrival_fit import ArrivalFit, BoolArray, Minima, minimise
+from .multistatic import emission_time, FloatArray
+
+
+@frozen(kw_only=True)
+class Limits:
+    """What a fix must satisfy.
+
+    max_range: m from the middle of the instruments; max_std: m, along the worst axis;
+    max_condition: of the covariance; min_p_value: of the chi-square test; max_outliers: rows that
+    may be left out (0: none); refuse_ambiguous: turn an ambiguous fix into a refusal.
+    """
+
+    max_range: float = 10_000.0
+    max_std: float = 100.0
+    max_condition: float = 1e8
+    min_p_value: float = 1e-3
+    max_outliers: int = 10
+    refuse_ambiguous: bool = False
+
+
+DEFAULT_LIMITS = Limits()
+
+
+@frozen(eq=False)
+class Candidate:
+    """Another position (2,) that explains the ping nearly as well, with its covariance (2, 2) and
+    chi-square."""
+
+    position: FloatArray
+    covariance: FloatArray
+    cost: float
+
+    def distance2(self, position: FloatArray) -> float:
+        """Squared Mahalanobis distance of another position (2,) from this one."""
+        gap = position - self.position
+        return float(gap @ np.linalg.solve(self.covariance, gap))
+
+
+@frozen(eq=False, kw_only=True)
+class Localisation:
+    """A fix: position (2,) m, covariance (2, 2) m^2, chi-square `cost` with `dof` degrees of
+    freedom and its p-value (1 where dof is 0 and nothing can be tested); best of `alternatives`
+    first.
+
+    used, used_bearing: (n,) which arrival times and bearings the fix rests on. emission_time (s,
+    on the clock of the arrivals) and var_emission_time (s^2): None when every row has a
+    transmitter.
+    """
+
+    position: FloatArray
+    covariance: FloatArray
+    cost: float
+    dof: int
+    p_value: float
+    ambiguous: bool
+    alternatives: tuple[Candidate, ...]
+    used: BoolArray
+    used_bearing: BoolArray
+    emission_time: float | None = None
+    var_emission_time: float | None = None
+
+
+@frozen(eq=False)
+class Refusal:
+    """No fix. `reason` is one of too_few, singular_geometry, poor_fit, ambiguous, diverged,
+    out_of_range."""
+
+    reason: str
+    sentence: str
+    alternatives: tuple[Candidate, ...] = ()
+
+
+AMBIGUITY_COST = 9.21
+"""Chi-square above the best within which another minimum is an alternative: likelihood ratio of
+100 to 1."""
+
+DISTINCT = 4.0
+"""Squared Mahalanobis distance beyond which two minima are two positions."""
+
+SEEDS = 4
+"""Minima from which the search goes on when a row is left out."""
+
+QUADRATIC = (0.3, 3.5)
+"""What chi-square may rise by one standard deviation from the fix; 1 where the covariance
+describes the likelihood."""
+
+
+def localise(rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike, *, tx: ArrayLike | None = None,
+             bearing: ArrayLike | None = None, var_bearing: ArrayLike | None = None,
+             target_z: float = 0.0, sound_speed: float = 1500.0,
+             limits: Limits = DEFAULT_LIMITS) -> Localisation | Refusal:
+    """Find the target of one ping from its n arrivals.
+
+    rx (n, 3) m; toa (n,) s and var_toa (n,) s^2; tx (n, 3) m, rows of NaN (or None) where the
+    target itself emits; bearing (n,) rad and var_bearing (n,) rad^2. A time or bearing that is not
+    finite or has no positive variance is not used. The times of rows with a transmitter count from
+    its transmission. Raises ValueError for arrays whose lengths differ or receivers that are not
+    finite.
+    """
+    tx_, rx_, times, bearings = _checked(tx, rx, toa, var_toa, bearing, var_bearing)
+    fit = _problem(tx_, rx_, times, bearings, target_z, sound_speed, limits.max_range)
+    if _dof(fit, np.ones(len(fit.weight), bool)) < 0:
+        return Refusal('too_few', f'{len(fit.weight)} arrival times and bearings fix no position')
+    kept, minima = _search(fit, limits)
+    if not len(minima.cost):
+        return Refusal('diverged', 'the search for the position did not converge')
+    candidates = _candidates(fit, minima)
+    if not candidates:
+        return Refusal('out_of_range', 'the position lies further than '
+                       f'{limits.max_range:g} m from the instruments')
+    best, *rivals = candidates
+    dof = _dof(fit, kept)
+    refusal = _doubt(fit, fit.weight * kept, best, dof, limits)
+    if refusal is not None:
+        return refusal
+    if rivals and limits.refuse_ambiguous:
+        return Refusal('ambiguous', f'{len(candidates)} positions explain the arrivals about '
+                       'equally well', tuple(candidates))
+    emission, var_emission = _emission(fit, kept, best, sound_speed)
+    return Localisation(
+        position=best.position, covariance=best.covariance, cost=best.cost, dof=dof,
+        p_value=_p_value(best.cost, dof), ambiguous=bool(rivals), alternatives=tuple(rivals),
+        used=_spread(kept[:len(fit.rx)], _usable(times)),
+        used_bearing=_spread(kept[len(fit.rx):], _usable(bearings)),
+        emission_time=emission, var_emission_time=var_emission)
+
+
+def _checked(tx: ArrayLike | None, rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike,
+             bearing: ArrayLike | None, var_bearing: ArrayLike | None) -> tuple[FloatArray, ...]:
+    """tx (n, 3), rx (n, 3), and times (n, 2), bearings (n, 2) as pairs of value and variance."""
+    rx_ = np.asarray(rx, np.float64)
+    n = len(rx_)
+    tx_ = np.full((n, 3), np.nan) if tx is None else np.asarray(tx, np.float64)
+    missing = np.full(n, np.nan)
+    columns = [missing if values is None else np.asarray(values, np.float64)
+               for values in (toa, var_toa, bearing, var_bearing)]
+    if rx_.shape != (n, 3) or tx_.shape != (n, 3) or any(len(each) != n for each in columns):
+        raise ValueError('every arrival needs tx and rx positions (n, 3), a time and a variance')
+    if not np.isfinite(rx_).all():
+        raise ValueError('a receiver position is not finite')
+    return tx_, rx_, np.column_stack(columns[:2]), np.column_stack(columns[2:])
+
+
+def _problem(tx: FloatArray, rx: FloatArray, times: FloatArray, bearings: FloatArray,
+             target_z: float, sound_speed: float, max_range: float) -> ArrivalFit:
+    """The least-squares problem of the usable rows."""
+    hears, sees = _usable(times), _usable(bearings)
+    active = _finite_rows(tx[hears])
+    toa, var_toa = times[hears].T
+    # Passive times may count from any epoch: from their own first arrival they keep their digits.
+    epoch = float(toa[~active].min(initial=np.inf))
+    path = sound_speed * (toa - np.where(active, 0.0, epoch))
+    variance = np.concatenate([sound_speed**2 * var_toa, bearings[sees, 1]])
+    return ArrivalFit(
+        tx=np.where(active[:, None], tx[hears], rx[hears]), rx=rx[hears], active=active,
+        bearing_rx=rx[sees], observed=np.concatenate([path, bearings[sees, 0]]),
+        weight=1.0 / variance, target_z=target_z, max_range=max_range, epoch=epoch)
+
+
+def _usable(rows: FloatArray) -> BoolArray:
+    """Which (n,) of the pairs of value and variance (n, 2) hold a measurement."""
+    return _finite_rows(rows) & (rows[:, 1] > 0.0)
+
+
+def _finite_rows(rows: FloatArray) -> BoolArray:
+    return np.asarray(np.isfinite(rows).all(axis=-1))
+
+
+def _spread(kept: BoolArray, usable: BoolArray) -> BoolArray:
+    """What was kept of the usable rows, told for all rows (n,)."""
+    told = usable.copy()
+    told[usable] = kept
+    return told
+
+
+def _dof(fit: ArrivalFit, kept: BoolArray) -> int:
+    """Rows less unknowns: x, y and, where passive rows are kept, the time of emission."""
+    return int(kept.sum()) - 2 - int((kept[:len(fit.rx)] & ~fit.active).any())
+
+
+def _p_value(cost: float, dof: int) -> float:
+    return float(chdtrc(dof, cost)) if dof > 0 else 1.0
+
+
+def _search(fit: ArrivalFit, limits: Limits) -> tuple[BoolArray, Minima]:
+    """Which rows (m,) to keep, and the minima of the sum of squares over them, best first."""
+    kept = np.ones(len(fit.weight), bool)
+    minima = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
+    for _ in range(limits.max_outliers):
+        dof = _dof(fit, kept)
+        if dof < 2 or not len(minima.cost) or _p_value(minima.cost[0], dof) >= limits.min_p_value:
+            break
+        suspects = np.flatnonzero(kept)
+        seeds = minima.position[:SEEDS]
+        all_but_one = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
+        trials = minimise(fit, np.tile(seeds, (len(suspects), 1)),
+                          np.repeat(all_but_one, len(seeds), axis=0))
+        kept[suspects[int(np.argmin(trials.cost)) // len(seeds)]] = False
+        weight = fit.weight * kept
+        afresh = minimise(fit, fit.starts(weight), weight)
+        # Leaving out another row may do as well and lead elsewhere: such fixes compete too.
+        minima = afresh.joined(trials).distinct()
+    return kept, minima
+
+
+def _candidates(fit: ArrivalFit, minima: Minima) -> list[Candidate]:
+    """The minima in range that match the best one or nearly so, apart from each other."""
+    near = np.linalg.norm(minima.position - fit.centre, axis=-1) <= fit.max_range
+    level = minima.cost <= minima.cost[0] + AMBIGUITY_COST
+    found: list[Candidate] = []
+    for index in np.flatnonzero(near & level):
+        position = minima.position[index]
+        if all(other.distance2(position) > DISTINCT for other in found):
+            # That the target is in range is the weakest of priors, and keeps the inverse finite.
+            information = minima.information[index] + np.eye(2) / fit.max_range**2
+            cost = float(minima.cost[index])
+            found.append(Candidate(position, np.linalg.inv(information), cost))
+    return found
+
+
+def _doubt(fit: ArrivalFit, weight: FloatArray, best: Candidate, dof: int,
+           limits: Limits) -> Refusal | None:
+    """Why the best candidate must not be believed, or None."""
+    variances, axes = np.linalg.eigh(best.covariance)
+    if variances[1] > limits.max_std**2 or variances[1] > limits.max_condition * variances[0]:
+        return Refusal('singular_geometry', 'the geometry leaves a standard deviation of '
+                       f'{np.sqrt(variances[1]):.3g} m')
+    aside = (axes * np.sqrt(variances)).T
+    rise = fit.cost(best.position + np.concatenate([aside, -aside]), weight) - best.cost
+    if rise.min() < QUADRATIC[0] or rise.max() > QUADRATIC[1]:
+        return Refusal('singular_geometry', 'around the fix the likelihood is not what its '
+                       'covariance says, as near the line between transmitter and receiver')
+    p_value = _p_value(best.cost, dof)
+    if p_value < limits.min_p_value:
+        return Refusal('poor_fit', f'chi-square {best.cost:.4g} with {dof} degrees of freedom '
+                       f'(p = {p_value:.2g})')
+    return None
+
+
+def _emission(fit: ArrivalFit, kept: BoolArray, best: Candidate,
+              sound_speed: float) -> tuple[float | None, float | None]:
+    """Time of emission and its variance from the passive rows kept; None without such rows."""
+    rows = np.flatnonzero(kept[:len(fit.rx)] & ~fit.active)
+    if not len(rows):
+        return None, None
+    time, variance = emission_time(
+        fit.observed[rows] / sound_speed, 1.0 / (sound_speed**2 * fit.weight[rows]),
+        fit.rx[rows], best.position, target_z=fit.target_z, sound_speed=sound_speed,
+        covariance=best.covariance)
+    return fit.epoch + time, variance
