@@ -132,29 +132,34 @@ class TrackerNode(Node):
                                    world_frame=self._node_config.world_frame_convention)
         subscription = self._endpoints.subscribe(
             message_class(type_name), topic.name,
-            functools.partial(self._receive, topic.name, reader),
+            functools.partial(self._receive, topic, reader),
             input_qos(self._node_config.queue_depth))
         return subscription.topic_name
 
-    def _receive(self, name: str, reader: Callable[[Any], Any], message: Any) -> None:
+    def _receive(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Take one message all the way; whatever it holds, the node goes on."""
         start = time.monotonic()
-        self._meter.arrived(name, start)
+        self._meter.arrived(topic.name, start)
         try:
             if self._enabled:
-                measurement = reader(message)
-                self._guard.check(measurement)
-                self._publish(self.tracker.process(measurement))
+                self._process(topic, reader, message)
             else:
                 self._ignored += 1
         except Rejection as rejection:
-            self._refuse(name, rejection)
+            self._refuse(topic, rejection)
         except Exception:
             if not self.context.ok():
                 raise  # the middleware went away under our feet: `run` knows
-            self._recover(name)
+            self._recover(topic)
         self._acknowledge(message.header.stamp)
         self._meter.spent(time.monotonic() - start)
+
+    def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
+        measurement = reader(message)
+        self._guard.check(measurement)
+        if (doubt := topic.doubt(message)) is not None:
+            self._doubt(topic, doubt)
+        self._publish(self.tracker.process(measurement))
 
     def _publish(self, estimates: list[Estimate]) -> None:
         if not estimates:
@@ -164,18 +169,25 @@ class TrackerNode(Node):
             self._published += 1
         self.show(estimates[-1])
 
-    def _refuse(self, name: str, rejection: Rejection) -> None:
+    def _doubt(self, topic: InputTopic, reason: str) -> None:
+        if reason not in self._meter.doubted:
+            self.get_logger().warning(
+                f"a message on '{topic.name}' is used but deserves a look: {reason} "
+                '(said once, counted in /diagnostics)')
+        self._meter.doubted[reason] += 1
+
+    def _refuse(self, topic: InputTopic, rejection: Rejection) -> None:
         if rejection.reason not in self._meter.refused:
             self.get_logger().warning(
-                f"a message on '{name}' is refused: {rejection.sentence} "
+                f"a message on '{topic.name}' is refused: {rejection.sentence} "
                 f"(said once; '{rejection.reason}' is counted in /diagnostics)")
         self._meter.refused[rejection.reason] += 1
 
-    def _recover(self, name: str) -> None:
+    def _recover(self, topic: InputTopic) -> None:
         """Outlive a bug: a node at sea must not end because of one message."""
         self._errors['internal_error'] += 1
-        self.get_logger().error(f"internal error on a message on '{name}', the tracker starts "
-                                f'afresh; please report this:\n{traceback.format_exc()}')
+        self.get_logger().error(f"internal error on a message on '{topic.name}', the tracker "
+                                f'starts afresh; please report this:\n{traceback.format_exc()}')
         self._start_afresh()
 
     def _acknowledge(self, stamp: Any) -> None:

@@ -26,6 +26,7 @@ class Meter:
     def __init__(self) -> None:
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
+        self.doubted: Counter[str] = Counter()
         self.last: dict[str, float] = {}
         self._durations: deque[float] = deque(maxlen=_WINDOW)
 
@@ -88,6 +89,7 @@ class Reporter:
             values[f'{name} rate [Hz]'] = fresh[name] / elapsed
             values[f'{name} silent for [s]'] = now - meter.last.get(name, np.nan)
         values |= {f'refused: {reason}': n for reason, n in sorted(meter.refused.items())}
+        values |= {f'doubtful: {reason}': n for reason, n in sorted(meter.doubted.items())}
         values |= {f'lost on {topic}': n for topic, n in sorted(lost.items())}
         values |= {f'incompatible peer on {topic}': policy
                    for topic, policy in sorted(incompatible.items())}

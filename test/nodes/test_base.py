@@ -259,3 +259,13 @@ def test_two_nodes_of_one_name_space_do_not_meddle(make_bench):
     publisher.publish(a_fix(1.0))
     bench.spin_until(lambda: left.tracker.counts['used'])
     assert not right.tracker.counts
+
+
+def test_a_covariance_of_zeros_is_used_as_unknown_and_said_once(rig, capfd):
+    blank = a_fix(1.0)
+    blank.pose.covariance[:] = 0.0
+    again = a_fix(2.0)
+    again.pose.covariance[:] = 0.0
+    rig.send(blank, again)
+    assert rig.answer == (2, 0, 2)
+    assert capfd.readouterr().err.count('zero_covariance') == 1
