@@ -248,21 +248,26 @@ class Tracks:
             self.next_id + count,
         )
 
-    def scan(self, hit: BoolArray, stamp_ns: int, rules: TrackRules) -> tuple[Tracks, BoolArray]:
-        """Take in one scan: `hit` (T,) says which tracks got a detection.
+    def scan(
+        self, hit: BoolArray, stamp_ns: int, rules: TrackRules, *, looked: BoolArray | None = None
+    ) -> tuple[Tracks, BoolArray]:
+        """Take in one scan: `hit` (T,) says which tracks got a detection, `looked` (T,) which could
+        have got one (all by default). A track nobody looked for is neither hit nor missed.
 
         Returns the tracks that live on and ``kept`` (T,), True for those, with which to thin the
         states kept beside them.
         """
-        age = self.age + 1
-        seen = np.column_stack([_window(self.seen, rules.confirm_window)[:, 1:], hit])
-        misses = np.where(hit, 0, self.misses + 1)
+        looked = np.ones(len(self), np.bool_) if looked is None else looked | hit
+        age = self.age + looked
+        before = _window(self.seen, rules.confirm_window)
+        seen = np.where(looked[:, None], np.column_stack([before[:, 1:], hit]), before)
+        misses = np.where(hit, 0, self.misses + looked)
         last_hit_ns = np.where(hit, stamp_ns, self.last_hit_ns)
         hits = seen.sum(axis=1)
         confirmed = (self.status != TrackStatus.TENTATIVE) | (hits >= rules.confirm_hits)
         status = np.where(
             confirmed,
-            np.where(hit, TrackStatus.CONFIRMED, TrackStatus.COASTING),
+            np.where(hit, TrackStatus.CONFIRMED, np.where(looked, TrackStatus.COASTING, self.status)),
             TrackStatus.TENTATIVE,
         )
         missed_in_window = np.minimum(age, rules.confirm_window) - hits

@@ -26,22 +26,22 @@ def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray,
     x0 = np.zeros((T, M, n))
     P0 = np.zeros((T, M, n, n))
     c = np.zeros((T, M))
-    d = np.empty(n)
+    d, W = np.empty(n), np.empty(M)
     for t in range(T):
         p = t % transition.shape[0]
         for j in range(M):
             total = 0.0
             for i in range(M):
-                total += transition[p, i, j] * mu[t, i]
+                W[i] = transition[p, i, j] * mu[t, i]
+                total += W[i]
             c[t, j] = total
+            scale = 1.0 / total if total > 0.0 else 0.0
             for i in range(M):
-                w = transition[p, i, j] * mu[t, i] / total if total > 0.0 else mu[t, i]
-                if w == 0.0:
-                    continue
+                W[i] = W[i] * scale if total > 0.0 else mu[t, i]
                 for a in range(n):
-                    x0[t, j, a] += w * x[t, i, a]
+                    x0[t, j, a] += W[i] * x[t, i, a]
             for i in range(M):
-                w = transition[p, i, j] * mu[t, i] / total if total > 0.0 else mu[t, i]
+                w = W[i]
                 if w == 0.0:
                     continue
                 for a in range(n):

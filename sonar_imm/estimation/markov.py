@@ -3,9 +3,8 @@
 Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
 
 A chain is stated at a reference step, but sonar is irregular. `RateChain` turns the matrix into a generator once,
-``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of 0.1 s equal one of 1 s. Learning
-from data (`adapt_counts`, `adapt_product`) does not touch the generator: it yields a *correction*, a factor for each
-transition, which `corrected` applies to the matrix of any step.
+``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation`
+lets the data correct it.
 """
 
 from __future__ import annotations
@@ -129,46 +128,27 @@ def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
     return out
 
 
-def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatArray) -> FloatArray:
-    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights; (..., M, M) from (..., M, M), (..., M) twice."""
-    joint = P * mu_before[..., :, None]
-    c = joint.sum(axis=-2, keepdims=True)
-    return np.asarray(joint / np.where(c > 0.0, c, 1.0) * mu_after[..., None, :])
+class EventChain:
+    """Models that are events rather than states: each step draws anew from one law, whatever came before.
 
-
-def adapt_counts(counts: FloatArray, expected: FloatArray, posterior: FloatArray, nominal: FloatArray,
-                 ) -> tuple[FloatArray, FloatArray]:
-    """Dirichlet counts, n_ij += W_ij mu_j, beside what the nominal matrix of the same step would have had us count.
-
-    All (..., M, M); gives the new (counts, expected). See `counts_correction`.
+    law (M,): of a reference step; its first model is 'nothing happens', which gets likelier as the step shrinks:
+    Pr(nothing in dt) = law_0 ** (dt / step). The matrices have identical rows (the filter is then a GPB1).
     """
-    return counts + posterior, expected + posterior.sum(axis=-1, keepdims=True) * nominal
 
+    def __init__(self, law: ArrayLike, step: float):
+        row = check_transition_matrix(np.tile(np.asarray(law, np.float64), (np.size(law), 1)))[0]
+        if not step > 0.0:
+            raise ValueError(f'the reference step must be positive, got {step}')
+        self.step = float(step)
+        self.matrix = np.tile(row, (len(row), 1))
 
-def counts_correction(counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float) -> FloatArray:
-    """Factor for each transition, (n + N0 P0) / (e + N0 P0), `prior` P0 being the matrix of the reference step.
-
-    At a constant step e_ij = n_i. P0_ij and the corrected matrix is the Dirichlet posterior mean, rownorm(n + N0 P0);
-    at irregular steps the factor compares like with like, which counting alone would not.
-    """
-    given = expected + weight * prior
-    return np.asarray(np.where(given > 0.0, (counts + weight * prior) / np.where(given > 0.0, given, 1.0), 1.0))
-
-
-def adapt_product(correction: FloatArray, mu_after: FloatArray, prior: FloatArray, guard: float) -> FloatArray:
-    """Eq. (1) of the diver paper, P_ij <- P_ij mu_j / sum, guarded by P <- (1 - guard) P + guard P0, as a factor on P0.
-
-    Unguarded the exponent of mu doubles each step and rows become one-hot within five.
-    """
-    P = corrected(prior, correction) * mu_after[..., None, :]
-    total = P.sum(axis=-1, keepdims=True)
-    P = np.where(total > 0.0, P / np.where(total > 0.0, total, 1.0), prior)
-    P = (1.0 - guard) * P + guard * prior
-    return np.asarray(np.where(prior > 0.0, P / np.where(prior > 0.0, prior, 1.0), 1.0))
-
-
-def corrected(P: FloatArray, correction: FloatArray) -> FloatArray:
-    """Apply a learnt factor to the matrix of any step and renormalise the rows. (..., M, M)."""
-    out = P * correction
-    total = out.sum(axis=-1, keepdims=True)
-    return np.asarray(np.where(total > 0.0, out / np.where(total > 0.0, total, 1.0), P))
+    def transition(self, dt: float) -> FloatArray:
+        """P(dt), (M, M)."""
+        if not dt >= 0.0:
+            raise ValueError(f'a time step cannot be negative, got {dt}')
+        row = self.matrix[0].copy()
+        nothing = row[0] ** (dt / self.step)
+        happens = row[1:].sum()
+        row[1:] *= (1.0 - nothing) / happens if happens > 0.0 else 0.0
+        row[0] = 1.0 - row[1:].sum()
+        return np.tile(row, (len(row), 1))

@@ -39,14 +39,17 @@ class DiverConfig(Config):
 
     # -- how divers move -----------------------------------------------------------------------------------------------
     speed_mean: float = parameter(0.75, 'speed expected of a new track (heading_speed sets)', unit='m/s', low=0.0, high=20.0)
-    speed_std: float = parameter(0.4, 'its standard deviation; velocity spread of a new track in the other sets', unit='m/s',
-                                 low=1e-3, high=20.0)
+    speed_std: float = parameter(0.4, 'its standard deviation', unit='m/s', low=1e-3, high=20.0)
+    velocity_std: float = parameter(0.7, 'velocity of a new track on each axis, around zero (sets with a velocity state)',
+                                    unit='m/s', low=1e-3, high=20.0)
     speed_noise: float = parameter(0.005, 'speed random walk over a reference step (heading_speed sets)', unit='m/s', low=0.0,
                                    high=10.0)
     lateral_noise: float = parameter(0.24, 'sideways wander over a reference step (heading_speed sets)', unit='m', low=0.0,
                                      high=10.0)
     lateral_speed_std: float = parameter(0.2, 'spread of the lateral velocity of heading_speed_lateral', unit='m/s', low=0.0,
                                          high=10.0)
+    lateral_speed_time: float = parameter(10.0, 'time in which the lateral velocity of heading_speed_lateral fades', unit='s',
+                                          low=1e-2, high=1e5)
     hover_noise: float = parameter(0.05, 'position wander over a reference step while stopped', unit='m', low=0.0, high=10.0)
     fixed_speed: float = parameter(1.0, 'speed of world_headings', unit='m/s', low=0.0, high=20.0)
     velocity_noise: float = parameter(0.19, 'velocity noise over a reference step of world_headings and relative_headings',
@@ -55,6 +58,9 @@ class DiverConfig(Config):
                                                       'cv_cv both, cv_ct the first for CV and the second for CT',
                                                       unit='m/s^2', low=0.0, high=100.0)
     turn_rate_deg: float = parameter(20.0, 'turn rate of the two CT models of cv_ct', unit='deg/s', low=0.0, high=180.0)
+
+    baseline_stay_probability: float = parameter(0.85, 'probability of keeping the model over a reference step (cv_cv, cv_ct)',
+                                                 low=0.0, high=1.0)
 
     # -- measurements --------------------------------------------------------------------------------------------------
     fix_std: float = parameter(1.0, 'standard deviation on each axis of a fix that comes without covariance', unit='m',
@@ -73,6 +79,13 @@ class DiverConfig(Config):
                                 read_only=False)
     gate_probability: float = parameter(0.999, 'chi-square probability inside which a measurement may belong to a track',
                                         low=0.5, high=0.9999999, read_only=False)
+
+    detection_probability: float = parameter(0.9, 'probability that a scan holds a diver that is there', low=0.01, high=0.9999,
+                                             read_only=False)
+    clutter_density: float = parameter(1e-4, 'false fixes expected in a scan, for each square metre', unit='1/m^2', low=1e-12,
+                                       high=1e3, read_only=False)
+    fixes_are_scans: bool = parameter(True, 'fixes of one stamp are a whole scan: a diver without one was missed. Off for '
+                                      'transponders polled in turn', read_only=False)
 
     # -- tracks --------------------------------------------------------------------------------------------------------
     max_tracks: int = parameter(20, 'most divers at once; 1 means a single diver is known to be there', low=1, high=2000)

@@ -1,0 +1,191 @@
+"""Is the estimate right, and is it as good as it says?
+
+*Right*: `rmse` for one target; `gospa` and `ospa` for sets of targets, where some are missed, some
+are invented and nobody says which belongs to which; `identity_switches` along time.
+
+*As good as it says*: an error divided by its own covariance, squared, is chi-square distributed
+when the filter is consistent (`nees` for states, `nis` for innovations). One value says little;
+the average of many has narrow `average_bounds`. Larger: the filter believes too much in itself;
+smaller: it wastes information. `interval_coverage` asks the same of any interval, and
+`innovation_autocorrelation` finds what a model has missed in time: innovations of a good filter
+are white.
+
+References: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*
+(2001), sec. 5.4; Schuhmacher, Vo, Vo, *A consistent metric for performance evaluation of
+multi-object filters*, IEEE TSP 56(8), 2008; Rahmathullah, Garcia-Fernandez, Svensson, *Generalized
+optimal sub-pattern assignment metric*, FUSION 2017.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .kalman import factorise, FloatArray, log_density
+
+IntArray = NDArray[np.int64]
+
+
+def rmse(error: FloatArray) -> float:
+    """Root of the mean over all leading axes of the squared length of `error` (..., n)."""
+    return float(np.sqrt(np.mean(np.sum(np.square(error), axis=-1))))
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised estimation error squared ``e' P^-1 e`` (...,), e (..., n), P (..., n, n):
+    chi-square with n degrees of freedom.
+
+    Raises CovarianceError when a covariance is not positive definite.
+    """
+    return log_density(error, factorise(covariance))[0]
+
+
+def nis(innovation: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised innovation squared ``nu' S^-1 nu`` (...,), nu (..., m), S (..., m, m)."""
+    return nees(innovation, covariance)
+
+
+def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tuple[float, float]:
+    """Two-sided bounds of the average of `count` independent chi-square values of `dimension`
+    degrees of freedom.
+
+    Values of one run are correlated in time, so `count` is the number of runs, not of steps, when states are judged."""
+    from scipy.stats import chi2
+
+    tail = 0.5 * (1.0 - probability)
+    low, high = chi2.ppf([tail, 1.0 - tail], count * dimension) / count
+    return float(low), float(high)
+
+
+def normal_interval(
+    mean: FloatArray, standard_deviation: FloatArray, probability: float
+) -> tuple[FloatArray, FloatArray]:
+    """Ends of the central interval that holds a Gaussian with `probability`."""
+    from scipy.stats import norm
+
+    half = float(norm.ppf(0.5 * (1.0 + probability))) * standard_deviation
+    return mean - half, mean + half
+
+
+def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> float:
+    """Share of `truth` inside [low, high], NaN when there is none."""
+    inside = (low <= truth) & (truth <= high)
+    return float(np.mean(inside)) if inside.size else math.nan
+
+
+def coverage_bounds(
+    count: int, probability: float, confidence: float = 0.95
+) -> tuple[float, float]:
+    """Two-sided bounds of `interval_coverage` for `count` independent intervals that are what they
+    claim (binomial)."""
+    from scipy.stats import binom
+
+    tail = 0.5 * (1.0 - confidence)
+    low, high = binom.ppf([tail, 1.0 - tail], count, probability) / count
+    return float(low), float(high)
+
+
+class Whiteness(NamedTuple):
+    """autocorrelation: (lags,) of lag 1, 2, ...; bound: each lies within +-bound with the stated
+    probability if white."""
+
+    autocorrelation: FloatArray
+    bound: float
+
+
+def innovation_autocorrelation(
+    innovation: FloatArray, covariance: FloatArray, lags: int = 10, probability: float = 0.95
+) -> Whiteness:
+    """Autocorrelation along time of the whitened innovations: innovation (K, m), covariance (K, m,
+    m), K > lags."""
+    from scipy.stats import norm
+
+    white = np.linalg.solve(factorise(covariance), innovation[..., None])[..., 0]
+    steps, m = white.shape
+    if steps <= lags:
+        raise ValueError(f'{steps} innovations are too few for {lags} lags')
+    values = [
+        np.sum(white[lag:] * white[:-lag])
+        / np.sqrt(np.sum(white[lag:] ** 2) * np.sum(white[:-lag] ** 2))
+        for lag in range(1, lags + 1)
+    ]
+    return Whiteness(
+        np.array(values), float(norm.ppf(0.5 * (1.0 + probability)) / np.sqrt(steps * m))
+    )
+
+
+class Gospa(NamedTuple):
+    """distance; and the three parts of ``distance ** order``, which add up to it: localisation,
+    missed, false.
+
+    estimate_of: (truths,) index of the estimate matched to each truth, -1 for the missed.
+    """
+
+    distance: float
+    localisation: float
+    missed: float
+    false: float
+    estimate_of: IntArray
+
+
+def gospa(truth: FloatArray, estimate: FloatArray, cutoff: float, order: float = 2.0) -> Gospa:
+    """Generalised OSPA (alpha = 2) between the point sets `truth` (T, n) and `estimate` (D, n),
+    either may be empty.
+
+    ``(min sum over matched d^p + c^p / 2 (missed + false))^(1/p)``; points `cutoff` or more apart
+    are not matched.
+    """
+    cost, rows, columns = _match(truth, estimate, cutoff, order)
+    near = cost < cutoff**order
+    estimate_of = np.full(len(truth), -1, np.int64)
+    estimate_of[rows[near]] = columns[near]
+    matched = int(near.sum())
+    localisation = float(cost[near].sum())
+    missed = 0.5 * cutoff**order * (len(truth) - matched)
+    false = 0.5 * cutoff**order * (len(estimate) - matched)
+    return Gospa(
+        (localisation + missed + false) ** (1.0 / order), localisation, missed, false, estimate_of
+    )
+
+
+def ospa(truth: FloatArray, estimate: FloatArray, cutoff: float, order: float = 2.0) -> float:
+    """Optimal sub-pattern assignment distance between two point sets (T, n) and (D, n): a mean
+    error per target, in the units of the points, between 0 and `cutoff`."""
+    most = max(len(truth), len(estimate))
+    if most == 0:
+        return 0.0
+    cost, _, _ = _match(truth, estimate, cutoff, order)
+    unmatched = cutoff**order * abs(len(truth) - len(estimate))
+    return float(((cost.sum() + unmatched) / most) ** (1.0 / order))
+
+
+def _match(
+    truth: FloatArray, estimate: FloatArray, cutoff: float, order: float
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Costs, rows and columns of the assignment of least total ``min(d, cutoff)^order``."""
+    if cutoff <= 0.0 or order < 1.0:
+        raise ValueError('GOSPA and OSPA need cutoff > 0 and order >= 1')
+    from scipy.optimize import linear_sum_assignment
+
+    if not len(truth) or not len(estimate):
+        return np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64)
+    distance = np.linalg.norm(truth[:, None] - estimate, axis=-1)
+    cost = np.minimum(distance, cutoff) ** order
+    rows, columns = linear_sum_assignment(cost)
+    return cost[rows, columns], rows, columns
+
+
+def identity_switches(track_id: IntArray) -> int:
+    """How often a target changes the track that follows it: track_id (K, T) over time, -1 where it
+    is missed.
+
+    A gap is no switch; coming back under another identity is.
+    """
+    switches = 0
+    for column in np.asarray(track_id).T:
+        followed = column[column != -1]
+        switches += int(np.count_nonzero(np.diff(followed)))
+    return switches

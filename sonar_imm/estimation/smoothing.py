@@ -1,0 +1,205 @@
+"""Smoothing: what the past was, once the future is known.
+
+`rts_smooth` is the Rauch-Tung-Striebel smoother. It walks back over a stored forward pass,
+
+    G   = P_k F' (F P_k F' + Q)^-1                      the gain, F and Q of the step from k to k+1
+    x^s_k = x_k + G (x^s_{k+1} - F x_k - b)
+    P^s_k = (I - G F) P_k (I - G F)' + G Q G' + G P^s_{k+1} G'
+
+in a form that is a sum of squares. It needs no inverse of F, so motions that forget (a velocity
+that is drawn anew at each step has rows of zeros in F) are nothing special, nor is a motion
+without noise in some direction: F P F' + Q may be singular.
+
+`imm_smooth` does the same for several models. Every pair (i at k, j at k+1) is smoothed as above,
+x^s_j drawing x_i back, and the pairs are merged over j with the weight
+
+    Pr(i, j | all data) = Pr(i | j, all data) Pr(j | all data), Pr(i | x', j) ~ P_ij mu_i N(x'; F_j
+    x_i + b_j, F_j P_i F_j' + Q_j),   averaged over x' ~ N(x^s_j, P^s_j) .
+
+The last factor is what the state one step later tells about the model now: leaving it out (Kim
+1994) forgets that a diver who is found in the east must have gone east. The average is taken over
+the sigma points of x^s_j. With one model, or with models that are all the same, this is the RTS
+smoother exactly; otherwise it is approximate, as the filter is: mixtures are replaced by their
+first two moments.
+
+Convention: the arrays of step k describe the move *into* k, from k-1; those of step 0 are not
+used.
+
+References: Rauch, Tung, Striebel, AIAA Journal 3(8), 1965; Kim, *Dynamic linear models with
+Markov-switching*, J. Econometrics 60, 1994; Barber, *Expectation correction for smoothed inference
+in switching linear dynamical systems*, JMLR 7, 2006; Nadarajah et al., *IMM forward filtering and
+backward smoothing for maneuvering target tracking*, IEEE TAES 48(3), 2012.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from . import imm
+from .kalman import apply, FloatArray, symmetrise, transpose
+from .unscented import sigma_offsets
+
+# Eigenvalues of a correlation matrix below this are rounding.
+_NEGLIGIBLE = 1e-13
+
+
+class IMMSmoothed(NamedTuple):
+    """x (K, M, n), P (K, M, n, n) of each model given all data, and its probability mu (K, M)."""
+
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+
+    def combine(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """One answer for each step: mean (K, q) and covariance (K, q, q) of the outputs ``E x``, E
+        (M, q, n)."""
+        return imm.combine(self.x, self.P, self.mu, E)
+
+
+def rts_smooth(
+    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Smooth a forward pass: x (K, ..., n) and P (K, ..., n, n) filtered; F, Q (K, ..., n, n) and
+    B (K, ..., n) of the move into each step. Returns the smoothed x and P."""
+    smoothed_x, smoothed_P = x.copy(), P.copy()
+    for k in range(len(x) - 2, -1, -1):
+        predicted = apply(F[k + 1], x[k]) + (0.0 if B is None else B[k + 1])
+        S = F[k + 1] @ P[k] @ transpose(F[k + 1]) + Q[k + 1]
+        precision, _ = _precision(S, np.diagonal(S, axis1=-2, axis2=-1))
+        smoothed_x[k], smoothed_P[k] = _draw_back(
+            x[k],
+            P[k],
+            F[k + 1],
+            Q[k + 1],
+            precision,
+            smoothed_x[k + 1] - predicted,
+            smoothed_P[k + 1],
+        )
+    return smoothed_x, smoothed_P
+
+
+def imm_smooth(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+    B: FloatArray | None = None,
+) -> IMMSmoothed:
+    """Smooth the forward pass of an IMM filter.
+
+    x: (K, M, n), P: (K, M, n, n), mu: (K, M) after each update; transition: (K, M, M),
+    ``transition[k, i, j] = Pr(j at k | i at k-1)``; F, Q: (K, M, n, n), B: (K, M, n) of the move
+    into each step. A model that turns out impossible keeps its filtered state, with probability
+    zero.
+    """
+    smoothed = IMMSmoothed(x.copy(), P.copy(), mu.copy())
+    for k in range(len(x) - 2, -1, -1):
+        b = np.zeros(x.shape[2:]) if B is None else B[k + 1]
+        later = IMMSmoothed(smoothed.x[k + 1], smoothed.P[k + 1], smoothed.mu[k + 1])
+        step = _imm_step(x[k], P[k], mu[k], transition[k + 1], F[k + 1], Q[k + 1], b, later)
+        smoothed.x[k], smoothed.P[k], smoothed.mu[k] = step
+    return smoothed
+
+
+def _imm_step(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+    b: FloatArray,
+    later: IMMSmoothed,
+) -> IMMSmoothed:
+    """One step back. Axes (M, M, ...) are (i at k, j at k+1)."""
+    predicted = np.einsum('jab,ib->ija', F, x) + b
+    S = F @ P[:, None] @ transpose(F) + Q
+    # One scale for all i: what is negligible must be judged alike for all, or the determinants
+    # could not be compared.
+    scale = np.diagonal(S, axis1=-2, axis2=-1).max(axis=0)
+    precision, log_determinant = _precision(S, scale)
+    joint, later_x, later_P = _meet(mu, transition, predicted, precision, log_determinant, later)
+    branch_x, branch_P = _draw_back(
+        x[:, None], P[:, None], F, Q, precision, later_x - predicted, later_P
+    )
+    smoothed_mu = joint.sum(axis=1)
+    possible = smoothed_mu > 0.0
+    weights = joint / np.where(possible, smoothed_mu, 1.0)[:, None]
+    smoothed_x = np.einsum('ij,ija->ia', weights, branch_x)
+    spread = branch_x - smoothed_x[:, None]
+    smoothed_P = np.einsum('ij,ijab->iab', weights, branch_P) + np.einsum(
+        'ij,ija,ijb->iab', weights, spread, spread
+    )
+    return IMMSmoothed(
+        np.where(possible[:, None], smoothed_x, x),
+        symmetrise(np.where(possible[:, None, None], smoothed_P, P)),
+        smoothed_mu / smoothed_mu.sum(),
+    )
+
+
+def _meet(
+    mu: FloatArray,
+    transition: FloatArray,
+    predicted: FloatArray,
+    precision: FloatArray,
+    log_determinant: FloatArray,
+    later: IMMSmoothed,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``Pr(i at k, j at k+1 | all data)`` (M, M), and mean (M, M, n) and covariance (M, M, n, n)
+    of the state at k+1 in each of these cases."""
+    offsets, weights = sigma_offsets(later.P)
+    points = later.x[:, None] + offsets
+    deviation = points - predicted[:, :, None]
+    distance = np.einsum('ijsa,ijsa->ijs', deviation @ precision, deviation)
+    with np.errstate(divide='ignore'):
+        prior = np.log(transition * mu[:, None])
+    log_joint = (prior - 0.5 * log_determinant)[:, :, None] - 0.5 * distance
+    highest = log_joint.max(axis=0)
+    joint = np.exp(log_joint - np.where(np.isfinite(highest), highest, 0.0))
+    total = joint.sum(axis=0)
+    share = weights * joint / np.where(total > 0.0, total, 1.0)
+    probability = share.sum(axis=-1)
+    share = (
+        np.where(probability[..., None] > 0.0, share, weights)
+        / np.where(probability > 0.0, probability, 1.0)[..., None]
+    )
+    mean = np.einsum('ijs,jsa->ija', share, points)
+    spread = points - mean[:, :, None]
+    covariance = transpose(spread * share[..., None]) @ spread
+    return probability * later.mu, mean, covariance
+
+
+def _draw_back(
+    x: FloatArray,
+    P: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+    precision: FloatArray,
+    surprise: FloatArray,
+    later_P: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    gain = P @ transpose(F) @ precision
+    kept = np.eye(x.shape[-1]) - gain @ F
+    covariance = kept @ P @ transpose(kept) + gain @ (Q + later_P) @ transpose(gain)
+    return x + apply(gain, surprise), symmetrise(covariance)
+
+
+def _precision(S: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse (..., n, n) and log determinant (...,) of `S`, which may be singular.
+
+    `scale` (..., n) are variances that take the units out; after that, eigenvalues that are
+    rounding are lifted to `_NEGLIGIBLE`. A direction without any uncertainty thereby gets a huge
+    precision, and deviations in it are zero.
+    """
+    root = np.sqrt(np.where(scale > 0.0, scale, 1.0))
+    values, vectors = np.linalg.eigh(symmetrise(S) / (root[..., :, None] * root[..., None, :]))
+    values = np.maximum(values, _NEGLIGIBLE)
+    scaled = vectors / root[..., :, None]
+    return (
+        (scaled / values[..., None, :]) @ transpose(scaled),
+        np.log(values).sum(axis=-1) + 2.0 * np.log(root).sum(axis=-1),
+    )

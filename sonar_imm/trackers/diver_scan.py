@@ -1,0 +1,151 @@
+"""One scan of the diver tracker: what is known before it, the updates in the middle, what is known after it."""
+
+from __future__ import annotations
+
+from attrs import evolve, frozen
+import numpy as np
+
+from ..estimation import imm_kernels
+from ..estimation.adaptation import AdaptiveChain
+from ..estimation.association import assign, association_cost, gate, gate_threshold, Tracks, TrackStatus
+from ..measurements import FloatArray
+from .diver_config import DiverConfig
+from .diver_models import ModelSet
+from .diver_sensing import Bearings, Group, Positions, RangeSums, reduced, TagPing
+
+SCALE_PRIOR = 20.0
+"""Numbers measured that the stated covariances are worth when their scale is being learnt."""
+
+SCALE_MEMORY = 400.0
+"""Numbers measured over which the learnt scale forgets."""
+
+
+@frozen(eq=False, kw_only=True)
+class Divers:
+    """All that is known after a scan: T tracks with M models of n states.
+
+    x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
+    (T,): of this scan, NaN and 0 without a hit; scale (2, 2): for fixes and for arrivals the sum
+    of squared residuals in units of their stated variance, and their number; broken: tracks ended
+    so far because their numbers were not finite.
+    """
+
+    stamp_ns: int
+    life: Tracks
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+    learnt: FloatArray
+    nis: FloatArray
+    nis_dof: np.ndarray
+    scale: FloatArray
+    broken: int = 0
+
+    def factor(self) -> FloatArray:
+        """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
+        return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
+
+
+class Scan:
+    """The tracks in the middle of a scan: predicted when made, updated by `take`, done with `result`."""
+
+    def __init__(self, config: DiverConfig, models: ModelSet, chain: AdaptiveChain, before: Divers,
+                 stamp_ns: int):
+        self.config, self.models, self.chain, self.before = config, models, chain, before
+        self.stamp_ns = stamp_ns
+        self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
+        self.transition = chain.transition(before.learnt, self.dt)
+        motion = models.motion(self.dt)
+        x, P, self.mu = imm_kernels.mix(before.x, before.P, before.mu, self.transition)
+        self.x, self.P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        self.nis = np.zeros(len(x))
+        self.nis_dof = np.zeros(len(x), np.uint16)
+        self.scale = before.scale.copy()
+
+    def take(self, group: Group) -> np.ndarray:
+        """Update the tracks with what the group holds for them; True (D,) for what was taken."""
+        taken = np.zeros(len(group.z), bool)
+        chosen = self._associate(group)
+        if isinstance(group, TagPing) and not (chosen >= 0).any():
+            group = reduced(group, self.config)
+            chosen = self._associate(group)
+        tracks = np.flatnonzero(chosen >= 0)
+        if len(tracks):
+            taken[chosen[tracks]] = True
+            self._update(group, tracks, chosen[tracks])
+            if isinstance(group, RangeSums):
+                self._take_bearings(group.bearings(), tracks, chosen[tracks])
+        return taken
+
+    def result(self) -> Divers:
+        """What is known now; the transitions have learnt from the tracks that were hit."""
+        hit = np.flatnonzero(self.nis_dof > 0)
+        learnt = self.before.learnt.copy()
+        shared = len(self.transition) == 1
+        learnt[hit] = self.chain.learn(learnt[hit], self.transition if shared else self.transition[hit],
+                                       self.before.mu[hit], self.mu[hit], self.dt)
+        return evolve(self.before, stamp_ns=self.stamp_ns, x=self.x, P=self.P, mu=self.mu, learnt=learnt,
+                      nis=np.where(self.nis_dof > 0, self.nis, np.nan), nis_dof=self.nis_dof, scale=self.scale)
+
+    def _associate(self, group: Group) -> np.ndarray:
+        """The detection of each track (T,), -1 for none; confirmed tracks choose before tentative ones."""
+        chosen = np.full(len(self.x), -1)
+        free = np.arange(len(group.z))
+        tentative = self.before.life.status == TrackStatus.TENTATIVE
+        for tracks in (np.flatnonzero(~tentative), np.flatnonzero(tentative)):
+            if len(tracks) and len(free):
+                mean, covariance = self._expected(group, tracks)
+                pairs = gate(mean, covariance, group.z[free], group.R[free],
+                             gate_threshold(self.config.gate_probability, group.z.shape[1]))
+                cost = association_cost(pairs.log_likelihood, self.config.detection_probability, group.clutter)
+                found = assign(pairs.target, pairs.detection, cost, len(tracks), len(free))
+                chosen[tracks[found >= 0]] = free[found[found >= 0]]
+                free = np.setdiff1d(free, chosen)
+        return chosen
+
+    def _expected(self, group: Group, tracks: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        """Mean (t, m) and covariance (t, m, m), without R, of what the group would measure of `tracks`."""
+        x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
+        if isinstance(group, Positions):
+            return imm_kernels.combine(x, P, mu, np.ascontiguousarray(self.models.E[:, :2]))
+        h, H = group.linearise(x, self.models.E)
+        mean = np.einsum('tj,tjm->tm', mu, h)
+        spread = h - mean[:, None]
+        covariance = H @ P @ np.swapaxes(H, -1, -2) + spread[..., :, None] * spread[..., None, :]
+        return mean, np.einsum('tj,tjmk->tmk', mu, covariance)
+
+    def _update(self, group: Group, tracks: np.ndarray, detection: np.ndarray) -> None:
+        """Update `tracks` (t,), each with its `detection` (t,)."""
+        x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
+        h, H = group.linearise(x, self.models.E)
+        R = np.ascontiguousarray(group.R[detection])
+        x, P, mu, _, nis, ok = imm_kernels.update(x, P, mu, group.innovation(h, detection),
+                                                  np.ascontiguousarray(H), R)
+        self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
+        self.nis[tracks] += np.where(ok, nis, 0.0)
+        self.nis_dof[tracks] += np.where(ok, group.z.shape[1], 0).astype(np.uint16)
+        if self.config.estimate_covariance_scale:
+            self._learn_scale(group, tracks, detection)
+
+    def _take_bearings(self, bearings: Bearings, tracks: np.ndarray, detection: np.ndarray) -> None:
+        """Bearings belong to the echo they came with; the gate only keeps wild ones out."""
+        known = np.isfinite(bearings.z[detection, 0])
+        tracks, detection = tracks[known], detection[known]
+        if not len(tracks):
+            return
+        h, H = bearings.linearise(self.x[tracks], self.models.E)
+        innovation = np.einsum('tj,tj->t', self.mu[tracks], bearings.innovation(h, detection)[..., 0])
+        _, covariance = self._expected(bearings, tracks)
+        nis = innovation ** 2 / (covariance[:, 0, 0] + bearings.R[detection, 0, 0])
+        near = nis <= gate_threshold(self.config.gate_probability, 1)
+        self._update(bearings, tracks[near], detection[near])
+
+    def _learn_scale(self, group: Group, tracks: np.ndarray, detection: np.ndarray) -> None:
+        """Compare residuals with the stated covariance: E[r r' + H P H'] = R after the update, where R is right."""
+        mean, covariance = self._expected(group, tracks)
+        residual = group.z[detection] - mean
+        spread = residual[:, :, None] * residual[:, None, :] + covariance
+        stated = group.R[detection] / group.factor
+        total = float(np.trace(np.linalg.solve(stated, spread), axis1=-2, axis2=-1).sum())
+        row = self.scale[group.kind] + (total, residual.size)
+        self.scale[group.kind] = row * min(1.0, SCALE_MEMORY / row[1])
