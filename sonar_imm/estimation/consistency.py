@@ -52,12 +52,14 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
     """Two-sided bounds of the average of `count` independent chi-square values of `dimension`
     degrees of freedom.
 
-    Values of one run are correlated in time, so `count` is the number of runs, not of steps, when states are judged."""
+    Errors of one run are correlated in time: for states, `count` is the number of runs, not of
+    steps.
+    """
     from scipy.stats import chi2
 
     tail = 0.5 * (1.0 - probability)
-    low, high = chi2.ppf([tail, 1.0 - tail], count * dimension) / count
-    return float(low), float(high)
+    low, high = chi2.ppf(tail, count * dimension), chi2.ppf(1.0 - tail, count * dimension)
+    return float(low) / count, float(high) / count
 
 
 def normal_interval(
@@ -84,8 +86,8 @@ def coverage_bounds(
     from scipy.stats import binom
 
     tail = 0.5 * (1.0 - confidence)
-    low, high = binom.ppf([tail, 1.0 - tail], count, probability) / count
-    return float(low), float(high)
+    low, high = binom.ppf(tail, count, probability), binom.ppf(1.0 - tail, count, probability)
+    return float(low) / count, float(high) / count
 
 
 class Whiteness(NamedTuple):

@@ -1,0 +1,206 @@
+"""Consistency and distance measures against closed forms, brute force and Stone Soup."""
+
+import datetime
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from sonar_imm.estimation import kalman
+from sonar_imm.estimation.consistency import (
+    average_bounds,
+    coverage_bounds,
+    gospa,
+    identity_switches,
+    innovation_autocorrelation,
+    interval_coverage,
+    nees,
+    nis,
+    normal_interval,
+    ospa,
+    rmse,
+)
+
+
+def test_rmse():
+    assert rmse(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx(np.sqrt(12.5), rel=1e-15)
+
+
+def test_nees_by_hand():
+    error, P = np.array([[1.0, 2.0], [0.0, 3.0]]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    expected = [e @ np.linalg.inv(P) @ e for e in error]
+    np.testing.assert_allclose(nees(error, P), expected, rtol=1e-13)
+    np.testing.assert_allclose(nis(error, P), expected, rtol=1e-13)
+
+
+def test_average_bounds_hold_as_often_as_they_say():
+    rng = np.random.default_rng(1)
+    average = rng.chisquare(4, (4000, 50)).mean(axis=1)
+    low, high = average_bounds(50, 4)
+    assert (low < 4.0 < high) and chi2.cdf(high * 50, 200) - chi2.cdf(
+        low * 50, 200
+    ) == pytest.approx(0.95, abs=1e-9)
+    assert np.mean((low <= average) & (average <= high)) == pytest.approx(0.95, abs=0.015)
+
+
+def test_coverage_of_honest_and_of_boastful_intervals():
+    rng = np.random.default_rng(2)
+    truth = rng.normal(size=2000)
+    low, high = coverage_bounds(2000, 0.9)
+    assert (
+        low
+        <= interval_coverage(truth, *normal_interval(np.zeros(2000), np.ones(2000), 0.9))
+        <= high
+    )
+    assert (
+        interval_coverage(truth, *normal_interval(np.zeros(2000), 0.5 * np.ones(2000), 0.9)) < low
+    )
+    assert np.isnan(interval_coverage(np.empty(0), np.empty(0), np.empty(0)))
+
+
+def filtered_innovations(rng, q, q_assumed):
+    """Innovations of a filter that assumes process noise `q_assumed` on a walk with `q`."""
+    F, H, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]]), np.eye(1)
+    shape = np.array([[0.25, 0.5], [0.5, 1.0]])
+    truth, x, P, nus, Ss = np.zeros(2), np.zeros(2), np.eye(2), [], []
+    for _ in range(600):
+        truth = F @ truth + np.array([0.5, 1.0]) * rng.normal() * np.sqrt(q)
+        x, P = kalman.predict(x, P, F, q_assumed * shape)
+        nu = H @ truth + rng.normal(size=1) - H @ x
+        updated = kalman.update(x, P, nu, H, R)
+        x, P = updated.x, updated.P
+        nus.append(nu)
+        Ss.append(updated.innovation_covariance)
+    return np.array(nus), np.array(Ss)
+
+
+def test_whiteness_tells_a_good_filter_from_a_sluggish_one():
+    good = innovation_autocorrelation(
+        *filtered_innovations(np.random.default_rng(3), 0.1, 0.1), lags=20, probability=0.999
+    )
+    assert (np.abs(good.autocorrelation) < good.bound).all()
+    sluggish = innovation_autocorrelation(
+        *filtered_innovations(np.random.default_rng(3), 0.1, 1e-4), lags=20
+    )
+    assert sluggish.autocorrelation[0] > 5 * sluggish.bound
+    with pytest.raises(ValueError, match='too few'):
+        innovation_autocorrelation(np.zeros((5, 1)), np.ones((5, 1, 1)), lags=5)
+
+
+# -- sets of targets ------------------------------------------------------------------------------
+# ---------------------
+
+POINTS = np.array([[0.0, 0.0], [10.0, 0.0]])
+NOTHING = np.empty((0, 2))
+
+
+@pytest.mark.parametrize(
+    'truth, estimate, expected',
+    [
+        (POINTS, POINTS, (0.0, 0.0, 0.0)),
+        (POINTS, POINTS[::-1] + [0.0, 1.0], (2.0, 0.0, 0.0)),
+        (POINTS, POINTS[:1], (0.0, 8.0, 0.0)),
+        (POINTS[:1], POINTS, (0.0, 0.0, 8.0)),
+        (POINTS[:1], POINTS[1:], (0.0, 8.0, 8.0)),
+        (NOTHING, POINTS, (0.0, 0.0, 16.0)),
+        (POINTS, NOTHING, (0.0, 16.0, 0.0)),
+        (NOTHING, NOTHING, (0.0, 0.0, 0.0)),
+    ],
+)
+def test_gospa_parts_by_hand(truth, estimate, expected):
+    result = gospa(truth, estimate, cutoff=4.0, order=2.0)
+    assert (result.localisation, result.missed, result.false) == pytest.approx(expected, abs=1e-12)
+    assert result.distance == pytest.approx(np.sqrt(sum(expected)), abs=1e-12)
+
+
+def test_ospa_by_hand():
+    assert ospa(POINTS, POINTS[:1], cutoff=4.0) == pytest.approx(np.sqrt(16.0 / 2), rel=1e-12)
+    assert ospa(POINTS, POINTS + [0.0, 1.0], cutoff=4.0) == pytest.approx(1.0, rel=1e-12)
+    assert ospa(NOTHING, NOTHING, cutoff=4.0) == 0.0
+    assert ospa(NOTHING, POINTS, cutoff=4.0) == 4.0
+
+
+def brute_gospa(truth, estimate, c, p):
+    """Over all partial matchings, by definition."""
+    best = np.inf
+    for choice in itertools.product(range(-1, len(estimate)), repeat=len(truth)):
+        used = [d for d in choice if d >= 0]
+        if len(set(used)) == len(used):
+            near = sum(
+                np.linalg.norm(truth[t] - estimate[d]) ** p for t, d in enumerate(choice) if d >= 0
+            )
+            best = min(best, near + c**p / 2 * (len(truth) + len(estimate) - 2 * len(used)))
+    return best ** (1 / p)
+
+
+SETS = (
+    st.integers(0, 2**32 - 1)
+    .map(lambda seed: np.random.default_rng(seed))
+    .map(lambda rng: tuple(rng.uniform(0, 6, (rng.integers(0, 5), 2)) for _ in range(3)))
+)
+
+
+@given(SETS, st.sampled_from([1.0, 2.0]))
+def test_gospa_is_the_least_over_all_matchings(sets, p):
+    assert gospa(sets[0], sets[1], 2.0, p).distance == pytest.approx(
+        brute_gospa(sets[0], sets[1], 2.0, p), abs=1e-9
+    )
+
+
+@given(SETS, st.sampled_from([1.0, 2.0]))
+def test_both_are_metrics(sets, p):
+    a, b, c = sets
+    for measure in (lambda x, y: ospa(x, y, 2.0, p), lambda x, y: gospa(x, y, 2.0, p).distance):
+        assert measure(a, b) == pytest.approx(measure(b, a), abs=1e-12)
+        assert measure(a, c) <= measure(a, b) + measure(b, c) + 1e-9
+        assert measure(a, a) == 0.0
+
+
+@given(SETS)
+def test_stone_soup_agrees(sets):
+    metrics = pytest.importorskip('stonesoup.metricgenerator.ospametric')
+    states = pytest.importorskip('stonesoup.types.state')
+    now = datetime.datetime(2024, 1, 1)
+    truth, estimate = (
+        [states.State(point, timestamp=now) for point in points] for points in sets[:2]
+    )
+    if not truth and not estimate:
+        return  # Stone Soup cannot say what nothing is worth
+    ours = gospa(sets[0], sets[1], 2.0, 2.0)
+    theirs = metrics.GOSPAMetric(c=2.0, p=2.0).compute_gospa_metric(estimate, truth)[0].value
+    assert ours.distance == pytest.approx(theirs['distance'], abs=1e-9)
+    assert (ours.localisation, ours.missed, ours.false) == pytest.approx(
+        (theirs['localisation'], theirs['missed'], theirs['false']), abs=1e-9
+    )
+    # Order 1 only: for others Stone Soup assigns by distance and scores by distance to the order.
+    assert ospa(sets[0], sets[1], 2.0, 1.0) == pytest.approx(
+        metrics.OSPAMetric(c=2.0, p=1.0).compute_OSPA_distance(estimate, truth).value, abs=1e-9
+    )
+
+
+def test_gospa_says_who_is_whom():
+    result = gospa(POINTS, np.array([[10.0, 1.0], [50.0, 0.0], [0.5, 0.0]]), cutoff=4.0)
+    assert list(result.estimate_of) == [2, 0]
+
+
+@pytest.mark.parametrize('arguments', [(0.0, 2.0), (1.0, 0.5)])
+def test_nonsense_is_refused(arguments):
+    with pytest.raises(ValueError, match='cutoff > 0'):
+        gospa(POINTS, POINTS, *arguments)
+
+
+@pytest.mark.parametrize(
+    'ids, switches',
+    [
+        ([[1, 2], [1, 2], [1, 2]], 0),
+        ([[1, 2], [2, 1]], 2),
+        ([[1, 2], [-1, 2], [1, 2]], 0),
+        ([[1, 2], [-1, 2], [3, 2], [1, -1]], 2),
+        ([[-1, -1]], 0),
+    ],
+)
+def test_identity_switches(ids, switches):
+    assert identity_switches(np.array(ids)) == switches
