@@ -1,0 +1,77 @@
+"""What every converter shares: counting bad rows, building the bag, telling what was done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from attrs import define, Factory
+
+from sonar_imm.measurements import Rejection
+
+from .csv_table import BadRow, CsvTable, Row
+from .sources import BagError
+from .writer import BagWriter
+
+T = TypeVar('T')
+Record = tuple[int, str, Any]
+"""(stamp in ns, topic, rosbags message)"""
+
+MOST_NAMED = 20
+"""So many bad rows are named one by one, the rest is counted."""
+
+
+@define
+class ConversionReport:
+    """What a conversion did.
+
+    messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
+    each of the first bad rows and for the file as a whole; notes: facts worth telling, such as the
+    origin of local coordinates, also kept in the bag.
+    """
+
+    path: Path
+    rows: int = 0
+    bad_rows: int = 0
+    messages: dict[str, int] = Factory(dict)
+    problems: list[str] = Factory(list)
+    notes: dict[str, str] = Factory(dict)
+
+    def bad_row(self, path: Path, where: str, why: object) -> None:
+        """Count a bad row and name it while there are few."""
+        self.bad_rows += 1
+        if self.bad_rows <= MOST_NAMED:
+            self.problems.append(f'{path.name}, {where}: {why}')
+        elif self.bad_rows == MOST_NAMED + 1:
+            self.problems.append('further bad rows are counted but not listed')
+
+    def read_rows(self, table: CsvTable, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
+        """Yield the rows of `table` that `parse` accepts; count and name the others."""
+        for row in table:
+            self.rows += 1
+            try:
+                yield row, parse(row)
+            except (BadRow, Rejection) as error:
+                self.bad_row(table.path, f'line {row.line}', error)
+
+
+def write_bag(out: str | Path, records: Iterable[Record], report: ConversionReport, *,
+              source: str, storage: str = 'mcap') -> ConversionReport:
+    """Write `records` in time order into a new bag at `out`; log time = stamp.
+
+    Raises `BagError` when there is nothing to write or the bag cannot be made.
+    """
+    ordered = sorted(records, key=lambda record: record[0])
+    if not ordered:
+        first = f' (the first problem: {report.problems[0]})' if report.problems else ''
+        raise BagError(f'{source} has nothing that could be converted{first}')
+    with BagWriter(out, storage=storage, custom_data=_provenance(source, report.notes)) as bag:
+        for stamp_ns, topic, message in ordered:
+            bag.write(topic, message, stamp_ns)
+            report.messages[topic] = report.messages.get(topic, 0) + 1
+    return report
+
+
+def _provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
+    return {'source': source, 'converted_by': 'sonar-imm convert', **notes}

@@ -1,0 +1,246 @@
+"""Other people's CSV files: any delimiter, any names of columns, any unit of time.
+
+The reader knows each quantity by one name (``x``, ``stamp``, ...) and a list of names that people
+give it. Columns that are called something else are mapped by hand, and a row that cannot be read
+is a `BadRow` that names its line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import csv
+from datetime import datetime, timezone
+from decimal import Decimal
+import math
+from pathlib import Path
+import re
+
+from attrs import field, frozen
+
+from sonar_imm.parameters import did_you_mean
+
+from .sources import BagError
+
+TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
+
+ALIASES: dict[str, tuple[str, ...]] = {
+    'stamp': ('stamp', 'time', 'timestamp', 't', 'datetime', 'date_time', 'utc',
+              'utc_time', 'epoch', 'unix_time'),
+    'x': ('x', 'east', 'easting', 'px', 'pos_x', 'position_x', 'utm_e', 'utm_x', 'e'),
+    'y': ('y', 'north', 'northing', 'py', 'pos_y', 'position_y', 'utm_n', 'utm_y', 'n'),
+    'z': ('z', 'up', 'pz', 'pos_z', 'position_z'),
+    'depth': ('depth', 'down'),
+    'latitude': ('latitude', 'lat'),
+    'longitude': ('longitude', 'lon', 'lng', 'long'),
+    'height': ('height', 'altitude', 'alt', 'ellipsoidal_height'),
+    'var_x': ('var_x', 'var_east', 'xx', 'cov_xx', 'cov_x_x'),
+    'cov_xy': ('cov_xy', 'cov_east_north', 'xy', 'cov_x_y'),
+    'var_y': ('var_y', 'var_north', 'yy', 'cov_yy', 'cov_y_y'),
+    'std_x': ('std_x', 'std_east', 'sigma_x', 'sigma_east', 'sd_x', 'sx'),
+    'std_y': ('std_y', 'std_north', 'sigma_y', 'sigma_north', 'sd_y', 'sy'),
+    'std': ('std', 'sigma', 'accuracy', 'std_xy', 'sigma_xy', 'position_std'),
+    'vx': ('vx', 'v_east', 've', 'vel_x', 'velocity_x'),
+    'vy': ('vy', 'v_north', 'vn', 'vel_y', 'velocity_y'),
+    'id': ('id', 'track_id', 'target', 'target_id', 'tag', 'diver', 'name'),
+    'ping': ('ping', 'ping_id', 'ping_number'),
+    'receiver': ('receiver', 'rx', 'rx_id', 'receiver_id', 'hydro', 'hydrophone', 'station',
+                 'name', 'id'),
+    'transmitter': ('transmitter', 'tx', 'tx_id', 'transmitter_id', 'source', 'name', 'id'),
+    'arrival': ('arrival', 'arrival_time', 'time_of_arrival', 'detection_time'),
+    'toa': ('toa', 'travel_time', 'delay', 'tof', 'time_of_flight'),
+    'var_toa': ('var_toa', 'toa_variance', 'var_arrival'),
+    'std_toa': ('std_toa', 'sigma_toa', 'std_arrival', 'sigma_arrival'),
+    'bearing': ('bearing', 'azimuth', 'doa'),
+    'var_bearing': ('var_bearing',),
+    'std_bearing': ('std_bearing', 'sigma_bearing'),
+}
+_UNIT = re.compile(r'_(m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
+_TIME = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
+
+
+class BadRow(ValueError):
+    """A row that cannot be used; the text says why."""
+
+
+@frozen(kw_only=True)
+class CsvOptions:
+    """How to read a CSV file.
+
+    columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``; what is not listed is
+    found by its usual names (`ALIASES`, case and units aside).
+    time_unit: of numeric times, one of s, ms, us, ns; empty: by the header (``time_ms``), else s.
+    ISO 8601 texts are recognised by themselves; without a zone they are UTC.
+    time_offset_ns: added to every time, for files that count from their own start.
+    delimiter: empty: found from the header line.
+    """
+
+    columns: Mapping[str, str] = field(factory=dict)
+    time_unit: str = ''
+    time_offset_ns: int = 0
+    delimiter: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        if self.time_unit not in ('', *TIME_UNITS):
+            raise BagError(f"the time unit must be one of {', '.join(TIME_UNITS)}, "
+                           f"got '{self.time_unit}'")
+        for name in self.columns:
+            if name not in ALIASES:
+                raise BagError(f"there is no quantity '{name}' to map a column to"
+                               f'{did_you_mean(name, ALIASES)}')
+
+
+@frozen
+class Row:
+    """One line of data; the methods raise `BadRow`."""
+
+    table: CsvTable
+    line: int
+    cells: list[str]
+
+    def text(self, name: str) -> str:
+        """The cell as text; empty when the column is missing or the line is short."""
+        index = self.table.index.get(name, len(self.cells))
+        return self.cells[index].strip() if index < len(self.cells) else ''
+
+    def number(self, name: str) -> float:
+        """A number that has to be there and be finite."""
+        value = self.optional(name)
+        if math.isnan(value):
+            raise BadRow(f'{self.table.header(name)} is empty')
+        return value
+
+    def optional(self, name: str) -> float:
+        """A number, NaN when the cell is empty, missing or says NaN."""
+        text = self.text(name)
+        if not text:
+            return math.nan
+        try:
+            value = float(text if self.table.delimiter == ',' else text.replace(',', '.'))
+        except ValueError:
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
+        if math.isinf(value):
+            raise BadRow(f'{self.table.header(name)} is infinite')
+        return value
+
+    def seconds_ns(self, name: str) -> int:
+        """A duration or a time as integer nanoseconds, exactly as written."""
+        text = self.text(name)
+        try:
+            value = Decimal(text if self.table.delimiter == ',' else text.replace(',', '.'))
+            nanoseconds = value * self.table.time_scale(name)
+            if not abs(nanoseconds) < 2**63:
+                raise BadRow(f"{self.table.header(name)} is '{text[:40]}', beyond the year 2262; "
+                             'is the time unit right?')
+            return round(nanoseconds)
+        except ArithmeticError:
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time") from None
+
+    def stamp_ns(self, name: str = 'stamp') -> int:
+        """A time since 1970 in integer nanoseconds, with the offset of the options added."""
+        parts = _TIME.match(self.text(name))
+        stamp = _iso_ns(*parts.groups()) if parts else self.seconds_ns(name)
+        stamp += self.table.options.time_offset_ns
+        if not 0 < stamp < 2**31 * 10**9:
+            raise BadRow(f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
+                         'can hold; a time offset and the time unit can mend that')
+        return stamp
+
+
+class CsvTable:
+    """The header of a CSV file and an iterator over its rows. Raises `BagError` for no CSV."""
+
+    def __init__(self, path: str | Path, options: CsvOptions | None = None):
+        self.path = Path(path)
+        self.options = options or CsvOptions()
+        try:
+            with self._open() as file:
+                lines = (line for line in file if line.strip() and not line.startswith('#'))
+                first = next(lines, '')
+        except OSError as error:
+            raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
+        if not first or '\0' in first:
+            raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
+        self.delimiter = self.options.delimiter or max(',;\t| ', key=first.count)
+        self._headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        self.index = self._find_columns()
+
+    def __iter__(self) -> Iterator[Row]:
+        with self._open() as file:
+            reader = csv.reader(file, **self._dialect)
+            header_seen = False
+            while True:
+                try:
+                    cells = next(reader)
+                except StopIteration:
+                    return
+                except csv.Error as error:
+                    raise BagError(f'{self.path}, line {reader.line_num}: {error}') from None
+                if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
+                    continue
+                if header_seen:
+                    yield Row(self, reader.line_num, cells)
+                header_seen = True
+
+    def has(self, *names: str) -> bool:
+        """Say whether every one of these quantities has a column."""
+        return all(name in self.index for name in names)
+
+    def require(self, *names: str) -> None:
+        """Raise `BagError` naming the quantities without a column and what the file has."""
+        if missing := [name for name in names if name not in self.index]:
+            raise BagError(f'{self.path} has no column for {" and ".join(missing)}; it has '
+                           f'{", ".join(self._headers)}; say which column holds '
+                           f'{"it" if len(missing) == 1 else "them"}')
+
+    def header(self, name: str) -> str:
+        """What the file calls a quantity."""
+        return self._headers[self.index[name]] if name in self.index else name
+
+    def time_scale(self, name: str) -> int:
+        """Nanoseconds in one unit of a time column."""
+        if self.options.time_unit:
+            return TIME_UNITS[self.options.time_unit]
+        suffix = re.search(r'[_ \[(](ms|us|ns|s)[\])]?$', self.header(name).lower())
+        return TIME_UNITS[suffix.group(1) if suffix else 's']
+
+    @property
+    def _dialect(self) -> dict:
+        return {'delimiter': self.delimiter, 'skipinitialspace': True}
+
+    def _open(self):
+        return self.path.open(encoding='utf-8-sig', errors='replace', newline='')
+
+    def _find_columns(self) -> dict[str, int]:
+        """Match headers with quantities: mapped by hand first, then by their usual names."""
+        by_hand = {}
+        for name, header in self.options.columns.items():
+            if header not in self._headers:
+                raise BagError(f"{self.path} has no column '{header}'"
+                               f'{did_you_mean(header, self._headers)}')
+            by_hand[name] = self._headers.index(header)
+        found = dict(by_hand)
+        plain = [_plain(header) for header in self._headers]
+        for name, aliases in ALIASES.items():
+            matches = [plain.index(alias) for alias in aliases if alias in plain]
+            matches = [index for index in matches if index not in by_hand.values()]
+            if name not in found and matches:
+                found[name] = matches[0]
+        return found
+
+
+def _plain(header: str) -> str:
+    """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
+    name = re.sub(r'[\[(].*', '', header.lower()).strip()
+    return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))
+
+
+def _iso_ns(date: str, clock: str, fraction: str | None, zone: str | None) -> int:
+    """Nanoseconds since 1970 of an ISO 8601 time."""
+    zone = '+00:00' if zone in (None, 'Z') else zone if ':' in zone else f'{zone[:3]}:{zone[3:]}'
+    try:
+        moment = datetime.fromisoformat(f'{date}T{clock}{zone}')
+    except ValueError as error:
+        raise BadRow(str(error)) from None
+    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
+    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)

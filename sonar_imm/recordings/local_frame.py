@@ -1,0 +1,60 @@
+"""Positions of CSV rows in local east-north-up metres, also from latitude and longitude."""
+
+from __future__ import annotations
+
+import math
+
+from msg_adapters.arrivals import FARTHEST
+
+from .csv_table import BadRow, CsvTable, Row
+from .sources import BagError
+
+
+class LocalFrame:
+    """Where the positions of a table lie.
+
+    origin: (latitude, longitude, height) in degrees and metres; None for tables in metres. Without
+    a stated origin the first position read becomes it. Raises `BagError` for a table without
+    positions.
+    """
+
+    def __init__(self, table: CsvTable, origin: tuple[float, ...] | None = None):
+        self.geodetic = not table.has('x', 'y') and table.has('latitude', 'longitude')
+        if not self.geodetic:
+            table.require('x', 'y')
+        self.origin = None if origin is None or not self.geodetic else _checked(origin)
+
+    def position(self, row: Row) -> tuple[float, float, float]:
+        """Give x, y, z of a row in metres. Raises `BadRow`."""
+        if self.geodetic:
+            return self._from_geodetic(row)
+        z = row.optional('z') if row.table.has('z') else -row.optional('depth')
+        x, y, z = row.number('x'), row.number('y'), 0.0 if math.isnan(z) else z
+        if max(abs(x), abs(y), abs(z)) > FARTHEST:
+            raise BadRow(f'the position {x:g}, {y:g}, {z:g} is further than 100,000 km away')
+        return x, y, z
+
+    def notes(self) -> dict[str, str]:
+        """What has to be kept to find the way back to latitude and longitude."""
+        if self.origin is None:
+            return {}
+        return {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
+
+    def _from_geodetic(self, row: Row) -> tuple[float, float, float]:
+        from pymap3d import geodetic2enu  # only needed for latitudes
+        latitude, longitude = row.number('latitude'), row.number('longitude')
+        if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+            raise BadRow(f'latitude {latitude:g}, longitude {longitude:g} is no place on Earth')
+        height = row.optional('height') if row.table.has('height') else -row.optional('depth')
+        height = 0.0 if math.isnan(height) else height
+        if self.origin is None:
+            self.origin = (latitude, longitude, 0.0)
+        east, north, up = geodetic2enu(latitude, longitude, height, *self.origin)
+        return float(east), float(north), float(up)
+
+
+def _checked(origin: tuple[float, ...]) -> tuple[float, float, float]:
+    """Complete an origin with height 0."""
+    if len(origin) not in (2, 3) or not all(map(math.isfinite, origin)) or abs(origin[0]) > 90.0:
+        raise BagError(f'an origin is latitude, longitude and perhaps height, got {origin}')
+    return (*map(float, origin), 0.0)[:3]
