@@ -1,0 +1,82 @@
+"""The ``sonar-imm`` command: one small module a subcommand, loaded only when it is called.
+
+Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141
+nobody reads the output. What a user can get wrong ends in one line on standard error; a traceback
+is a bug.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import sys
+
+import click
+
+from .. import __version__
+from .lazy import LazyGroup
+
+PROGRAM = 'sonar-imm'
+
+COMMANDS = {
+    'simulate': 'Write a bag of simulated measurements with truth.',
+    'convert': 'Turn other formats (CSV, JSON, ...) into a bag.',
+    'info': 'Say what is in a bag, which tracker fits it and what is wrong with it.',
+    'track': 'Track a recorded bag offline: estimates as bag and CSV.',
+    'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
+    'play': 'Publish a bag to live nodes.',
+    'check': 'Start the real nodes, play the bags, compare with track and truth.',
+    'bench': 'Measure speed against other libraries, in one run.',
+    'demo': 'Live node, offline tracker, score and report on a shipped bag.',
+}
+
+
+@click.group(name=PROGRAM, cls=LazyGroup, package=__name__, summaries=COMMANDS,
+             invoke_without_command=True,
+             context_settings={'help_option_names': ['-h', '--help'], 'max_content_width': 100},
+             epilog=f'`{PROGRAM} COMMAND --help` shows the options of a command and an example.')
+@click.version_option(__version__, prog_name=PROGRAM)
+@click.pass_context
+def command(ctx: click.Context) -> None:
+    """Track what sonar sees, with several motion models at once."""
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and give its exit code. The only place that turns errors into words."""
+    try:
+        status = command.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx else PROGRAM
+        return _complain(f'{error.format_message().rstrip(".")} (see {path} --help)')
+    except click.ClickException as error:
+        return _complain(error.format_message())
+    except click.Abort:
+        return _complain('interrupted', 130)
+    except SystemExit as leaving:
+        # click itself leaves this way when the reader of our output has gone, as in `... | head`.
+        return 141 if isinstance(leaving.__context__, BrokenPipeError) else int(leaving.code or 0)
+    except Exception as error:
+        sentence = _what_the_user_can_mend(error)
+        if sentence is None:
+            raise
+        return _complain(sentence)
+
+
+def _what_the_user_can_mend(error: Exception) -> str | None:
+    """The sentence of an error in the input, the configuration or the machine; None for a bug."""
+    from ..measurements import Rejection
+    from ..parameters import ConfigError
+    from ..recordings.reader import BagError
+    if isinstance(error, (ConfigError, Rejection, BagError)):
+        return str(error)
+    if isinstance(error, OSError):
+        known = error.filename and error.strerror
+        return f'{error.filename}: {error.strerror}' if known else str(error)
+    return None
+
+
+def _complain(sentence: str, status: int = 2) -> int:
+    print(f'{PROGRAM}: {" ".join(sentence.split())}', file=sys.stderr)
+    return status

@@ -1,0 +1,167 @@
+"""What several subcommands share: ``--set``, ``--params``, JSON and progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+import contextlib
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+import click
+
+from ..nodes.config import NodeConfig
+from ..parameters import (
+    Config,
+    ConfigError,
+    did_you_mean,
+    parameters_from_yaml,
+    ParameterSpec,
+)
+from ..trackers import System, SYSTEMS
+
+Advance = Callable[[int], None]
+
+BAG = click.Path(path_type=Path)
+SECONDS_BETWEEN_LINES = 5.0
+
+
+def example(*lines: str) -> str:
+    """The epilog of a help page: example command lines, kept as they are."""
+    return '\b\nExample:\n' + '\n'.join(f'  {line}' for line in lines)
+
+
+def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--json``: the result as one JSON object on standard output."""
+    return click.option('--json', 'as_json', is_flag=True,
+                        help='Print the result as JSON.')(function)
+
+
+def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--set name=value``, as often as needed."""
+    return click.option('--set', 'overrides', metavar='NAME=VALUE', multiple=True,
+                        callback=_split_overrides,
+                        help='Change one parameter; may be given several times.')(function)
+
+
+def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--system``: which tracker; not needed while the bag fits one only."""
+    return click.option('--system', type=click.Choice(list(SYSTEMS)), default=None,
+                        help='Which tracker; by default the one whose inputs are in the bag.'
+                        )(function)
+
+
+def topics_by_name(pairs: Iterable[str]) -> dict[str, str] | None:
+    """``fix=/usbl/pose`` as ``{'/usbl/pose': 'fix'}``; None when there are none."""
+    topics = {}
+    for pair in pairs:
+        name, equals, topic = pair.partition('=')
+        if not (name and equals and topic):
+            raise click.BadParameter(f"'{pair}' is not of the form INPUT=TOPIC")
+        topics[topic] = name
+    return topics or None
+
+
+def _split_overrides(_ctx: click.Context, _param: click.Parameter,
+                     values: Iterable[str]) -> dict[str, str]:
+    pairs = {}
+    for value in values:
+        name, equals, text = value.partition('=')
+        if not equals or not name.strip():
+            raise click.BadParameter(f"'{value}' is not of the form NAME=VALUE")
+        pairs[name.strip()] = text.strip()
+    return pairs
+
+
+def _typed(text: str, spec: ParameterSpec | None) -> Any:
+    if spec is None:
+        return text
+    if spec.kind.endswith('[]'):
+        parts = [part.strip() for part in text.strip('[]() ').split(',') if part.strip()]
+        return [_scalar(part, spec.kind[:-2]) for part in parts]
+    return _scalar(text, spec.kind)
+
+
+def _scalar(text: str, kind: str) -> Any:
+    if kind == 'bool':
+        return {'true': True, 'false': False}.get(text.lower(), text)
+    if kind == 'str':
+        return text
+    try:
+        return int(text) if kind == 'int' else float(text)
+    except ValueError:
+        return text
+
+
+def load_config(system: System, params: Path | None,
+                overrides: dict[str, str]) -> tuple[Config, NodeConfig]:
+    """The parameters of tracker and node: defaults, then the file, then ``--set``.
+
+    Raises `ConfigError` with one sentence for each mistake.
+    """
+    types = (system.config_type(), NodeConfig)
+    values = _parameters_of(params, system.name) if params else {}
+    specs = {spec.name: spec for config_type in types for spec in config_type.specs()}
+    values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
+    unknown = [f"unknown parameter '{name}'{did_you_mean(name, specs)}"
+               for name in values if name not in specs]
+    if unknown:
+        raise ConfigError(*unknown)
+    tracker, node = (config_type.from_mapping(values, ignore_unknown=True)
+                     for config_type in types)
+    return tracker, node
+
+
+def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
+    try:
+        values = parameters_from_yaml(path.read_text(encoding='utf-8'), node_name=node_name)
+    except UnicodeDecodeError:
+        raise ConfigError(f'{path} is not a text file') from None
+    except ConfigError as error:
+        raise ConfigError(f'{path}: {error}') from None
+    # What every ROS 2 node understands and no tracker needs, and what says which message types
+    # a live node subscribes to: a recording knows its own.
+    return {key: value for key, value in values.items()
+            if key not in ('use_sim_time', 'qos_overrides') and not key.endswith('_type')}
+
+
+def print_json(result: Any) -> None:
+    """Print `result` as JSON; NaN and infinity, which JSON lacks, become null."""
+    from ..evaluation.run_folder import finite
+    click.echo(json.dumps(finite(result), indent=2))
+
+
+def say(text: str = '', *, quiet: bool = False) -> None:
+    """A line for people on standard output; silent when the output is JSON."""
+    if not quiet:
+        click.echo(text)
+
+
+@contextlib.contextmanager
+def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[Advance]:
+    """Yields ``advance(count)``: a bar on a terminal, a line now and then elsewhere (stderr)."""
+    if quiet or not total:
+        yield lambda count: None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+        with Progress(console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(what, total=total)
+            yield lambda count: bar.advance(task, count)
+    else:
+        yield _plain_progress(what, total)
+
+
+def _plain_progress(what: str, total: int) -> Advance:
+    """A line every few seconds, so that a log of a short job stays empty."""
+    done, told = 0, time.monotonic()
+
+    def advance(count: int) -> None:
+        nonlocal done, told
+        done += count
+        if time.monotonic() - told > SECONDS_BETWEEN_LINES:
+            told = time.monotonic()
+            click.echo(f'{what}: {done} of {total}', err=True)
+    return advance

@@ -1,0 +1,56 @@
+"""``sonar-imm info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .common import BAG, example, json_option, print_json, progress
+
+
+@click.command(epilog=example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
+@click.argument('bag', type=BAG)
+@click.option('--strict', is_flag=True, help='Stop at the first damage instead of reading on.')
+@json_option
+def command(bag: Path, strict: bool, as_json: bool) -> None:
+    """Say what is in BAG, which tracker fits it and what is wrong with it.
+
+    BAG is a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 .bag file. Exit code 1 when
+    no tracker can use it.
+    """
+    from ..evaluation.inspection import inspect
+    from ..recordings.reader import BagReader
+    with BagReader(bag, strict=strict) as reader:
+        total = sum(topic.count for topic in reader.topics)
+        with progress('reading', total, quiet=as_json) as advance:
+            found = inspect(reader, advance)
+    print_json(found) if as_json else _print(found)
+    if not found['systems']:
+        raise click.exceptions.Exit(1)
+
+
+def _print(found: dict[str, Any]) -> None:
+    click.echo(f'{found["bag"]}: {found["messages"]} messages in {found["duration_s"]:.1f} s')
+    for topic in found['topics']:
+        rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
+        frames = f', frame {", ".join(topic["frames"])}' if any(topic['frames']) else ''
+        click.echo(f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}{frames}')
+        for suited in topic['suits']:
+            click.echo(f'      fits {suited}')
+        for problem in topic['problems']:
+            click.echo(f'      problem: {problem}')
+    for problem in found['problems']:
+        click.echo(f'problem: {problem}')
+    for system, inputs in found['systems'].items():
+        click.echo(f'to track it: {_track_line(found["bag"], system, inputs)}')
+    if not found['systems']:
+        click.echo('no tracker can use it')
+
+
+def _track_line(bag: str, system: str, inputs: dict[str, list[str]]) -> str:
+    """The command that tracks the recording; topics are named where their names do not fit."""
+    named = [f' --topic {name}={topics[0]}' for name, topics in inputs.items()
+             if not any(topic.split('/')[-1] == name for topic in topics)]
+    return f'sonar-imm track {bag} OUT_DIR --system {system}{"".join(named)}'

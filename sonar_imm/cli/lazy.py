@@ -1,0 +1,39 @@
+"""A click group that knows its subcommands by name and imports a module only to run it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import click
+
+from ..parameters import did_you_mean
+
+
+class LazyGroup(click.Group):
+    """Subcommand NAME is the attribute ``command`` of the module ``<package>.NAME``."""
+
+    def __init__(self, *args: Any, package: str, summaries: Mapping[str, str], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._package = package
+        self._summaries = summaries
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._summaries)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in self._summaries:
+            return None
+        return import_module(f'{self._package}.{name}').command
+
+    def resolve_command(self, ctx: click.Context,
+                        args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in self._summaries and not args[0].startswith('-'):
+            ctx.fail(f"there is no command '{args[0]}'{did_you_mean(args[0], self._summaries)}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The help page, from the summaries alone: loading every module would take seconds."""
+        with formatter.section('Commands'):
+            formatter.write_dl(list(self._summaries.items()))

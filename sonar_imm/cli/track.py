@@ -1,0 +1,111 @@
+"""``sonar-imm track``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import time
+from typing import Any
+
+import click
+
+from ..trackers import System, SYSTEMS
+from .common import (
+    BAG,
+    example,
+    json_option,
+    load_config,
+    print_json,
+    progress,
+    say,
+    set_option,
+    system_option,
+    topics_by_name,
+)
+
+
+@click.command(epilog=example(
+    'sonar-imm track dive.bag out', 'sonar-imm track dive.bag out --set model_set=cv_cv',
+    'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml'))
+@click.argument('bag', type=BAG)
+@click.argument('out_dir', type=click.Path(path_type=Path))
+@system_option
+@click.option('--params', type=click.Path(path_type=Path, dir_okay=False),
+              help='Parameter file: ROS 2 form or a plain mapping.')
+@set_option
+@click.option('--topic', 'topics', metavar='INPUT=TOPIC', multiple=True,
+              help='Which topic is which input, e.g. fix=/usbl/pose; may be given several times.')
+@click.option('--order', type=click.Choice(['recorded', 'stamp']), default='recorded',
+              show_default=True, help='As the messages arrived, or sorted by their stamps.')
+@click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
+@click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
+@json_option
+def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
+            overrides: dict[str, str], topics: tuple[str, ...], order: str, overwrite: bool,
+            strict: bool, as_json: bool) -> None:
+    """Track the recording BAG offline and write the estimates to OUT_DIR.
+
+    OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
+    same bytes in bag and CSV.
+    """
+    from ..evaluation.tracking import InputOptions
+    chosen = choose_system(bag, system, topics)
+    config, node = load_config(chosen, params, overrides)
+    options = InputOptions(topics=topics_by_name(topics), order=order, frame_id=node.frame_id,
+                           world_frame=node.world_frame_convention)
+    run = track_recording(bag, out_dir, chosen, config, options, overwrite=overwrite,
+                          strict=strict, quiet=as_json)
+    print_json(run) if as_json else _print(run, out_dir)
+
+
+def choose_system(bag: Path, name: str | None, topics: tuple[str, ...] = ()) -> System:
+    """The tracker called `name`, or else the first one that finds its inputs in `bag`."""
+    from ..recordings.measurements import fitting_topics
+    from ..recordings.reader import BagError, BagReader
+    if name is not None:
+        return SYSTEMS[name]
+    failures = []
+    with BagReader(bag) as reader:
+        for system in SYSTEMS.values():
+            try:
+                fitting_topics(reader, system.name, topics_by_name(topics))
+                return system
+            except BagError as error:
+                failures.append(error)
+    raise failures[0]
+
+
+def track_recording(bag: Path, out_dir: Path, system: System, config: Any, options: Any, *,
+                    overwrite: bool = False, strict: bool = False,
+                    quiet: bool = False) -> dict[str, Any]:
+    """Track `bag` into `out_dir`; gives the content of run.json. Raises `BagError`."""
+    from ..evaluation.run_folder import fingerprint, RUN, run_record, RunFolder
+    from ..evaluation.tracking import OfflineRun
+    from ..recordings.reader import BagReader
+    begin = time.perf_counter()
+    with BagReader(bag, strict=strict) as reader:
+        offline = OfflineRun(reader, system, config, options)
+        folder = RunFolder(out_dir)
+        folder.prepare(overwrite=overwrite)
+        with progress('tracking', offline.total, quiet=quiet) as advance:
+            written = folder.write_estimates(offline.estimates(advance), system.name)
+        problems = list(reader.problems)
+    run = run_record(
+        system=system.name, bag=str(bag.resolve()), **fingerprint(bag), topics=offline.topics,
+        order=options.order, world_frame=options.world_frame, messages=offline.messages,
+        **written, counts=offline.outcomes(), refused=offline.refusals(), problems=problems,
+        parameters=config.as_dict(),
+        timings={'wall_s': time.perf_counter() - begin, **offline.timings()})
+    folder.write_json(RUN, run)
+    return run
+
+
+def _print(run: dict[str, Any], out_dir: Path) -> None:
+    say(f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
+        f'written to {out_dir}')
+    say('  ' + ', '.join(f'{name} {count}' for name, count in run['counts'].items()))
+    for reason, entry in run['refused'].items():
+        say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')
+    for problem in run['problems']:
+        say(f'  problem: {problem}')
+    if run['rows'] == 0:
+        say('  no track was made; sonar-imm info may tell why')

@@ -1,0 +1,141 @@
+"""What is in a recording, which tracker it suits, and what is wrong with it."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from attrs import define, field
+import numpy as np
+
+from msg_adapters.headers import stamp_ns
+from msg_adapters.inputs import INPUTS, InputTopic
+
+from ..measurements import Rejection
+from ..recordings.reader import BagMessage, BagReader, TopicInfo
+from .series import SECOND
+
+LONG_GAP = 10.0
+"""A gap is worth telling when it is this many times the usual time between two messages."""
+
+
+@define
+class _Heard:
+    """What was seen of one topic."""
+
+    topic: TopicInfo
+    logs: array[int] = field(factory=lambda: array('q'))
+    stamps: array[int] = field(factory=lambda: array('q'))
+    frames: Counter[str] = field(factory=Counter)
+    no_stamp: int = 0
+    good: Counter[tuple[str, str]] = field(factory=Counter)
+    refused: dict[tuple[str, str], Counter[str]] = field(factory=dict)
+    doubts: Counter[str] = field(factory=Counter)
+    examples: dict[str, str] = field(factory=dict)
+
+
+def inspect(bag: BagReader, advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
+    """Read a whole open recording. Gives plain values, fit for JSON.
+
+    topics: one entry each with count, rate, span, frames, which tracker input it suits and its
+    problems; problems: of the recording as a whole; systems: topic by input for each tracker.
+    """
+    heard = {topic.name: _Heard(topic) for topic in bag.topics}
+    for item in bag.messages():
+        advance(1)
+        _look_at(item, heard[item.topic])
+    topics = [_topic_entry(entry) for entry in heard.values()]
+    first = min((entry.logs[0] for entry in heard.values() if entry.logs), default=0)
+    last = max((entry.logs[-1] for entry in heard.values() if entry.logs), default=0)
+    return {'bag': str(bag.path), 'duration_s': (last - first) / SECOND,
+            'messages': sum(len(entry.logs) for entry in heard.values()), 'topics': topics,
+            'systems': _systems(topics), 'problems': list(bag.problems)}
+
+
+def _look_at(item: BagMessage, heard: _Heard) -> None:
+    heard.logs.append(item.log_ns)
+    header = getattr(item.message, 'header', None)
+    if header is not None:
+        heard.frames[str(header.frame_id)] += 1
+        if stamp := _usable_stamp(item.message):
+            heard.stamps.append(stamp)
+        else:
+            heard.no_stamp += 1
+    for system, entry in _readers(item):
+        try:
+            entry.readers[item.type_name](item.message)
+            heard.good[system, entry.name] += 1
+            if (code := entry.doubt(item.message)) is not None:
+                heard.doubts[code] += 1
+        except Rejection as rejection:
+            heard.refused.setdefault((system, entry.name), Counter())[rejection.reason] += 1
+            heard.examples.setdefault(rejection.reason, rejection.sentence)
+
+
+def _usable_stamp(message: Any) -> int | None:
+    try:
+        stamp = stamp_ns(message)
+    except Rejection:
+        return None
+    return stamp if stamp > 0 else None
+
+
+def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
+    """The tracker inputs a message could be for. Truth is nobody's input."""
+    if 'truth' in item.topic.split('/'):
+        return []
+    return [(system, entry) for system, entries in INPUTS.items() for entry in entries
+            if item.type_name in entry.readers]
+
+
+def _topic_entry(heard: _Heard) -> dict[str, Any]:
+    span = (heard.logs[-1] - heard.logs[0]) / SECOND if heard.logs else 0.0
+    suits = [f'{system} {name}' for system, name in heard.good]
+    return {'name': heard.topic.name, 'type': heard.topic.type_name, 'count': heard.topic.count,
+            'rate_hz': (len(heard.logs) - 1) / span if span > 0 else None,
+            'frames': list(heard.frames), 'suits': suits,
+            'problems': _stamp_problems(heard) + _content_problems(heard)}
+
+
+def _stamp_problems(heard: _Heard) -> list[str]:
+    problems = []
+    if heard.no_stamp:
+        problems.append(f'{heard.no_stamp} messages without a usable stamp')
+    steps = np.diff(np.array(heard.stamps, np.int64))
+    if backward := int(np.count_nonzero(steps < 0)):
+        problems.append(f'{backward} stamps older than the one before, by up to '
+                        f'{-steps.min() / SECOND:.3g} s')
+    if repeated := int(np.count_nonzero(steps == 0)):
+        problems.append(f'{repeated} stamps equal to the one before')
+    forward = steps[steps > 0]
+    if len(forward) > 2 and forward.max() > LONG_GAP * np.median(forward):
+        gaps = int(np.count_nonzero(forward > LONG_GAP * np.median(forward)))
+        problems.append(f'{gaps} gaps in the stamps, the longest {forward.max() / SECOND:.3g} s '
+                        f'against {np.median(forward) / SECOND:.3g} s as a rule')
+    return problems
+
+
+def _content_problems(heard: _Heard) -> list[str]:
+    """Refusals of the input that the topic is, or is called; of others they mean nothing."""
+    problems = []
+    if len(heard.frames) > 1:
+        problems.append(f'several frames: {", ".join(map(repr, heard.frames))}')
+    for key, reasons in heard.refused.items():
+        if key in heard.good or heard.topic.name.split('/')[-1] == key[1]:
+            problems += [f'{count} messages refused as {key[1]} ({reason}): '
+                         f'{heard.examples[reason]}' for reason, count in reasons.items()]
+    problems += [f'{count} messages with {code.replace("_", " ")}'
+                 for code, count in heard.doubts.items()]
+    return problems
+
+
+def _systems(topics: list[dict[str, Any]]) -> dict[str, dict[str, list[str]]]:
+    """Topics by input for each tracker that the recording has something for."""
+    systems: dict[str, dict[str, list[str]]] = {}
+    for topic in topics:
+        for suited in topic['suits']:
+            system, name = suited.split(' ')
+            systems.setdefault(system, {}).setdefault(name, []).append(topic['name'])
+    return systems

@@ -1,0 +1,121 @@
+"""The bare page of a report: HTML and CSS, no knowledge of tracking.
+
+Everything is inside the one file, plotly.js too: a report can be mailed and opened offline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from html import escape
+
+from attrs import frozen
+import plotly.graph_objects as go
+import plotly.offline
+
+STYLE = """
+:root { --ink: #1b2733; --soft: #5b6875; --line: #e0e6ec; --blue: #0072B2; --ground: #f4f7f9; }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--ground); color: var(--ink); line-height: 1.5;
+  font-family: Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif; }
+header { background: linear-gradient(120deg, #0b2a42, #0f4c6e); color: white;
+  padding: 40px 0 84px; }
+header small { letter-spacing: .08em; text-transform: uppercase; opacity: .75; font-size: 12px; }
+h1 { margin: 4px 0 12px; font-size: 30px; font-weight: 650; overflow-wrap: anywhere; }
+header p { margin: 0; max-width: 820px; font-size: 17px; opacity: .95; }
+.wrap { max-width: 1180px; margin: 0 auto; padding: 0 24px; }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(164px, 1fr)); gap: 14px;
+  margin-top: -54px; }
+.card, section { background: white; border: 1px solid var(--line); border-radius: 10px;
+  box-shadow: 0 1px 3px rgba(20, 40, 60, .06); }
+.card { padding: 16px 18px; }
+.card b { display: block; font-size: 27px; font-weight: 650; font-variant-numeric: tabular-nums; }
+.card span { font-size: 13px; font-weight: 600; }
+.card i { display: block; font-style: normal; font-size: 12.5px; color: var(--soft); }
+section { margin: 18px 0; padding: 22px 26px; overflow-x: auto; }
+h2 { margin: 0 0 2px; font-size: 19px; }
+section > p { margin: 0 0 8px; color: var(--soft); max-width: 860px; font-size: 14px; }
+table { border-collapse: collapse; width: 100%; font-size: 13.5px; }
+th { text-align: left; color: var(--soft); font-weight: 600;
+  border-bottom: 2px solid var(--line); }
+th, td { padding: 5px 12px 5px 0; vertical-align: top; }
+td { border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
+td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
+details summary { cursor: pointer; color: var(--blue); font-size: 14px; padding: 4px 0; }
+footer { color: var(--soft); font-size: 12.5px; padding: 8px 0 40px; }
+@media print { body { background: white; } section, .card { box-shadow: none;
+  break-inside: avoid; } }
+"""
+
+
+@frozen
+class Card:
+    """One key number: the number, what it is, one line that puts it in relation."""
+
+    value: str
+    title: str
+    remark: str = ''
+
+
+@frozen
+class Section:
+    """A part of the page: heading, one paragraph in plain words, then a figure or some HTML."""
+
+    title: str
+    text: str
+    figure: go.Figure | None = None
+    html: str = ''
+
+
+def render(*, kicker: str, title: str, summary: str, cards: Iterable[Card],
+           sections: Iterable[Section], footer: str) -> str:
+    """The whole page as text. The same arguments give the same bytes."""
+    body = '\n'.join(_section(section, index) for index, section in enumerate(sections))
+    boxes = '\n'.join(f'<div class="card"><span>{escape(card.title)}</span>'
+                      f'<b>{escape(card.value)}</b><i>{escape(card.remark)}</i></div>'
+                      for card in cards)
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(title)}</title>
+<style>{STYLE}</style>
+<script>{plotly.offline.get_plotlyjs()}</script></head>
+<body><header><div class="wrap"><small>{escape(kicker)}</small><h1>{escape(title)}</h1>
+<p>{escape(summary)}</p></div></header>
+<main class="wrap"><div class="cards">{boxes}</div>
+{body}
+<footer>{escape(footer)}</footer></main></body></html>
+"""
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """An HTML table; numbers keep their columns."""
+    head = ''.join(f'<th>{escape(text)}</th>' for text in header)
+    body = ''.join(f'<tr>{"".join(_cell(value) for value in row)}</tr>' for row in rows)
+    return f'<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
+
+
+def folded(summary: str, html: str) -> str:
+    """`html` behind a line that opens it."""
+    return f'<details><summary>{escape(summary)}</summary>{html}</details>'
+
+
+def mapping_table(header: tuple[str, str], values: Mapping[str, object]) -> str:
+    """A two-column table of names and values."""
+    return table(header, values.items())
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f'<td class="number">{value:.6g}</td>'
+    kind = ' class="number"' if isinstance(value, int) else ''
+    text = ', '.join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+    return f'<td{kind}>{escape(text)}</td>'
+
+
+def _section(section: Section, index: int) -> str:
+    figure = '' if section.figure is None else section.figure.to_html(
+        full_html=False, include_plotlyjs=False, div_id=f'figure-{index}',
+        config={'displaylogo': False, 'responsive': True,
+                'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d']})
+    return (f'<section><h2>{escape(section.title)}</h2><p>{escape(section.text)}</p>'
+            f'{figure}{section.html}</section>')

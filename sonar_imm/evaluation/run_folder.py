@@ -1,0 +1,182 @@
+"""The folder of a tracked recording: what ``track`` writes and ``evaluate`` reads.
+
+estimate/      the estimates as a bag, topic ``/<system>/estimate``
+estimate.csv   the same rows as text: stamp_ns, then the columns of the contract
+run.json       where they come from; written last, so a folder without it is not a finished run
+metrics.json   and report.html, once evaluated
+
+The bag and the CSV hold nothing that depends on the time or the machine: the same command writes
+the same bytes. What does depend on them is in run.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import csv
+import hashlib
+from importlib.metadata import version
+import json
+import math
+from pathlib import Path
+import platform
+import shutil
+from typing import Any
+
+import numba
+import numpy
+import scipy
+
+from msg_adapters.estimates import read_estimate, write_estimate
+
+from .. import __version__
+from ..estimates import Estimate
+from ..measurements import Fix, Rejection
+from ..recordings.measurements import measurements_of
+from ..recordings.reader import BagError, BagReader
+from ..recordings.writer import BagWriter, ros_message
+from .series import Series, series_of
+
+BAG, CSV, RUN, METRICS, REPORT = ('estimate', 'estimate.csv', 'run.json', 'metrics.json',
+                                  'report.html')
+TRUTH_TOPIC = '/truth/estimate'
+
+
+class RunFolder:
+    """A folder for one run, and how to fill it."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def prepare(self, *, overwrite: bool = False) -> None:
+        """Make the folder, without an earlier run in it.
+
+        Raises `BagError` when one is there and may not be overwritten. Other files are left alone.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise BagError(f'{self.path} is a file; a folder is needed')
+        old = [self.path / name for name in (BAG, CSV, RUN, METRICS, REPORT)]
+        old = [path for path in old if path.exists()]
+        if old and not overwrite:
+            raise BagError(f'{self.path} holds a run already ({old[0].name}); choose another '
+                           'folder or say --overwrite')
+        for path in old:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        self.path.mkdir(parents=True, exist_ok=True)
+
+    def write_estimates(self, estimates: Iterable[Estimate], system: str) -> dict[str, int]:
+        """Write bag and CSV as the estimates come; gives how many estimates and rows."""
+        written = {'estimates': 0, 'rows': 0}
+        with BagWriter(self.path / BAG) as bag, CsvTable(self.path / CSV) as table:
+            for estimate in estimates:
+                bag.write(f'/{system}/estimate', write_estimate(estimate, ros_message),
+                          estimate.stamp_ns)
+                table.write(estimate)
+                written['estimates'] += 1
+                written['rows'] += len(estimate)
+        return written
+
+    def write_json(self, name: str, content: Any) -> Path:
+        """Write `content` as JSON; NaN and infinity, which JSON lacks, become null."""
+        path = self.path / name
+        path.write_text(json.dumps(finite(content), indent=2) + '\n', encoding='utf-8')
+        return path
+
+    def read_run(self) -> dict[str, Any]:
+        """The content of run.json. Raises `BagError` when the folder holds no finished run."""
+        path = self.path / RUN
+        if not path.is_file():
+            raise BagError(f'{self.path} holds no finished run: {RUN} is missing; '
+                           'make one with sonar-imm track')
+        try:
+            run = json.loads(path.read_text(encoding='utf-8'))
+            if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
+                raise ValueError('keys are missing')
+        except (ValueError, AttributeError) as error:
+            raise BagError(f'{path} cannot be understood: {error}') from None
+        return run
+
+    def read_series(self) -> Series:
+        """The estimates of the run. Raises `BagError` when its bag is damaged."""
+        try:
+            return series_of(_read_estimates(self.path / BAG, None))
+        except (Rejection, ValueError) as error:
+            raise BagError(f'{self.path / BAG}: {error}') from None
+
+
+class CsvTable:
+    """estimate.csv, a row an estimate row; floats as the shortest text that reads back exactly."""
+
+    def __init__(self, path: Path):
+        self._file = path.open('w', encoding='utf-8', newline='')
+        self._writer = csv.writer(self._file, lineterminator='\n')
+        self._names: list[str] | None = None
+
+    def __enter__(self) -> CsvTable:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, estimate: Estimate) -> None:
+        """Append the rows of one estimate. Raises ValueError when the columns change."""
+        columns = estimate.columns()
+        if self._names is None:
+            self._names = list(columns)
+            self._writer.writerow(['stamp_ns', *columns])
+        elif self._names != list(columns):
+            raise ValueError('the columns change from one estimate to another')
+        for row in zip(*(column.tolist() for column in columns.values())):
+            self._writer.writerow([estimate.stamp_ns, *row])
+
+
+def read_truth(path: Path) -> Series | None:
+    """The truth in the bag at `path`, None when it has none. Raises `BagError`."""
+    estimates = _read_estimates(path, TRUTH_TOPIC)
+    return series_of(estimates) if estimates else None
+
+
+def read_fixes(run: dict[str, Any]) -> list[Fix]:
+    """The raw fixes that went into `run`. Raises `BagError`."""
+    with BagReader(run['bag']) as bag:
+        heard = measurements_of(bag, run['system'], run['topics'],
+                                world_frame=run.get('world_frame', 'enu'))
+        return [item.measurement for item in heard if isinstance(item.measurement, Fix)]
+
+
+def _read_estimates(path: Path, topic: str | None) -> list[Estimate]:
+    with BagReader(path) as bag:
+        return [read_estimate(item.message)
+                for item in bag.messages(None if topic is None else [topic])]
+
+
+def run_record(**facts: Any) -> dict[str, Any]:
+    """The content of run.json: `facts` and the versions of what computes."""
+    versions = {'sonar_imm': __version__, 'python': platform.python_version(),
+                'numpy': numpy.__version__, 'scipy': scipy.__version__,
+                'numba': numba.__version__, 'rosbags': version('rosbags')}
+    return {**facts, 'versions': versions}
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a recording: of the file, or of all files of the folder in order."""
+    files = sorted(item for item in path.rglob('*') if item.is_file()) if path.is_dir() else [path]
+    digest, size = hashlib.sha256(), 0
+    for file in files:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path).as_posix()).encode())
+        with file.open('rb') as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+                size += len(block)
+    return {'bag_bytes': size, 'bag_sha256': digest.hexdigest()}
+
+
+def finite(value: Any) -> Any:
+    """`value` with None for floats that are not finite, so that any JSON parser reads it."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return value

@@ -1,0 +1,193 @@
+"""Scores of a tracked recording: how far from the truth, and whether the stated uncertainty holds.
+
+`score` gives one nested dict of plain numbers, which is `metrics.json`:
+
+position, velocity   RMSE, median and 95 % point of the error of confirmed tracks
+raw_fix              the same of the fixes as they came, the number a tracker has to beat
+lag                  the shift of truth that makes the error smallest: late stamps, a towed tag
+consistency          NEES and NIS against their chi-square bounds, coverage of the ellipses
+tracks, gospa        several targets: identity switches, losses, false tracks, and GOSPA
+models               how probable each motion model was, and how often the leading one changed
+
+The chi-square bounds take successive errors as independent. Errors of one track are correlated
+over a few stamps, so a mean slightly outside its bounds is no proof; one far outside is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+from ..estimation.consistency import average_bounds, gospa, nees
+from ..measurements import Fix
+from .matching import match, Matching, track_summary
+from .series import FloatArray, SECOND, Series
+from .truth import Truth
+
+COVERAGE_LEVELS = (0.5, 0.9, 0.95)
+LAG_RANGE = 30.0
+
+
+def score(series: Series, truth: Truth | None = None, *, fixes: Series | None = None,
+          cutoff: float = 10.0) -> dict[str, Any]:
+    """All metrics of a run. Without `truth` only what needs none: NIS, models, counts.
+
+    fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is off target.
+    """
+    confirmed = series.confirmed()
+    span = (series.scan_ns[-1] - series.scan_ns[0]) / SECOND if len(series.scan_ns) else 0.0
+    metrics: dict[str, Any] = {
+        'stamps': len(series.scan_ns), 'span_s': float(span), 'rows_confirmed': len(confirmed),
+        'rows_tentative': len(series) - len(confirmed),
+        'tracks_confirmed': len(np.unique(confirmed.track_id)),
+        'consistency': {'nis': nis_summary(confirmed)}, 'models': model_summary(confirmed)}
+    if truth is None or not len(truth):
+        return metrics
+    matching = match(confirmed, truth, cutoff=cutoff)
+    metrics['cutoff_m'] = float(cutoff)
+    metrics['scored_stamps'] = len(matching.scan_ns)
+    metrics['position'] = error_summary(matching.distance)
+    speed_error = np.hypot(*matching.error[:, 2:].T)
+    metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')
+    if fixes is not None and len(fixes):
+        metrics['raw_fix'] = error_summary(match(fixes, truth, cutoff=cutoff).distance)
+    metrics['consistency'].update(truth_consistency(matching))
+    metrics['tracks'] = track_summary(matching)
+    metrics['gospa'] = gospa_summary(matching, truth, cutoff)
+    metrics['lag'] = best_lag(matching, truth)
+    return metrics
+
+
+def fix_series(fixes: Iterable[Fix]) -> Series:
+    """Fixes as a series without tracks: every row has track id 0, no velocity, no models."""
+    ordered = sorted(fixes, key=lambda fix: fix.stamp_ns)
+    n = len(ordered)
+    stamp_ns = np.array([fix.stamp_ns for fix in ordered], np.int64)
+    state, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
+    for row, fix in enumerate(ordered):
+        state[row, :2] = fix.position[:2]
+        if fix.covariance is not None:
+            covariance[row, :2, :2] = fix.covariance
+    return Series(scan_ns=np.unique(stamp_ns), stamp_ns=stamp_ns, track_id=np.zeros(n, np.int64),
+                  track_state=np.ones(n, np.int64), state=state, covariance=covariance,
+                  model_names=(), probabilities=np.empty((n, 0)), nis=np.full(n, np.nan),
+                  nis_dof=np.full(n, np.nan))
+
+
+def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
+    """RMSE, median and 95 % point of non-negative errors; NaN when there are none."""
+    if not len(error):
+        return {'n': 0, **{f'{name}_{unit}': float('nan') for name in ('rmse', 'median', 'p95')}}
+    return {'n': len(error), f'rmse_{unit}': float(np.sqrt(np.mean(error**2))),
+            f'median_{unit}': float(np.median(error)),
+            f'p95_{unit}': float(np.percentile(error, 95.0))}
+
+
+def truth_consistency(matching: Matching) -> dict[str, Any]:
+    """NEES on position and on the whole state, and the coverage of the position ellipses."""
+    error, covariance = matching.error, matching.series.covariance[matching.row]
+    position = usable_nees(error[:, :2], covariance[:, :2, :2])
+    state = usable_nees(error, covariance)
+    result: dict[str, Any] = {
+        'nees_position': chi2_summary(position, 2),
+        'coverage': {f'{100 * level:g}': float(np.mean(position <= chi2.ppf(level, 2)))
+                     if len(position) else float('nan') for level in COVERAGE_LEVELS},
+        'unusable_covariances': len(error) - len(position)}
+    return {**result, 'nees_state': chi2_summary(state, 4)} if len(state) else result
+
+
+def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """NEES of the rows that are finite and whose covariance is positive definite."""
+    good = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    good[good] = np.linalg.eigvalsh(covariance[good])[:, 0] > 0.0
+    return nees(error[good], covariance[good]) if good.any() else np.empty(0)
+
+
+def nis_summary(series: Series) -> dict[str, Any]:
+    """NIS of all hits against its bounds; divided by its degrees of freedom where these vary."""
+    nis, dof = hits_of(series)
+    if not len(nis) or (dof == dof[0]).all():
+        return chi2_summary(nis, int(dof[0]) if len(nis) else 2)
+    low, high = average_bounds(1, int(dof.sum()))
+    mean, low, high = (float(value / dof.sum()) for value in (nis.sum(), low, high))
+    return {'n': len(nis), 'dof': 1, 'mean': mean, 'low': low, 'high': high,
+            'believable': low <= mean <= high, 'divided_by_dof': True}
+
+
+def hits_of(series: Series) -> tuple[FloatArray, FloatArray]:
+    """NIS and degrees of freedom of the rows that had a hit."""
+    hits = np.isfinite(series.nis) & (series.nis_dof > 0)
+    return series.nis[hits], series.nis_dof[hits]
+
+
+def chi2_summary(values: FloatArray, dof: int) -> dict[str, Any]:
+    """Mean of chi-square values with its 95 % two-sided bounds (dof is expected)."""
+    if not len(values):
+        return {'n': 0, 'dof': dof, 'mean': float('nan'), 'believable': None}
+    low, high = average_bounds(len(values), dof)
+    mean = float(np.mean(values))
+    return {'n': len(values), 'dof': dof, 'mean': mean, 'low': low, 'high': high,
+            'believable': bool(low <= mean <= high)}
+
+
+def model_summary(series: Series) -> dict[str, Any]:
+    """Mean probability and share of leading of each model; changes of the leader a minute."""
+    if not len(series) or not series.model_names:
+        return {}
+    leader = np.argmax(series.probabilities, axis=1)
+    changes, duration = 0, 0.0
+    for track_id in np.unique(series.track_id):
+        rows = series.track_id == track_id
+        changes += int(np.count_nonzero(np.diff(leader[rows])))
+        duration += float(np.ptp(series.stamp_ns[rows])) / SECOND
+    return {
+        'mean_probability': dict(zip(series.model_names,
+                                     series.probabilities.mean(axis=0).tolist())),
+        'leads': {name: float(np.mean(leader == index))
+                  for index, name in enumerate(series.model_names)},
+        'leader_changes_per_minute': 60.0 * changes / duration if duration > 0 else float('nan')}
+
+
+def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, float]:
+    """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and the parts it is made of."""
+    series, states = matching.series, truth.at(matching.scan_ns)
+    starts = np.searchsorted(series.stamp_ns, matching.scan_ns, side='left')
+    ends = np.searchsorted(series.stamp_ns, matching.scan_ns, side='right')
+    parts = []
+    for scan, (start, end) in enumerate(zip(starts, ends)):
+        there = states[matching.present[:, scan], scan, :2]
+        parts.append(gospa(there, series.state[start:end, :2], cutoff))
+    if not parts:
+        return {}
+    half = 0.5 * cutoff**2
+    return {'mean_m': float(np.mean([part.distance for part in parts])),
+            'missed_per_scan': float(np.mean([part.missed for part in parts])) / half,
+            'false_per_scan': float(np.mean([part.false for part in parts])) / half}
+
+
+def best_lag(matching: Matching, truth: Truth) -> dict[str, float]:
+    """The lag of `Truth.shifted` with the least RMSE: a coarse search, then a fine one.
+
+    Positive: the estimates agree best with truth that much later. The pairs stay as they are.
+    """
+    stamp_ns = matching.series.stamp_ns[matching.row]
+    position = matching.series.state[matching.row, :2]
+
+    def rmse(lag: float) -> float:
+        states = truth.shifted(lag).at(stamp_ns)[matching.target, np.arange(len(stamp_ns)), :2]
+        distance = np.hypot(*(position - states).T)
+        return error_summary(distance[np.isfinite(distance)])['rmse_m']
+
+    reach = min(LAG_RANGE, float(np.ptp(stamp_ns)) / SECOND / 4.0) if len(stamp_ns) else 0.0
+    if reach <= 0.0:
+        return {}
+    grid = np.linspace(-reach, reach, 61)
+    coarse = grid[int(np.nanargmin([rmse(lag) for lag in grid]))]
+    step = grid[1] - grid[0]
+    fine = minimize_scalar(rmse, bounds=(coarse - step, coarse + step), method='bounded')
+    return {'best_s': float(fine.x), 'rmse_at_best_m': float(fine.fun),
+            'rmse_at_zero_m': rmse(0.0)}

@@ -1,0 +1,151 @@
+"""Tracking a recording offline: the same readers, the same tracker and the same order as live.
+
+A tracker revises what it said when late input arrives. Offline only the last word on each stamp is
+wanted, in order of stamps; `Revisions` keeps estimates just as long as they can still change, so
+that memory does not grow with the recording.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+import time
+from typing import Any
+
+from attrs import asdict, define, frozen
+import numpy as np
+
+from msg_adapters.frames import FrameGuard
+
+from ..estimates import Estimate
+from ..measurements import Rejection
+from ..parameters import Config
+from ..recordings.measurements import fitting_topics, measurements_of
+from ..recordings.reader import BagReader
+from ..trackers import System
+from .series import SECOND
+
+
+@frozen(kw_only=True)
+class InputOptions:
+    """How to read a recording. topics: input by topic name, None to pick what fits by name."""
+
+    topics: Mapping[str, str] | None = None
+    order: str = 'recorded'
+    world_frame: str = 'enu'
+    frame_id: str = ''
+
+
+@define
+class Refused:
+    """How many messages were refused for one reason, and what the first one was told."""
+
+    count: int
+    example: str
+
+
+class Revisions:
+    """Holds estimates while they can still be revised; the last one of a stamp wins.
+
+    window_ns: how far back a late measurement can reach. A clock that was restarted begins anew:
+    what is held from before is final then.
+    """
+
+    def __init__(self, window_ns: int):
+        self.window_ns = window_ns
+        self._held: dict[int, Estimate] = {}
+
+    def add(self, estimates: Iterable[Estimate]) -> list[Estimate]:
+        """Take in what one measurement made; gives what has become final, oldest first."""
+        final: list[Estimate] = []
+        for estimate in estimates:
+            newest = max(self._held, default=estimate.stamp_ns)
+            if estimate.stamp_ns < newest - self.window_ns:
+                final += self.finish()
+            self._held[estimate.stamp_ns] = estimate
+        if self._held:
+            oldest = max(self._held) - self.window_ns
+            final += self._release(sorted(stamp for stamp in self._held if stamp < oldest))
+        return final
+
+    def finish(self) -> list[Estimate]:
+        """Everything still held, oldest first."""
+        return self._release(sorted(self._held))
+
+    def _release(self, stamps: list[int]) -> list[Estimate]:
+        return [self._held.pop(stamp) for stamp in stamps]
+
+
+class OfflineRun:
+    """One pass of a tracker over an open recording. The counters are complete after `estimates`.
+
+    topics: input by topic name, as used. refused: by reason code. durations: seconds of each call
+    of the tracker. Raises `BagError` when no topic fits the tracker.
+    """
+
+    def __init__(self, bag: BagReader, system: System, config: Config,
+                 options: InputOptions | None = None):
+        self.options = options or InputOptions()
+        self._bag = bag
+        self._system = system
+        chosen = fitting_topics(bag, system.name, self.options.topics)
+        self.topics = {name: entry.name for name, entry in chosen.items()}
+        self.tracker = system.build(config)
+        self.refused: dict[str, Refused] = {}
+        self.messages = 0
+        self.durations = array('d')
+        self._window_ns = round(getattr(config, 'history', 0.0) * SECOND)
+
+    @property
+    def total(self) -> int:
+        """How many messages there are to read."""
+        return sum(topic.count for topic in self._bag.topics if topic.name in self.topics)
+
+    def estimates(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Estimate]:
+        """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
+        revisions = Revisions(self._window_ns)
+        for measurement in self._measurements(advance):
+            begin = time.perf_counter()
+            made = self.tracker.process(measurement)
+            self.durations.append(time.perf_counter() - begin)
+            yield from revisions.add(made)
+        yield from revisions.finish()
+
+    def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
+        guard = FrameGuard(self.options.frame_id)
+        for heard in measurements_of(self._bag, self._system.name, self.topics,
+                                     world_frame=self.options.world_frame,
+                                     order=self.options.order):
+            self.messages += 1
+            advance(1)
+            try:
+                if isinstance(heard.measurement, Rejection):
+                    raise heard.measurement
+                guard.check(heard.measurement)
+            except Rejection as rejection:
+                self._refuse(heard.topic, rejection)
+                continue
+            yield heard.measurement
+
+    def _refuse(self, topic: str, rejection: Rejection) -> None:
+        entry = self.refused.setdefault(rejection.reason,
+                                        Refused(0, f'{topic}: {rejection.sentence}'))
+        entry.count += 1
+
+    def outcomes(self) -> dict[str, int]:
+        """What happened to the messages: counts of the tracker, and those refused before."""
+        counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
+        refused = sum(entry.count for entry in self.refused.values())
+        return {**counts, 'refused': refused} if refused else counts
+
+    def refusals(self) -> dict[str, dict[str, Any]]:
+        """Count and example by reason, as plain values."""
+        return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
+
+    def timings(self) -> dict[str, float]:
+        """Milliseconds a measurement takes the tracker: total, median and 99 % point."""
+        spent = np.array(self.durations) * 1e3
+        if not len(spent):
+            return {}
+        return {'tracker_total_ms': float(spent.sum()), 'tracker_p50_ms': float(np.median(spent)),
+                'tracker_p99_ms': float(np.percentile(spent, 99.0))}
