@@ -11,10 +11,13 @@ ROOT = Path(__file__).resolve().parent
 
 REQUIRES = [
     'attrs>=23.1',
+    'backports.zstd',
     'click>=8.1',
+    'lz4>=4.0',
     'numba>=0.58',
     'numpy>=1.26',
     'plotly>=5.15',
+    'pymap3d>=3.0',
     'PyYAML>=6.0',
     'rich>=13.0',
     'rosbags>=0.11,<0.12',

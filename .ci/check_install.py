@@ -1,4 +1,4 @@
-"""Check a colcon install of sonar_imm: what `ros2 run` needs is there, the command and the node run.
+"""Check a colcon install of sonar_imm: what `ros2 run` needs is there and works.
 
 Usage: python check_install.py PREFIX, after sourcing the workspace's local_setup.bash.
 """
@@ -19,6 +19,7 @@ STOP_LIMIT = 20.0
 
 def main(prefix: Path) -> None:
     from ament_index_python.packages import get_package_prefix
+
     import sonar_imm
     from sonar_imm.resources import shared_file
 
@@ -33,9 +34,10 @@ def main(prefix: Path) -> None:
 
 def start_and_interrupt(executable: Path) -> None:
     """Start the node, wait until it says it is ready, press Ctrl-C: it has to leave with 0."""
-    node = subprocess.Popen([executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    node = subprocess.Popen([executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                            text=True)
     lines: queue.Queue[str] = queue.Queue()
-    reader = threading.Thread(target=lambda: [lines.put(line) for line in node.stdout], daemon=True)
+    reader = threading.Thread(target=forward, args=(node, lines), daemon=True)
     reader.start()
     said = wait_for('ready', lines, node)
     node.send_signal(signal.SIGINT)
@@ -48,6 +50,11 @@ def start_and_interrupt(executable: Path) -> None:
     while not lines.empty():
         said += lines.get()
     expect(status == 0 and 'Traceback' not in said, f'diver_node stops on SIGINT with {status}')
+
+
+def forward(node: subprocess.Popen[str], lines: queue.Queue[str]) -> None:
+    for line in node.stdout:
+        lines.put(line)
 
 
 def wait_for(word: str, lines: queue.Queue[str], node: subprocess.Popen[str]) -> str:

@@ -17,17 +17,12 @@ from collections.abc import Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
 import struct
-import sys
 from typing import NamedTuple
 from zlib import crc32
 
+from backports import zstd
 import lz4.frame
 import numpy as np
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
 
 MAGIC = b'\x89MCAP0\r\n'
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F

@@ -1,0 +1,235 @@
+"""The package keeps its promises: one version, one list of dependencies, floors, fresh docs."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from pathlib import Path
+import re
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+import msg_adapters
+import sonar_imm
+
+ROOT = Path(__file__).resolve().parents[1]
+if not (ROOT / 'setup.py').is_file():
+    pytest.skip('these tests read the source tree', allow_module_level=True)
+
+# rosdep keys (package.xml) and PyPI names (setup.py) of the same thing.
+PYPI_OF_KEY = {
+    'python3-attrs': 'attrs',
+    'python3-click': 'click',
+    'python3-filterpy-pip': 'filterpy',
+    'python3-hypothesis': 'hypothesis',
+    'python3-numba': 'numba',
+    'python3-numpy': 'numpy',
+    'python3-pymap3d': 'pymap3d',
+    'python3-pytest': 'pytest',
+    'python3-pytest-benchmark': 'pytest-benchmark',
+    'python3-pytest-xdist': 'pytest-xdist',
+    'python3-rich': 'rich',
+    'python3-rosbags-pip': 'rosbags',
+    'python3-scipy': 'scipy',
+    'python3-stonesoup-pip': 'stonesoup',
+    'python3-yaml': 'PyYAML',
+}
+WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
+IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
+COMMON_INTERFACES = {'actionlib_msgs', 'diagnostic_msgs', 'geometry_msgs', 'nav_msgs',
+                     'sensor_msgs', 'shape_msgs', 'std_msgs', 'std_srvs', 'stereo_msgs',
+                     'trajectory_msgs', 'visualization_msgs'}
+COME_WITH_RCLPY = {'builtin_interfaces', 'rcl_interfaces', 'rosgraph_msgs'}
+ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_python'}
+
+# A room may import from its own floor and from lower ones.
+FLOORS = {
+    'sonar_imm.resources': 0,
+    'sonar_imm.estimation': 0,
+    'sonar_imm.acoustics': 1,
+    'sonar_imm.parameters': 2,
+    'sonar_imm.measurements': 2,
+    'sonar_imm.estimates': 2,
+    'msg_adapters': 3,
+    'sonar_imm.trackers': 3,
+    'sonar_imm.simulation': 4,
+    'sonar_imm.recordings': 5,
+    'sonar_imm.evaluation': 6,
+    'sonar_imm.nodes': 7,
+    'sonar_imm.cli': 8,
+}
+SIDE_BY_SIDE = {('msg_adapters', 'sonar_imm.trackers'), ('sonar_imm.trackers', 'msg_adapters')}
+ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
+
+LONG_FILES: dict[str, str] = {}  # path below the root: why it may exceed 400 lines
+MODULES = sorted(path for room in ('sonar_imm', 'msg_adapters')
+                 for path in (ROOT / room).rglob('*.py'))
+
+
+@pytest.fixture(scope='module')
+def manifest() -> ElementTree.Element:
+    return ElementTree.parse(ROOT / 'package.xml').getroot()
+
+
+@pytest.fixture(scope='module')
+def setup_lists() -> dict[str, object]:
+    """The literals assigned at the top of setup.py."""
+    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
+    return {node.targets[0].id: ast.literal_eval(node.value) for node in tree.body
+            if isinstance(node, ast.Assign) and isinstance(node.value, (ast.List, ast.Dict))}
+
+
+def test_there_is_one_version(manifest: ElementTree.Element) -> None:
+    assert sonar_imm.__version__ == msg_adapters.__version__ == manifest.findtext('version')
+    changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    assert re.search(rf'^{re.escape(sonar_imm.__version__)} \(.+\)$', changelog, re.MULTILINE)
+
+
+def test_setup_reads_that_version() -> None:
+    text = (ROOT / 'sonar_imm' / '__init__.py').read_text(encoding='utf-8')
+    assert re.findall(r"^__version__ = '([^']+)'$", text, re.MULTILINE) == [sonar_imm.__version__]
+
+
+def test_package_xml_and_setup_name_the_same_run_time_dependencies(
+        manifest: ElementTree.Element, setup_lists: dict[str, list[str]]) -> None:
+    wanted = {PYPI_OF_KEY[key] for key in texts(manifest, 'exec_depend') if key != 'rclpy'}
+    assert wanted | WITHOUT_KEY == {distribution(line) for line in setup_lists['REQUIRES']}
+
+
+def test_package_xml_and_setup_name_the_same_test_dependencies(
+        manifest: ElementTree.Element, setup_lists: dict[str, dict[str, list[str]]]) -> None:
+    wanted = {PYPI_OF_KEY[key] for key in texts(manifest, 'test_depend')}
+    assert wanted == {distribution(line) for line in setup_lists['EXTRAS']['test']}
+
+
+def test_every_import_is_declared(
+        manifest: ElementTree.Element, setup_lists: dict[str, list[str]]) -> None:
+    declared = {IMPORT_OF_PYPI.get(name, name) for name in
+                (distribution(line) for line in setup_lists['REQUIRES'])}
+    declared |= texts(manifest, 'depend') | texts(manifest, 'exec_depend')
+    declared |= {'msg_adapters', 'sonar_imm', *sys.stdlib_module_names}
+    used = {name.split('.')[0] for path in MODULES for name in imports(path)}
+    assert used - declared == set()
+
+
+def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element) -> None:
+    assert texts(manifest, 'depend') <= COMMON_INTERFACES | COME_WITH_RCLPY
+
+
+@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_go_down_the_floors(path: Path) -> None:
+    here = room_of(module_name(path))
+    if here is None:  # sonar_imm/__init__.py only looks whether msg_adapters is its own
+        assert module_name(path) == 'sonar_imm'
+        assert {room_of(name) for name in imports(path)} <= {None, 'msg_adapters'}
+        return
+    for name in imports(path):
+        there = room_of(name)
+        if there is not None:
+            assert FLOORS[there] <= FLOORS[here], f'{here} must not import {name}'
+            assert (here, there) not in SIDE_BY_SIDE, f'{here} must not import {name}'
+
+
+@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_ros_and_rosbags_stay_in_their_rooms(path: Path) -> None:
+    here = room_of(module_name(path))
+    for name in imports(path):
+        top = name.split('.')[0]
+        rooms = ONLY_IN.get('rclpy' if top in ROS_MODULES else top)
+        assert rooms is None or here in rooms, f'{here} must not import {name}'
+
+
+def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None:
+    file = ROOT / 'sonar_imm' / 'estimation' / 'imagined.py'
+    source = ('from ..nodes import diver\nfrom .. import cli\nfrom . import kalman\n'
+              'def f():\n    import rclpy.node\n')
+    assert set(imported_names(source, file)) >= {
+        'sonar_imm.nodes.diver', 'sonar_imm.cli', 'sonar_imm.estimation.kalman', 'rclpy.node'}
+
+
+def test_no_file_is_too_long() -> None:
+    files = [path for room in ('sonar_imm', 'msg_adapters', 'test', 'benchmarks', 'docs')
+             for path in (ROOT / room).rglob('*.py')]
+    lengths = {str(path.relative_to(ROOT)): len(path.read_text(encoding='utf-8').splitlines())
+               for path in files}
+    too_long = {name for name, lines in lengths.items() if lines > 400}
+    assert too_long == set(LONG_FILES), 'over 400 lines, or listed without need'
+
+
+def test_generated_files_are_up_to_date() -> None:
+    spec = importlib.util.spec_from_file_location('generate', ROOT / 'docs' / 'generate.py')
+    generate = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generate)
+    files = generate.generated()
+    assert files
+    for name, text in files.items():
+        found = (ROOT / name).read_text(encoding='utf-8') if (ROOT / name).exists() else ''
+        assert found == text, f'{name} is out of date: run `make docs`'
+
+
+def test_default_parameter_file_holds_the_defaults() -> None:
+    from sonar_imm.parameters import parameters_from_yaml
+    from sonar_imm.trackers import SYSTEMS
+    for system in SYSTEMS.values():
+        text = (ROOT / 'config' / f'{system.name}.yaml').read_text(encoding='utf-8')
+        values = parameters_from_yaml(text, node_name=system.name)
+        config = system.config_type()
+        assert config.lint(values) == []
+        assert config.from_mapping(values, ignore_unknown=True) == config()
+
+
+def test_topics_page_names_every_input() -> None:
+    from msg_adapters.inputs import INPUTS
+    page = (ROOT / 'docs' / 'topics.md').read_text(encoding='utf-8')
+    for topics in INPUTS.values():
+        for topic in topics:
+            for type_name in topic.readers:
+                row = rf'^\| `{topic.name}` \| .*{re.escape(type_name.split("/")[-1])}'
+                assert re.search(row, page, re.MULTILINE), f'{topic.name} {type_name}'
+
+
+@pytest.mark.parametrize('page', sorted(p.relative_to(ROOT).as_posix() for p in
+                                        [*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')]))
+def test_links_between_pages_lead_somewhere(page: str) -> None:
+    text = (ROOT / page).read_text(encoding='utf-8')
+    for target in re.findall(r'\]\(([^)#]+)(?:#[^)]*)?\)', text):
+        if '://' not in target:
+            assert ((ROOT / page).parent / target).exists(), f'{page} links to {target}'
+
+
+def texts(manifest: ElementTree.Element, tag: str) -> set[str]:
+    return {element.text for element in manifest.iter(tag)}
+
+
+def distribution(requirement: str) -> str:
+    return re.match(r'[A-Za-z0-9_.-]+', requirement).group()
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def room_of(name: str) -> str | None:
+    """The room a dotted name lies in, None outside the house."""
+    return next((room for room in FLOORS if name == room or name.startswith(room + '.')), None)
+
+
+def imports(path: Path) -> list[str]:
+    return imported_names(path.read_text(encoding='utf-8'), path)
+
+
+def imported_names(source: str, path: Path) -> list[str]:
+    """Every name the source imports, made absolute, at the top or inside a function."""
+    package = module_name(path) if path.name == '__init__.py' else module_name(path.parent)
+    names = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package.split('.')[:len(package.split('.')) - node.level + 1]
+            stem = '.'.join([*(base if node.level else []), *filter(None, [node.module])])
+            names += [f'{stem}.{alias.name}' for alias in node.names]
+    return names
