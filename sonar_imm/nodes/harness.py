@@ -1,0 +1,191 @@
+"""Real nodes without launch: start one, play a bag to it in lock-step, take its estimates.
+
+``sonar-imm check`` compares the estimates with those of the offline tracker, bit by bit;
+``sonar-imm bench`` reads the delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+import os
+from pathlib import Path
+import random
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+
+from attrs import frozen
+import numpy as np
+
+from msg_adapters.inputs import InputTopic
+
+from ..estimates import Estimate
+from ..recordings.measurements import fitting_topics
+from ..recordings.reader import BagReader
+from .link import Link, LinkError
+from .lockstep import Counts, LockStep, Recorder
+from .player import NAME, Player, PlayOptions
+
+START_LIMIT = 90.0
+"""Seconds a node may take to appear, with nothing compiled yet, on a slow or busy machine."""
+_STOP_LIMIT = 10.0
+_LOG_TAIL = 12
+
+
+@frozen(eq=False)
+class LockstepResult:
+    """What a live node made of a recording.
+
+    estimates: all it published, in order; counts: messages it took and refused, and estimates it
+    published; delays: seconds from sending a message to its last estimate, one for each message
+    that brought an estimate; exit_code and log: of the node's process, after SIGINT; problems:
+    sentences about the recording.
+    """
+
+    estimates: list[Estimate]
+    counts: Counts
+    delays: tuple[float, ...]
+    exit_code: int
+    log: str
+    problems: tuple[str, ...]
+
+    def latency_ms(self) -> dict[str, float]:
+        """Percentiles of the delays in milliseconds: ``p50`` and ``p99``; NaN without any."""
+        values = np.percentile(self.delays, (50, 99)) if self.delays else (np.nan, np.nan)
+        return {'p50': 1e3 * float(values[0]), 'p99': 1e3 * float(values[1])}
+
+
+def run_lockstep(path: Path | str, system: str, *, params_file: Path | str | None = None,
+                 topics: Mapping[str, str] | None = None,
+                 progress: Callable[[int], None] = lambda count: None) -> LockstepResult:
+    """Start the node of `system` as a process and play the bag at `path` to it in lock-step.
+
+    topics: recorded topic names to input names, as in `fitting_topics`; by default those that fit.
+    Node and player meet in a ROS domain of their own on this machine. Raises `BagError` for the
+    bag and `LinkError` when the node ends, does not answer or refuses its parameters.
+    """
+    with contextlib.ExitStack() as stack:
+        bag = stack.enter_context(BagReader(path))
+        inputs = fitting_topics(bag, system, topics)
+        domain = stack.enter_context(reserved_domain_id())
+        stack.enter_context(_environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
+                                         ROS_LOCALHOST_ONLY=None))
+        node = stack.enter_context(NodeProcess(system, domain_id=domain, arguments=_arguments(
+            bag, system, inputs, params_file)))
+        link = stack.enter_context(Link(NAME, domain_id=domain))
+        recorder = Recorder(link, f'/{system}')
+        lockstep = LockStep(link, f'/{system}', recorder=recorder, trouble=node.trouble)
+        player = Player(bag, link, PlayOptions(
+            topics=tuple(inputs), lockstep=f'/{system}',
+            remap={name: f'/{entry.name}' for name, entry in inputs.items()}), lockstep)
+        player.run(progress, START_LIMIT)
+        exit_code = node.stop()
+        result = player.result()
+        return LockstepResult(recorder.estimates(), lockstep.counts, result.delays, exit_code,
+                              node.log(), result.problems)
+
+
+class NodeProcess:
+    """A node of this package as a process of its own; stopped at the end of ``with``."""
+
+    def __init__(self, system: str, *, domain_id: int, arguments: Sequence[str] = ()):
+        """Start it. `arguments` follow ``--ros-args``."""
+        self.system = system
+        root = str(Path(__file__).resolve().parents[2])
+        environment = dict(os.environ, ROS_DOMAIN_ID=str(domain_id), PYTHONUNBUFFERED='1',
+                           RCUTILS_COLORIZED_OUTPUT='0', PYTHONPATH=os.pathsep.join(
+                               filter(None, [root, os.environ.get('PYTHONPATH')])))
+        self._log = tempfile.NamedTemporaryFile(mode='ab', prefix=f'sonar_imm_{system}_')
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', f'sonar_imm.nodes.{system}', '--ros-args',
+             '-r', f'__node:={system}', *arguments],
+            env=environment, stdout=self._log, stderr=subprocess.STDOUT)
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+        self._log.close()
+
+    def log(self) -> str:
+        """Give what the node wrote so far."""
+        return Path(self._log.name).read_text(encoding='utf-8', errors='replace')
+
+    def trouble(self) -> str | None:
+        """Say how the node ended; None while it runs."""
+        code = self.process.poll()
+        if code is None:
+            return None
+        tail = ' | '.join(self.log().splitlines()[-_LOG_TAIL:])
+        return f"node '/{self.system}' ended with exit code {code}: {tail or 'no word'}"
+
+    def stop(self, how: signal.Signals = signal.SIGINT) -> int:
+        """Ask the node to stop, then insist; gives its exit code."""
+        for request in (how, signal.SIGTERM, signal.SIGKILL):
+            if self.process.poll() is None:
+                self.process.send_signal(request)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self.process.wait(_STOP_LIMIT)
+        return self.process.returncode
+
+
+@contextlib.contextmanager
+def reserved_domain_id() -> Iterator[int]:
+    """Reserve a ROS domain on this machine, so that checks neither meddle nor are meddled with.
+
+    A listening port stands for the domain, as in the isolation of launch_testing. Raises
+    `LinkError` when all are taken.
+    """
+    candidates = list(range(1, 101))
+    random.SystemRandom().shuffle(candidates)
+    for domain_id in candidates:
+        with socket.socket() as claim:
+            try:
+                claim.bind(('127.0.0.1', 22119 + domain_id))
+            except OSError:
+                continue
+            yield domain_id
+            return
+    raise LinkError('no free ROS domain on this machine')
+
+
+@contextlib.contextmanager
+def _environment(**values: str | None) -> Iterator[None]:
+    """Set environment variables for a while; None unsets."""
+    before = {name: os.environ.get(name) for name in values}
+    _set_environment(values)
+    try:
+        yield
+    finally:
+        _set_environment(before)
+
+
+def _set_environment(values: Mapping[str, str | None]) -> None:
+    for name, value in values.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+
+
+def _arguments(bag: BagReader, system: str, inputs: Mapping[str, InputTopic],
+               params_file: Path | str | None) -> list[str]:
+    """Write the ROS arguments of a node that loses nothing and expects the types of the bag."""
+    parameters = {f'qos_overrides./{system}/estimate.publisher.history': 'keep_all'}
+    types = {topic.name: topic.type_name for topic in bag.topics}
+    for topic, entry in inputs.items():
+        parameters[f'qos_overrides./{entry.name}.subscription.history'] = 'keep_all'
+        parameters[f'qos_overrides./{entry.name}.subscription.reliability'] = 'reliable'
+        if len(entry.readers) == 1:
+            continue
+        known = parameters.setdefault(f'{entry.name}_type', types[topic])
+        if known != types[topic]:
+            raise LinkError(f"the input '{entry.name}' would come as {known} and as "
+                            f'{types[topic]}: a node can hear only one of them')
+    arguments = ['--params-file', str(params_file)] if params_file else []
+    return arguments + [word for name, value in parameters.items()
+                        for word in ('-p', f'{name}:={value}')]

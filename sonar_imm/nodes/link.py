@@ -1,0 +1,67 @@
+"""A small ROS 2 peer for programs that are no node themselves: the player and the checks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import time
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+MATCH_LIMIT = 15.0
+"""Seconds to wait for peers. Discovery is usually instant but now and then takes three seconds."""
+
+
+class LinkError(RuntimeError):
+    """Replay that cannot go on; one sentence for the user."""
+
+
+class Link:
+    """A node in a context of its own, spun only while something waits; ended by ``with``.
+
+    It installs no signal handlers: Ctrl-C stays a KeyboardInterrupt of the calling program.
+    """
+
+    def __init__(self, name: str, *, domain_id: int | None = None):
+        """Open a node called `name`; `domain_id` None means the one of the environment."""
+        self.context = Context()
+        rclpy.init(args=[name], context=self.context, domain_id=domain_id,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self.node = Node(name, context=self.context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> Link:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def spin(self, seconds: float) -> None:
+        """Serve callbacks for at most `seconds`; returns after the first one."""
+        self._executor.spin_once(timeout_sec=max(seconds, 0.0))
+
+    def wait_for(self, predicate: Callable[[], Any], limit: float,
+                 trouble: Callable[[], str | None] = lambda: None) -> bool:
+        """Spin until `predicate()` holds: True, or False after `limit` seconds.
+
+        `trouble` is asked ten times a second; a sentence from it is raised as `LinkError`.
+        """
+        now = time.monotonic()
+        end, next_look = now + limit, now
+        while not predicate():
+            now = time.monotonic()
+            if now >= next_look:
+                if sentence := trouble():
+                    raise LinkError(sentence)
+                next_look = now + 0.1
+            if now >= end:
+                return False
+            self.spin(min(end - now, 0.1))
+        return True

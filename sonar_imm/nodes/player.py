@@ -1,0 +1,250 @@
+"""Publishing a recording to live nodes, with the spellings of ``ros2 bag play``.
+
+Messages go out as they were recorded, byte for byte, stamps included, in the order and at the pace
+of their log times, or in lock-step with one node. What cannot be decoded, or whose type is not
+installed, is left out and told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+import time
+
+from attrs import field, frozen
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from ..parameters import did_you_mean
+from ..recordings.messages import typestore
+from ..recordings.reader import BagMessage, BagReader
+from .link import Link, LinkError, MATCH_LIMIT
+from .lockstep import LockStep
+from .messages import make, message_class
+from .qos import lockstep_qos, output_qos
+
+CLOCK_HZ = 40.0
+"""Rate of /clock where only ``--clock`` is said, as in ``ros2 bag play``."""
+NAME = 'sonar_imm_player'
+_GREETING = 1.0
+_DEPTH = 100
+_NANO = 10**9
+
+
+def _positive(instance: PlayOptions, attribute: object, value: float | None) -> None:
+    if value is not None and not 0.0 < value < float('inf'):
+        raise LinkError(f'the {attribute.name} must be positive, got {value:g}')
+
+
+@frozen(kw_only=True)
+class PlayOptions:
+    """How to play. Raises `LinkError` for a rate that is not positive.
+
+    rate: speed, 2 is twice as fast; loop: start over at the end; start_offset: seconds of the
+    recording to skip; delay: seconds to wait before the first message; start_paused: wait for the
+    service ``/sonar_imm_player/resume``; clock: Hz of /clock, None for none; topics: only these
+    (recorded names), empty for all; remap: recorded to published topic names; lockstep: full name
+    of the node to keep step with (``/diver``), empty to keep the recorded pace.
+    """
+
+    rate: float = field(default=1.0, validator=_positive)
+    loop: bool = False
+    start_offset: float = 0.0
+    delay: float = 0.0
+    start_paused: bool = False
+    clock: float | None = field(default=None, validator=_positive)
+    topics: tuple[str, ...] = ()
+    remap: Mapping[str, str] = field(factory=dict)
+    lockstep: str = ''
+
+
+@frozen
+class PlayResult:
+    """What was played: messages published, sentences about what was not, and lock-step delays."""
+
+    published: int
+    problems: tuple[str, ...]
+    delays: tuple[float, ...] = ()
+
+
+def play(path: Path | str, options: PlayOptions, *, domain_id: int | None = None,
+         progress: Callable[[int], None] = lambda count: None) -> PlayResult:
+    """Publish the bag at `path`; ends with it, or never with ``loop``.
+
+    `progress` is called with the number of messages just published. Raises `BagError` for a bag
+    that cannot be read and `LinkError` when there is nothing to publish or nobody answers.
+    """
+    with BagReader(path) as bag, Link(NAME, domain_id=domain_id) as link:
+        player = Player(bag, link, options)
+        player.run(progress)
+        return player.result()
+
+
+class Player:
+    """One playing of one open bag over one link."""
+
+    def __init__(self, bag: BagReader, link: Link, options: PlayOptions,
+                 lockstep: LockStep | None = None):
+        """Advertise the topics. `lockstep` replaces the one that `options` would make."""
+        self._bag = bag
+        self._link = link
+        self._options = options
+        self._problems: list[str] = []
+        self._publishers = self._advertise()
+        self._lockstep = lockstep
+        if options.lockstep and not lockstep:
+            self._lockstep = LockStep(link, options.lockstep)
+        self._clock = Ticker(link, options.clock) if options.clock else None
+        self._pause = Pause(link, options.start_paused)
+        self._published = 0
+
+    def run(self, progress: Callable[[int], None] = lambda count: None,
+            start_limit: float = MATCH_LIMIT) -> None:
+        """Play to the end, once or for ever; a node to step with has `start_limit` s to come."""
+        stepped = self._meet(start_limit)
+        self._link.wait_for(lambda: False, self._options.delay)
+        while True:
+            before = self._published
+            self._play_once(stepped, progress)
+            if not self._options.loop or self._published == before:
+                return
+
+    def result(self) -> PlayResult:
+        """Sum up."""
+        return PlayResult(self._published, (*self._problems, *self._bag.problems),
+                          tuple(self._lockstep.delays) if self._lockstep else ())
+
+    def _advertise(self) -> dict[str, Publisher]:
+        """Make a publisher for each topic to play: {recorded name: publisher}."""
+        recorded = {topic.name: topic.type_name for topic in self._bag.topics}
+        for name in (*self._options.topics, *self._options.remap):
+            if name not in recorded:
+                raise LinkError(f"{self._bag.path} has no topic '{name}'"
+                                f'{did_you_mean(name, recorded)}')
+        # Reliable, which every listener accepts; in lock-step nothing may be dropped at all.
+        qos = lockstep_qos() if self._options.lockstep else output_qos(_DEPTH)
+        publishers = {}
+        for name in self._options.topics or recorded:
+            if name == '/clock' and self._options.clock:
+                continue  # ours replaces the recorded one
+            try:
+                cls = message_class(recorded[name])
+            except ImportError as error:
+                self._problems.append(f'topic {name} is not published: {error}')
+                continue
+            publishers[name] = self._link.node.create_publisher(
+                cls, self._options.remap.get(name, name), qos)
+        if not publishers:
+            raise LinkError(f'{self._bag.path} has nothing to publish')
+        return publishers
+
+    def _meet(self, limit: float) -> set[str]:
+        """Wait for listeners; gives the published names that go in lock-step.
+
+        Without lock-step it waits a moment at most: there may rightly be no listener.
+        """
+        publishers = self._publishers.values()
+        if self._lockstep:
+            return self._lockstep.connect(publishers, limit)
+        self._link.wait_for(lambda: all(p.get_subscription_count() for p in publishers),
+                            _GREETING)
+        return set()
+
+    def _play_once(self, stepped: set[str], progress: Callable[[int], None]) -> None:
+        first: int | None = None
+        skipped = round(self._options.start_offset * _NANO)
+        pace: Pace | None = None
+        for item in self._bag.messages(list(self._publishers)):
+            first = item.log_ns if first is None else first
+            if item.log_ns - first < skipped:
+                continue
+            pace = pace or Pace(item.log_ns, self._options.rate)
+            self._wait(pace, item.log_ns, paced=not stepped)
+            publisher = self._publishers[item.topic]
+            if publisher.topic_name in stepped:
+                self._lockstep.step(publisher, self._cdr(item))
+            else:
+                publisher.publish(self._cdr(item))
+            self._published += 1
+            progress(1)
+
+    def _wait(self, pace: Pace, log_ns: int, *, paced: bool) -> None:
+        """Serve the link until `log_ns` is due; in lock-step only a pause makes it wait."""
+        while True:
+            if self._pause.paused:
+                start = time.monotonic()
+                self._link.wait_for(lambda: not self._pause.paused, 0.5)
+                pace.postpone(time.monotonic() - start)
+                continue
+            wait = pace.seconds_until(log_ns) if paced else 0.0
+            if self._clock:
+                self._clock.tick(pace.now_ns() if wait > 0.0 else log_ns, always=not paced)
+            if wait <= 0.0:
+                return
+            self._link.spin(min(wait, self._clock.until_next() if self._clock else 0.1, 0.1))
+
+    def _cdr(self, item: BagMessage) -> bytes:
+        """Give the message as ROS 2 sends it; ROS 1 bags hold another serialization."""
+        if self._bag.path.is_file() and self._bag.path.suffix == '.bag':
+            return bytes(typestore().serialize_cdr(item.message, item.type_name))
+        return bytes(item.raw)
+
+
+class Pace:
+    """Maps log times to the steady clock."""
+
+    def __init__(self, first_ns: int, rate: float):
+        self._first_ns = first_ns
+        self._rate = rate
+        self._start = time.monotonic()
+
+    def postpone(self, seconds: float) -> None:
+        """Account for a pause."""
+        self._start += seconds
+
+    def seconds_until(self, log_ns: int) -> float:
+        """How long until `log_ns` is due; negative when it is late."""
+        due = self._start + (log_ns - self._first_ns) / _NANO / self._rate
+        return due - time.monotonic()
+
+    def now_ns(self) -> int:
+        """The log time that is due now."""
+        elapsed = time.monotonic() - self._start
+        return self._first_ns + round(elapsed * self._rate * _NANO)
+
+
+class Ticker:
+    """Publishes /clock at a steady rate of real time."""
+
+    def __init__(self, link: Link, hertz: float):
+        self._publisher = link.node.create_publisher(Clock, '/clock', 10)
+        self._period = 1.0 / hertz
+        self._next = 0.0
+
+    def until_next(self) -> float:
+        """Seconds until the next tick is due."""
+        return max(self._next - time.monotonic(), 0.0)
+
+    def tick(self, now_ns: int, *, always: bool = False) -> None:
+        """Publish `now_ns` when a tick is due, or in any case."""
+        if self.until_next() > 0.0 and not always:
+            return
+        self._next = time.monotonic() + self._period
+        seconds, nanoseconds = divmod(now_ns, _NANO)
+        self._publisher.publish(Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds,
+                                                 nanosec=nanoseconds)))
+
+
+class Pause:
+    """The services ``~/pause`` and ``~/resume`` (std_srvs/Trigger)."""
+
+    def __init__(self, link: Link, paused: bool):
+        self.paused = paused
+        link.node.create_service(Trigger, '~/pause', lambda q, a: self._set(True, a))
+        link.node.create_service(Trigger, '~/resume', lambda q, a: self._set(False, a))
+
+    def _set(self, paused: bool, answer: Trigger.Response) -> Trigger.Response:
+        self.paused = paused
+        answer.success, answer.message = True, 'paused' if paused else 'playing'
+        return answer
