@@ -10,17 +10,21 @@ in a form that is a sum of squares. It needs no inverse of F, so motions that fo
 that is drawn anew at each step has rows of zeros in F) are nothing special, nor is a motion
 without noise in some direction: F P F' + Q may be singular.
 
-`imm_smooth` does the same for several models. Every pair (i at k, j at k+1) is smoothed as above,
-x^s_j drawing x_i back, and the pairs are merged over j with the weight
+`imm_smooth` does the same for several models. Every pair (model i at k, model j at k+1) is
+smoothed as above, and the pairs are merged over j with their probabilities,
 
-    Pr(i, j | all data) = Pr(i | j, all data) Pr(j | all data), Pr(i | x', j) ~ P_ij mu_i N(x'; F_j
-    x_i + b_j, F_j P_i F_j' + Q_j),   averaged over x' ~ N(x^s_j, P^s_j) .
+    Pr(i, j | all data) = Pr(j | all data) E[ Pr(i | x', j) ],        x' ~ N(x^s_j, P^s_j),
+    Pr(i | x', j) ~ P_ij mu_i N(x'; F_j x_i + b_j, F_j P_i F_j' + Q_j).
 
-The last factor is what the state one step later tells about the model now: leaving it out (Kim
-1994) forgets that a diver who is found in the east must have gone east. The average is taken over
-the sigma points of x^s_j. With one model, or with models that are all the same, this is the RTS
-smoother exactly; otherwise it is approximate, as the filter is: mixtures are replaced by their
-first two moments.
+The normal density is what the state one step later tells about the model now; without it (Kim
+1994) the smoother forgets that a diver who is found in the east must have gone east. The
+expectation is taken over the sigma points of x^s_j. The same shares Pr(i | x', j) sort those
+points into the cases i, and each case has its own mean and covariance of x', from which x_i is
+drawn back: a sharper form of Barber's expectation correction.
+
+With one model, or with models that are all the same, this is the RTS smoother exactly; with states
+that are drawn anew at each step it is the forward-backward algorithm exactly. Otherwise it is
+approximate, as the filter is: mixtures are replaced by their first two moments.
 
 Convention: the arrays of step k describe the move *into* k, from k-1; those of step 0 are not
 used.
@@ -53,8 +57,7 @@ class IMMSmoothed(NamedTuple):
     mu: FloatArray
 
     def combine(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """One answer for each step: mean (K, q) and covariance (K, q, q) of the outputs ``E x``, E
-        (M, q, n)."""
+        """Mean (K, q) and covariance (K, q, q) of the outputs ``E x``, with E (M, q, n)."""
         return imm.combine(self.x, self.P, self.mu, E)
 
 
@@ -94,7 +97,10 @@ def imm_smooth(
     x: (K, M, n), P: (K, M, n, n), mu: (K, M) after each update; transition: (K, M, M),
     ``transition[k, i, j] = Pr(j at k | i at k-1)``; F, Q: (K, M, n, n), B: (K, M, n) of the move
     into each step. A model that turns out impossible keeps its filtered state, with probability
-    zero.
+    zero. Takes about 3 ms a step with 17 models of 3 states.
+
+    Raises ValueError when the forward pass contradicts itself: a model is probable at k, but
+    `transition` allows no way from any probable model at k-1 to any probable one at k.
     """
     smoothed = IMMSmoothed(x.copy(), P.copy(), mu.copy())
     for k in range(len(x) - 2, -1, -1):
@@ -127,6 +133,8 @@ def _imm_step(
         x[:, None], P[:, None], F, Q, precision, later_x - predicted, later_P
     )
     smoothed_mu = joint.sum(axis=1)
+    if not smoothed_mu.any():
+        raise ValueError('no probable model leads to a probable model of the next step')
     possible = smoothed_mu > 0.0
     weights = joint / np.where(possible, smoothed_mu, 1.0)[:, None]
     smoothed_x = np.einsum('ij,ija->ia', weights, branch_x)
