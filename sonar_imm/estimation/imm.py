@@ -29,6 +29,9 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
+MIN_GATE_PROBABILITY = 1e-6
+"""A model less probable than this opens no gate."""
+
 
 class Mixed(NamedTuple):
     """x (T, M, n) and P (T, M, n, n) mixed for each model, and its predicted probability c (T, M)."""
@@ -118,9 +121,25 @@ def combine(x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray) -> tupl
     return mean, 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
-def predicted_measurement(x: FloatArray, P: FloatArray, c: FloatArray, H: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (T, m) and covariance (T, m, m), without R, of H x over the predicted mixture: for gating."""
-    return combine(x, P, c, H)
+def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray,
+         threshold: float) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Which detections (D, m) with covariances R (D, m, m) may belong to which target.
+
+    h (T, M, m): what each model expects; H (T or 1, M, m, n) its Jacobian; P (T, M, n, n), c (T, M)
+    predicted. A detection is inside when it is inside the gate of *some* model that is not
+    impossible: the moment-matched gate of the mixture is too small for a sharp turn seen by a
+    sensor that is accurate in one direction, and loses the track there.
+    Gives target, detection and log-likelihood ln sum_j c_j N(nu_j; 0, S_j), each (pairs,), in order.
+    """
+    possible = c >= MIN_GATE_PROBABILITY
+    S = (H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None]
+    v = z[None, :, None] - h[:, None]
+    nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
+    log_density = -0.5 * (nis + h.shape[-1] * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1])
+    inside = ((nis <= threshold) & possible[:, None]).any(axis=-1)
+    target, detection = np.nonzero(inside)
+    weight = np.where(possible, c, 0.0)[target]
+    return target, detection, np.log(np.sum(weight * np.exp(log_density[inside]), axis=-1))
 
 
 def embed(F: ArrayLike, Q: ArrayLike, B: ArrayLike, index: Sequence[int], n: int, fill_mean: ArrayLike = 0.0,

@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .imm import MIN_GATE_PROBABILITY
 from .jit import kernel
 
 FloatArray = NDArray[np.float64]
@@ -243,6 +244,73 @@ def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, 
 
 
 @kernel
+def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray,
+         R: FloatArray, threshold: float,
+         ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """See `imm.gate`: target, detection, log_likelihood, each (pairs,)."""
+    T, M, m = h.shape
+    D, n = len(z), P.shape[2]
+    S0, PHt = np.empty((M, m, m)), np.empty((n, m))
+    S, L, nothing = np.empty((m, m)), np.zeros((m, m)), np.zeros((m, m))
+    v, w, low, high = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+    widest = np.zeros(m)
+    for d in range(D):
+        for r in range(m):
+            widest[r] = max(widest[r], R[d, r, r])
+    size, capacity = 0, max(T, D) + 16
+    target, detection = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    log_likelihood = np.empty(capacity)
+    for t in range(T):
+        low[:], high[:] = np.inf, -np.inf
+        for j in range(M):
+            if c[t, j] < MIN_GATE_PROBABILITY:
+                continue
+            _innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
+            for r in range(m):
+                reach = math.sqrt(threshold * max(S0[j, r, r] + widest[r], 0.0))
+                low[r] = min(low[r], h[t, j, r] - reach)
+                high[r] = max(high[r], h[t, j, r] + reach)
+        for d in range(D):
+            near = True
+            for r in range(m):
+                near = near and low[r] <= z[d, r] <= high[r]
+            if not near:
+                continue
+            total, inside = 0.0, False
+            for j in range(M):
+                if c[t, j] < MIN_GATE_PROBABILITY:
+                    continue
+                for r in range(m):
+                    v[r] = z[d, r] - h[t, j, r]
+                    for s in range(m):
+                        S[r, s] = S0[j, r, s] + R[d, r, s]
+                if not _cholesky(S, L):
+                    continue
+                nis = _whitened_square(L, v, w)
+                inside = inside or nis <= threshold
+                value = -0.5 * (nis + m * LOG_2PI)
+                for r in range(m):
+                    value -= math.log(L[r, r])
+                total += c[t, j] * math.exp(value)
+            if not inside:
+                continue
+            if size == capacity:
+                capacity *= 2
+                target, detection = _grown(target, capacity), _grown(detection, capacity)
+                log_likelihood = _grown(log_likelihood, capacity)
+            target[size], detection[size], log_likelihood[size] = t, d, math.log(total)
+            size += 1
+    return target[:size].copy(), detection[:size].copy(), log_likelihood[:size].copy()
+
+
+@kernel
+def _grown(array: NDArray, capacity: int) -> NDArray:
+    out = np.empty(capacity, array.dtype)
+    out[:len(array)] = array
+    return out
+
+
+@kernel
 def combine(x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
     """See `imm.combine`."""
     T, M, n = x.shape
@@ -314,5 +382,6 @@ def warm() -> None:
     mix(x, P, mu, transition)
     predict(x, P, F, F, B)
     update(x, P, mu, np.zeros((1, 2, 2)), E[None], R)
+    gate(np.zeros((1, 2, 2)), E[None], P, mu, z, R, 9.0)
     combine(x, P, mu, E)
     linear_cycle(x, P, mu, transition, F, F, B, z, E, R, E)

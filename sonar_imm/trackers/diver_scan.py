@@ -7,7 +7,7 @@ import numpy as np
 
 from ..estimation import imm_kernels
 from ..estimation.adaptation import AdaptiveChain
-from ..estimation.association import assign, association_cost, gate, gate_threshold, Tracks, TrackStatus
+from ..estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
 from ..measurements import FloatArray
 from .diver_config import DiverConfig
 from .diver_models import ModelSet
@@ -90,17 +90,18 @@ class Scan:
     def _associate(self, group: Group) -> np.ndarray:
         """The detection of each track (T,), -1 for none; confirmed tracks choose before tentative ones."""
         chosen = np.full(len(self.x), -1)
-        free = np.arange(len(group.z))
+        free = np.ones(len(group.z), bool)
         tentative = self.before.life.status == TrackStatus.TENTATIVE
-        for tracks in (np.flatnonzero(~tentative), np.flatnonzero(tentative)):
-            if len(tracks) and len(free):
-                mean, covariance = self._expected(group, tracks)
-                pairs = gate(mean, covariance, group.z[free], group.R[free],
-                             gate_threshold(self.config.gate_probability, group.z.shape[1]))
-                cost = association_cost(pairs.log_likelihood, self.config.detection_probability, group.clutter)
-                found = assign(pairs.target, pairs.detection, cost, len(tracks), len(free))
-                chosen[tracks[found >= 0]] = free[found[found >= 0]]
-                free = np.setdiff1d(free, chosen)
+        h, H = group.linearise(self.x, self.models.E)
+        threshold = gate_threshold(self.config.gate_probability, group.z.shape[1])
+        target, detection, log_likelihood = imm_kernels.gate(
+            h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold)
+        cost = association_cost(log_likelihood, self.config.detection_probability, group.clutter)
+        for own in (~tentative, tentative):
+            pairs = own[target] & free[detection]
+            found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
+            chosen = np.where(found >= 0, found, chosen)
+            free[found[found >= 0]] = False
         return chosen
 
     def _expected(self, group: Group, tracks: np.ndarray) -> tuple[FloatArray, FloatArray]:
