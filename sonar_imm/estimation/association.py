@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 from functools import lru_cache
+from itertools import chain
 import math
 from typing import NamedTuple
 
@@ -76,8 +77,8 @@ def gate(
     Raises CovarianceError when an innovation covariance ``S = covariance + R`` is not positive
     definite.
     """
-    R = np.broadcast_to(R, (len(detections), *R.shape[-2:]))
     target, detection = _near(predicted, covariance, detections, R, threshold)
+    R = np.broadcast_to(R, (len(detections), *R.shape[-2:]))
     factor = factorise(covariance[target] + R[detection], 'innovation covariance')
     nis, log_likelihood = log_density(detections[detection] - predicted[target], factor)
     inside = nis <= threshold
@@ -99,11 +100,12 @@ def _near(
         return np.empty(0, np.int64), np.empty(0, np.int64)
     from scipy.spatial import cKDTree
 
-    spread = np.linalg.eigvalsh(covariance)[:, -1] + np.linalg.eigvalsh(R)[:, -1].max()
+    spread = np.linalg.eigvalsh(covariance)[:, -1] + np.linalg.eigvalsh(R)[..., -1].max()
     radius = np.sqrt(threshold * np.maximum(spread, 0.0)) * (1.0 + 1e-9)
     found = cKDTree(detections).query_ball_point(predicted, radius, return_sorted=True)
     counts = np.fromiter(map(len, found), np.int64, len(found))
-    return np.repeat(np.arange(len(found)), counts), np.concatenate(found).astype(np.int64)
+    detection = np.fromiter(chain.from_iterable(found), np.int64, int(counts.sum()))
+    return np.repeat(np.arange(len(found)), counts), detection
 
 
 def association_cost(
@@ -135,6 +137,9 @@ def assign(
     chosen = np.full(targets, -1, np.int64)
     worthwhile = cost < 0.0
     target, detection, cost = target[worthwhile], detection[worthwhile], cost[worthwhile]
+    if len(np.unique(target)) == len(target) and len(np.unique(detection)) == len(detection):
+        chosen[target] = detection  # nothing is contested
+        return chosen
     nodes = targets + detections
     graph = coo_matrix((np.ones(len(cost)), (target, targets + detection)), shape=(nodes, nodes))
     label = connected_components(graph, directed=False)[1][target]
@@ -145,24 +150,29 @@ def assign(
     chosen[target[alone]] = detection[alone]
     for start, size in zip(starts[sizes > 1], sizes[sizes > 1]):
         pairs = order[start : start + size]
-        _assign_cluster(chosen, target[pairs], detection[pairs], cost[pairs])
+        for t, d in _solve_cluster(target[pairs], detection[pairs], cost[pairs]):
+            chosen[t] = d
     return chosen
 
 
-def _assign_cluster(
-    chosen: IntArray, target: IntArray, detection: IntArray, cost: FloatArray
-) -> None:
+def _solve_cluster(
+    target: IntArray, detection: IntArray, cost: FloatArray
+) -> list[tuple[int, int]]:
     """Solve one cluster densely. A cell of cost zero stands for 'not assigned', so a full
     assignment always exists."""
     from scipy.optimize import linear_sum_assignment
 
-    rows, row = np.unique(target, return_inverse=True)
-    columns, column = np.unique(detection, return_inverse=True)
+    # Plain dictionaries: most clusters hold two pairs, for which numpy.unique is the slowest part.
+    rows = {t: i for i, t in enumerate(sorted(set(target.tolist())))}
+    columns = {d: j for j, d in enumerate(sorted(set(detection.tolist())))}
     table = np.zeros((len(rows), len(columns)))
-    table[row, column] = cost
-    for i, j in zip(*linear_sum_assignment(table)):
-        if table[i, j] < 0.0:
-            chosen[rows[i]] = columns[j]
+    table[[rows[t] for t in target.tolist()], [columns[d] for d in detection.tolist()]] = cost
+    targets, detections = list(rows), list(columns)
+    return [
+        (targets[i], detections[j])
+        for i, j in zip(*linear_sum_assignment(table))
+        if table[i, j] < 0.0
+    ]
 
 
 class TrackStatus(IntEnum):
@@ -251,8 +261,8 @@ class Tracks:
     def scan(
         self, hit: BoolArray, stamp_ns: int, rules: TrackRules, *, looked: BoolArray | None = None
     ) -> tuple[Tracks, BoolArray]:
-        """Take in one scan: `hit` (T,) says which tracks got a detection, `looked` (T,) which could
-        have got one (all by default). A track nobody looked for is neither hit nor missed.
+        """Take in one scan: `hit` (T,) says which tracks got a detection, `looked` (T,) which
+        could have got one (all by default). A track nobody looked for is neither hit nor missed.
 
         Returns the tracks that live on and ``kept`` (T,), True for those, with which to thin the
         states kept beside them.
@@ -267,7 +277,9 @@ class Tracks:
         confirmed = (self.status != TrackStatus.TENTATIVE) | (hits >= rules.confirm_hits)
         status = np.where(
             confirmed,
-            np.where(hit, TrackStatus.CONFIRMED, np.where(looked, TrackStatus.COASTING, self.status)),
+            np.where(
+                hit, TrackStatus.CONFIRMED, np.where(looked, TrackStatus.COASTING, self.status)
+            ),
             TrackStatus.TENTATIVE,
         )
         missed_in_window = np.minimum(age, rules.confirm_window) - hits
