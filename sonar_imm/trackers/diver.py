@@ -149,6 +149,8 @@ class DiverTracker:
             kept[kept] = room
             life, births = life.only(room), []
         births = births[:max(0, 10 + 5 * config.max_tracks - len(life))]
+        if not births and kept.all():
+            return evolve(now, life=life)
         new = [self.models.new_track(*birth) for birth in births]
         M, n, count = len(self.models.names), self.models.n, len(new)
         return Divers(
