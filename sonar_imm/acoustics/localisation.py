@@ -9,7 +9,7 @@ with a short reason. What guards it:
   is called ambiguous.
 * **Singular baseline.** Between transmitter and receiver the gradient of the range sum vanishes. A
   fix is refused when its largest standard deviation or the condition number of its covariance
-  passes the limit, or when one standard deviation away the likelihood is not what the covariance
+  passes the limit, or when two standard deviations away the likelihood is not what the covariance
   says: the covariance would be a fiction.
 * **Late reflections.** When the chi-square test fails, the row whose removal helps most is left
   out, one at a time, while a degree of freedom remains to test the rest with.
@@ -100,6 +100,10 @@ class Refusal:
     alternatives: tuple[Candidate, ...] = ()
 
 
+LARGEST = 1e12
+"""Positions, times and bearings beyond this (m, s, rad), and variances beyond its square or below
+the inverse of that, are no measurements; within it no square overflows."""
+
 AMBIGUITY_COST = 9.21
 """Chi-square above the best within which another minimum is an alternative: likelihood ratio of
 100 to 1."""
@@ -110,9 +114,10 @@ DISTINCT = 4.0
 SEEDS = 4
 """Minima from which the search goes on when a row is left out."""
 
+ASIDE = 2.0
 QUADRATIC = (0.3, 3.5)
-"""What chi-square may rise by one standard deviation from the fix; 1 where the covariance
-describes the likelihood."""
+"""What chi-square may rise by `ASIDE` standard deviations from the fix, as a share of the
+ASIDE^2 it rises by where the covariance describes the likelihood."""
 
 
 def localise(rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike, *, tx: ArrayLike | None = None,
@@ -128,6 +133,7 @@ def localise(rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike, *, tx: ArrayLike
     finite.
     """
     tx_, rx_, times, bearings = _checked(tx, rx, toa, var_toa, bearing, var_bearing)
+    times[(np.abs(tx_) > LARGEST).any(axis=-1)] = np.nan
     fit = _problem(tx_, rx_, times, bearings, target_z, sound_speed, limits.max_range)
     if _dof(fit, np.ones(len(fit.weight), bool)) < 0:
         return Refusal('too_few', f'{len(fit.weight)} arrival times and bearings fix no position')
@@ -164,10 +170,10 @@ def _checked(tx: ArrayLike | None, rx: ArrayLike, toa: ArrayLike, var_toa: Array
     missing = np.full(n, np.nan)
     columns = [missing if values is None else np.asarray(values, np.float64)
                for values in (toa, var_toa, bearing, var_bearing)]
-    if rx_.shape != (n, 3) or tx_.shape != (n, 3) or any(len(each) != n for each in columns):
+    if rx_.shape != (n, 3) or tx_.shape != (n, 3) or any(each.shape != (n,) for each in columns):
         raise ValueError('every arrival needs tx and rx positions (n, 3), a time and a variance')
-    if not np.isfinite(rx_).all():
-        raise ValueError('a receiver position is not finite')
+    if not (np.abs(rx_) <= LARGEST).all():
+        raise ValueError(f'a receiver position is not finite or beyond {LARGEST:g} m')
     return tx_, rx_, np.column_stack(columns[:2]), np.column_stack(columns[2:])
 
 
@@ -175,7 +181,7 @@ def _problem(tx: FloatArray, rx: FloatArray, times: FloatArray, bearings: FloatA
              target_z: float, sound_speed: float, max_range: float) -> ArrivalFit:
     """The least-squares problem of the usable rows."""
     hears, sees = _usable(times), _usable(bearings)
-    active = _finite_rows(tx[hears])
+    active: BoolArray = np.asarray(np.isfinite(tx[hears]).all(axis=-1))
     toa, var_toa = times[hears].T
     # Passive times may count from any epoch: from their own first arrival they keep their digits.
     epoch = float(toa[~active].min(initial=np.inf))
@@ -189,11 +195,9 @@ def _problem(tx: FloatArray, rx: FloatArray, times: FloatArray, bearings: FloatA
 
 def _usable(rows: FloatArray) -> BoolArray:
     """Which (n,) of the pairs of value and variance (n, 2) hold a measurement."""
-    return _finite_rows(rows) & (rows[:, 1] > 0.0)
-
-
-def _finite_rows(rows: FloatArray) -> BoolArray:
-    return np.asarray(np.isfinite(rows).all(axis=-1))
+    value, variance = rows.T
+    return np.asarray((np.abs(value) <= LARGEST) & (variance >= LARGEST**-2)
+                      & (variance <= LARGEST**2))
 
 
 def _spread(kept: BoolArray, usable: BoolArray) -> BoolArray:
@@ -255,8 +259,9 @@ def _doubt(fit: ArrivalFit, weight: FloatArray, best: Candidate, dof: int,
     if variances[1] > limits.max_std**2 or variances[1] > limits.max_condition * variances[0]:
         return Refusal('singular_geometry', 'the geometry leaves a standard deviation of '
                        f'{np.sqrt(variances[1]):.3g} m')
-    aside = (axes * np.sqrt(variances)).T
-    rise = fit.cost(best.position + np.concatenate([aside, -aside]), weight) - best.cost
+    aside = ASIDE * (axes * np.sqrt(variances)).T
+    around = fit.cost(best.position + np.concatenate([aside, -aside]), weight)
+    rise = (around - best.cost) / ASIDE**2
     if rise.min() < QUADRATIC[0] or rise.max() > QUADRATIC[1]:
         return Refusal('singular_geometry', 'around the fix the likelihood is not what its '
                        'covariance says, as near the line between transmitter and receiver')

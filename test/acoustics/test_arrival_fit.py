@@ -1,0 +1,95 @@
+"""The least-squares problem of one ping: derivatives, projection, closed form, search."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.acoustics import multistatic
+from sonar_imm.acoustics.arrival_fit import ArrivalFit, minimise
+
+Z = -6.0
+RX = np.array([[80.0, 5.0, -2.0], [-30.0, 70.0, -3.0], [60.0, 90.0, -1.0], [-70.0, -20.0, -4.0],
+               [10.0, -60.0, -2.0]])
+TRUTH = np.array([22.0, 31.0])
+
+
+def problem(active, offset=0.0, bearings=2):
+    active = np.array(active)
+    tx = np.where(active[:, None], [5.0, -12.0, -3.0], RX)
+    path = multistatic.pseudo_range(TRUTH, RX, Z, 0.0) + np.where(
+        active, multistatic.pseudo_range(TRUTH, tx, Z), offset)
+    seen = multistatic.bearing(TRUTH, RX[:bearings])
+    return ArrivalFit(tx=tx, rx=RX, active=active, bearing_rx=RX[:bearings],
+                      observed=np.concatenate([path, seen]),
+                      weight=np.linspace(1.0, 3.0, len(RX) + bearings), target_z=Z,
+                      max_range=1000.0)
+
+
+KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_residuals_vanish_at_the_truth_whatever_the_emission(kind):
+    fit = problem(KINDS[kind], offset=-750.0)
+    residual, _ = fit.residuals(TRUTH[None], fit.weight)
+    assert_allclose(residual, 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_jacobian_equals_finite_differences_also_with_rows_left_out(kind):
+    fit = problem(KINDS[kind], offset=40.0)
+    weight = fit.weight * [1, 1, 0, 1, 1, 0, 1]
+    at, h = np.array([[10.0, -15.0]]), 1e-5
+    _, jacobian = fit.residuals(at, weight)
+    numeric = [(fit.residuals(at - h * e, weight)[0] - fit.residuals(at + h * e, weight)[0])
+               / (2 * h) for e in np.eye(2)]
+    assert_allclose(jacobian[0], np.stack(numeric, axis=-1)[0], atol=1e-6)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_cost_is_the_sum_of_squares_with_the_best_emission(kind):
+    fit = problem(KINDS[kind], offset=40.0)
+    places = np.random.default_rng(1).uniform(-50, 50, (20, 2))
+    residual, _ = fit.residuals(places, fit.weight)
+    assert_allclose(fit.cost(places, fit.weight), np.square(residual) @ fit.weight)
+    if kind != 'active':
+        shift = np.append(~fit.active, [False, False])
+        for offset in (-1e-3, 1e-3):
+            worse = np.square(residual + offset * shift) @ fit.weight
+            assert (worse > fit.cost(places, fit.weight)).all()
+
+
+def test_closed_form_meets_the_truth():
+    fit = problem(KINDS['passive'], offset=123.0, bearings=0)
+    for rows in ([0, 1, 2], [0, 1, 2, 3, 4]):
+        meeting = fit._closed_form(np.array(rows))
+        assert np.linalg.norm(meeting - TRUTH, axis=-1).min() < 1e-6
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_search_finds_the_lowest_point_of_a_fine_grid(kind):
+    fit = problem(KINDS[kind], offset=40.0)
+    fit.observed[:] += np.random.default_rng(4).normal(0.0, 3.0, 7) * [1, 1, 1, 1, 1, 0.02, 0.02]
+    minima = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
+    axis = np.linspace(-150, 150, 601)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    assert minima.converged.all() and (np.diff(minima.cost) >= 0.0).all()
+    best = fit.cost(grid, fit.weight)
+    assert minima.cost[0] <= best.min()
+    assert np.linalg.norm(grid[best.argmin()] - minima.position[0]) < 1.0
+
+
+def test_each_start_may_have_its_own_weights():
+    fit = problem(KINDS['active'], bearings=0)
+    fit.observed[2] += 30.0
+    starts = np.tile(TRUTH + [3.0, -2.0], (5, 1))
+    without = fit.weight * (1.0 - np.eye(5))
+    minima = minimise(fit, starts, without)
+    assert minima.cost.argmin() == 2
+    assert_allclose(minima.position[2], TRUTH, atol=1e-3)
+    assert minima.cost[[0, 1, 3, 4]].min() > 1.0
+
+
+def test_without_starts_there_are_no_minima():
+    fit = problem(KINDS['active'])
+    assert len(minimise(fit, np.empty((0, 2)), fit.weight).distinct().cost) == 0

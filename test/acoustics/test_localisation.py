@@ -1,0 +1,356 @@
+"""The fix: statistics against the bound, ghosts, singular geometry, reflections, hostile input."""
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
+import pytest
+from scipy.stats import chi2, kstest
+
+from sonar_imm.acoustics import multistatic
+from sonar_imm.acoustics.localisation import Limits, Localisation, localise, Refusal
+
+SOUND_SPEED, Z, SIGMA = 1500.0, -5.0, 1e-4
+TX = np.array([5.0, -10.0, -2.0])
+RX = np.array([[100.0, 10.0, -2.0], [-20.0, 90.0, -3.0], [70.0, 95.0, -1.0], [-60.0, 20.0, -3.0],
+               [20.0, -70.0, -2.0], [110.0, 60.0, -4.0], [-70.0, 80.0, -1.0], [40.0, 40.0, -2.0]])
+TRUTH = np.array([31.0, 42.0])
+
+
+def active(n, truth=TRUTH, tx=TX, rx=RX, sigma=0.0, seed=0, **more):
+    """Arguments of `localise` for n receivers and one transmitter."""
+    transmitters = np.tile(tx, (n, 1))
+    noise = sigma * np.random.default_rng(seed).standard_normal(n)
+    toa = multistatic.range_sum(truth, transmitters, rx[:n], Z) / SOUND_SPEED + noise
+    return dict(rx=rx[:n], toa=toa, var_toa=np.full(n, SIGMA**2), tx=transmitters, target_z=Z,
+                sound_speed=SOUND_SPEED, **more)
+
+
+def passive(n, truth=TRUTH, rx=RX, sigma=0.0, seed=0, emission=1e9, **more):
+    """Arguments of `localise` for n receivers of a tag that emits at an unknown time."""
+    noise = sigma * np.random.default_rng(seed).standard_normal(n)
+    toa = multistatic.pseudo_range(truth, rx[:n], Z) / SOUND_SPEED + noise + emission
+    return dict(rx=rx[:n], toa=toa, var_toa=np.full(n, SIGMA**2), target_z=Z,
+                sound_speed=SOUND_SPEED, **more)
+
+
+def distance2(fix, truth):
+    gap = truth - fix.position
+    return float(gap @ np.linalg.solve(fix.covariance, gap))
+
+
+# -- statistics ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('kind', ['active', 'passive', 'bearings'])
+def test_errors_are_what_the_covariance_and_the_bound_say(kind):
+    runs, n, sigma_bearing = 300, 6, np.radians(0.3)
+    fixes, gaps = [], []
+    for seed in range(runs):
+        if kind == 'passive':
+            scene = passive(n, sigma=SIGMA, seed=seed, emission=3.0)
+        else:
+            scene = active(n, sigma=SIGMA, seed=seed)
+        if kind == 'bearings':
+            noise = sigma_bearing * np.random.default_rng(10_000 + seed).standard_normal(n)
+            scene.update(bearing=multistatic.bearing(TRUTH, RX[:n]) + noise,
+                         var_bearing=np.full(n, sigma_bearing**2))
+        fix = localise(**scene, limits=Limits(min_p_value=1e-9))
+        assert isinstance(fix, Localisation) and not fix.ambiguous and fix.used.all()
+        fixes.append(fix)
+        gaps.append(fix.position - TRUTH)
+    bound = multistatic.crlb(TRUTH, None if kind == 'passive' else np.tile(TX, (n, 1)), RX[:n],
+                             np.full(n, SIGMA**2), target_z=Z, sound_speed=SOUND_SPEED,
+                             var_bearing=sigma_bearing**2 if kind == 'bearings' else None)
+    low, high = chi2.ppf([0.025, 0.975], 2 * runs) / runs
+    assert low < np.mean([distance2(fix, TRUTH) for fix in fixes]) < high
+    assert low < np.mean([gap @ np.linalg.solve(bound, gap) for gap in gaps]) < high
+    assert_allclose(np.mean([fix.covariance for fix in fixes], axis=0), bound, rtol=0.02,
+                    atol=1e-3 * np.trace(bound))
+    assert kstest([fix.p_value for fix in fixes], 'uniform').pvalue > 0.01
+    dof = {'active': 4, 'passive': 3, 'bearings': 10}[kind]
+    assert {fix.dof for fix in fixes} == {dof}
+    assert low * dof / 2 * 0.9 < np.mean([fix.cost for fix in fixes]) < high * dof / 2 * 1.1
+
+
+def test_emission_time_of_a_tag():
+    gaps = []
+    for seed in range(200):
+        fix = localise(**passive(6, sigma=SIGMA, seed=seed, emission=12.5))
+        gaps.append((fix.emission_time - 12.5) / np.sqrt(fix.var_emission_time))
+    low, high = chi2.ppf([0.025, 0.975], 200) / 200
+    assert low < np.mean(np.square(gaps)) < high
+    assert localise(**active(4)).emission_time is None
+
+
+def test_passive_fix_minimises_the_augmented_sum_of_squares():
+    from scipy.optimize import least_squares
+    scene = passive(5, sigma=SIGMA, seed=3, emission=2.0)
+
+    def residuals(x):
+        predicted = multistatic.pseudo_range(x[:2], scene['rx'], Z, x[2])
+        return (SOUND_SPEED * scene['toa'] - predicted) / (SOUND_SPEED * SIGMA)
+
+    joint = least_squares(residuals, np.append(TRUTH, 3000.0), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    fix = localise(**scene)
+    assert_allclose(fix.position, joint.x[:2], atol=1e-4)
+    assert fix.emission_time == pytest.approx(joint.x[2] / SOUND_SPEED, abs=1e-7)
+    assert fix.cost == pytest.approx(2.0 * joint.cost, rel=1e-5)
+    covariance = np.linalg.inv(joint.jac.T @ joint.jac)
+    assert_allclose(fix.covariance, covariance[:2, :2], rtol=1e-4)
+    assert fix.var_emission_time == pytest.approx(covariance[2, 2] / SOUND_SPEED**2, rel=1e-3)
+
+
+@settings(max_examples=40, derandomize=True, deadline=None)
+@given(angle=st.floats(-4.0, 4.0), east=st.floats(-1e4, 1e4), north=st.floats(-1e4, 1e4),
+       order=st.permutations(range(5)), tag=st.booleans())
+def test_fix_turns_and_moves_with_the_scene(angle, east, north, order, tag):
+    more = dict(sigma=SIGMA, seed=8)
+    scene = passive(5, emission=4.0, **more) if tag else active(5, **more)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = dict(scene)
+    for name in ('rx', 'tx', 'toa', 'var_toa'):
+        if name in scene:
+            moved[name] = scene[name][list(order)]
+    for name in {'rx', 'tx'} & set(scene):
+        moved[name][:, :2] = moved[name][:, :2] @ turn.T + [east, north]
+    first, second = localise(**scene), localise(**moved)
+    assert_allclose(second.position, turn @ first.position + [east, north], atol=1e-3)
+    assert_allclose(second.covariance, turn @ first.covariance @ turn.T, atol=1e-4)
+
+
+def test_two_transmitters_and_a_mixture_of_active_and_passive_rows():
+    tx = np.vstack([np.tile(TX, (2, 1)), np.tile([60.0, -40.0, -1.0], (2, 1))])
+    toa = multistatic.range_sum(TRUTH, tx, RX[:4], Z) / SOUND_SPEED
+    fix = localise(RX[:4], toa, np.full(4, SIGMA**2), tx=tx, target_z=Z)
+    assert_allclose(fix.position, TRUTH, atol=1e-3)
+    tag = passive(4, emission=0.3)
+    rx, toa, tx = (np.concatenate(pair) for pair in (
+        (RX[:2], RX[2:6]), (toa[:2], multistatic.pseudo_range(TRUTH, RX[2:6], Z) / 1500.0 + 0.3),
+        (tx[:2], np.full((4, 3), np.nan))))
+    fix = localise(rx, toa, np.full(6, SIGMA**2), tx=tx, target_z=tag['target_z'])
+    assert_allclose(fix.position, TRUTH, atol=1e-3)
+    assert fix.dof == 3 and fix.emission_time == pytest.approx(0.3, abs=1e-6)
+
+
+def test_bearings_alone_triangulate():
+    bearing = multistatic.bearing(TRUTH, RX[:3])
+    nothing = np.full(3, np.nan)
+    fix = localise(RX[:3], nothing, nothing, bearing=bearing, var_bearing=np.full(3, 1e-4))
+    assert_allclose(fix.position, TRUTH, atol=1e-3)
+    assert not fix.used.any() and fix.used_bearing.all() and fix.dof == 1
+
+
+# -- ghosts --------------------------------------------------------------------------------------
+
+
+def crossings(tx, rx, toa):
+    """Where two ellipses cross, by walking around the first: positions (k, 2)."""
+    c, a = 0.5 * (tx[0] + rx[0])[:2], 0.5 * SOUND_SPEED * toa[0]
+    f = 0.5 * np.hypot(*(tx[0] - rx[0])[:2])
+    major = (tx[0] - rx[0])[:2] / (2.0 * f)
+    angle = np.linspace(0.0, 2.0 * np.pi, 400_001)
+    along, across = a * np.cos(angle), np.sqrt(a * a - f * f) * np.sin(angle)
+    walk = c + along[:, None] * major + across[:, None] * np.array([-major[1], major[0]])
+    miss = multistatic.range_sum(walk, tx[1:], rx[1:], Z)[:, 0] - SOUND_SPEED * toa[1]
+    return walk[:-1][np.sign(miss[:-1]) != np.sign(miss[1:])]
+
+
+LEVEL = np.array([1.0, 1.0, 0.0])  # Flat scenes, as the walk around the ellipse needs.
+HEIGHT = np.array([0.0, 0.0, Z])
+
+
+def matches(fix, expected):
+    found = np.array([fix.position, *(other.position for other in fix.alternatives)])
+    gaps = np.linalg.norm(found[:, None] - expected, axis=-1)
+    return len(found) == len(expected) and gaps.min(axis=0).max() < 0.01
+
+
+def test_two_ellipses_cross_twice_and_both_positions_are_told():
+    rx, tx = RX * LEVEL + HEIGHT, TX * LEVEL + HEIGHT
+    scene = active(2, tx=tx, rx=rx)
+    expected = crossings(scene['tx'], scene['rx'], scene['toa'])
+    assert len(expected) == 2
+    fix = localise(**scene)
+    assert fix.ambiguous and fix.dof == 0 and fix.p_value == 1.0
+    assert matches(fix, expected)
+    for other in (fix, *fix.alternatives):
+        sums = multistatic.range_sum(other.position, scene['tx'], scene['rx'], Z)
+        assert_allclose(sums, SOUND_SPEED * scene['toa'], atol=1e-4)
+    refused = localise(**scene, limits=Limits(refuse_ambiguous=True))
+    assert refused.reason == 'ambiguous' and len(refused.alternatives) == 2
+
+
+def test_two_ellipses_without_a_common_focus_cross_four_times():
+    tx = np.array([[-60.0, 0.0, Z], [0.0, -60.0, Z]])
+    toa = np.full(2, 170.0 / SOUND_SPEED)
+    expected = crossings(tx, -tx * [1, 1, -1], toa)
+    assert len(expected) == 4
+    fix = localise(-tx * [1, 1, -1], toa, np.full(2, SIGMA**2), tx=tx, target_z=Z)
+    assert fix.ambiguous and len(fix.alternatives) == 3 and matches(fix, expected)
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_truth_is_the_fix_or_one_of_its_ghosts(seed):
+    rng = np.random.default_rng(seed)
+    rx = np.column_stack([rng.uniform(-100, 100, (3, 2)), rng.uniform(-9, -1, 3)])
+    truth = rng.uniform(-150, 150, 2)
+    for scene in (active(2, truth, rx=rx), passive(3, truth, rx=rx, emission=1.0)):
+        fix = localise(**scene)
+        if isinstance(fix, Refusal):
+            assert fix.reason == 'singular_geometry'
+            continue
+        found = [fix.position, *(other.position for other in fix.alternatives)]
+        assert min(np.linalg.norm(found - truth, axis=-1)) < 0.05
+
+
+def test_a_third_receiver_or_a_bearing_settles_it():
+    assert not localise(**active(3, sigma=SIGMA)).ambiguous
+    scene = active(2, bearing=multistatic.bearing(TRUTH, RX[:2]), var_bearing=np.full(2, 1e-3))
+    fix = localise(**scene)
+    assert not fix.ambiguous
+    assert_allclose(fix.position, TRUTH, atol=1e-3)
+
+
+def test_receivers_in_a_line_leave_left_and_right_open():
+    rx = np.array([[x, 0.0, Z] for x in (-60.0, -20.0, 15.0, 70.0)])
+    for scene in (passive(4, rx=rx), active(4, rx=rx, tx=np.array([5.0, 0.0, Z]))):
+        fix = localise(**scene)
+        assert fix.ambiguous and matches(fix, np.array([TRUTH, TRUTH * [1, -1]]))
+
+
+# -- singular geometry ---------------------------------------------------------------------------
+
+
+def test_target_between_transmitter_and_receivers_in_line_is_refused():
+    rx = np.array([[100.0, 0.0, Z], [140.0, 0.0, Z], [170.0, 0.0, Z]])
+    for seed in range(50):
+        scene = active(3, np.array([40.0, 0.0]), tx=np.array([0.0, 0.0, Z]), rx=rx, sigma=SIGMA,
+                       seed=seed)
+        refusal = localise(**scene)
+        assert isinstance(refusal, Refusal)
+        assert refusal.reason in ('singular_geometry', 'diverged')
+
+
+def test_near_a_baseline_a_fix_is_refused_or_near():
+    """Half a metre beside the line noise alone decides: no crossing, or two a few metres apart."""
+    tx, rx = np.array([0.0, 0.0, Z]), np.array([[100.0, 0.0, Z], [30.0, 80.0, Z]])
+    truth, refused, nees = np.array([45.0, 0.5]), 0, []
+    for seed in range(200):
+        fix = localise(**active(2, truth, tx=tx, rx=rx, sigma=SIGMA, seed=seed))
+        if isinstance(fix, Refusal):
+            refused += 1
+            assert fix.reason in ('singular_geometry', 'diverged')
+            continue
+        candidates = [fix, *fix.alternatives]
+        assert min(np.linalg.norm(each.position - truth) for each in candidates) < 10.0
+        nees.append(min(distance2(each, truth) for each in candidates))
+    assert 100 < refused < 190
+    # Where range goes with the square of the distance, a 2 sigma error looks like 4 sigma.
+    assert np.median(nees) < 12.0 and np.max(nees) < 64.0
+
+
+def test_limits():
+    far = passive(6, np.array([3000.0, 100.0]), sigma=SIGMA)
+    assert localise(**far, limits=Limits(max_std=5.0)).reason == 'singular_geometry'
+    assert localise(**far, limits=Limits(max_condition=10.0)).reason == 'singular_geometry'
+    assert isinstance(localise(**far, limits=Limits(max_std=1000.0)), Localisation)
+    beyond = active(5, np.array([900.0, 0.0]), limits=Limits(max_range=500.0))
+    assert localise(**beyond).reason == 'out_of_range'
+
+
+# -- reflections ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('make, n, late', [
+    (active, 4, [2]), (active, 6, [0]), (active, 8, [1, 4]), (active, 8, [0, 2, 5]),
+    (passive, 6, [3]), (passive, 8, [0, 6])])
+def test_late_reflections_are_left_out(make, n, late):
+    for seed in range(8):
+        scene = make(n, sigma=SIGMA, seed=seed)
+        scene['toa'] = scene['toa'].copy()
+        scene['toa'][late] += np.linspace(4e-3, 9e-3, len(late))
+        fix = localise(**scene)
+        assert_array_equal(np.flatnonzero(~fix.used), late)
+        assert distance2(fix, TRUTH) < 25.0
+        assert fix.dof == n - len(late) - (2 if make is active else 3)
+        alone = localise(**{**scene, 'var_toa': np.where(fix.used, SIGMA**2, np.nan)})
+        assert_allclose(fix.position, alone.position, atol=1e-4)
+
+
+def test_a_wrong_bearing_is_left_out():
+    bearing = multistatic.bearing(TRUTH, RX[:4]) + [0.0, 0.0, 0.5, 0.0]
+    fix = localise(**active(4, bearing=bearing, var_bearing=np.full(4, 1e-4)))
+    assert fix.used.all()
+    assert_array_equal(fix.used_bearing, [True, True, False, True])
+
+
+def test_poor_fit_when_nothing_is_left_to_test_with():
+    scene = passive(4, sigma=SIGMA)
+    scene['toa'] = scene['toa'] + [0.0, 8e-3, 0.0, 0.0]
+    refusal = localise(**scene)
+    assert refusal.reason == 'poor_fit' and '1 degrees of freedom' in refusal.sentence
+    scene = active(6)
+    scene['toa'][1] += 5e-3
+    assert localise(**scene, limits=Limits(max_outliers=0)).reason == 'poor_fit'
+
+
+def test_two_ways_to_leave_a_row_out_are_ambiguous():
+    """Rows 0 and 1 fit two mirrored positions, row 2 only the one and row 3 only the other."""
+    mirror = np.array([6.0 - TRUTH[0], TRUTH[1]])
+    rx = np.vstack([[3.0, 80.0, Z], [3.0, -60.0, Z], RX[0], RX[3]])
+    tx = np.tile([3.0, 10.0, Z], (4, 1))
+    toa = multistatic.range_sum(TRUTH, tx, rx, Z) / SOUND_SPEED
+    toa[3] = multistatic.range_sum(mirror, tx[3:], rx[3:], Z)[0] / SOUND_SPEED
+    fix = localise(rx, toa, np.full(4, SIGMA**2), tx=tx, target_z=Z)
+    assert fix.ambiguous and fix.dof == 1
+    assert matches(fix, np.array([TRUTH, mirror]))
+
+
+# -- input ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('scene', [active(1), passive(2), passive(1), active(0), passive(0)])
+def test_too_few(scene):
+    assert localise(**scene).reason == 'too_few'
+
+
+def test_rows_that_are_not_measured_are_not_used():
+    scene = active(6, sigma=SIGMA, seed=4)
+    good = localise(**{name: value[:4] if name in ('rx', 'tx', 'toa', 'var_toa') else value
+                       for name, value in scene.items()})
+    scene['toa'][4], scene['var_toa'][5] = np.nan, 0.0
+    fix = localise(**scene)
+    assert_array_equal(fix.used, [True] * 4 + [False] * 2)
+    assert_allclose(fix.position, good.position, atol=1e-4)
+
+
+@pytest.mark.parametrize('change', [
+    {'toa': np.zeros(3)}, {'tx': np.zeros((3, 3))}, {'rx': np.zeros((4, 2))},
+    {'bearing': np.zeros(5)}, {'rx': np.full((4, 3), np.nan)}, {'var_toa': 1e-8}])
+def test_arrays_that_do_not_fit_raise(change):
+    with pytest.raises(ValueError, match='receiver|every arrival'):
+        localise(**{**active(4), **change})
+
+
+ANY = st.one_of(st.floats(), st.sampled_from([0.0, 1e-320, 1e308, -1e308, 1e-9, 0.05, np.nan]),
+                st.floats(0.0, 0.2))
+
+
+@settings(max_examples=150, derandomize=True, deadline=None)
+@given(st.integers(0, 6).flatmap(lambda n: st.tuples(
+    *(st.lists(ANY, min_size=n, max_size=n) for _ in range(4)),
+    st.lists(st.floats(-1e8, 1e8), min_size=6 * n, max_size=6 * n), st.booleans())))
+def test_no_input_raises_or_gives_nan(data):
+    toa, var_toa, bearing, var_bearing, places, tag = data
+    n = len(toa)
+    places = np.reshape(places, (2, n, 3))
+    places[1, :1] *= 1e300
+    result = localise(places[0], toa, var_toa, tx=None if tag else places[1], bearing=bearing,
+                      var_bearing=var_bearing)
+    if isinstance(result, Refusal):
+        assert result.reason in ('too_few', 'singular_geometry', 'poor_fit', 'diverged',
+                                 'out_of_range')
+    else:
+        assert np.isfinite(result.position).all() and np.isfinite(result.cost)
+        assert np.linalg.eigvalsh(result.covariance)[0] > 0.0
