@@ -58,10 +58,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # click itself leaves this way when the reader of our output has gone, as in `... | head`.
         return 141 if isinstance(leaving.__context__, BrokenPipeError) else int(leaving.code or 0)
     except Exception as error:
+        if _replay_failed(error):
+            return _complain(str(error), 1)
         sentence = _what_the_user_can_mend(error)
         if sentence is None:
             raise
         return _complain(sentence)
+
+
+def _replay_failed(error: Exception) -> bool:
+    """Whether a live node did not do its part. Only commands that load rclpy can meet it."""
+    link = sys.modules.get('sonar_imm.nodes.link')
+    return link is not None and isinstance(error, link.LinkError)
 
 
 def _what_the_user_can_mend(error: Exception) -> str | None:
@@ -71,10 +79,21 @@ def _what_the_user_can_mend(error: Exception) -> str | None:
     from ..recordings.reader import BagError
     if isinstance(error, (ConfigError, Rejection, BagError)):
         return str(error)
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        return missing_package(error.name.split('.')[0])
     if isinstance(error, OSError):
         known = error.filename and error.strerror
         return f'{error.filename}: {error.strerror}' if known else str(error)
     return None
+
+
+def missing_package(name: str) -> str | None:
+    """How to come by a package that only some commands need; None for one that all need."""
+    remedies = {
+        'rclpy': "ROS 2 is not here: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
+        'filterpy': "FilterPy is not here: pip install 'sonar_imm[test]'",
+    }
+    return remedies.get(name)
 
 
 def _complain(sentence: str, status: int = 2) -> int:

@@ -41,9 +41,28 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """``--set name=value``, as often as needed."""
-    return click.option('--set', 'overrides', metavar='NAME=VALUE', multiple=True,
-                        callback=_split_overrides,
+    return pairs_option('--set', 'overrides', metavar='NAME=VALUE',
                         help='Change one parameter; may be given several times.')(function)
+
+
+def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
+    """An option of the form NAME=VALUE, as often as needed; the command gets a dict."""
+    def split(_ctx: click.Context, _param: click.Parameter, values: Iterable[str]
+              ) -> dict[str, str]:
+        pairs = {}
+        for value in values:
+            name, equals, text = value.partition('=')
+            if not equals or not name.strip():
+                raise click.BadParameter(f"'{value}' is not of the form {metavar}")
+            pairs[name.strip()] = text.strip()
+        return pairs
+    return click.option(*names, metavar=metavar, multiple=True, callback=split, help=help)
+
+
+def topic_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--topic input=topic``, as often as needed; the command gets topics by input."""
+    return pairs_option('--topic', 'topics', metavar='INPUT=TOPIC', help='Which topic is which '
+                        'input, e.g. fix=/usbl/pose; may be given several times.')(function)
 
 
 def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,28 +70,6 @@ def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
     return click.option('--system', type=click.Choice(list(SYSTEMS)), default=None,
                         help='Which tracker; by default the one whose inputs are in the bag.'
                         )(function)
-
-
-def topics_by_name(pairs: Iterable[str]) -> dict[str, str] | None:
-    """``fix=/usbl/pose`` as ``{'/usbl/pose': 'fix'}``; None when there are none."""
-    topics = {}
-    for pair in pairs:
-        name, equals, topic = pair.partition('=')
-        if not (name and equals and topic):
-            raise click.BadParameter(f"'{pair}' is not of the form INPUT=TOPIC")
-        topics[topic] = name
-    return topics or None
-
-
-def _split_overrides(_ctx: click.Context, _param: click.Parameter,
-                     values: Iterable[str]) -> dict[str, str]:
-    pairs = {}
-    for value in values:
-        name, equals, text = value.partition('=')
-        if not equals or not name.strip():
-            raise click.BadParameter(f"'{value}' is not of the form NAME=VALUE")
-        pairs[name.strip()] = text.strip()
-    return pairs
 
 
 def _typed(text: str, spec: ParameterSpec | None) -> Any:

@@ -109,7 +109,7 @@ def _lines(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((title, f'{values["mean"]:.2f}, believable {values["low"]:.2f} to '
                                  f'{values["high"]:.2f}'))
     coverage = metrics['consistency'].get('coverage', {})
-    if coverage:
+    if metrics.get('position', {}).get('n'):
         lines.append(('truth inside 50 / 90 / 95 % ellipse',
                       ' / '.join(f'{100 * share:.0f} %' for share in coverage.values())))
     if metrics.get('lag'):

@@ -19,7 +19,7 @@ from .common import (
     say,
     set_option,
     system_option,
-    topics_by_name,
+    topic_option,
 )
 
 
@@ -32,15 +32,14 @@ from .common import (
 @click.option('--params', type=click.Path(path_type=Path, dir_okay=False),
               help='Parameter file: ROS 2 form or a plain mapping.')
 @set_option
-@click.option('--topic', 'topics', metavar='INPUT=TOPIC', multiple=True,
-              help='Which topic is which input, e.g. fix=/usbl/pose; may be given several times.')
+@topic_option
 @click.option('--order', type=click.Choice(['recorded', 'stamp']), default='recorded',
               show_default=True, help='As the messages arrived, or sorted by their stamps.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
 def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
-            overrides: dict[str, str], topics: tuple[str, ...], order: str, overwrite: bool,
+            overrides: dict[str, str], topics: dict[str, str], order: str, overwrite: bool,
             strict: bool, as_json: bool) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
@@ -50,14 +49,19 @@ def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
     from ..evaluation.tracking import InputOptions
     chosen = choose_system(bag, system, topics)
     config, node = load_config(chosen, params, overrides)
-    options = InputOptions(topics=topics_by_name(topics), order=order, frame_id=node.frame_id,
+    options = InputOptions(topics=inputs_by_topic(topics), order=order, frame_id=node.frame_id,
                            world_frame=node.world_frame_convention)
     run = track_recording(bag, out_dir, chosen, config, options, overwrite=overwrite,
                           strict=strict, quiet=as_json)
     print_json(run) if as_json else _print(run, out_dir)
 
 
-def choose_system(bag: Path, name: str | None, topics: tuple[str, ...] = ()) -> System:
+def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
+    """What `recordings` wants of ``--topic``: input by topic name, None to choose by name."""
+    return {topic: name for name, topic in topics.items()} or None
+
+
+def choose_system(bag: Path, name: str | None, topics: dict[str, str]) -> System:
     """The tracker called `name`, or else the first one that finds its inputs in `bag`."""
     from ..recordings.measurements import fitting_topics
     from ..recordings.reader import BagError, BagReader
@@ -67,7 +71,7 @@ def choose_system(bag: Path, name: str | None, topics: tuple[str, ...] = ()) -> 
     with BagReader(bag) as reader:
         for system in SYSTEMS.values():
             try:
-                fitting_topics(reader, system.name, topics_by_name(topics))
+                fitting_topics(reader, system.name, inputs_by_topic(topics))
                 return system
             except BagError as error:
                 failures.append(error)

@@ -50,15 +50,17 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in plain words."""
     position = metrics.get('position', {})
     if not position.get('n'):
-        return (f'{metrics["tracks_confirmed"]} tracks in {metrics["span_s"]:.0f} s. There is no '
-                'truth to compare with, so this page shows what the tracker says of itself.')
+        known = 'scored_stamps' in metrics
+        return (f'{metrics["tracks_confirmed"]} confirmed tracks in {metrics["span_s"]:.0f} s. '
+                + ('None of them met the truth.' if known else 'There is no truth to compare '
+                   'with, so this page shows what the tracker says of itself.'))
     words = [f'On average the track lies {position["rmse_m"]:.2f} m from the truth (RMS).']
     raw = metrics.get('raw_fix', {})
     if raw.get('n'):
         change = 1.0 - position['rmse_m'] / raw['rmse_m']
         words.append(f'The raw fixes lie {raw["rmse_m"]:.2f} m away: tracking '
                      + (f'removes {100 * change:.0f} % of the error.' if change >= 0.0
-                        else f'adds {-100 * change:.0f} %.'))
+                        else f'adds {-100 * change:.0f} % to it.'))
     words.append(belief_sentence(metrics['consistency']['coverage']['95']))
     return ' '.join(words)
 

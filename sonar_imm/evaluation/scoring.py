@@ -30,6 +30,7 @@ from .truth import Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0
+SINGULAR = 1e-9
 
 
 def score(series: Series, truth: Truth | None = None, *, fixes: Series | None = None,
@@ -96,14 +97,22 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
         'nees_position': chi2_summary(position, 2),
         'coverage': {f'{100 * level:g}': float(np.mean(position <= chi2.ppf(level, 2)))
                      if len(position) else float('nan') for level in COVERAGE_LEVELS},
-        'unusable_covariances': len(error) - len(position)}
-    return {**result, 'nees_state': chi2_summary(state, 4)} if len(state) else result
+        'singular_position_covariances': len(error) - len(position)}
+    if known := int(np.isfinite(error).all(axis=1).sum()):
+        result['nees_state'] = chi2_summary(state, 4)
+        result['singular_state_covariances'] = known - len(state)
+    return result
 
 
 def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """NEES of the rows that are finite and whose covariance is positive definite."""
+    """NEES of the rows that are finite and whose covariance is not singular.
+
+    A filter that is certain of one heading states a velocity along that heading only: its whole
+    covariance is singular then, and NEES says nothing.
+    """
     good = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    good[good] = np.linalg.eigvalsh(covariance[good])[:, 0] > 0.0
+    values = np.linalg.eigvalsh(covariance[good])
+    good[good] = values[:, 0] > SINGULAR * values[:, -1]
     return nees(error[good], covariance[good]) if good.any() else np.empty(0)
 
 
