@@ -43,11 +43,9 @@ IntArray = NDArray[np.int64]
 def gate_threshold(probability: float, dimension: int) -> float:
     """Normalised innovation squared inside which a `dimension`-vector of the target itself lies
     with `probability`."""
-    from scipy.stats import (
-        chi2,
-    )  # scipy.stats takes long to import, and trackers without gates do without
+    from scipy.special import gammaincinv  # scipy.stats has it too, but takes a second to import
 
-    return float(chi2.ppf(probability, dimension))
+    return 2.0 * float(gammaincinv(dimension / 2.0, probability))
 
 
 class Pairs(NamedTuple):
