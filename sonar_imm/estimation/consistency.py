@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .kalman import factorise, FloatArray, log_density
+from .kalman import factorise, FloatArray, log_density, solve
 
 IntArray = NDArray[np.int64]
 
@@ -105,7 +105,7 @@ def innovation_autocorrelation(
     m), K > lags."""
     from scipy.stats import norm
 
-    white = np.linalg.solve(factorise(covariance), innovation[..., None])[..., 0]
+    white = solve(factorise(covariance), innovation[..., None])[..., 0]
     steps, m = white.shape
     if steps <= lags:
         raise ValueError(f'{steps} innovations are too few for {lags} lags')

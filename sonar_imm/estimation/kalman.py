@@ -94,7 +94,7 @@ def update(
     cross = H @ P
     S = symmetrise(cross @ transpose(H) + R)
     factor = factorise(S, 'innovation covariance')
-    gain = transpose(np.linalg.solve(transpose(factor), np.linalg.solve(factor, cross)))
+    gain = transpose(solve(transpose(factor), solve(factor, cross)))
     kept = np.eye(x.shape[-1]) - gain @ H
     nis, log_likelihood = log_density(innovation, factor)
     return Updated(
@@ -120,10 +120,18 @@ def factorise(S: FloatArray, what: str = 'covariance') -> FloatArray:
         raise CovarianceError(f'{what} is not positive definite', np.asarray(indefinite)) from None
 
 
+def solve(matrix: FloatArray, columns: FloatArray) -> FloatArray:
+    """``matrix^-1 columns``, (..., m, m) and (..., m, q), broadcast over the leading axes."""
+    # numpy before 2.0 takes a second argument with one axis less for a stack of vectors.
+    missing = max(matrix.ndim - columns.ndim, 0)
+    stack = columns.reshape((1,) * missing + columns.shape)
+    return np.asarray(np.linalg.solve(matrix, stack), dtype=np.float64)
+
+
 def log_density(deviation: FloatArray, factor: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Squared Mahalanobis distance (...,) and log density (...,) of `deviation` (..., m) under
     ``N(0, factor factor')``."""
-    white = np.linalg.solve(factor, deviation[..., None])[..., 0]
+    white = solve(factor, deviation[..., None])[..., 0]
     distance = np.einsum('...i,...i->...', white, white)
     log_root_determinant = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
     return distance, -0.5 * (distance + deviation.shape[-1] * LOG_2PI) - log_root_determinant

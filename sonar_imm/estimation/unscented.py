@@ -38,6 +38,7 @@ from .kalman import (
     factorise,
     FloatArray,
     log_density,
+    solve,
     symmetrise,
     transpose,
     Updated,
@@ -141,7 +142,7 @@ def update(
     S = symmetrise(transpose(weighted) @ cloud.after + R)
     factor = factorise(S, 'innovation covariance')
     cross = transpose(weighted) @ cloud.before
-    gain = transpose(np.linalg.solve(transpose(factor), np.linalg.solve(factor, cross)))
+    gain = transpose(solve(transpose(factor), solve(factor, cross)))
     innovation = _wrap(z - cloud.mean, angles)
     rest = cloud.before - cloud.after @ transpose(gain)
     covariance = transpose(rest * cloud.weights[:, None]) @ rest + gain @ R @ transpose(gain)

@@ -78,6 +78,16 @@ def test_a_batch_is_its_members(rng):
                 np.testing.assert_allclose(whole[t, m], single, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize('batch', [(5,), (5, 3)])
+def test_one_state_against_many_measurement_noises(rng, batch):
+    x, P, H, nu = rng.normal(size=3), random_covariance(rng, 3), np.eye(2, 3), rng.normal(size=2)
+    R = random_covariance(rng, *batch, 2)
+    whole = update(x, P, nu, H, R)
+    for i in np.ndindex(batch):
+        for part, single in zip(whole, update(x, P, nu, H, R[i])):
+            np.testing.assert_allclose(part[i], single, rtol=1e-9, atol=1e-12)
+
+
 def test_a_perfect_measurement_is_allowed():
     updated = update(
         np.zeros(2), np.eye(2), np.array([3.0]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
