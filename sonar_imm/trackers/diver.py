@@ -90,18 +90,19 @@ class DiverTracker:
             self.counts['too_late'] -= judgement.reinstated
             life = self._history.state.life
             self._history = self._new_history(life.only(np.zeros(len(life), bool)))
-        revised: dict[int, Estimate] = {}
+        revised: dict[int, Divers] = {}
         for item in judgement.released:
-            revised.update(self._insert(item))
-        return [revised[stamp] for stamp in sorted(revised)]
+            revised.update(self._revise(item))
+        return [self._estimate(revised[stamp_ns]) for stamp_ns in sorted(revised)]
 
-    def _insert(self, item: Measurement) -> dict[int, Estimate]:
+    def _revise(self, item: Measurement) -> list[tuple[int, Divers]]:
+        """Put an item in its place in time; the states of its scan and of the later ones."""
         newest = self._history.newest_ns
         inserted = self._history.insert(item.stamp_ns, _key(item), item, self._scan)
         self.counts[inserted.verdict] += 1
         if inserted.revised and newest is not None and item.stamp_ns < newest:
             self.counts['late'] += 1
-        return {stamp: self._estimate(state) for stamp, state in inserted.revised}
+        return inserted.revised
 
     def _new_history(self, life: Tracks) -> ReplayHistory[Divers, Measurement]:
         M, n = len(self.models.names), self.models.n
