@@ -205,6 +205,19 @@ def test_time_ends_a_track_too():
     assert live('1110', RULES, dt=101) == [0, 0, 1, None]
 
 
+def test_a_track_nobody_looked_for_is_neither_hit_nor_missed():
+    tracks = Tracks.none(RULES).born(2, 0, RULES)
+    for k in range(1, 9):
+        tracks, kept = tracks.scan(
+            np.array([False, False]), k, RULES, looked=np.array([False, k > 6])
+        )
+        assert kept.all()
+    assert list(tracks.misses) == [0, 2] and list(tracks.age) == [1, 3]
+    tracks, _ = tracks.scan(np.array([True, True]), 9, RULES, looked=np.array([False, True]))
+    assert list(tracks.seen.sum(axis=1)) == [2, 2] and list(tracks.age) == [2, 4]
+    assert not tracks.scan(np.array([False, False]), 110, RULES, looked=np.zeros(2, bool))[1].any()
+
+
 def test_identities_are_never_used_again():
     tracks = Tracks.none(RULES).born(3, 0, RULES)
     tracks, kept = tracks.scan(np.array([True, False, True]), 101, RULES)
