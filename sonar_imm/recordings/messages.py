@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
@@ -24,7 +25,7 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def ros_message(type_name: str, **fields: Any) -> Any:
+def ros_message(type_name: str, /, **fields: Any) -> Any:
     """Build a rosbags message; the `make` of the adapters for recordings.
 
     Fields left out are zero or empty. Bulk data may be bytes, arrays or lists: they are copied
@@ -42,6 +43,22 @@ def ros_message(type_name: str, **fields: Any) -> Any:
 def _layout(type_name: str) -> tuple[Any, dict[str, Any]]:
     """Look up the class of a message and the kinds of its fields, in order."""
     return typestore().types[type_name], dict(typestore().fielddefs[type_name][1])
+
+
+def decode_cdr(types: Typestore, type_name: str, raw: bytes) -> Any:
+    """Decode CDR bytes into a rosbags message. Raises `SerdeError` or KeyError (unknown type).
+
+    Fast-CDR, which most of ROS 2 writes with, reserves room to align the elements of sequences and
+    leaves it at the end when the last sequences are empty, as in a JointState without velocities.
+    rosbags takes that for damage, so up to 16 spare bytes are cut off.
+    """
+    for spare in (0, 4, 8, 12):
+        try:
+            return types.deserialize_cdr(raw[:len(raw) - spare], type_name)
+        except SerdeError as error:
+            if 'size mismatch' not in str(error):
+                raise
+    return types.deserialize_cdr(raw[:-16], type_name)
 
 
 def _cast(kind: Any, value: Any) -> Any:

@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
 from .mcap_scan import McapScan, zstd
-from .messages import typestore
+from .messages import decode_cdr, typestore
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -104,6 +104,8 @@ class RosbagsSource:
                 yield RawMessage(link.topic, link.msgtype, log_ns, _unpacked(raw))
 
     def decode(self, type_name: str, raw: bytes) -> Any:
+        if self._reader.is2:
+            return decode_cdr(self._reader.typestore, type_name, raw)
         return self._reader.deserialize(raw, type_name)
 
     def close(self) -> None:
@@ -136,7 +138,7 @@ class ScanSource:
             yield RawMessage(chosen[number].topic, chosen[number].type_name, log_ns, raw)
 
     def decode(self, type_name: str, raw: bytes) -> Any:
-        return self._types.deserialize_cdr(raw, type_name)
+        return decode_cdr(self._types, type_name, raw)
 
     def close(self) -> None:
         self._scan.close()

@@ -1,0 +1,104 @@
+import numpy as np
+import pytest
+
+from msg_adapters.estimates import (
+    read_estimate,
+    write_estimate,
+    write_model_probabilities,
+    write_odometry,
+    write_truth,
+)
+from msg_adapters.fixes import UNKNOWN_VARIANCE
+from msg_adapters.table import encode_table
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Rejection
+from sonar_imm.recordings.messages import ros_message, typestore
+
+STATES = ('px', 'py', 'vx', 'vy')
+
+
+def estimate(rows=2, seed=1):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((rows, 4, 4))
+    probabilities = rng.random((rows, 3))
+    state = rng.standard_normal((rows, 4)) * 1e5
+    xyz = np.column_stack([state[:, :2], np.full(rows, -4.0)]).astype(np.float32)
+    return Estimate(stamp_ns=1700000000123456789, frame_id='map', xyz=xyz, state_names=STATES,
+                    state=state, covariance=root @ root.transpose(0, 2, 1),
+                    model_names=('heading_000', 'heading_022', 'hover'),
+                    probabilities=probabilities / probabilities.sum(axis=1, keepdims=True),
+                    extras={'track_id': np.arange(7, 7 + rows, dtype=np.uint32),
+                            'track_state': np.ones(rows, np.uint8),
+                            'nis': np.full(rows, np.nan)})
+
+
+def through_cdr(message):
+    name = message.__msgtype__
+    return typestore().deserialize_cdr(typestore().serialize_cdr(message, name), name)
+
+
+@pytest.mark.parametrize('rows', [0, 1, 5])
+def test_an_estimate_reads_back_bit_for_bit(rows):
+    first = estimate(rows)
+    again = read_estimate(through_cdr(write_estimate(first, ros_message)))
+    assert (again.stamp_ns, again.frame_id) == (first.stamp_ns, first.frame_id)
+    assert again.state_names == STATES and again.model_names == first.model_names
+    for name, column in first.columns().items():
+        assert again.columns()[name].tobytes() == np.ascontiguousarray(column).tobytes(), name
+        assert again.columns()[name].dtype == column.dtype
+
+
+def test_the_columns_are_those_of_the_contract():
+    message = write_estimate(estimate(), ros_message)
+    assert [field.name for field in message.fields] == [
+        'x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px', 'cov_px_py', 'cov_px_vx', 'cov_px_vy',
+        'cov_py_py', 'cov_py_vx', 'cov_py_vy', 'cov_vx_vx', 'cov_vx_vy', 'cov_vy_vy',
+        'prob_heading_000', 'prob_heading_022', 'prob_hover', 'track_id', 'track_state', 'nis']
+    assert [field.datatype for field in message.fields] == [7] * 3 + [8] * 17 + [6, 2, 8]
+
+
+@pytest.mark.parametrize('gone', ['x', 'cov_px_vy', 'px'])
+def test_a_table_without_a_column_is_refused(gone):
+    columns = estimate().columns()
+    del columns[gone]
+    message = encode_table(columns, stamp_ns=1, frame_id='map', make=ros_message)
+    with pytest.raises(Rejection, match=gone) as caught:
+        read_estimate(message)
+    assert caught.value.reason == 'missing_column'
+
+
+def test_truth_comes_back_as_extras():
+    message = write_truth([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [[0.1, 0.2], [np.nan, np.nan]],
+                          [3, 9], stamp_ns=5, frame_id='map', make=ros_message)
+    assert [field.name for field in message.fields] == ['x', 'y', 'z', 'px', 'py', 'vx', 'vy',
+                                                        'track_id']
+    truth = read_estimate(message)
+    assert truth.extras['py'].tolist() == [2.0, 5.0]
+    assert truth.extras['track_id'].tolist() == [3, 9]
+    assert truth.extras['vx'][0] == 0.1 and truth.xyz[1].tolist() == [4.0, 5.0, 6.0]
+
+
+def test_odometry_shows_one_diver_with_velocity_in_the_world():
+    first = estimate()
+    message = through_cdr(write_odometry(first, 1, ros_message))
+    assert message.child_frame_id == 'diver_8' and message.header.frame_id == 'map'
+    pose, twist = message.pose, message.twist
+    assert [pose.pose.position.x, pose.pose.position.y] == first.state[1, :2].tolist()
+    assert pose.pose.position.z == -4.0
+    assert [twist.twist.linear.x, twist.twist.linear.y] == first.state[1, 2:].tolist()
+    quaternion = pose.pose.orientation
+    assert (quaternion.x, quaternion.y, quaternion.z, quaternion.w) == (0.0, 0.0, 0.0, 1.0)
+    for got, block in ((pose.covariance, first.covariance[1, :2, :2]),
+                       (twist.covariance, first.covariance[1, 2:, 2:])):
+        matrix = got.reshape(6, 6)
+        assert (matrix[:2, :2] == block).all()
+        assert (matrix[2:, 2:] == np.eye(4) * UNKNOWN_VARIANCE).all()
+        assert not matrix[:2, 2:].any() and not matrix[2:, :2].any()
+
+
+def test_model_probabilities_are_named_scalars():
+    first = estimate()
+    message = through_cdr(write_model_probabilities(first, 0, ros_message))
+    assert message.name == list(first.model_names)
+    assert message.position.tolist() == first.probabilities[0].tolist()
+    assert len(message.velocity) == len(message.effort) == 0

@@ -1,0 +1,76 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from msg_adapters.headers import make_header, ned_to_enu, stamp_ns, to_enu, wrap
+from sonar_imm.measurements import Arrivals, Fix, Rejection
+from sonar_imm.recordings.messages import ros_message
+
+
+def fix(frame_id='map'):
+    return Fix(stamp_ns=5, position=(1.0, 2.0, 3.0), covariance=[[4.0, 0.5], [0.5, 9.0]],
+               frame_id=frame_id)
+
+
+def arrivals(**changes):
+    return Arrivals(**{'stamp_ns': 5, 'tx_id': [1], 'rx_id': [2], 'tx': [[1.0, 2.0, 3.0]],
+                       'rx': [[4.0, 5.0, 6.0]], 'toa': [0.1], 'var_toa': [np.nan],
+                       'bearing': [0.25], 'var_bearing': [0.01], 'frame_id': 'map_ned', **changes})
+
+
+@pytest.mark.parametrize('stamp', [0, 7, 1_000_000_007, 2**31 * 10**9 - 1, 1700000000123456789])
+def test_stamps_round_trip_exactly(stamp):
+    header = make_header(stamp, 'map', ros_message)
+    assert stamp_ns(SimpleNamespace(header=header)) == stamp
+
+
+def test_a_stamp_beyond_2038_is_no_header():
+    with pytest.raises(ValueError, match='cannot hold'):
+        make_header(2**31 * 10**9, 'map', ros_message)
+
+
+def test_a_nanosecond_field_of_a_second_is_refused():
+    message = SimpleNamespace(header=SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=10**9)))
+    with pytest.raises(Rejection) as caught:
+        stamp_ns(message)
+    assert caught.value.reason == 'bad_stamp'
+
+
+def test_a_fix_turns_from_ned_to_enu_with_its_covariance():
+    turned = ned_to_enu(fix('map_ned'))
+    assert turned.position.tolist() == [2.0, 1.0, -3.0]
+    assert turned.covariance.tolist() == [[9.0, 0.5], [0.5, 4.0]]
+    assert turned.frame_id == 'map'
+
+
+def test_a_bearing_means_the_same_direction_after_turning():
+    for bearing in (-3.0, 0.25, 1.0, 3.1):
+        north, east = np.cos(bearing), np.sin(bearing)
+        turned = ned_to_enu(arrivals(bearing=[bearing]))
+        assert np.cos(turned.bearing[0]) == pytest.approx(east)
+        assert np.sin(turned.bearing[0]) == pytest.approx(north)
+    assert turned.tx.tolist() == [[2.0, 1.0, -3.0]] and turned.rx.tolist() == [[5.0, 4.0, -6.0]]
+
+
+def test_turning_twice_changes_nothing_but_the_frame():
+    once = ned_to_enu(arrivals())
+    twice = ned_to_enu(once)
+    assert np.allclose(twice.bearing, [0.25]) and (twice.tx == arrivals().tx).all()
+
+
+def test_a_ned_frame_is_refused_under_enu_and_read_under_ned():
+    with pytest.raises(Rejection, match='north-east-down') as caught:
+        to_enu(fix('map_ned'), 'enu')
+    assert caught.value.reason == 'frame_ned'
+    assert to_enu(fix('map_ned'), 'ned').frame_id == 'map'
+    assert to_enu(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(ValueError, match='enu, ned'):
+        to_enu(fix(), 'nwu')
+
+
+def test_wrap_stays_in_its_half_open_interval():
+    angles = np.linspace(-20.0, 20.0, 1001)
+    wrapped = wrap(angles)
+    assert (wrapped >= -np.pi).all() and (wrapped < np.pi).all()
+    assert np.allclose(np.exp(1j * wrapped), np.exp(1j * angles))
