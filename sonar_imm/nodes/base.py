@@ -28,7 +28,7 @@ import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import InvalidQoSProfileException
 from std_srvs.srv import SetBool, Trigger
@@ -194,11 +194,11 @@ class TrackerNode(Node):
         """Say on ~/processed that everything so far is answered; `stamp` is the message's."""
         row = {'messages': self._meter.received.total(), 'refused': self._meter.refused.total(),
                'estimates': self._published}
-        table = encode_table({name: np.array([value], np.uint32) for name, value in row.items()},
-                             stamp_ns=0, frame_id='', make=make)
+        answer = encode_table({name: np.array([n], np.uint32) for name, n in row.items()},
+                              stamp_ns=0, frame_id='', make=make)
         if stamp is not None:
-            table.header.stamp = stamp
-        self._processed.publish(table)
+            answer.header.stamp = stamp
+        self._processed.publish(answer)
 
     def _start_afresh(self) -> None:
         self.tracker.reset()
@@ -242,8 +242,9 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     node = None
     try:
         _init(args)
+        executor = SingleThreadedExecutor()
         node = make_node()
-        rclpy.spin(node)
+        rclpy.spin(node, executor)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ConfigError as error:

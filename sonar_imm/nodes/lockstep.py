@@ -13,6 +13,7 @@ import time
 from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.estimates import read_estimate
@@ -35,16 +36,19 @@ class Counts(NamedTuple):
 
 
 class Recorder:
-    """Collects ``~/estimate`` of a node, losing nothing."""
+    """Collects ``~/estimate`` of a node, losing nothing; decodes only when asked, to be quick."""
 
     def __init__(self, link: Link, node_name: str):
-        self.messages: list[PointCloud2] = []
-        link.node.create_subscription(PointCloud2, f'{node_name}/estimate', self.messages.append,
-                                      lockstep_qos())
+        self._raw: list[bytes] = []
+        link.node.create_subscription(PointCloud2, f'{node_name}/estimate', self._raw.append,
+                                      lockstep_qos(), raw=True)
+
+    def __len__(self) -> int:
+        return len(self._raw)
 
     def estimates(self) -> list[Estimate]:
         """Decode what was collected."""
-        return [read_estimate(message) for message in self.messages]
+        return [read_estimate(deserialize_message(raw, PointCloud2)) for raw in self._raw]
 
 
 class LockStep:
@@ -121,7 +125,7 @@ class LockStep:
 
     def _caught_up(self) -> bool:
         return self.counts.messages >= self._sent and (
-            self._recorder is None or len(self._recorder.messages) >= self.counts.estimates)
+            self._recorder is None or len(self._recorder) >= self.counts.estimates)
 
     def _recorded(self) -> bool:
         return self._recorder is None or bool(

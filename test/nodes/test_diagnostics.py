@@ -1,0 +1,124 @@
+"""What /diagnostics says, from invented histories and from a real node."""
+
+from collections import Counter
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import pytest
+
+from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.diagnostics import Meter, Reporter
+from sonar_imm.nodes.qos import output_qos
+
+
+class Desk:
+    """A reporter whose clock the test sets."""
+
+    def __init__(self):
+        self.meter = Meter()
+        self.reporter = Reporter('diver', {'fix': '/fix', 'arrivals': '/arrivals'}, self.meter)
+
+    def report(self, now, **changes):
+        state = {'enabled': True, 'stale_after': 5.0, 'counts': Counter(used=3),
+                 'health': {'NIS': 1.5}, 'lost': {}, 'incompatible': {}, **changes}
+        message = self.reporter.report(Time(sec=9), now, **state)
+        assert message.header.stamp.sec == 9
+        self.input, self.tracker = message.status
+        self.values = {pair.key: pair.value for status in message.status for pair in status.values}
+
+
+@pytest.fixture
+def desk():
+    return Desk()
+
+
+def test_a_silent_start_is_stale(desk):
+    desk.report(1.0)
+    assert desk.input.level == DiagnosticStatus.STALE
+    assert (desk.input.name, desk.tracker.name) == ('diver: input', 'diver: tracker')
+    assert desk.values['fix silent for [s]'] == 'nan'
+
+
+def test_rates_are_those_since_the_last_report(desk):
+    desk.report(0.0)
+    for k in range(10):
+        desk.meter.arrived('fix', k / 5.0)
+    desk.report(2.0)
+    assert desk.input.level == DiagnosticStatus.OK
+    assert desk.values['fix rate [Hz]'] == '5'
+    assert desk.values['fix silent for [s]'] == '0.2'
+    assert desk.values['arrivals received'] == '0'
+    assert desk.values['count: used'] == '3'
+    assert desk.values['NIS'] == '1.5'
+
+
+def test_silence_becomes_stale(desk):
+    desk.meter.arrived('fix', 1.0)
+    desk.report(6.0)
+    assert desk.input.level == DiagnosticStatus.OK
+    desk.report(6.5)
+    assert desk.input.level == DiagnosticStatus.STALE
+    assert desk.input.message == 'no message for 5.5 s'
+
+
+def test_refusals_warn_while_they_last(desk):
+    desk.report(0.0)
+    for k in range(4):
+        desk.meter.arrived('fix', 0.1 * k)
+    desk.meter.refused['nan'] += 1
+    desk.report(1.0)
+    assert desk.input.level == DiagnosticStatus.WARN
+    assert desk.values['refused: nan'] == '1'
+    desk.meter.arrived('fix', 1.5)
+    desk.meter.refused['frame'] += 1
+    desk.report(2.0)
+    assert desk.input.level == DiagnosticStatus.ERROR
+    assert desk.input.message == 'every message is refused: frame'
+    desk.meter.arrived('fix', 2.5)
+    desk.report(3.0)
+    assert desk.input.level == DiagnosticStatus.OK
+
+
+def test_losses_and_incompatible_peers_warn(desk):
+    desk.meter.arrived('fix', 1.0)
+    desk.report(1.0, lost={'fix': 4})
+    assert desk.input.level == DiagnosticStatus.WARN
+    assert desk.values['lost on fix'] == '4'
+    desk.report(1.5, incompatible={'fix': 'RELIABILITY'})
+    assert desk.input.level == DiagnosticStatus.WARN
+    assert desk.values['incompatible peer on fix'] == 'RELIABILITY'
+
+
+def test_compute_time_and_a_tracker_that_cannot_keep_up(desk):
+    desk.report(0.0)
+    for k in range(10):
+        desk.meter.arrived('fix', k / 10.0)
+        desk.meter.spent(0.05)
+    desk.report(1.0)
+    assert desk.values['compute time p50 [ms]'] == '50'
+    assert desk.tracker.level == DiagnosticStatus.OK
+    for k in range(30):
+        desk.meter.arrived('fix', 1.0 + k / 30.0)
+    desk.report(2.0)
+    assert desk.tracker.level == DiagnosticStatus.WARN
+
+
+def test_internal_errors_and_disabling_show(desk):
+    desk.meter.arrived('fix', 0.0)
+    desk.report(1.0, enabled=False)
+    assert desk.tracker.message == 'disabled'
+    assert 'disabled' in desk.input.message
+    desk.report(2.0, counts={'internal_error': 1})
+    assert desk.tracker.level == DiagnosticStatus.ERROR
+
+
+def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker):
+    bench = make_bench('-p', 'diagnostics_period:=0.05', '-r', '__ns:=/auv1',
+                       '-p', 'use_sim_time:=true')  # no /clock at all: still it reports
+    heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    bench.add(TrackerNode('walker', context=bench.context))
+    bench.spin_until(lambda: len(heard) >= 3)
+    assert [status.name for status in heard[-1].status] == ['auv1/walker: input',
+                                                            'auv1/walker: tracker']
+    values = {pair.key: pair.value for pair in heard[-1].status[0].values}
+    assert values['fix topic'] == '/auv1/fix'

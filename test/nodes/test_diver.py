@@ -1,0 +1,72 @@
+"""The diver node's displays: odometry of every confirmed diver, probabilities of one."""
+
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+
+from msg_adapters.fixes import write_fix
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fix
+from sonar_imm.nodes.diver import DiverNode
+from sonar_imm.nodes.messages import make, message_class
+
+
+@pytest.fixture
+def rig(make_bench):
+    bench = make_bench()
+    node = bench.add(DiverNode(context=bench.context))
+    odometry = bench.listen(Odometry, '/diver/odometry')
+    probabilities = bench.listen(JointState, '/diver/model_probabilities')
+    bench.spin_until(lambda: node.count_subscribers('/diver/odometry')
+                     and node.count_subscribers('/diver/model_probabilities'))
+    return bench, node, odometry, probabilities
+
+
+def an_estimate(ids, states):
+    rows = len(ids)
+    return Estimate(
+        stamp_ns=5 * 10**9, frame_id='map', xyz=np.zeros((rows, 3), np.float32),
+        state_names=('px', 'py', 'vx', 'vy'), state=np.arange(4.0 * rows).reshape(rows, 4),
+        covariance=np.tile(np.eye(4), (rows, 1, 1)), model_names=('heading_000', 'hover'),
+        probabilities=np.array([[0.25 + 0.01 * i, 0.75 - 0.01 * i] for i in ids]).reshape(-1, 2),
+        extras={'track_id': np.array(ids, np.uint32), 'track_state': np.array(states, np.uint8),
+                'nis': np.full(rows, np.nan)})
+
+
+def test_confirmed_divers_are_shown_and_the_oldest_gives_the_probabilities(rig):
+    bench, node, odometry, probabilities = rig
+    node.show(an_estimate([9, 3, 5, 2], [1, 2, 1, 0]))  # 2 is tentative, 3 coasts
+    bench.spin_until(lambda: len(odometry) == 3 and probabilities)
+    assert [m.child_frame_id for m in odometry] == ['diver_9', 'diver_3', 'diver_5']
+    assert odometry[1].twist.twist.linear.x == 6.0
+    assert odometry[1].header.stamp.sec == 5
+    assert len(probabilities) == 1
+    assert list(probabilities[0].name) == ['heading_000', 'hover']
+    assert probabilities[0].position[0] == pytest.approx(0.28)
+
+
+def test_nothing_is_shown_of_tentative_tracks_and_of_none(rig):
+    bench, node, odometry, probabilities = rig
+    node.show(an_estimate([1], [0]))
+    node.show(an_estimate([], []))
+    node.show(an_estimate([1], [1]))
+    bench.spin_until(lambda: odometry and probabilities)
+    assert len(odometry) == len(probabilities) == 1
+
+
+def test_a_diver_is_tracked_from_fixes(rig):
+    bench, node, odometry, probabilities = rig
+    publisher = bench.peer.create_publisher(
+        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10)
+    bench.spin_until(publisher.get_subscription_count)
+    for second in range(1, 31):
+        publisher.publish(write_fix(Fix(
+            stamp_ns=second * 10**9, position=(1.0 * second, 0.0, 0.0),
+            covariance=0.01 * np.eye(2), frame_id='map'), make))
+        bench.spin_until(lambda want=second: node._meter.received['fix'] == want)
+    bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 30)
+    assert odometry[-1].pose.pose.position.x == pytest.approx(30.0, abs=0.5)
+    assert odometry[-1].twist.twist.linear.x == pytest.approx(1.0, abs=0.2)
+    best = int(np.argmax(probabilities[-1].position))
+    assert probabilities[-1].name[best] == 'heading_000'
