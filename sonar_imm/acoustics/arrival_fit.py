@@ -32,6 +32,8 @@ MAX_ITERATIONS = 60
 SMALLEST_GAIN = 1e-7
 """A step ends the iteration when it promises to lower chi-square by less than this share of it (or
 1e-10)."""
+FAR = 10.0
+"""A run further out than this many `max_range` is given up where it is."""
 SAME_POINT = 1e-3
 """Minima closer than this, in metres, are one."""
 
@@ -188,8 +190,7 @@ class Minima:
 
 
 def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
-    """Levenberg-Marquardt from every start (k, 2) at once; `weight` (m,) or one row a start (k,
-    m)."""
+    """Levenberg-Marquardt from every start (k, 2) at once; `weight` (m,), or (k, m) by start."""
     weight = np.broadcast_to(weight, (len(starts), len(fit.weight)))
     position, damping = starts.copy(), np.full(len(starts), 1e-3)
     residual, jacobian = fit.residuals(position, weight)
@@ -206,6 +207,9 @@ def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
         gain = (gradient * step).sum(axis=-1)
         converged |= (gain < SMALLEST_GAIN * cost + 1e-10) & (~better | (damping <= 1.0))
         position = np.where(better[:, None], trial, position)
+        # Hyperbolas lead some runs to infinity: nothing plausible lies there, so they end.
+        away = np.abs(position - fit.centre).max(axis=-1)
+        converged |= away > FAR * fit.max_range
         cost = np.where(better, trial_cost, cost)
         trial_information, trial_gradient = _normal_equations(residual, jacobian, weight)
         information = np.where(better[:, None, None], trial_information, information)
