@@ -25,8 +25,9 @@ def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) ->
         topic, write = _WRITERS[type(one.measurement)]
         records.append((one.received_ns, topic, write(one.measurement, ros_message)))
     for track in scene.truth:
-        records += track_records(track.stamp_ns, track.position, track.velocity, track.track_id,
-                                 scene.frame_id)
+        records += track_records(
+            track.stamp_ns, track.position, track.velocity, track.track_id, scene.frame_id
+        )
     with BagWriter(out, custom_data=provenance) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)

@@ -69,12 +69,9 @@ class RosbagsSource:
     def __init__(self, path: Path):
         self._reader = AnyReader([path], default_typestore=typestore())
         self._reader.open()
-        try:
-            # rosbags ignores its default types as soon as the bag defines a single one
-            _add_known_types(self._reader.typestore)
-        except BaseException:
-            self._reader.close()
-            raise
+        # rosbags ignores its default types as soon as the bag defines a single one
+        _add_known_types(self._reader.typestore, [link.msgtype for link in
+                                                  self._reader.connections])
 
     @property
     def custom_data(self) -> dict[str, str]:
@@ -124,7 +121,8 @@ class ScanSource:
                 self._types.register(get_types_from_idl(channel.definition))
             elif channel.definition:
                 self._types.register(get_types_from_msg(channel.definition, channel.type_name))
-        _add_known_types(self._types)
+        _add_known_types(self._types, [channel.type_name
+                                       for channel in self._scan.channels.values()])
 
     def topics(self) -> list[TopicInfo]:
         return [TopicInfo(channel.topic, channel.type_name, self._scan.counts[number],
@@ -192,32 +190,33 @@ def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], l
     failures = []
     for file in files:
         try:
-            source = _open_file(file)
+            source, damage = _open_file(file)
         except Exception as error:  # see the module docstring
             failures.append(f'{file} cannot be read: {one_line(error)}{_advice(file)}')
             continue
         sources.append(source)
-        if lost := getattr(source, 'lost', ''):
-            problems.append(f'{file} {lost}; {sum(topic.count for topic in source.topics())} '
-                            'messages were recovered, the rest is lost')
-        problems += _leftovers(file)
+        problems += damage + _leftovers(file)
     if not sources:
         raise BagError('; '.join(failures))
     return sources, problems + failures
 
 
-def _open_file(file: Path) -> Source:
+def _open_file(file: Path) -> tuple[Source, list[str]]:
     """Open one storage file by rosbags or, for MCAP that it refuses, by a scan."""
     try:
         source = RosbagsSource(file)
     except Exception:
         if file.suffix != '.mcap' or not file.stat().st_size:
             raise
-        return ScanSource(file)
+        scan = ScanSource(file)
+        count = sum(topic.count for topic in scan.topics())
+        if scan.lost:
+            return scan, [f'{file} {scan.lost}; {count} messages were recovered, the rest is lost']
+        return scan, [f'{file} has a damaged end; all its {count} messages were recovered']
     if source.unordered:
         source.close()
-        return ScanSource(file)
-    return source
+        return ScanSource(file), []
+    return source, []
 
 
 def _unpacked(raw: bytes) -> bytes:
@@ -242,10 +241,11 @@ def _split_order(file: Path) -> tuple[int, str]:
     return len(file.name), file.name
 
 
-def _add_known_types(types: Any) -> None:
+def _add_known_types(types: Any, names: list[str]) -> None:
     """Let `types` fall back on the Jazzy definitions for what the recording does not define."""
     known = typestore().fielddefs
-    types.register({name: known[name] for name in known if name not in types.fielddefs})
+    if any(name in known and name not in types.fielddefs for name in names):
+        types.register({name: known[name] for name in known if name not in types.fielddefs})
 
 
 def one_line(error: Exception) -> str:

@@ -1,0 +1,42 @@
+import os
+from pathlib import Path
+
+import pytest
+
+from msg_adapters.fixes import write_fix
+from sonar_imm.measurements import Fix
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.writer import BagWriter
+
+START = 1_700_000_000 * 10**9
+
+
+@pytest.fixture
+def real_data():
+    """The folder of real recordings, or a skip."""
+    default = Path(__file__).resolve().parents[2].parent / 'shared' / 'data'
+    folder = Path(os.environ.get('SONAR_IMM_DATA', default))
+    if not folder.is_dir():
+        pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
+    return folder
+
+
+@pytest.fixture
+def fix_message():
+    """Make the message of the i-th fix, one a second."""
+    def make(i, **changes):
+        return write_fix(Fix(**{'stamp_ns': START + i * 10**9, 'position': (i, 2.0, 0.0),
+                                'covariance': [[4.0, 0.5], [0.5, 9.0]], 'frame_id': 'map',
+                                **changes}), ros_message)
+    return make
+
+
+@pytest.fixture
+def write_fixes(tmp_path, fix_message):
+    """Write a bag of n fixes and give its path."""
+    def write(n=50, name='bag', **options):
+        with BagWriter(tmp_path / name, **options) as bag:
+            for i in range(n):
+                bag.write('/fix', fix_message(i), START + i * 10**9)
+        return tmp_path / name
+    return write

@@ -1,0 +1,263 @@
+import shutil
+import sqlite3
+import struct
+
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+from sonar_imm.recordings.messages import ros_message, typestore
+from sonar_imm.recordings.reader import BagError, BagReader
+from sonar_imm.recordings.writer import BagWriter
+
+FIX = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+CUSTOM = 'my_msgs/msg/Custom'
+KINDS = [(plugin, mode) for plugin in StoragePlugin for mode in CompressionMode
+         if (plugin, mode) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)]
+
+
+def storage_file(path):
+    return next(file for file in path.iterdir() if file.suffix in ('.mcap', '.db3'))
+
+
+def read(path, **options):
+    with BagReader(path, **options) as bag:
+        return list(bag.messages()), bag.problems
+
+
+def cut(path, share):
+    data = path.read_bytes()
+    path.write_bytes(data[:int(len(data) * share)])
+
+
+class TestWhole:
+    @pytest.mark.parametrize('version', [8, 9])
+    @pytest.mark.parametrize('plugin, mode', KINDS)
+    def test_every_kind_of_rosbag2(self, tmp_path, fix_message, plugin, version, mode):
+        writer = Writer(tmp_path / 'bag', version=version, storage_plugin=plugin)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            link = writer.add_connection('/fix', FIX, typestore=typestore())
+            for i in range(5):
+                writer.write(link, 10 + i, typestore().serialize_cdr(fix_message(i), FIX))
+        items, problems = read(tmp_path / 'bag')
+        assert [item.log_ns for item in items] == [10, 11, 12, 13, 14] and not problems
+        assert [item.message.pose.pose.position.x for item in items] == [0, 1, 2, 3, 4]
+        assert [item.index for item in items] == [0, 1, 2, 3, 4]
+
+    @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+    def test_a_bare_file_and_a_directory_without_metadata(self, write_fixes, storage):
+        path = write_fixes(storage=storage)
+        file = storage_file(path)
+        assert len(read(file)[0]) == 50 and not read(file)[1]
+        assert len(read(path / 'metadata.yaml')[0]) == 50
+        (path / 'metadata.yaml').unlink()
+        items, problems = read(path)
+        assert len(items) == 50 and len(problems) == 1 and 'no metadata.yaml' in problems[0]
+
+    def test_a_ros_1_bag(self, tmp_path):
+        store = get_typestore(Stores.ROS1_NOETIC)
+        types = store.types
+        with Writer1(tmp_path / 'old.bag') as writer:
+            kind = 'geometry_msgs/msg/PointStamped'
+            link = writer.add_connection('/fix', kind, typestore=store)
+            stamp = types['builtin_interfaces/msg/Time'](sec=5, nanosec=7)
+            header = types['std_msgs/msg/Header'](seq=1, stamp=stamp, frame_id='map')
+            point = types['geometry_msgs/msg/Point'](x=1.0, y=2.0, z=3.0)
+            writer.write(link, 9, store.serialize_ros1(types[kind](header, point), kind))
+        items, problems = read(tmp_path / 'old.bag')
+        assert items[0].message.point.y == 2.0 and items[0].type_name == kind and not problems
+
+    def test_files_of_a_split_bag_are_merged_by_log_time(self, tmp_path, fix_message):
+        split = tmp_path / 'split'
+        split.mkdir()
+        for number, logs in (('2', [30, 50]), ('10', [40, 50])):
+            with BagWriter(tmp_path / f's_{number}') as bag:
+                for log in logs:
+                    bag.write('/fix', fix_message(int(number)), log)
+            shutil.copy(tmp_path / f's_{number}' / f's_{number}.mcap', split)
+        items, _ = read(split)
+        assert [(item.log_ns, item.message.pose.pose.position.x) for item in items] == [
+            (30, 2), (40, 10), (50, 2), (50, 10)]
+        with BagReader(split) as bag:
+            assert [(topic.name, topic.count) for topic in bag.topics] == [('/fix', 4)]
+
+
+class TestOrder:
+    def late(self, tmp_path, fix_message):
+        with BagWriter(tmp_path / 'bag') as bag:
+            for i, log in ((2, 10), (0, 20), (1, 20), (3, 5)):
+                bag.write('/fix', fix_message(i), log)
+            bag.write('/note', ros_message('std_msgs/msg/String', data='no stamp'), 7)
+        return tmp_path / 'bag'
+
+    def test_recorded_order_is_log_time_then_order_of_the_file(self, tmp_path, fix_message):
+        with BagReader(self.late(tmp_path, fix_message)) as bag:
+            order = [item.message.pose.pose.position.x for item in bag.messages(['/fix'])]
+            assert order == [3, 2, 0, 1]
+
+    def test_stamp_order_undoes_lateness(self, tmp_path, fix_message):
+        with BagReader(self.late(tmp_path, fix_message)) as bag:
+            items = list(bag.messages(order='stamp'))
+            assert items[0].topic == '/note'
+            assert [item.message.pose.pose.position.x for item in items[1:]] == [0, 1, 2, 3]
+            assert [item.index for item in items] == [1, 3, 4, 2, 0]
+            with pytest.raises(ValueError, match='recorded, stamp'):
+                next(bag.messages(order='random'))
+
+    def test_without_decoding_the_bytes_remain(self, tmp_path, fix_message):
+        with BagReader(self.late(tmp_path, fix_message)) as bag:
+            item = next(bag.messages(['/note'], decode=False))
+            assert item.message is None
+            assert typestore().deserialize_cdr(item.raw, item.type_name).data == 'no stamp'
+
+    def test_an_unknown_topic_gives_nothing(self, write_fixes):
+        with BagReader(write_fixes(3)) as bag:
+            assert list(bag.messages(['/other'])) == [] and list(bag.messages([])) == []
+
+
+class TestDamage:
+    @pytest.mark.parametrize('share', [0.3, 0.9, 0.999])
+    def test_a_truncated_mcap_gives_what_is_before_the_damage(self, write_fixes, share):
+        path = write_fixes()
+        whole = read(path)[0]
+        file = storage_file(path)
+        cut(file, share)
+        for target in (path, file):
+            items, problems = read(target)
+            assert 50 * share * 0.7 < len(items) <= 50
+            assert [item.raw for item in items] == [item.raw for item in whole[:len(items)]]
+            assert f'{len(items)} messages' in problems[-1] and 'recovered' in problems[-1]
+            with pytest.raises(BagError), BagReader(target, strict=True):
+                pass
+
+    @pytest.mark.parametrize('share', [0.0, 0.2, 0.9])
+    def test_a_truncated_db3_is_one_sentence(self, write_fixes, share):
+        path = write_fixes(500, storage='sqlite3')
+        cut(storage_file(path), share)
+        with pytest.raises(BagError, match='sqlite3 bag.db3 .recover') as caught:
+            read(path)
+        assert '\n' not in caught.value.sentence
+
+    def test_the_end_of_a_db3_that_is_missing_is_a_problem(self, write_fixes):
+        path = write_fixes(500, storage='sqlite3')
+        data = storage_file(path).read_bytes()
+        storage_file(path).write_bytes(data[:len(data) - 1000])
+        items, problems = read(path)
+        assert 0 < len(items) < 500 and 'damaged' in problems[0] and 'lost' in problems[0]
+        with pytest.raises(BagError, match='damaged'):
+            read(path, strict=True)
+
+    def test_rows_in_a_write_ahead_log_are_told(self, write_fixes):
+        path = write_fixes(3, storage='sqlite3')
+        log = path / 'bag.db3-wal'
+        log.touch()
+        assert not read(path)[1]
+        log.write_bytes(bytes(100))
+        for target in (path, path / 'bag.db3'):
+            items, problems = read(target)
+            assert len(items) == 3 and 'bag.db3-wal holds 100 bytes' in problems[0]
+
+    def test_a_real_write_ahead_log_hides_rows_from_the_reader(self, write_fixes):
+        path = write_fixes(3, storage='sqlite3')
+        recorder = sqlite3.connect(path / 'bag.db3')
+        recorder.execute('pragma journal_mode=wal')
+        recorder.execute("insert into messages (topic_id, timestamp, data) values (1, 9, x'00')")
+        recorder.commit()
+        copy = path.parent / 'crashed'
+        shutil.copytree(path, copy)
+        recorder.close()
+        items, problems = read(copy)
+        assert len(items) == 3 and 'not read' in problems[0]
+
+    def test_a_flipped_bit_costs_one_message_not_the_bag(self, tmp_path, fix_message):
+        with BagWriter(tmp_path / 'bag') as bag:
+            for i in range(3):
+                raw = bytearray(typestore().serialize_cdr(fix_message(i), FIX))
+                if i == 1:
+                    raw[12:16] = struct.pack('<I', 2**31)  # length of frame_id
+                bag.write_raw('/fix', FIX, bytes(raw), i)
+        items, problems = read(tmp_path / 'bag')
+        assert [item.index for item in items] == [0, 2]
+        assert problems[0].startswith('topic /fix: 1 message could not be decoded')
+        with pytest.raises(BagError, match='message 1'):
+            read(tmp_path / 'bag', strict=True)
+
+    def test_missing_files_of_the_metadata(self, write_fixes):
+        path = write_fixes()
+        storage_file(path).rename(path / 'other.mcap')
+        items, problems = read(path)
+        assert len(items) == 50 and 'missing' in problems[0]
+
+    def test_metadata_that_are_no_yaml(self, write_fixes):
+        path = write_fixes()
+        (path / 'metadata.yaml').write_text('{[')
+        items, problems = read(path)
+        assert len(items) == 50 and len(problems) == 1 and '\n' not in problems[0]
+
+    @pytest.mark.parametrize('name, content', [
+        ('no', None), ('x.mcap', b''), ('x.mcap', b'nonsense'), ('x.db3', b'nonsense' * 100),
+        ('x.bag', b'nonsense'), ('x.txt', b''), ('x.mcap.zstd', b''), ('dir', 'dir'),
+        ('x.mcap', b'\x89MCAP0\r\n'), ('x.bag', b'')])
+    def test_what_is_no_recording_is_one_sentence(self, tmp_path, name, content):
+        path = tmp_path / name
+        if content == 'dir':
+            path.mkdir()
+        elif content is not None:
+            path.write_bytes(content)
+        try:
+            items, problems = read(path)
+        except BagError as error:
+            assert str(path) in error.sentence and '\n' not in error.sentence
+        else:
+            assert not items and 'cut off' in problems[0]
+
+
+class TestTypes:
+    def add_custom(self, path, *, known=True, definition=True):
+        """Write /custom of a type nobody knows, and perhaps /fix, into an sqlite3 bag."""
+        store = get_typestore(Stores.ROS2_JAZZY)
+        store.register(get_types_from_msg('float64 value', CUSTOM))
+        with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            link = writer.add_connection('/custom', CUSTOM, typestore=store)
+            writer.write(link, 1, store.serialize_cdr(store.types[CUSTOM](value=2.5), CUSTOM))
+            if known:
+                link = writer.add_connection('/text', 'std_msgs/msg/String', typestore=store)
+                text = store.types['std_msgs/msg/String'](data='hello')
+                writer.write(link, 2, store.serialize_cdr(text, 'std_msgs/msg/String'))
+        if not definition:
+            with sqlite3.connect(storage_file(path)) as database:
+                database.execute('delete from message_definitions where topic_type = ?', (CUSTOM,))
+            database.close()
+
+    def test_a_type_defined_in_the_bag_is_read(self, tmp_path):
+        self.add_custom(tmp_path / 'bag')
+        items, problems = read(tmp_path / 'bag')
+        assert items[0].message.value == 2.5 and not problems
+
+    def test_an_undefined_type_is_told_and_the_rest_is_read(self, tmp_path):
+        self.add_custom(tmp_path / 'bag', definition=False)
+        with BagReader(tmp_path / 'bag') as bag:
+            assert [(topic.name, topic.decodable) for topic in bag.topics] == [
+                ('/custom', False), ('/text', True)]
+            assert CUSTOM in bag.problems[0]
+            assert [item.message.data for item in bag.messages(['/text'])] == ['hello']
+            assert [item.topic for item in bag.messages()] == ['/text']
+            assert 'could not be decoded' in bag.problems[1]
+
+    def test_a_bag_without_any_definition_uses_the_known_ones(self, tmp_path):
+        self.add_custom(tmp_path / 'bag')
+        with sqlite3.connect(storage_file(tmp_path / 'bag')) as database:
+            database.execute('delete from message_definitions')
+        database.close()
+        items, problems = read(tmp_path / 'bag')
+        assert [item.topic for item in items] == ['/text'] and CUSTOM in problems[0]
+
+    def test_a_known_type_is_read_although_only_another_one_is_defined(self, tmp_path):
+        self.add_custom(tmp_path / 'bag')
+        with sqlite3.connect(storage_file(tmp_path / 'bag')) as database:
+            database.execute("delete from message_definitions where topic_type like 'std_msgs%'")
+        database.close()
+        items, problems = read(tmp_path / 'bag')
+        assert [item.topic for item in items] == ['/custom', '/text'] and not problems

@@ -1,0 +1,67 @@
+import filecmp
+
+import pytest
+
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.sources import BagError
+from sonar_imm.recordings.writer import BagWriter
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_the_same_input_gives_the_same_bytes_of_every_file(tmp_path, write_fixes, storage):
+    first = write_fixes(name='one/bag', storage=storage, custom_data={'b': '2', 'a': '1'})
+    second = write_fixes(name='two/bag', storage=storage, custom_data={'a': '1', 'b': '2'})
+    names = sorted(file.name for file in first.iterdir())
+    assert 'metadata.yaml' in names and len(names) == 2
+    assert filecmp.cmpfiles(first, second, names, shallow=False) == (names, [], [])
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_what_is_written_is_read(write_fixes, storage):
+    with BagReader(write_fixes(7, storage=storage, custom_data={'source': 'x.csv'})) as bag:
+        assert [(topic.name, topic.count) for topic in bag.topics] == [('/fix', 7)]
+        assert bag.custom_data == {'source': 'x.csv'} and not bag.problems
+        assert [item.message.pose.pose.position.x for item in bag.messages()] == list(range(7))
+
+
+def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
+    path = write_fixes(1)
+    text = (path / 'metadata.yaml').read_text()
+    assert 'version: 8' in text
+    with BagReader(path) as bag:
+        profile, = bag.topics[0].offered_qos
+        assert profile.reliability.name == 'RELIABLE' and profile.depth == 10
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_an_exception_does_not_lose_what_was_written(tmp_path, fix_message, storage):
+    with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / 'bag', storage=storage) as bag:
+        bag.write('/fix', fix_message(0), 5)
+        raise KeyboardInterrupt
+    with BagReader(tmp_path / 'bag') as bag:
+        assert len(list(bag.messages())) == 1 and not bag.problems
+
+
+def test_an_existing_target_is_left_alone(write_fixes, tmp_path):
+    path = write_fixes(3)
+    with pytest.raises(BagError, match='exists already'):
+        BagWriter(path)
+    with BagReader(path) as bag:
+        assert bag.topics[0].count == 3
+    (tmp_path / 'file').write_text('x')
+    with pytest.raises(BagError, match='cannot be written|exists'):
+        BagWriter(tmp_path / 'file' / 'bag')
+
+
+def test_an_empty_bag_is_a_bag(tmp_path):
+    with BagWriter(tmp_path / 'bag'):
+        pass
+    with BagReader(tmp_path / 'bag') as bag:
+        assert bag.topics == [] and list(bag.messages()) == [] and not bag.problems
+
+
+def test_programming_errors_are_told(tmp_path, fix_message):
+    with pytest.raises(ValueError, match='mcap, sqlite3'):
+        BagWriter(tmp_path / 'bag', storage='zip')
+    with BagWriter(tmp_path / 'bag') as bag, pytest.raises(ValueError, match='log time'):
+        bag.write('/fix', fix_message(0), -1)
