@@ -91,8 +91,9 @@ def run_lockstep(path: Path | str, system: str, *, params_file: Path | str | Non
 class NodeProcess:
     """A node of this package as a process of its own; stopped at the end of ``with``."""
 
-    def __init__(self, system: str, *, domain_id: int, arguments: Sequence[str] = ()):
-        """Start it. `arguments` follow ``--ros-args``."""
+    def __init__(self, system: str, *, domain_id: int, arguments: Sequence[str] = (),
+                 module: str = ''):
+        """Start it. `arguments` follow ``--ros-args``; `module` is where its ``main`` is."""
         self.system = system
         root = str(Path(__file__).resolve().parents[2])
         environment = dict(os.environ, ROS_DOMAIN_ID=str(domain_id), PYTHONUNBUFFERED='1',
@@ -100,7 +101,7 @@ class NodeProcess:
                                filter(None, [root, os.environ.get('PYTHONPATH')])))
         self._log = tempfile.NamedTemporaryFile(mode='ab', prefix=f'sonar_imm_{system}_')
         self.process = subprocess.Popen(
-            [sys.executable, '-m', f'sonar_imm.nodes.{system}', '--ros-args',
+            [sys.executable, '-m', module or f'sonar_imm.nodes.{system}', '--ros-args',
              '-r', f'__node:={system}', *arguments],
             env=environment, stdout=self._log, stderr=subprocess.STDOUT)
 

@@ -27,7 +27,7 @@ from .qos import lockstep_qos, output_qos
 CLOCK_HZ = 40.0
 """Rate of /clock where only ``--clock`` is said, as in ``ros2 bag play``."""
 NAME = 'sonar_imm_player'
-_GREETING = 1.0
+_FIRST_LISTENER, _OTHER_LISTENERS = 5.0, 0.5
 _DEPTH = 100
 _NANO = 10**9
 
@@ -142,13 +142,17 @@ class Player:
     def _meet(self, limit: float) -> set[str]:
         """Wait for listeners; gives the published names that go in lock-step.
 
-        Without lock-step it waits a moment at most: there may rightly be no listener.
+        Without lock-step it waits a few seconds for the first listener at most, and then a moment
+        for the others: rightly, there may be none on some topics.
         """
         publishers = self._publishers.values()
         if self._lockstep:
             return self._lockstep.connect(publishers, limit)
+        if not self._link.wait_for(lambda: any(p.get_subscription_count() for p in publishers),
+                                   _FIRST_LISTENER):
+            self._problems.append('nobody was listening when playing began')
         self._link.wait_for(lambda: all(p.get_subscription_count() for p in publishers),
-                            _GREETING)
+                            _OTHER_LISTENERS)
         return set()
 
     def _play_once(self, stepped: set[str], progress: Callable[[int], None]) -> None:

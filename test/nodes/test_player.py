@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
 from sonar_imm.nodes import lockstep as lockstep_module
+from sonar_imm.nodes import player as player_module
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.harness import reserved_domain_id
 from sonar_imm.nodes.link import Link, LinkError
@@ -89,10 +90,18 @@ def test_topics_remapping_and_offset(bag, link, domain):
     assert ear.positions(COUNT - 10) == list(range(10, COUNT))
 
 
-def test_the_pace_follows_the_log_times(bag, domain):
+def test_the_pace_follows_the_log_times(bag, link, domain):
+    Ear(link, PoseWithCovarianceStamped, '/fix')
     start = time.monotonic()
     play(bag, PlayOptions(rate=0.5, topics=('/fix',)), domain_id=domain)
     assert time.monotonic() - start >= (COUNT - 1) * STEP / 1e9 / 0.5
+
+
+def test_playing_to_nobody_is_noticed(bag, domain, monkeypatch):
+    monkeypatch.setattr(player_module, '_FIRST_LISTENER', 0.2)
+    result = play(bag, PlayOptions(rate=10.0), domain_id=domain)
+    assert result.published == COUNT + 1
+    assert result.problems == ('nobody was listening when playing began',)
 
 
 def test_pace_maps_both_ways_and_allows_for_pauses():
@@ -105,7 +114,8 @@ def test_pace_maps_both_ways_and_allows_for_pauses():
 
 def test_the_clock_runs_along(bag, link, domain):
     ear = Ear(link, Clock, '/clock')
-    play(bag, PlayOptions(clock=100.0), domain_id=domain)
+    Ear(link, PoseWithCovarianceStamped, '/fix')
+    play(bag, PlayOptions(clock=100.0, topics=('/fix',)), domain_id=domain)
     link.wait_for(lambda: len(ear.heard) >= 5, 10.0)
     ticks = [tick.clock.sec * 10**9 + tick.clock.nanosec for tick in ear.heard]
     assert ticks == sorted(ticks)

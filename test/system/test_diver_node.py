@@ -1,0 +1,167 @@
+"""The real diver node as a process: lock-step against offline, signals, bad parameters."""
+
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from msg_adapters.fixes import write_fix
+from msg_adapters.frames import FrameGuard
+from sonar_imm.measurements import Fix, Rejection
+from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id, run_lockstep
+from sonar_imm.nodes.link import LinkError
+from sonar_imm.recordings.measurements import measurements_of
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.writer import BagWriter
+from sonar_imm.trackers import SYSTEMS
+
+pytestmark = pytest.mark.system
+
+START = 1_700_000_000 * 10**9
+SECOND = 10**9
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Two divers and what a sea trial adds: late, repeated, unusable and far-off fixes."""
+    path = tmp_path_factory.mktemp('bags') / 'rough'
+    rng = np.random.default_rng(20240)
+    with BagWriter(path) as writer:
+        log_ns = START
+        for k in range(120):
+            for diver in (0, 1):
+                late = 3 if k % 11 == 10 else 0
+                stamp = START + (k - late) * SECOND + (late > 0) * SECOND // 3
+                place = np.array([-40.0 + 0.7 * k + 30.0 * diver, 40.0 - 0.5 * k, 0.0])
+                place[:2] += rng.normal(scale=0.3, size=2) + (k % 23 == 22) * 500.0
+                message = write_fix(Fix(stamp_ns=stamp, position=place, frame_id='map',
+                                        covariance=0.09 * np.eye(2)), ros_message)
+                if k % 17 == 16:
+                    message.pose.pose.position.y = float('inf')
+                if k == 60:
+                    message.header.frame_id = 'odom'
+                log_ns += SECOND // 10
+                writer.write('/usbl/fix', message, log_ns)
+                if k % 19 == 18:
+                    writer.write('/usbl/fix', message, log_ns + 1)
+    return path
+
+
+def offline(path, **parameters):
+    """What the tracker makes of the bag without ROS."""
+    system = SYSTEMS['diver']
+    tracker = system.build(system.config_type()(**parameters))
+    guard, estimates = FrameGuard(), []
+    with BagReader(path) as reader:
+        for heard in measurements_of(reader, 'diver'):
+            try:
+                if not isinstance(heard.measurement, Rejection):
+                    guard.check(heard.measurement)
+                    estimates += tracker.process(heard.measurement)
+            except Rejection:
+                pass
+    return estimates
+
+
+def assert_same_tables(live, recorded):
+    assert [e.stamp_ns for e in live] == [e.stamp_ns for e in recorded]
+    for a, b in zip(live, recorded):
+        assert a.frame_id == b.frame_id
+        left, right = a.columns(), b.columns()
+        assert list(left) == list(right)
+        for name in left:
+            assert left[name].dtype == right[name].dtype, name
+            assert left[name].tobytes() == right[name].tobytes(), name
+
+
+def test_live_lockstep_equals_offline_byte_for_byte(bag):
+    result = run_lockstep(bag, 'diver')
+    expected = offline(bag)
+    assert len(expected) > 100
+    assert_same_tables(result.estimates, expected)
+    assert result.counts.messages == 252
+    assert result.counts.refused > 10
+    assert result.exit_code == 0
+    assert 'Traceback' not in result.log
+    assert 'ready, hears /fix' in result.log
+    assert 0.0 < result.latency_ms()['p50'] <= result.latency_ms()['p99']
+
+
+def test_the_parameter_file_reaches_the_live_node(bag, tmp_path):
+    file = tmp_path / 'diver.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    model_set: cv_cv\n    max_tracks: 3\n'
+                    '    transition_matrix: []\n')
+    result = run_lockstep(bag, 'diver', params_file=file)
+    assert_same_tables(result.estimates, offline(bag, model_set='cv_cv', max_tracks=3))
+
+
+def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
+    file = tmp_path / 'diver.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    sound_speed: 1500\n')
+    with pytest.raises(LinkError, match=r"exit code 2: parameter 'sound_speed' is a double: "
+                                        r'write 1500\.0 instead of 1500'):
+        run_lockstep(bag, 'diver', params_file=file)
+
+
+@pytest.mark.parametrize('arguments, sentence', [
+    (('-p', 'sound_speed:=1500'), 'write 1500.0 instead of 1500'),
+    (('-p', 'sound_speed:=15.0'), 'must be between 1300 and 1700'),
+    (('-p', 'confirm_hits:=9'), 'confirm_hits (9) cannot exceed confirm_window'),
+    (('-p', 'qos_overrides./fix.subscription.reliability:=often'), 'often'),
+    (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
+    (('--no-such-flag',), '--no-such-flag'),
+])
+def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence):
+    with reserved_domain_id() as domain, \
+            NodeProcess('diver', domain_id=domain, arguments=arguments) as node:
+        assert node.process.wait(30.0) == 2
+        lines = [line for line in node.log().splitlines() if '[rcl]' not in line]
+    assert len(lines) == 1
+    assert sentence in lines[0]
+
+
+def wait_until_ready(nodes, limit=90.0):
+    end = time.monotonic() + limit
+    while not all('ready, hears' in node.log() for node in nodes):
+        assert all(node.process.poll() is None for node in nodes)
+        assert time.monotonic() < end, [node.log() for node in nodes]
+        time.sleep(0.02)
+
+
+def assert_clean_end(nodes, how):
+    for node in nodes:
+        node.process.send_signal(how)
+    for node in nodes:
+        assert node.process.wait(15.0) == 0, node.log()
+        assert 'Traceback' not in node.log()
+        assert 'Error' not in node.log()
+
+
+def test_sigterm_ends_the_diver_node_cleanly():
+    with reserved_domain_id() as domain:
+        with NodeProcess('diver', domain_id=domain) as node:
+            wait_until_ready([node])
+            assert_clean_end([node], signal.SIGTERM)
+
+
+@pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_a_node_cleanly_twenty_times(how, monkeypatch):
+    # the light tracker of the node tests starts fast; `run` is the same
+    monkeypatch.setenv('PYTHONPATH', str(Path(__file__).parents[1] / 'nodes'))
+    for _ in range(5):
+        with reserved_domain_id() as domain:
+            nodes = [NodeProcess('walker', domain_id=domain, module='walker') for _ in range(4)]
+            wait_until_ready(nodes)
+            assert_clean_end(nodes, how)
+
+
+def test_modules_of_the_nodes_load_neither_scipy_nor_numba():
+    code = ('import sys, sonar_imm.nodes.diver; '
+            'print([m for m in ("numba", "scipy", "rosbags", "plotly") if m in sys.modules])')
+    said = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == '[]'
