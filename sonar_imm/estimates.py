@@ -1,11 +1,12 @@
-"""What a tracker gives out: one shape for all four systems, a table with one row a target, range bin or reflector."""
+"""What a tracker gives out: one shape for all four systems, a table with one row a target, range
+bin or reflector."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 from attrs import field, frozen
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -33,24 +34,37 @@ class Estimate:
         return len(self.state)
 
     def columns(self) -> dict[str, NDArray]:
-        """The columns of ``~/estimate`` in the order of the contract: x y z, states, cov_<a>_<b>, prob_<model>, extras."""
-        table: dict[str, NDArray] = dict(zip('xyz', np.asarray(self.xyz, np.float32).reshape(-1, 3).T))
+        """The columns of ``~/estimate`` in the order of the contract: x y z, states, cov_<a>_<b>,
+        prob_<model>, extras."""
+        table: dict[str, NDArray] = dict(
+            zip('xyz', np.asarray(self.xyz, np.float32).reshape(-1, 3).T)
+        )
         table.update(zip(self.state_names, self.state.T))
         for i, a in enumerate(self.state_names):
             for j, b in enumerate(self.state_names[i:], start=i):
                 table[f'cov_{a}_{b}'] = self.covariance[:, i, j]
-        table.update((f'prob_{name}', column) for name, column in zip(self.model_names, self.probabilities.T))
+        table.update(
+            (f'prob_{name}', column)
+            for name, column in zip(self.model_names, self.probabilities.T)
+        )
         table.update(self.extras)
         return table
 
     @classmethod
-    def from_columns(cls, columns: Mapping[str, NDArray], *, stamp_ns: int, frame_id: str = '') -> Estimate:
-        """Inverse of `columns`. Raises ValueError when x, y, z or a covariance column is missing."""
+    def from_columns(
+        cls, columns: Mapping[str, NDArray], *, stamp_ns: int, frame_id: str = ''
+    ) -> Estimate:
+        """Inverse of `columns`. Raises ValueError when x, y, z or a covariance column is
+        missing."""
         names = list(columns)
         if names[:3] != ['x', 'y', 'z']:
             raise ValueError('an estimate table starts with the columns x, y, z')
-        states = tuple(name[4:4 + (len(name) - 5) // 2] for name in names
-                       if name.startswith('cov_') and name[4:4 + (len(name) - 5) // 2] == name[5 + (len(name) - 5) // 2:])
+        states = tuple(
+            name[4 : 4 + (len(name) - 5) // 2]
+            for name in names
+            if name.startswith('cov_')
+            and name[4 : 4 + (len(name) - 5) // 2] == name[5 + (len(name) - 5) // 2 :]
+        )
         models = tuple(name[5:] for name in names if name.startswith('prob_'))
         rows, n = len(columns['x']), len(states)
         covariance = np.empty((rows, n, n))
@@ -60,10 +74,20 @@ class Estimate:
                     raise ValueError(f'an estimate table needs the column cov_{a}_{b}')
                 covariance[:, i, j] = covariance[:, j, i] = columns[f'cov_{a}_{b}']
         used = {'x', 'y', 'z', *states}
-        return cls(stamp_ns=stamp_ns, frame_id=frame_id,
-                   xyz=np.column_stack([columns[c] for c in 'xyz']).astype(np.float32),
-                   state_names=states, state=np.column_stack([columns[s] for s in states]) if n else np.empty((rows, 0)),
-                   covariance=covariance, model_names=models,
-                   probabilities=np.column_stack([columns[f'prob_{m}'] for m in models]) if models else np.empty((rows, 0)),
-                   extras={name: np.asarray(columns[name]) for name in names
-                           if name not in used and not name.startswith(('cov_', 'prob_'))})
+        return cls(
+            stamp_ns=stamp_ns,
+            frame_id=frame_id,
+            xyz=np.column_stack([columns[c] for c in 'xyz']).astype(np.float32),
+            state_names=states,
+            state=np.column_stack([columns[s] for s in states]) if n else np.empty((rows, 0)),
+            covariance=covariance,
+            model_names=models,
+            probabilities=np.column_stack([columns[f'prob_{m}'] for m in models])
+            if models
+            else np.empty((rows, 0)),
+            extras={
+                name: np.asarray(columns[name])
+                for name in names
+                if name not in used and not name.startswith(('cov_', 'prob_'))
+            },
+        )

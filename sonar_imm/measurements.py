@@ -1,22 +1,24 @@
 """What a tracker takes in: frozen values in SI units and radians, stamps in integer nanoseconds.
 
-A measurement that cannot be used is never built: its class raises `Rejection`, which carries a reason code to count
-and one sentence to show. The classes know nothing of ROS; `msg_adapters` makes them from messages.
+A measurement that cannot be used is never built: its class raises `Rejection`, which carries a
+reason code to count and one sentence to show. The classes know nothing of ROS; `msg_adapters`
+makes them from messages.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from attrs import field, frozen
+import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
 
 class Rejection(ValueError):
-    """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence` tells the user."""
+    """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
+    tells the user."""
 
     def __init__(self, reason: str, sentence: str):
         self.reason = reason
@@ -26,12 +28,16 @@ class Rejection(ValueError):
 
 def _floats(*shape: int | None) -> Any:
     """Converter to a read-only float64 array; a None in `shape` matches any length."""
+
     def convert(value: Any) -> FloatArray:
         array = np.array(value, dtype=np.float64)
-        if len(shape) != array.ndim or any(want not in (None, got) for want, got in zip(shape, array.shape)):
+        if len(shape) != array.ndim or any(
+            want not in (None, got) for want, got in zip(shape, array.shape)
+        ):
             raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
         array.flags.writeable = False
         return array
+
     return convert
 
 
@@ -42,9 +48,12 @@ def _ids(value: Any) -> NDArray[np.uint16]:
 
 
 def check_stamp(stamp_ns: int) -> None:
-    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year 2262."""
+    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
+    2262."""
     if not 0 < stamp_ns < 2**63:
-        raise Rejection('bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in')
+        raise Rejection(
+            'bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in'
+        )
 
 
 def check_covariance(covariance: FloatArray, what: str) -> None:
@@ -76,7 +85,10 @@ class Fix:
         if not np.isfinite(self.position[:2]).all():
             raise Rejection('nan', 'the fix has a position that is not finite')
         if np.abs(self.position[:2]).max() > 1e8:
-            raise Rejection('out_of_range', f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin')
+            raise Rejection(
+                'out_of_range',
+                f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin',
+            )
         if self.covariance is not None:
             covariance = _floats(2, 2)(self.covariance)
             check_covariance(covariance, 'a fix')
@@ -87,11 +99,12 @@ class Fix:
 class Arrivals:
     """Arrival times of one ping, one row a transmitter-receiver pair.
 
-    toa: (n,) seconds after the stamp. With a known transmitter (`tx` finite) the stamp is the transmission and the path
-    is transmitter - target - receiver. With `tx` NaN the target itself emits at an unknown time near the stamp
-    (an acoustic tag) and only differences between receivers carry information.
-    tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where unknown; bearing: (n,) rad at the receiver,
-    counter-clockwise from +x, NaN where not measured; var_bearing: (n,) rad^2.
+    toa: (n,) seconds after the stamp. With a known transmitter (`tx` finite) the stamp is the
+    transmission and the path is transmitter - target - receiver. With `tx` NaN the target itself
+    emits at an unknown time near the stamp (an acoustic tag) and only differences between
+    receivers carry information. tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where
+    unknown; bearing: (n,) rad at the receiver, counter-clockwise from +x, NaN where not measured;
+    var_bearing: (n,) rad^2.
     """
 
     stamp_ns: int
@@ -110,7 +123,10 @@ class Arrivals:
         n = len(self.toa)
         for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing'):
             if len(getattr(self, name)) != n:
-                raise Rejection('bad_shape', f'arrivals: {name} has {len(getattr(self, name))} rows, toa has {n}')
+                raise Rejection(
+                    'bad_shape',
+                    f'arrivals: {name} has {len(getattr(self, name))} rows, toa has {n}',
+                )
         if not np.isfinite(self.rx).all():
             raise Rejection('nan', 'arrivals: a receiver position is not finite')
 

@@ -1,21 +1,23 @@
-"""Parameters: declared once, used by the tracker, the ROS node, the offline YAML check and the documentation.
+"""Parameters: declared once, used by the tracker, the ROS node, the offline YAML check and the
+documentation.
 
-A tracker is built from one frozen attrs class that derives from `Config`. Every field is made with `parameter(...)`,
-which keeps the unit, the range and the description beside the default::
+A tracker is built from one frozen attrs class that derives from `Config`. Every field is made with
+`parameter(...)`, which keeps the unit, the range and the description beside the default::
 
     @frozen(kw_only=True)
     class WalkerConfig(Config):
         speed: float = parameter(0.5, 'speed of the walker', unit='m/s', low=0.0)
 
-`Config.from_mapping` builds a config from untrusted keys and reports *every* mistake in one sentence each;
-`Config.specs` lists what a node has to declare; `markdown_table` writes the table for the docs.
+`Config.from_mapping` builds a config from untrusted keys and reports *every* mistake in one
+sentence each; `Config.specs` lists what a node has to declare; `markdown_table` writes the table
+for the docs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 import difflib
 import math
-from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import attrs
@@ -37,8 +39,8 @@ class ConfigError(ValueError):
 
 @frozen
 class ParameterSpec:
-    """What is known of one parameter. `kind` is one of KINDS; `low` and `high` are inclusive and hold for every
-    element of an array."""
+    """What is known of one parameter. `kind` is one of KINDS; `low` and `high` are inclusive and
+    hold for every element of an array."""
 
     name: str
     kind: str
@@ -65,19 +67,30 @@ class ParameterSpec:
     def _scalar_problem(self, value: Any, kind: str) -> str | None:
         name = f"parameter '{self.name}'"
         if kind == 'bool':
-            return None if isinstance(value, bool) else f'{name} must be true or false, got {value!r}'
+            return (
+                None if isinstance(value, bool) else f'{name} must be true or false, got {value!r}'
+            )
         if kind == 'str':
             if not isinstance(value, str):
                 return f'{name} must be text, got {value!r}'
             if self.choices and value not in self.choices:
-                return f"{name} must be one of {', '.join(self.choices)}, got '{value}'{_did_you_mean(value, self.choices)}"
+                known = ', '.join(self.choices)
+                hint = did_you_mean(value, self.choices)
+                return f"{name} must be one of {known}, got '{value}'{hint}"
             return None
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or (kind == 'int' and not isinstance(value, int)):
-            return f"{name} must be {'a whole number' if kind == 'int' else 'a number'}, got {value!r}"
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or (kind == 'int' and not isinstance(value, int))
+        ):
+            wanted = 'a whole number' if kind == 'int' else 'a number'
+            return f'{name} must be {wanted}, got {value!r}'
         if not math.isfinite(value):
             return f'{name} must be finite, got {value!r}'
-        if (self.low is not None and value < self.low) or (self.high is not None and value > self.high):
-            return f'{name} must be {self.range_text()}, got {value!r}{" " + self.unit if self.unit else ""}'
+        if (self.low is not None and value < self.low) or (
+            self.high is not None and value > self.high
+        ):
+            return f'{name} must be {self.range_text()}, got {value!r} {self.unit}'.rstrip()
         return None
 
     def range_text(self) -> str:
@@ -91,7 +104,8 @@ class ParameterSpec:
         return ''
 
     def convert(self, value: Any) -> Any:
-        """The canonical Python value: tuples for lists, float for whole numbers given to a float."""
+        """The canonical Python value: tuples for lists, float for whole numbers given to a
+        float."""
         if self.kind == 'float':
             return float(value)
         if self.kind.endswith('[]'):
@@ -100,23 +114,44 @@ class ParameterSpec:
         return value
 
 
-def parameter(default: Any, description: str, *, kind: str | None = None, unit: str = '', low: float | None = None,
-              high: float | None = None, choices: tuple[str, ...] = (), read_only: bool = True) -> Any:
+def parameter(
+    default: Any,
+    description: str,
+    *,
+    kind: str | None = None,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    read_only: bool = True,
+) -> Any:
     """One field of a `Config`. The kind follows from the default; an empty list needs `kind`.
 
     `read_only=False` marks what a running node may change without losing its tracks.
     """
-    spec = ParameterSpec(name='', kind=kind or _kind_of(default), default=default, description=description, unit=unit,
-                         low=low, high=high, choices=choices, read_only=read_only)
+    spec = ParameterSpec(
+        name='',
+        kind=kind or _kind_of(default),
+        default=default,
+        description=description,
+        unit=unit,
+        low=low,
+        high=high,
+        choices=choices,
+        read_only=read_only,
+    )
     return attrs.field(default=default, converter=_convert_quietly(spec), metadata={_KEY: spec})
 
 
 @frozen(kw_only=True)
 class Config:
-    """Base of every parameter set. Derive with ``@attrs.frozen(kw_only=True)``; override `check` for rules across fields."""
+    """Base of every parameter set. Derive with ``@attrs.frozen(kw_only=True)``; override `check`
+    for rules across fields."""
 
     def __attrs_post_init__(self) -> None:
-        problems = [trouble for spec in self.specs() if (trouble := spec.problem(getattr(self, spec.name)))]
+        problems = [
+            trouble for spec in self.specs() if (trouble := spec.problem(getattr(self, spec.name)))
+        ]
         if not problems:
             problems = list(self.check())
         if problems:
@@ -128,41 +163,66 @@ class Config:
 
     @classmethod
     def specs(cls) -> tuple[ParameterSpec, ...]:
-        return tuple(attrs.evolve(field.metadata[_KEY], name=field.name)
-                     for field in attrs.fields(cls) if _KEY in field.metadata)
+        return tuple(
+            attrs.evolve(field.metadata[_KEY], name=field.name)
+            for field in attrs.fields(cls)
+            if _KEY in field.metadata
+        )
 
     @classmethod
-    def from_mapping(cls: type[C], values: Mapping[str, Any], *, ignore_unknown: bool = False) -> C:
-        """Build from untrusted keys. Raises `ConfigError` naming every unknown key (with a suggestion) and bad value."""
+    def from_mapping(
+        cls: type[C], values: Mapping[str, Any], *, ignore_unknown: bool = False
+    ) -> C:
+        """Build from untrusted keys. Raises `ConfigError` naming every unknown key (with a
+        suggestion) and bad value."""
         specs = {spec.name: spec for spec in cls.specs()}
         unknown = [key for key in values if key not in specs]
-        problems = [] if ignore_unknown else [f"unknown parameter '{key}'{_did_you_mean(key, specs)}" for key in unknown]
+        problems = (
+            []
+            if ignore_unknown
+            else [f"unknown parameter '{key}'{did_you_mean(key, specs)}" for key in unknown]
+        )
         known = {key: value for key, value in values.items() if key in specs}
-        problems += [trouble for key, value in known.items() if (trouble := specs[key].problem(value))]
+        problems += [
+            trouble for key, value in known.items() if (trouble := specs[key].problem(value))
+        ]
         if problems:
             raise ConfigError(*problems)
         return cls(**known)
 
     @classmethod
     def lint(cls, values: Mapping[str, Any]) -> list[str]:
-        """Warnings about values that work offline but that a ROS 2 node refuses: a whole number given to a double."""
+        """Warnings about values that work offline but that a ROS 2 node refuses: a whole number
+        given to a double."""
         specs = {spec.name: spec for spec in cls.specs()}
-        return [f"parameter '{key}' is a double: write {float(value)!r} instead of {value!r}, or ROS 2 refuses it"
-                for key, value in values.items()
-                if key in specs and specs[key].kind == 'float' and isinstance(value, int) and not isinstance(value, bool)]
+        return [
+            f"parameter '{key}' is a double: write {float(value)!r} instead of {value!r}, "
+            'or ROS 2 refuses it'
+            for key, value in values.items()
+            if key in specs
+            and specs[key].kind == 'float'
+            and isinstance(value, int)
+            and not isinstance(value, bool)
+        ]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain Python values, lists instead of tuples: fit for YAML, JSON and ROS."""
-        return {spec.name: list(value) if isinstance(value := getattr(self, spec.name), tuple) else value
-                for spec in self.specs()}
+        return {
+            spec.name: list(value)
+            if isinstance(value := getattr(self, spec.name), tuple)
+            else value
+            for spec in self.specs()
+        }
 
 
 def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
-    """The parameters in a YAML text: a ROS 2 parameter file (``/**:`` or the node's name) or a plain mapping.
+    """The parameters in a YAML text: a ROS 2 parameter file (``/**:`` or the node's name) or a
+    plain mapping.
 
     Raises `ConfigError` for a text that is not YAML or not a mapping.
     """
     import yaml
+
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -170,9 +230,14 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
     if tree is None:
         return {}
     if not isinstance(tree, dict):
-        raise ConfigError(f'a parameter file must hold a mapping, this one holds a {type(tree).__name__}')
-    sections = {key: section['ros__parameters'] for key, section in tree.items()
-                if isinstance(section, dict) and 'ros__parameters' in section}
+        raise ConfigError(
+            f'a parameter file must hold a mapping, this one holds a {type(tree).__name__}'
+        )
+    sections = {
+        key: section['ros__parameters']
+        for key, section in tree.items()
+        if isinstance(section, dict) and 'ros__parameters' in section
+    }
     if not sections:
         return {str(key): value for key, value in tree.items()}
     values: dict[str, Any] = {}
@@ -189,16 +254,14 @@ def markdown_table(cls: type[Config]) -> str:
         limits = ', '.join(f'`{choice}`' for choice in spec.choices) or spec.range_text()
         default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
         text = spec.description + ('' if spec.read_only else ' (may change while running)')
-        rows.append(f'| `{spec.name}` | {spec.kind} | `{default}` | {spec.unit} | {limits} | {text} |')
+        rows.append(
+            f'| `{spec.name}` | {spec.kind} | `{default}` | {spec.unit} | {limits} | {text} |'
+        )
     return '\n'.join(rows) + '\n'
 
 
-def did_you_mean(name: str, known: Any) -> str:
+def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``" (did you mean 'x'?)"`` or an empty text."""
-    return _did_you_mean(name, known)
-
-
-def _did_you_mean(name: str, known: Any) -> str:
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ''
 
@@ -213,6 +276,12 @@ def _kind_of(default: Any) -> str:
 
 def _convert_quietly(spec: ParameterSpec) -> Any:
     """Convert what can be converted; leave the rest for `problem` to name."""
+
     def convert(value: Any) -> Any:
-        return value if attrs.evolve(spec, low=None, high=None, choices=()).problem(value) else spec.convert(value)
+        return (
+            value
+            if attrs.evolve(spec, low=None, high=None, choices=()).problem(value)
+            else spec.convert(value)
+        )
+
     return convert

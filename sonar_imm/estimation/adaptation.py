@@ -1,14 +1,20 @@
 """Transition probabilities that the data correct, for each target by itself.
 
-What is learnt never touches the chain: it is a *correction*, a factor for each transition, applied to the matrix of
-whatever step comes next, ``P(dt) = rownorm(P0(dt) * correction)``. So learning and irregular steps live together.
+What is learnt never touches the chain: it is a *correction*, a factor for each transition, applied
+to the matrix of whatever step comes next, ``P(dt) = rownorm(P0(dt) * correction)``. So learning
+and irregular steps live together.
 
 Three forms (`AdaptiveChain`):
 
-counts   Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight` transitions a row. At a
-         constant step it is ``P = rownorm(n + weight P0)``. Sound, and the default of the diver tracker.
-paper    eq. (1) of the diver paper, ``P_ij <- P_ij mu_j / sum``, guarded by ``P <- (1 - guard) P + guard P0``.
-fixed    the chain as it is.
+counts
+    Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight`
+    transitions a row. At a constant step it is ``P = rownorm(n + weight P0)``. Sound, and the
+    default of the diver tracker.
+paper
+    Eq. (1) of the diver paper, ``P_ij <- P_ij mu_j / sum``, guarded by
+    ``P <- (1 - guard) P + guard P0``.
+fixed
+    The chain as it is.
 """
 
 from __future__ import annotations
@@ -34,9 +40,11 @@ class Chain(Protocol):
 
 
 class AdaptiveChain:
-    """A chain and the way T targets correct it. What was learnt is a value the caller keeps: `fresh`, `learn`.
+    """A chain and the way T targets correct it. What was learnt is a value the caller keeps:
+    `fresh`, `learn`.
 
-    weight: counts only, transitions a row the prior is worth; guard: paper only, share of the prior kept each time.
+    weight: counts only, transitions a row the prior is worth; guard: paper only, share of the
+    prior kept each time.
     """
 
     def __init__(self, chain: Chain, form: Form, *, weight: float = 2.0, guard: float = 0.7):
@@ -48,61 +56,89 @@ class AdaptiveChain:
         self.guard = guard
 
     def fresh(self, targets: int) -> FloatArray:
-        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 1 for paper, 0 for fixed."""
+        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 1 for paper,
+        0 for fixed."""
         M = len(self.chain.matrix)
         if self.form == 'counts':
             return np.zeros((targets, 2, M, M))
         return np.ones((targets, 1 if self.form == 'paper' else 0, M, M))
 
     def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
-        """The matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing can be learnt."""
+        """The matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing can be
+        learnt."""
         nominal = self.chain.transition(dt)
         if self.form == 'fixed':
             return np.array(nominal[None])
         if self.form == 'paper':
             return corrected(nominal, learnt[:, 0])
-        return corrected(nominal, counts_correction(learnt[:, 0], learnt[:, 1], self.chain.matrix, self.weight))
+        return corrected(
+            nominal, counts_correction(learnt[:, 0], learnt[:, 1], self.chain.matrix, self.weight)
+        )
 
-    def learn(self, learnt: FloatArray, transition: FloatArray, mu_before: FloatArray, mu_after: FloatArray, dt: float,
-              ) -> FloatArray:
-        """What is known after a step that used `transition` and took the model probabilities (targets, M) from
-        `mu_before` to `mu_after`. Only for targets that were measured: a miss teaches nothing."""
+    def learn(
+        self,
+        learnt: FloatArray,
+        transition: FloatArray,
+        mu_before: FloatArray,
+        mu_after: FloatArray,
+        dt: float,
+    ) -> FloatArray:
+        """What is known after a step that used `transition` and took the model probabilities
+        (targets, M) from `mu_before` to `mu_after`. Only for targets that were measured: a miss
+        teaches nothing."""
         if self.form == 'fixed':
             return learnt
         if self.form == 'paper':
             return adapt_product(learnt[:, 0], mu_after, self.chain.matrix, self.guard)[:, None]
         posterior = transition_posterior(transition, mu_before, mu_after)
-        return np.stack(adapt_counts(learnt[:, 0], learnt[:, 1], posterior, self.chain.transition(dt)), axis=1)
+        return np.stack(
+            adapt_counts(learnt[:, 0], learnt[:, 1], posterior, self.chain.transition(dt)), axis=1
+        )
 
 
 def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatArray) -> FloatArray:
-    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights; (..., M, M) from (..., M, M), (..., M) twice."""
+    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights; (..., M, M) from (...,
+    M, M), (..., M) twice."""
     joint = P * mu_before[..., :, None]
     c = joint.sum(axis=-2, keepdims=True)
     return np.asarray(joint / np.where(c > 0.0, c, 1.0) * mu_after[..., None, :])
 
 
-def adapt_counts(counts: FloatArray, expected: FloatArray, posterior: FloatArray, nominal: FloatArray,
-                 ) -> tuple[FloatArray, FloatArray]:
-    """Dirichlet counts, n_ij += W_ij mu_j, beside what the nominal matrix of the same step would have had us count.
+def adapt_counts(
+    counts: FloatArray,
+    expected: FloatArray,
+    posterior: FloatArray,
+    nominal: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Dirichlet counts, n_ij += W_ij mu_j, beside what the nominal matrix of the same step would
+    have had us count.
 
     All (..., M, M); gives the new (counts, expected). See `counts_correction`.
     """
     return counts + posterior, expected + posterior.sum(axis=-1, keepdims=True) * nominal
 
 
-def counts_correction(counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float) -> FloatArray:
-    """Factor for each transition, (n + N0 P0) / (e + N0 P0), `prior` P0 being the matrix of the reference step.
+def counts_correction(
+    counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float
+) -> FloatArray:
+    """Factor for each transition, (n + N0 P0) / (e + N0 P0), `prior` P0 being the matrix of the
+    reference step.
 
-    At a constant step e_ij = n_i. P0_ij and the corrected matrix is the Dirichlet posterior mean, rownorm(n + N0 P0);
-    at irregular steps the factor compares like with like, which counting alone would not.
+    At a constant step e_ij = n_i. P0_ij and the corrected matrix is the Dirichlet posterior mean,
+    rownorm(n + N0 P0); at irregular steps the factor compares like with like, which counting alone
+    would not.
     """
     given = expected + weight * prior
-    return np.asarray(np.where(given > 0.0, (counts + weight * prior) / np.where(given > 0.0, given, 1.0), 1.0))
+    return np.asarray(
+        np.where(given > 0.0, (counts + weight * prior) / np.where(given > 0.0, given, 1.0), 1.0)
+    )
 
 
-def adapt_product(correction: FloatArray, mu_after: FloatArray, prior: FloatArray, guard: float) -> FloatArray:
-    """Eq. (1) of the diver paper, P_ij <- P_ij mu_j / sum, guarded by P <- (1 - guard) P + guard P0, as a factor on P0.
+def adapt_product(
+    correction: FloatArray, mu_after: FloatArray, prior: FloatArray, guard: float
+) -> FloatArray:
+    """Eq. (1) of the diver paper, P_ij <- P_ij mu_j / sum, guarded by P <- (1 - guard) P + guard
+    P0, as a factor on P0.
 
     Unguarded the exponent of mu doubles each step and rows become one-hot within five.
     """

@@ -7,16 +7,17 @@ Four verbs make one cycle, each a pure function of arrays::
     step = update(x, P, mixed.c, innovation, H, R)           # each model meets the measurement
     mean, covariance = combine(step.x, step.P, step.mu, E)   # one answer
 
-Shapes: T targets, M models, n states, m measured values. ``x (T, M, n)``, ``P (T, M, n, n)``, ``mu (T, M)``,
-``transition (T or 1, M, M)`` with ``transition[t, i, j] = Pr(j at k | i at k-1)``, ``F, Q (M, n, n)``, ``B (M, n)``.
-A scan without a measurement for a target is mix and predict alone, with ``mu <- c``: the chain moves on, the transition
-matrix does not learn.
+Shapes: T targets, M models, n states, m measured values. ``x (T, M, n)``, ``P (T, M, n, n)``, ``mu
+(T, M)``, ``transition (T or 1, M, M)`` with ``transition[t, i, j] = Pr(j at k | i at k-1)``, ``F,
+Q (M, n, n)``, ``B (M, n)``. A scan without a measurement for a target is mix and predict alone,
+with ``mu <- c``: the chain moves on, the transition matrix does not learn.
 
-Models whose states differ in meaning or size share one embedding: `embed` pads the smaller one with components that
-are redrawn from a stated law at each step, and the output maps ``E (M, q, n)`` bring every model to the same outputs,
-e.g. position and velocity.
+Models whose states differ in meaning or size share one embedding: `embed` pads the smaller one
+with components that are redrawn from a stated law at each step, and the output maps ``E (M, q,
+n)`` bring every model to the same outputs, e.g. position and velocity.
 
-This module is the readable numpy form. `imm_kernels` compiles the same mathematics; the tests hold the two together.
+This module is the readable numpy form. `imm_kernels` compiles the same mathematics; the tests hold
+the two together.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ MIN_GATE_PROBABILITY = 1e-6
 
 
 class Mixed(NamedTuple):
-    """x (T, M, n) and P (T, M, n, n) mixed for each model, and its predicted probability c (T, M)."""
+    """x (T, M, n) and P (T, M, n, n) mixed for each model, and its predicted probability c (T,
+    M)."""
 
     x: FloatArray
     P: FloatArray
@@ -42,8 +44,9 @@ class Mixed(NamedTuple):
 
 
 class Updated(NamedTuple):
-    """x (T, M, n), P (T, M, n, n), mu (T, M); log_likelihood (T,) of the measurement; nis (T,) of the mixture's
-    moment-matched innovation; ok (T,) False where no model could be updated and the prediction was kept."""
+    """x (T, M, n), P (T, M, n, n), mu (T, M); log_likelihood (T,) of the measurement; nis (T,) of
+    the mixture's moment-matched innovation; ok (T,) False where no model could be updated and the
+    prediction was kept."""
 
     x: FloatArray
     P: FloatArray
@@ -54,10 +57,11 @@ class Updated(NamedTuple):
 
 
 def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray) -> Mixed:
-    """c_j = sum_i P_ij mu_i; x0_j = sum_i W_ij x_i; P0_j = sum_i W_ij [P_i + (x_i - x0_j)(.)^T], W_ij = P_ij mu_i / c_j.
+    """c_j = sum_i P_ij mu_i; x0_j = sum_i W_ij x_i; P0_j = sum_i W_ij [P_i + (x_i - x0_j)(.)^T],
+    W_ij = P_ij mu_i / c_j.
 
-    A model that nothing can become (c_j = 0) is given the mixture of all, so that it stays finite and can come back
-    when the chain allows.
+    A model that nothing can become (c_j = 0) is given the mixture of all, so that it stays finite
+    and can come back when the chain allows.
     """
     joint = transition * mu[:, :, None]
     c = joint.sum(axis=1)
@@ -69,18 +73,32 @@ def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray) ->
     return Mixed(x0, P0, c)
 
 
-def predict(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray | float = 0.0,
-            ) -> tuple[FloatArray, FloatArray]:
+def predict(
+    x: FloatArray,
+    P: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+    B: FloatArray | float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
     """x <- F x + B, P <- F P F^T + Q for each model."""
     moved = F @ P @ np.swapaxes(F, -1, -2) + Q
     return np.einsum('jab,tjb->tja', F, x) + B, 0.5 * (moved + np.swapaxes(moved, -1, -2))
 
 
-def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray) -> Updated:
-    """Kalman update of each model in Joseph form, and mu_j proportional to c_j N(nu_j; 0, S_j) in the log domain.
+def update(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    innovation: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+) -> Updated:
+    """Kalman update of each model in Joseph form, and mu_j proportional to c_j N(nu_j; 0, S_j) in
+    the log domain.
 
-    innovation (T, M, m); H (T or 1, M, m, n), the Jacobian at each model's own prediction for a nonlinear measurement;
-    R (T or 1, m, m). A model whose S is not positive definite keeps its prediction and gets no weight.
+    innovation (T, M, m); H (T or 1, M, m, n), the Jacobian at each model's own prediction for a
+    nonlinear measurement; R (T or 1, m, m). A model whose S is not positive definite keeps its
+    prediction and gets no weight.
     """
     m, n = H.shape[-2:]
     H = np.broadcast_to(H, (len(x), *H.shape[1:]))
@@ -93,8 +111,9 @@ def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, 
     K = np.where(usable[..., None, None], K, 0.0)
     L = np.linalg.cholesky(safe)
     whitened = np.linalg.solve(L, innovation[..., None])[..., 0]
-    log_likelihood = -0.5 * (np.sum(whitened ** 2, -1) + m * np.log(2.0 * np.pi)) \
-        - np.sum(np.log(np.diagonal(L, axis1=-2, axis2=-1)), -1)
+    log_likelihood = -0.5 * (np.sum(whitened**2, -1) + m * np.log(2.0 * np.pi)) - np.sum(
+        np.log(np.diagonal(L, axis1=-2, axis2=-1)), -1
+    )
     log_weight = np.log(np.where(c > 0.0, c, 1.0)) + log_likelihood
     log_weight = np.where((c > 0.0) & usable & np.isfinite(log_weight), log_weight, -np.inf)
     best = log_weight.max(axis=1)
@@ -107,29 +126,45 @@ def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, 
     P_new = 0.5 * (P_new + np.swapaxes(P_new, -1, -2))
     x_new = x + np.einsum('tjam,tjm->tja', K, innovation)
     nis = _mixture_nis(c, innovation, S)
-    return Updated(np.where(ok[:, None, None], x_new, x), np.where(ok[:, None, None, None], P_new, P), mu,
-                   np.where(ok, best + np.log(np.where(ok, total, 1.0)), -np.inf), np.where(ok, nis, np.nan), ok)
+    return Updated(
+        np.where(ok[:, None, None], x_new, x),
+        np.where(ok[:, None, None, None], P_new, P),
+        mu,
+        np.where(ok, best + np.log(np.where(ok, total, 1.0)), -np.inf),
+        np.where(ok, nis, np.nan),
+        ok,
+    )
 
 
-def combine(x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+def combine(
+    x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """The mixture's mean (T, q) and covariance (T, q, q) of the outputs E x; E (M, q, n)."""
     y = np.einsum('jqa,tja->tjq', E, x)
     mean = np.einsum('tj,tjq->tq', mu, y)
     spread = y - mean[:, None, :]
-    covariance = np.einsum('tj,tjqr->tqr', mu, E @ P @ np.swapaxes(E, -1, -2)) \
-        + np.einsum('tj,tjq,tjr->tqr', mu, spread, spread)
+    covariance = np.einsum('tj,tjqr->tqr', mu, E @ P @ np.swapaxes(E, -1, -2)) + np.einsum(
+        'tj,tjq,tjr->tqr', mu, spread, spread
+    )
     return mean, 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
 
 
-def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray,
-         threshold: float) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+def gate(
+    h: FloatArray,
+    H: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    threshold: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
     """Which detections (D, m) with covariances R (D, m, m) may belong to which target.
 
-    h (T, M, m): what each model expects; H (T or 1, M, m, n) its Jacobian; P (T, M, n, n), c (T, M)
-    predicted. A detection is inside when it is inside the gate of *some* model that is not
+    h (T, M, m): what each model expects; H (T or 1, M, m, n) its Jacobian; P (T, M, n, n), c (T,
+    M) predicted. A detection is inside when it is inside the gate of *some* model that is not
     impossible: the moment-matched gate of the mixture is too small for a sharp turn seen by a
-    sensor that is accurate in one direction, and loses the track there.
-    Gives target, detection and log-likelihood ln sum_j c_j N(nu_j; 0, S_j), each (pairs,), in order.
+    sensor that is accurate in one direction, and loses the track there. Gives target, detection
+    and log-likelihood ln sum_j c_j N(nu_j; 0, S_j), each (pairs,), in order.
     """
     possible = c >= MIN_GATE_PROBABILITY
     S = (H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None]
@@ -142,17 +177,29 @@ def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArr
     return target, detection, np.log(np.sum(weight * np.exp(log_density[inside]), axis=-1))
 
 
-def embed(F: ArrayLike, Q: ArrayLike, B: ArrayLike, index: Sequence[int], n: int, fill_mean: ArrayLike = 0.0,
-          fill_variance: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A model of fewer states inside an n-dimensional one: its own states sit at `index`; each other component is drawn
-    afresh from N(fill_mean, fill_variance) at every step, so that a model that needs it meets a sane prior when mixed.
+def embed(
+    F: ArrayLike,
+    Q: ArrayLike,
+    B: ArrayLike,
+    index: Sequence[int],
+    n: int,
+    fill_mean: ArrayLike = 0.0,
+    fill_variance: ArrayLike = 1.0,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A model of fewer states inside an n-dimensional one: its own states sit at `index`; each
+    other component is drawn afresh from N(fill_mean, fill_variance) at every step, so that a model
+    that needs it meets a sane prior when mixed.
 
     Gives F (n, n), Q (n, n), B (n,).
     """
     own = np.asarray(index, dtype=np.intp)
     if len(set(own.tolist())) != len(own) or (own < 0).any() or (own >= n).any():
         raise ValueError(f'index {list(index)} must name distinct components of {n}')
-    big_F, big_Q, big_B = np.zeros((n, n)), np.diag(np.full(n, fill_variance, dtype=np.float64)), np.full(n, fill_mean, np.float64)
+    big_F, big_Q, big_B = (
+        np.zeros((n, n)),
+        np.diag(np.full(n, fill_variance, dtype=np.float64)),
+        np.full(n, fill_mean, np.float64),
+    )
     big_F[np.ix_(own, own)] = np.asarray(F, np.float64)
     big_Q[np.ix_(own, own)] = np.asarray(Q, np.float64)
     big_B[own] = np.asarray(B, np.float64)
@@ -164,5 +211,7 @@ def _mixture_nis(c: FloatArray, innovation: FloatArray, S: FloatArray) -> FloatA
     spread = innovation - mean[:, None, :]
     total = np.einsum('tj,tjmk->tmk', c, S) + np.einsum('tj,tjm,tjk->tmk', c, spread, spread)
     scale = np.trace(total, axis1=-2, axis2=-1)
-    total = np.where((np.linalg.eigvalsh(total)[:, 0] > 1e-14 * scale)[:, None, None], total, np.nan)
+    total = np.where(
+        (np.linalg.eigvalsh(total)[:, 0] > 1e-14 * scale)[:, None, None], total, np.nan
+    )
     return np.asarray(np.einsum('tm,tm->t', mean, np.linalg.solve(total, mean[..., None])[..., 0]))

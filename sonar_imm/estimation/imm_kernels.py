@@ -1,8 +1,9 @@
-"""The verbs of `imm` compiled: the same mathematics over plain loops, some 300 times faster for one target.
+"""The verbs of `imm` compiled: the same mathematics over plain loops, some 300 times faster for
+one target.
 
-Signatures are those of `imm` with arrays only: ``B (M, n)`` is always given, and where `imm` broadcasts over targets
-(transition, H, R) an array of length one does. All arrays are float64 and C-contiguous. `warm` compiles or loads
-every kernel; call it before the first measurement.
+Signatures are those of `imm` with arrays only: ``B (M, n)`` is always given, and where `imm`
+broadcasts over targets (transition, H, R) an array of length one does. All arrays are float64 and
+C-contiguous. `warm` compiles or loads every kernel; call it before the first measurement.
 """
 
 from __future__ import annotations
@@ -14,14 +15,19 @@ from numpy.typing import NDArray
 
 from .imm import MIN_GATE_PROBABILITY
 from .jit import kernel
+from .small_matrices import cholesky, gain, innovation_covariance, joseph, whitened_square
 
 FloatArray = NDArray[np.float64]
 LOG_2PI = math.log(2.0 * math.pi)
 
 
 @kernel
-def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray,
-        ) -> tuple[FloatArray, FloatArray, FloatArray]:
+def mix(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M)."""
     T, M, n = x.shape
     x0 = np.zeros((T, M, n))
@@ -57,7 +63,9 @@ def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray,
 
 
 @kernel
-def predict(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray) -> tuple[FloatArray, FloatArray]:
+def predict(
+    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """See `imm.predict`."""
     T, M, n = x.shape
     x1 = np.empty((T, M, n))
@@ -85,108 +93,14 @@ def predict(x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: Float
 
 
 @kernel
-def _cholesky(S: FloatArray, L: FloatArray) -> bool:
-    """Lower Cholesky factor of S into L; False when S is not positive definite (or not finite)."""
-    m = S.shape[0]
-    for a in range(m):
-        for b in range(a + 1):
-            value = S[a, b]
-            for k in range(b):
-                value -= L[a, k] * L[b, k]
-            if a == b:
-                if not value > 0.0:
-                    return False
-                L[a, a] = math.sqrt(value)
-            else:
-                L[a, b] = value / L[b, b]
-    return True
-
-
-@kernel
-def _innovation_covariance(P: FloatArray, H: FloatArray, R: FloatArray, PHt: FloatArray, S: FloatArray) -> None:
-    """P H^T into PHt (n, m) and H P H^T + R into S (m, m)."""
-    m, n = H.shape
-    for a in range(n):
-        for r in range(m):
-            value = 0.0
-            for k in range(n):
-                value += P[a, k] * H[r, k]
-            PHt[a, r] = value
-    for r in range(m):
-        for s in range(r + 1):
-            value = 0.5 * (R[r, s] + R[s, r])
-            for k in range(n):
-                value += H[r, k] * PHt[k, s]
-            S[r, s] = value
-            S[s, r] = value
-
-
-@kernel
-def _gain(PHt: FloatArray, L: FloatArray, K: FloatArray) -> None:
-    """K = PHt S^-1 from S = L L^T: two triangular solves a row."""
-    n, m = PHt.shape
-    for a in range(n):
-        for r in range(m):
-            value = PHt[a, r]
-            for k in range(r):
-                value -= L[r, k] * K[a, k]
-            K[a, r] = value / L[r, r]
-        for r in range(m - 1, -1, -1):
-            value = K[a, r]
-            for k in range(r + 1, m):
-                value -= L[k, r] * K[a, k]
-            K[a, r] = value / L[r, r]
-
-
-@kernel
-def _joseph(P: FloatArray, K: FloatArray, H: FloatArray, R: FloatArray, A: FloatArray, AP: FloatArray, KR: FloatArray,
-            out: FloatArray) -> None:
-    """(I - K H) P (I - K H)^T + K R K^T into `out`, exactly symmetric; A, AP (n, n) and KR (n, m) are scratch."""
-    m, n = H.shape
-    for a in range(n):
-        for b in range(n):
-            value = 1.0 if a == b else 0.0
-            for r in range(m):
-                value -= K[a, r] * H[r, b]
-            A[a, b] = value
-        for r in range(m):
-            value = 0.0
-            for s in range(m):
-                value += K[a, s] * R[s, r]
-            KR[a, r] = value
-    for a in range(n):
-        for b in range(n):
-            value = 0.0
-            for k in range(n):
-                value += A[a, k] * P[k, b]
-            AP[a, b] = value
-    for a in range(n):
-        for b in range(a + 1):
-            value = 0.0
-            for k in range(n):
-                value += AP[a, k] * A[b, k]
-            for r in range(m):
-                value += KR[a, r] * K[b, r]
-            out[a, b] = value
-            out[b, a] = value
-
-
-@kernel
-def _whitened_square(L: FloatArray, v: FloatArray, w: FloatArray) -> float:
-    """v^T S^-1 v with S = L L^T; w (m,) is scratch."""
-    total = 0.0
-    for r in range(len(v)):
-        value = v[r]
-        for k in range(r):
-            value -= L[r, k] * w[k]
-        w[r] = value / L[r, r]
-        total += w[r] * w[r]
-    return total
-
-
-@kernel
-def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray,
-           ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+def update(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    innovation: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """See `imm.update`: x, P, mu, log_likelihood, nis, ok."""
     T, M, n = x.shape
     m = innovation.shape[2]
@@ -209,14 +123,16 @@ def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, 
         best = -np.inf
         for j in range(M):
             log_weight[j] = -np.inf
-            _innovation_covariance(P[t, j], H[h_t, j], R[r_t], PHt, S)
+            innovation_covariance(P[t, j], H[h_t, j], R[r_t], PHt, S)
             for r in range(m):
                 for s in range(m):
-                    S_mix[r, s] += c[t, j] * (S[r, s] + (innovation[t, j, r] - mean[r]) * (innovation[t, j, s] - mean[s]))
-            if not _cholesky(S, L):
+                    S_mix[r, s] += c[t, j] * (
+                        S[r, s] + (innovation[t, j, r] - mean[r]) * (innovation[t, j, s] - mean[s])
+                    )
+            if not cholesky(S, L):
                 continue
-            _gain(PHt, L, K)
-            value = -0.5 * (_whitened_square(L, innovation[t, j], scratch) + m * LOG_2PI)
+            gain(PHt, L, K)
+            value = -0.5 * (whitened_square(L, innovation[t, j], scratch) + m * LOG_2PI)
             for r in range(m):
                 value -= math.log(L[r, r])
             if c[t, j] > 0.0 and math.isfinite(value):
@@ -225,7 +141,7 @@ def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, 
             for a in range(n):
                 for r in range(m):
                     x1[t, j, a] += K[a, r] * innovation[t, j, r]
-            _joseph(P[t, j], K, H[h_t, j], R[r_t], A, AP, KR, P1[t, j])
+            joseph(P[t, j], K, H[h_t, j], R[r_t], A, AP, KR, P1[t, j])
         if not math.isfinite(best):
             x1[t] = x[t]
             P1[t] = P[t]
@@ -238,15 +154,21 @@ def update(x: FloatArray, P: FloatArray, c: FloatArray, innovation: FloatArray, 
         for j in range(M):
             mu[t, j] /= total
         log_likelihood[t] = best + math.log(total)
-        if _cholesky(S_mix, L):
-            nis[t] = _whitened_square(L, mean, scratch)
+        if cholesky(S_mix, L):
+            nis[t] = whitened_square(L, mean, scratch)
     return x1, P1, mu, log_likelihood, nis, ok
 
 
 @kernel
-def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray,
-         R: FloatArray, threshold: float,
-         ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+def gate(
+    h: FloatArray,
+    H: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    threshold: float,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
     """See `imm.gate`: target, detection, log_likelihood, each (pairs,)."""
     T, M, m = h.shape
     D, n = len(z), P.shape[2]
@@ -265,7 +187,7 @@ def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArr
         for j in range(M):
             if c[t, j] < MIN_GATE_PROBABILITY:
                 continue
-            _innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
+            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
             for r in range(m):
                 reach = math.sqrt(threshold * max(S0[j, r, r] + widest[r], 0.0))
                 low[r] = min(low[r], h[t, j, r] - reach)
@@ -284,9 +206,9 @@ def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArr
                     v[r] = z[d, r] - h[t, j, r]
                     for s in range(m):
                         S[r, s] = S0[j, r, s] + R[d, r, s]
-                if not _cholesky(S, L):
+                if not cholesky(S, L):
                     continue
-                nis = _whitened_square(L, v, w)
+                nis = whitened_square(L, v, w)
                 inside = inside or nis <= threshold
                 value = -0.5 * (nis + m * LOG_2PI)
                 for r in range(m):
@@ -306,12 +228,14 @@ def gate(h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArr
 @kernel
 def _grown(array: NDArray, capacity: int) -> NDArray:
     out = np.empty(capacity, array.dtype)
-    out[:len(array)] = array
+    out[: len(array)] = array
     return out
 
 
 @kernel
-def combine(x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+def combine(
+    x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """See `imm.combine`."""
     T, M, n = x.shape
     q = E.shape[1]
@@ -349,11 +273,30 @@ def combine(x: FloatArray, P: FloatArray, mu: FloatArray, E: FloatArray) -> tupl
 
 
 @kernel
-def linear_cycle(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray, F: FloatArray, Q: FloatArray,
-                 B: FloatArray, z: FloatArray, H: FloatArray, R: FloatArray, E: FloatArray,
-                 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray,
-                            NDArray[np.bool_]]:
-    """A whole cycle for targets whose measurements are already assigned: z (T, m), NaN where missed; H (M, m, n).
+def linear_cycle(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+    B: FloatArray,
+    z: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    E: FloatArray,
+) -> tuple[
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    FloatArray,
+    NDArray[np.bool_],
+]:
+    """A whole cycle for targets whose measurements are already assigned: z (T, m), NaN where
+    missed; H (M, m, n).
 
     Gives x, P, mu, mean, covariance, log_likelihood, nis, ok.
     """
@@ -375,7 +318,8 @@ def linear_cycle(x: FloatArray, P: FloatArray, mu: FloatArray, transition: Float
 
 
 def warm() -> None:
-    """Run every kernel once on tiny input: compiled or loaded from the cache, ready for the first measurement."""
+    """Run every kernel once on tiny input: compiled or loaded from the cache, ready for the first
+    measurement."""
     x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
     F, B, E = np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1))
     transition, z, R = np.full((1, 2, 2), 0.5), np.zeros((1, 2)), np.eye(2)[None]

@@ -1,8 +1,8 @@
 """The one place that knows how hot loops are compiled.
 
-Kernels are compiled on their first call and kept in numba's cache: beside the source when that is writable, else in
-the user's cache folder (or ``NUMBA_CACHE_DIR``). Where neither can be written, as in a locked-down container, the
-kernel still works and is compiled anew in each process.
+Kernels are compiled on their first call and kept in numba's cache: beside the source when that is
+writable, else in the user's cache folder (or ``NUMBA_CACHE_DIR``). Where neither can be written,
+as in a locked-down container, the kernel still works and is compiled anew in each process.
 """
 
 from __future__ import annotations

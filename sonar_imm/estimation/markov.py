@@ -1,10 +1,11 @@
-"""Markov chains over models: checks, stationary law, irregular time steps, persistence, learning from data.
+"""Markov chains over models: checks, stationary law, irregular time steps, persistence, learning
+from data.
 
 Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
 
-A chain is stated at a reference step, but sonar is irregular. `RateChain` turns the matrix into a generator once,
-``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation`
-lets the data correct it.
+A chain is stated at a reference step, but sonar is irregular. `RateChain` turns the matrix into a
+generator once, ``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of
+0.1 s equal one of 1 s. `adaptation` lets the data correct it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ _CACHED_STEPS = 256
 
 
 def check_transition_matrix(matrix: ArrayLike, *, atol: float = 1e-6) -> FloatArray:
-    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError when it is not a transition matrix."""
+    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError when it is not a
+    transition matrix."""
     P = np.array(matrix, dtype=np.float64)
     if P.ndim != 2 or P.shape[0] != P.shape[1] or not len(P):
         raise ValueError(f'a transition matrix is square, this one has shape {P.shape}')
@@ -38,7 +40,9 @@ def stationary_law(P: FloatArray) -> FloatArray:
     M = len(P)
     system = np.vstack([P.T - np.eye(M), np.ones(M)])
     if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
-        raise ValueError('the chain has closed classes that never meet: its stationary law is not unique')
+        raise ValueError(
+            'the chain has closed classes that never meet: its stationary law is not unique'
+        )
     law = np.linalg.lstsq(system, np.append(np.zeros(M), 1.0), rcond=None)[0]
     law = np.clip(law, 0.0, None)
     return np.asarray(law / law.sum())
@@ -47,8 +51,9 @@ def stationary_law(P: FloatArray) -> FloatArray:
 class RateChain:
     """A chain stated at `step` seconds, usable at any step.
 
-    The generator is the matrix logarithm. Some matrices have no valid one (negative rates); those rates are set to
-    zero, and `residual` says how far ``P(step)`` then is from the matrix given (0 when it is embeddable).
+    The generator is the matrix logarithm. Some matrices have no valid one (negative rates); those
+    rates are set to zero, and `residual` says how far ``P(step)`` then is from the matrix given (0
+    when it is embeddable).
     """
 
     def __init__(self, matrix: ArrayLike, step: float):
@@ -61,7 +66,8 @@ class RateChain:
         self._cache: OrderedDict[float, FloatArray] = OrderedDict()
 
     def transition(self, dt: float) -> FloatArray:
-        """P(dt), (M, M), read-only. The matrix as given when dt is the reference step and it is embeddable."""
+        """P(dt), (M, M), read-only. The matrix as given when dt is the reference step and it is
+        embeddable."""
         if not dt >= 0.0:
             raise ValueError(f'a time step cannot be negative, got {dt}')
         found = self._cache.get(dt)
@@ -81,7 +87,10 @@ class RateChain:
 
 
 def _expm(matrix: FloatArray) -> FloatArray:
-    from scipy.linalg import expm  # late: scipy.linalg costs start-up time that fixed steps do not need
+    from scipy.linalg import (
+        expm,
+    )  # late: scipy.linalg costs start-up time that fixed steps do not need
+
     return np.asarray(expm(matrix), dtype=np.float64)
 
 
@@ -89,7 +98,9 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
     if np.array_equal(P, np.eye(len(P))):
         return np.zeros_like(P)
     from scipy.linalg import logm
-    # A zero eigenvalue (identical rows) has no logarithm: the chain forgets everything at once. Mixing in a sliver of
+
+    # A zero eigenvalue (identical rows) has no logarithm: the chain forgets everything at once.
+    # Mixing in a sliver of
     # the identity stands for a very fast, finite rate; the residual tells how little that changes.
     singular = np.abs(np.linalg.eigvals(P)).min() < 1e-9
     base = (1.0 - 1e-8) * P + 1e-8 * np.eye(len(P)) if singular else P
@@ -101,7 +112,8 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
 
 
 def persistent_headings(directions: int, stay: float, concentration: float) -> FloatArray:
-    """Headings at 2 pi j / directions: stay with probability `stay`, else turn by a with weight exp(kappa cos a)."""
+    """Headings at 2 pi j / directions: stay with probability `stay`, else turn by a with weight
+    exp(kappa cos a)."""
     turns = 2.0 * np.pi * np.arange(1, directions) / directions
     weights = np.exp(concentration * (np.cos(turns) - 1.0))
     row = np.concatenate([[stay], (1.0 - stay) * weights / weights.sum()])
@@ -110,29 +122,24 @@ def persistent_headings(directions: int, stay: float, concentration: float) -> F
 
 
 def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
-    """Append a model that is entered from each other with probability `enter`, kept with `stay`, left uniformly.
-
-    What `enter` takes away comes from the turns; the diagonal of `P` stays. ValueError when it does not fit.
-    """
+    """Append a model that each other turns into with probability `enter`, that is kept with `stay`
+    and left uniformly. What `enter` takes comes from every entry of a row alike."""
     M = len(P)
-    keep = np.diag(P)
-    if (keep + enter > 1.0 + 1e-12).any():
-        raise ValueError('the probabilities of staying and of stopping exceed 1 together')
-    turning = np.where(keep < 1.0, (1.0 - keep - enter) / np.where(keep < 1.0, 1.0 - keep, 1.0), 0.0)
-    out = np.zeros((M + 1, M + 1))
-    out[:M, :M] = P * np.clip(turning, 0.0, None)[:, None]
-    np.fill_diagonal(out[:M, :M], keep)
-    out[:M, M] = 1.0 - out[:M, :M].sum(axis=1)
+    out = np.empty((M + 1, M + 1))
+    out[:M, :M] = (1.0 - enter) * P
+    out[:M, M] = enter
     out[M, :M] = (1.0 - stay) / M
     out[M, M] = stay
     return out
 
 
 class EventChain:
-    """Models that are events rather than states: each step draws anew from one law, whatever came before.
+    """Models that are events rather than states: each step draws anew from one law, whatever came
+    before.
 
-    law (M,): of a reference step; its first model is 'nothing happens', which gets likelier as the step shrinks:
-    Pr(nothing in dt) = law_0 ** (dt / step). The matrices have identical rows (the filter is then a GPB1).
+    law (M,): of a reference step; its first model is 'nothing happens', which gets likelier as the
+    step shrinks: Pr(nothing in dt) = law_0 ** (dt / step). The matrices have identical rows (the
+    filter is then a GPB1).
     """
 
     def __init__(self, law: ArrayLike, step: float):

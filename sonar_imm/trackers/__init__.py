@@ -1,4 +1,5 @@
-"""The trackers: one file a system. `SYSTEMS` says what exists; importing it does not load a tracker."""
+"""The trackers: one file a system. `SYSTEMS` says what exists; importing it does not load a
+tracker."""
 
 from __future__ import annotations
 
@@ -13,16 +14,19 @@ from ..parameters import Config
 
 
 class Tracker(Protocol):
-    """The only door to a tracker. `process` has no side effect outside the tracker: no log, no clock, no global state.
+    """The only door to a tracker. `process` has no side effect outside the tracker: no log, no
+    clock, no global state.
 
-    counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``, ``too_late``, ...).
+    counts: what happened to the input, by reason code (``used``, ``gated``, ``duplicate``,
+    ``too_late``, ...).
     """
 
     config: Any
     counts: Counter[str]
 
     def process(self, measurement: Any) -> list[Estimate]:
-        """Take one measurement in. Gives the estimates it made or revised, oldest first; the last is the newest state.
+        """Take one measurement in. Gives the estimates it made or revised, oldest first; the last
+        is the newest state.
 
         Never raises for bad data: what cannot be used is counted in `counts`."""
         ...
@@ -62,6 +66,11 @@ class System:
 
 
 SYSTEMS = {
-    'diver': System('diver', 'sonar_imm.trackers.diver', 'DiverConfig', 'DiverTracker',
-                    'divers from multistatic fixes or raw arrival times, 16-direction IMM'),
+    'diver': System(
+        'diver',
+        'sonar_imm.trackers.diver',
+        'DiverConfig',
+        'DiverTracker',
+        'divers from multistatic fixes or raw arrival times, 16-direction IMM',
+    ),
 }

@@ -4,7 +4,7 @@ A diver swims slowly and turns often. The tracker runs one motion model for each
 headings (`diver_models`) in an interacting multiple model filter, and lets the data correct the
 probabilities of turning. A scan of the world goes through
 
-    predict  ->  for each group of detections: gate, associate, update  ->  learn  ->  begin, end tracks
+    predict -> for each group of detections: gate, associate, update -> learn -> end, begin tracks
 
 and the whole of what is known after it is one value, `Divers`, so that a late measurement is put
 in its place by computing the scans after it again (`estimation.history`).
@@ -34,26 +34,35 @@ from .diver_sensing import Group, groups_of, Positions
 
 __all__ = ['DiverConfig', 'Divers', 'DiverTracker']
 
+
 class DiverTracker:
     """The tracker of `trackers.Tracker` for divers: `process` takes `Fix` and `Arrivals`."""
 
     def __init__(self, config: DiverConfig):
         self.config = config
         self.models = build_models(config)
-        self._chain = AdaptiveChain(self.models.chain, config.adaptation, weight=config.adaptation_prior,
-                                    guard=config.adaptation_guard)
+        self._chain = AdaptiveChain(
+            self.models.chain,
+            config.adaptation,
+            weight=config.adaptation_prior,
+            guard=config.adaptation_guard,
+        )
         self.reset()
 
     def reset(self) -> None:
         self.counts: Counter[str] = Counter()
         self._frame_id = ''
         self._gate: StampGate[Measurement] = StampGate(
-            _ns(self.config.history), _ns(self.config.max_gap), self.config.restart_after)
+            _ns(self.config.history), _ns(self.config.max_gap), self.config.restart_after
+        )
         self._history = self._new_history(Tracks.none(_rules(self.config)))
 
     def reconfigure(self, config: DiverConfig) -> None:
-        frozen_now = [spec.name for spec in config.specs() if spec.read_only
-                      and getattr(config, spec.name) != getattr(self.config, spec.name)]
+        frozen_now = [
+            spec.name
+            for spec in config.specs()
+            if spec.read_only and getattr(config, spec.name) != getattr(self.config, spec.name)
+        ]
         if frozen_now:
             raise ValueError(f'these parameters need a new tracker: {", ".join(frozen_now)}')
         self.config = config
@@ -62,15 +71,23 @@ class DiverTracker:
         imm_kernels.warm()
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, history=10.0))
         for second in (1, 2):
-            tracker.process(Fix(stamp_ns=second * 10 ** 9, position=np.zeros(3), covariance=np.eye(2)))
+            tracker.process(
+                Fix(stamp_ns=second * 10**9, position=np.zeros(3), covariance=np.eye(2))
+            )
 
     def health(self) -> dict[str, float]:
         now = self._history.state
         hit = now.nis_dof > 0
-        return {'tracks': len(now.life), 'confirmed': int((now.life.status != TrackStatus.TENTATIVE).sum()),
-                'nis_mean': float(np.mean(now.nis[hit] / now.nis_dof[hit])) if hit.any() else float('nan'),
-                'broken_tracks': now.broken,
-                'scale_fixes': float(now.factor()[0]), 'scale_arrivals': float(now.factor()[1])}
+        return {
+            'tracks': len(now.life),
+            'confirmed': int((now.life.status != TrackStatus.TENTATIVE).sum()),
+            'nis_mean': float(np.mean(now.nis[hit] / now.nis_dof[hit]))
+            if hit.any()
+            else float('nan'),
+            'broken_tracks': now.broken,
+            'scale_fixes': float(now.factor()[0]),
+            'scale_arrivals': float(now.factor()[1]),
+        }
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         if not isinstance(measurement, (Fix, Arrivals)):
@@ -106,10 +123,17 @@ class DiverTracker:
 
     def _new_history(self, life: Tracks) -> ReplayHistory[Divers, Measurement]:
         M, n = len(self.models.names), self.models.n
-        nobody = Divers(stamp_ns=0, life=life, x=np.empty((0, M, n)),
-                        P=np.empty((0, M, n, n)), mu=np.empty((0, M)),
-                        learnt=self._chain.fresh(0), nis=np.empty(0),
-                        nis_dof=np.empty(0, np.uint16), scale=np.zeros((2, 2)))
+        nobody = Divers(
+            stamp_ns=0,
+            life=life,
+            x=np.empty((0, M, n)),
+            P=np.empty((0, M, n, n)),
+            mu=np.empty((0, M)),
+            learnt=self._chain.fresh(0),
+            nis=np.empty(0),
+            nis_dof=np.empty(0, np.uint16),
+            scale=np.zeros((2, 2)),
+        )
         return ReplayHistory(nobody, _ns(self.config.history))
 
     # -- one scan ------------------------------------------------------------------------------
@@ -121,8 +145,9 @@ class DiverTracker:
         left = [(group, ~scan.take(group)) for group in groups_of(items, self.config, factor)]
         return self._census(scan.result(), self._births(items, left, float(factor[1])))
 
-    def _births(self, items: Sequence[Measurement], left: Sequence[tuple[Group, np.ndarray]],
-                factor: float) -> list[Birth]:
+    def _births(
+        self, items: Sequence[Measurement], left: Sequence[tuple[Group, np.ndarray]], factor: float
+    ) -> list[Birth]:
         """Where the detections no track took put new divers."""
         births: list[Birth] = []
         for group, free in left:
@@ -140,8 +165,12 @@ class DiverTracker:
         """End the tracks that are over and begin new ones."""
         config, rules = self.config, _rules(self.config)
         sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
-        life, kept = now.life.scan(now.nis_dof > 0, now.stamp_ns, rules,
-                                   looked=np.full(len(sound), config.fixes_are_scans))
+        life, kept = now.life.scan(
+            now.nis_dof > 0,
+            now.stamp_ns,
+            rules,
+            looked=np.full(len(sound), config.fixes_are_scans),
+        )
         life, kept = life.only(sound[kept]), kept & sound
         confirmed = life.status != TrackStatus.TENTATIVE
         if confirmed.sum() >= config.max_tracks:
@@ -149,36 +178,49 @@ class DiverTracker:
             room = confirmed & (np.cumsum(confirmed) <= config.max_tracks)
             kept[kept] = room
             life, births = life.only(room), []
-        births = births[:max(0, 10 + 5 * config.max_tracks - len(life))]
+        births = births[: max(0, 10 + 5 * config.max_tracks - len(life))]
         if not births and kept.all():
             return evolve(now, life=life)
         new = [self.models.new_track(*birth) for birth in births]
         M, n, count = len(self.models.names), self.models.n, len(new)
         return Divers(
-            stamp_ns=now.stamp_ns, life=life.born(count, now.stamp_ns, rules),
+            stamp_ns=now.stamp_ns,
+            life=life.born(count, now.stamp_ns, rules),
             x=np.concatenate([now.x[kept], np.reshape([one[0] for one in new], (count, M, n))]),
             P=np.concatenate([now.P[kept], np.reshape([one[1] for one in new], (count, M, n, n))]),
             mu=np.concatenate([now.mu[kept], np.reshape([one[2] for one in new], (count, M))]),
             learnt=np.concatenate([now.learnt[kept], self._chain.fresh(count)]),
             nis=np.append(now.nis[kept], np.full(count, np.nan)),
             nis_dof=np.append(now.nis_dof[kept], np.zeros(count, np.uint16)),
-            scale=now.scale, broken=now.broken + int((~sound).sum()))
+            scale=now.scale,
+            broken=now.broken + int((~sound).sum()),
+        )
 
     def _estimate(self, state: Divers) -> Estimate:
         mean, covariance = imm_kernels.combine(state.x, state.P, state.mu, self.models.E)
         depth = np.full(len(mean), self.config.target_z)
         return Estimate(
-            stamp_ns=state.stamp_ns, frame_id=self._frame_id,
-            xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32), state_names=OUTPUTS,
-            state=mean, covariance=covariance, model_names=self.models.names,
+            stamp_ns=state.stamp_ns,
+            frame_id=self._frame_id,
+            xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
+            state_names=OUTPUTS,
+            state=mean,
+            covariance=covariance,
+            model_names=self.models.names,
             probabilities=state.mu,
-            extras={'track_id': state.life.track_id, 'track_state': state.life.status,
-                    'nis': state.nis, 'nis_dof': state.nis_dof})
+            extras={
+                'track_id': state.life.track_id,
+                'track_state': state.life.status,
+                'nis': state.nis,
+                'nis_dof': state.nis_dof,
+            },
+        )
 
 
 def _rules(config: DiverConfig) -> TrackRules:
-    return TrackRules(config.confirm_hits, config.confirm_window, config.delete_misses,
-                      _ns(config.max_coast))
+    return TrackRules(
+        config.confirm_hits, config.confirm_window, config.delete_misses, _ns(config.max_coast)
+    )
 
 
 def _ns(seconds: float) -> int:

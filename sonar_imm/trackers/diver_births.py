@@ -16,7 +16,8 @@ Birth = tuple[FloatArray, FloatArray]
 """Position (2,) and covariance (2, 2)."""
 
 SEED_PAIRS = 3
-"""Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm it."""
+"""Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
+it."""
 
 MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
@@ -27,8 +28,9 @@ def births_from_fixes(group: Positions, free: np.ndarray) -> list[Birth]:
     return [(group.z[d], group.R[d]) for d in np.flatnonzero(free)]
 
 
-def births_from_ping(ping: Arrivals, free: np.ndarray, config: DiverConfig,
-                     factor: float) -> list[Birth]:
+def births_from_ping(
+    ping: Arrivals, free: np.ndarray, config: DiverConfig, factor: float
+) -> list[Birth]:
     """Positions from the rows (n,) of a ping that are `free`.
 
     With at most one echo for each transmitter-receiver pair this is one fix, with its ghosts,
@@ -54,8 +56,9 @@ def _by_pair(ping: Arrivals, rows: np.ndarray) -> list[np.ndarray]:
     return [rows[(pair == one).all(axis=1)] for one in np.unique(pair, axis=0)]
 
 
-def _fix(ping: Arrivals, rows: np.ndarray, config: DiverConfig,
-         factor: float) -> tuple[list[Birth], np.ndarray]:
+def _fix(
+    ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: float
+) -> tuple[list[Birth], np.ndarray]:
     """The fix of `rows` and its alternatives, and the rows it used."""
     fix = locate(ping, rows, config, config.covariance_scale * factor)
     if fix is None:
@@ -64,8 +67,9 @@ def _fix(ping: Arrivals, rows: np.ndarray, config: DiverConfig,
     return [(fix.position, fix.covariance), *ghosts], rows[fix.used]
 
 
-def _best_combination(ping: Arrivals, pairs: Sequence[np.ndarray], config: DiverConfig,
-                      factor: float) -> tuple[list[Birth], np.ndarray]:
+def _best_combination(
+    ping: Arrivals, pairs: Sequence[np.ndarray], config: DiverConfig, factor: float
+) -> tuple[list[Birth], np.ndarray]:
     """The fix that most pairs agree with, at least one more than seeded it."""
     best: tuple[list[Birth], np.ndarray] = ([], np.empty(0, np.intp))
     if len(pairs) <= SEED_PAIRS:
@@ -80,15 +84,16 @@ def _best_combination(ping: Arrivals, pairs: Sequence[np.ndarray], config: Diver
     return best
 
 
-def _agreeing(ping: Arrivals, pairs: Sequence[np.ndarray], birth: Birth, config: DiverConfig,
-              factor: float) -> np.ndarray:
+def _agreeing(
+    ping: Arrivals, pairs: Sequence[np.ndarray], birth: Birth, config: DiverConfig, factor: float
+) -> np.ndarray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
     position, covariance = birth
     expected = multistatic.range_sum(position, ping.tx, ping.rx, config.target_z)
     slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, config.target_z)
-    variance = config.sound_speed ** 2 \
-        * toa_variance(ping, config, config.covariance_scale * factor) \
-        + np.einsum('na,ab,nb->n', slope, covariance, slope)
+    variance = config.sound_speed**2 * toa_variance(
+        ping, config, config.covariance_scale * factor
+    ) + np.einsum('na,ab,nb->n', slope, covariance, slope)
     nis = np.square(config.sound_speed * ping.toa - expected) / variance
     nearest = np.array([rows[np.argmin(nis[rows])] for rows in pairs])
     return nearest[nis[nearest] <= 9.0]

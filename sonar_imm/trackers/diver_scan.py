@@ -1,4 +1,5 @@
-"""One scan of the diver tracker: what is known before it, the updates in the middle, what is known after it."""
+"""One scan of the diver tracker: what is known before it, the updates in the middle, what is known
+after it."""
 
 from __future__ import annotations
 
@@ -47,10 +48,17 @@ class Divers:
 
 
 class Scan:
-    """The tracks in the middle of a scan: predicted when made, updated by `take`, done with `result`."""
+    """The tracks in the middle of a scan: predicted when made, updated by `take`, done with
+    `result`."""
 
-    def __init__(self, config: DiverConfig, models: ModelSet, chain: AdaptiveChain, before: Divers,
-                 stamp_ns: int):
+    def __init__(
+        self,
+        config: DiverConfig,
+        models: ModelSet,
+        chain: AdaptiveChain,
+        before: Divers,
+        stamp_ns: int,
+    ):
         self.config, self.models, self.chain, self.before = config, models, chain, before
         self.stamp_ns = stamp_ns
         self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
@@ -82,20 +90,36 @@ class Scan:
         hit = np.flatnonzero(self.nis_dof > 0)
         learnt = self.before.learnt.copy()
         shared = len(self.transition) == 1
-        learnt[hit] = self.chain.learn(learnt[hit], self.transition if shared else self.transition[hit],
-                                       self.before.mu[hit], self.mu[hit], self.dt)
-        return evolve(self.before, stamp_ns=self.stamp_ns, x=self.x, P=self.P, mu=self.mu, learnt=learnt,
-                      nis=np.where(self.nis_dof > 0, self.nis, np.nan), nis_dof=self.nis_dof, scale=self.scale)
+        learnt[hit] = self.chain.learn(
+            learnt[hit],
+            self.transition if shared else self.transition[hit],
+            self.before.mu[hit],
+            self.mu[hit],
+            self.dt,
+        )
+        return evolve(
+            self.before,
+            stamp_ns=self.stamp_ns,
+            x=self.x,
+            P=self.P,
+            mu=self.mu,
+            learnt=learnt,
+            nis=np.where(self.nis_dof > 0, self.nis, np.nan),
+            nis_dof=self.nis_dof,
+            scale=self.scale,
+        )
 
     def _associate(self, group: Group) -> np.ndarray:
-        """The detection of each track (T,), -1 for none; confirmed tracks choose before tentative ones."""
+        """The detection of each track (T,), -1 for none; confirmed tracks choose before tentative
+        ones."""
         chosen = np.full(len(self.x), -1)
         free = np.ones(len(group.z), bool)
         tentative = self.before.life.status == TrackStatus.TENTATIVE
         h, H = group.linearise(self.x, self.models.E)
         threshold = gate_threshold(self.config.gate_probability, group.z.shape[1])
         target, detection, log_likelihood = imm_kernels.gate(
-            h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold)
+            h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold
+        )
         cost = association_cost(log_likelihood, self.config.detection_probability, group.clutter)
         for own in (~tentative, tentative):
             pairs = own[target] & free[detection]
@@ -105,7 +129,8 @@ class Scan:
         return chosen
 
     def _expected(self, group: Group, tracks: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Mean (t, m) and covariance (t, m, m), without R, of what the group would measure of `tracks`."""
+        """Mean (t, m) and covariance (t, m, m), without R, of what the group would measure of
+        `tracks`."""
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
         if isinstance(group, Positions):
             return imm_kernels.combine(x, P, mu, np.ascontiguousarray(self.models.E[:, :2]))
@@ -120,29 +145,35 @@ class Scan:
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
         h, H = group.linearise(x, self.models.E)
         R = np.ascontiguousarray(group.R[detection])
-        x, P, mu, _, nis, ok = imm_kernels.update(x, P, mu, group.innovation(h, detection),
-                                                  np.ascontiguousarray(H), R)
+        x, P, mu, _, nis, ok = imm_kernels.update(
+            x, P, mu, group.innovation(h, detection), np.ascontiguousarray(H), R
+        )
         self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
         self.nis[tracks] += np.where(ok, nis, 0.0)
         self.nis_dof[tracks] += np.where(ok, group.z.shape[1], 0).astype(np.uint16)
         if self.config.estimate_covariance_scale:
             self._learn_scale(group, tracks, detection)
 
-    def _take_bearings(self, bearings: Bearings, tracks: np.ndarray, detection: np.ndarray) -> None:
+    def _take_bearings(
+        self, bearings: Bearings, tracks: np.ndarray, detection: np.ndarray
+    ) -> None:
         """Bearings belong to the echo they came with; the gate only keeps wild ones out."""
         known = np.isfinite(bearings.z[detection, 0])
         tracks, detection = tracks[known], detection[known]
         if not len(tracks):
             return
         h, H = bearings.linearise(self.x[tracks], self.models.E)
-        innovation = np.einsum('tj,tj->t', self.mu[tracks], bearings.innovation(h, detection)[..., 0])
+        innovation = np.einsum(
+            'tj,tj->t', self.mu[tracks], bearings.innovation(h, detection)[..., 0]
+        )
         _, covariance = self._expected(bearings, tracks)
-        nis = innovation ** 2 / (covariance[:, 0, 0] + bearings.R[detection, 0, 0])
+        nis = innovation**2 / (covariance[:, 0, 0] + bearings.R[detection, 0, 0])
         near = nis <= gate_threshold(self.config.gate_probability, 1)
         self._update(bearings, tracks[near], detection[near])
 
     def _learn_scale(self, group: Group, tracks: np.ndarray, detection: np.ndarray) -> None:
-        """Compare residuals with the stated covariance: E[r r' + H P H'] = R after the update, where R is right."""
+        """Compare residuals with the stated covariance: E[r r' + H P H'] = R after the update,
+        where R is right."""
         mean, covariance = self._expected(group, tracks)
         residual = group.z[detection] - mean
         spread = residual[:, :, None] * residual[:, None, :] + covariance

@@ -1,4 +1,5 @@
-"""From a scan to numbers a filter can use: groups of detections of which each target causes at most one.
+"""From a scan to numbers a filter can use: groups of detections of which each target causes at
+most one.
 
 All fixes of a stamp are one group; of a multistatic ping, each transmitter-receiver pair is a
 group of its own, so that updates go through the receivers one after the other; a tag's ping is a
@@ -11,8 +12,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import numpy as np
 from attrs import field, frozen
+import numpy as np
 
 from ..acoustics import multistatic
 from ..acoustics.localisation import Localisation, localise
@@ -37,7 +38,8 @@ class Group:
     rows: np.ndarray = field(factory=lambda: np.empty(0, np.intp))
 
     def linearise(self, x: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Expected measurement (T, M, m) of states x (T, M, n) and its Jacobian (T or 1, M, m, n)."""
+        """Expected measurement (T, M, m) of states x (T, M, n) and its Jacobian (T or 1, M, m,
+        n)."""
         raise NotImplementedError
 
     def innovation(self, expected: FloatArray, detection: np.ndarray) -> FloatArray:
@@ -75,8 +77,14 @@ class RangeSums(Group):
 
     def bearings(self) -> Bearings:
         """The bearings that came with these echoes, detection by detection."""
-        return Bearings(z=self.bearing[:, None], R=self.var_bearing[:, None, None],
-                        clutter=self.clutter, kind=self.kind, factor=self.factor, rx=self.rx)
+        return Bearings(
+            z=self.bearing[:, None],
+            R=self.var_bearing[:, None, None],
+            clutter=self.clutter,
+            kind=self.kind,
+            factor=self.factor,
+            rx=self.rx,
+        )
 
 
 @frozen(eq=False, kw_only=True)
@@ -87,8 +95,10 @@ class Bearings(Group):
 
     def linearise(self, x: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         position = np.einsum('jma,tja->tjm', E[:, :2], x)
-        return (multistatic.bearing(position, self.rx[None]),
-                multistatic.bearing_jacobian(position, self.rx[None]) @ E[:, :2])
+        return (
+            multistatic.bearing(position, self.rx[None]),
+            multistatic.bearing_jacobian(position, self.rx[None]) @ E[:, :2],
+        )
 
     def innovation(self, expected: FloatArray, detection: np.ndarray) -> FloatArray:
         return multistatic.wrap_angle(super().innovation(expected, detection))
@@ -104,11 +114,15 @@ class TagPing(Group):
 
     def linearise(self, x: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         position = np.einsum('jma,tja->tjm', E[:, :2], x)
-        return (self.difference.predict(position, self.rx, self.target_z),
-                self.difference.jacobian(position, self.rx, self.target_z) @ E[:, :2])
+        return (
+            self.difference.predict(position, self.rx, self.target_z),
+            self.difference.jacobian(position, self.rx, self.target_z) @ E[:, :2],
+        )
 
 
-def groups_of(items: Sequence[Measurement], config: DiverConfig, factor: FloatArray) -> list[Group]:
+def groups_of(
+    items: Sequence[Measurement], config: DiverConfig, factor: FloatArray
+) -> list[Group]:
     """The groups of one stamp, in an order that depends on content only.
 
     factor (2,): learnt factor on the covariances of fixes and of arrivals.
@@ -128,7 +142,8 @@ def groups_of(items: Sequence[Measurement], config: DiverConfig, factor: FloatAr
 
 
 def reduced(group: TagPing, config: DiverConfig) -> TagPing:
-    """The same ping without the arrivals that do not fit the others, late reflections above all."""
+    """The same ping without the arrivals that do not fit the others, late reflections above
+    all."""
     ping, rows = group.ping, group.rows
     fix = locate(ping, rows, config, group.factor)
     if fix is None or fix.used.sum() in (len(rows), 0, 1):
@@ -136,19 +151,27 @@ def reduced(group: TagPing, config: DiverConfig) -> TagPing:
     return _tag_ping(ping, rows[fix.used], config, group.factor)
 
 
-def locate(ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: float) -> Localisation | None:
+def locate(
+    ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: float
+) -> Localisation | None:
     """The fix that `rows` of the ping give by themselves, None when they give none to believe."""
-    fix = localise(ping.rx[rows], ping.toa[rows], toa_variance(ping, config, factor)[rows],
-                   tx=ping.tx[rows], bearing=ping.bearing[rows],
-                   var_bearing=bearing_variance(ping, config)[rows], target_z=config.target_z,
-                   sound_speed=config.sound_speed)
+    fix = localise(
+        ping.rx[rows],
+        ping.toa[rows],
+        toa_variance(ping, config, factor)[rows],
+        tx=ping.tx[rows],
+        bearing=ping.bearing[rows],
+        var_bearing=bearing_variance(ping, config)[rows],
+        target_z=config.target_z,
+        sound_speed=config.sound_speed,
+    )
     return fix if isinstance(fix, Localisation) else None
 
 
 def toa_variance(ping: Arrivals, config: DiverConfig, factor: float) -> FloatArray:
     """Variance (n,) of the arrival times, s^2: the sender's where given."""
     known = np.isfinite(ping.var_toa) & (ping.var_toa > 0.0)
-    return np.asarray(np.where(known, ping.var_toa, config.toa_std ** 2) * factor)
+    return np.asarray(np.where(known, ping.var_toa, config.toa_std**2) * factor)
 
 
 def bearing_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
@@ -158,28 +181,52 @@ def bearing_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
 
 
 def _positions(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
-    unknown = np.eye(2) * config.fix_std ** 2
+    unknown = np.eye(2) * config.fix_std**2
     R = np.stack([unknown if fix.covariance is None else fix.covariance for fix in fixes])
-    return Positions(np.stack([fix.position[:2] for fix in fixes]), R * factor,
-                     config.clutter_density, 0, factor)
+    return Positions(
+        np.stack([fix.position[:2] for fix in fixes]),
+        R * factor,
+        config.clutter_density,
+        0,
+        factor,
+    )
 
 
 def _range_sums(ping: Arrivals, config: DiverConfig, factor: float) -> Iterator[RangeSums]:
-    variance = toa_variance(ping, config, factor) * config.sound_speed ** 2
+    variance = toa_variance(ping, config, factor) * config.sound_speed**2
     pair = np.column_stack([ping.tx_id, ping.rx_id])
     usable = np.isfinite(ping.toa) & np.isfinite(ping.tx).all(axis=1)
     for one in np.unique(pair[usable], axis=0):
         rows = np.flatnonzero(usable & (pair == one).all(axis=1))
-        yield RangeSums(z=config.sound_speed * ping.toa[rows, None], R=variance[rows, None, None],
-                        clutter=np.sqrt(config.clutter_density), kind=1, factor=factor, ping=ping,
-                        rows=rows, tx=ping.tx[rows[0]], rx=ping.rx[rows[0]],
-                        target_z=config.target_z, bearing=ping.bearing[rows],
-                        var_bearing=bearing_variance(ping, config)[rows])
+        yield RangeSums(
+            z=config.sound_speed * ping.toa[rows, None],
+            R=variance[rows, None, None],
+            clutter=np.sqrt(config.clutter_density),
+            kind=1,
+            factor=factor,
+            ping=ping,
+            rows=rows,
+            tx=ping.tx[rows[0]],
+            rx=ping.rx[rows[0]],
+            target_z=config.target_z,
+            bearing=ping.bearing[rows],
+            var_bearing=bearing_variance(ping, config)[rows],
+        )
 
 
 def _tag_ping(ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: float) -> TagPing:
     difference = multistatic.difference_measurement(
-        ping.toa[rows], toa_variance(ping, config, factor)[rows], config.sound_speed)
-    return TagPing(z=difference.z[None], R=difference.R[None], clutter=config.clutter_density,
-                   kind=1, factor=factor, ping=ping, rows=rows, rx=ping.rx[rows],
-                   target_z=config.target_z, difference=difference)
+        ping.toa[rows], toa_variance(ping, config, factor)[rows], config.sound_speed
+    )
+    return TagPing(
+        z=difference.z[None],
+        R=difference.R[None],
+        clutter=config.clutter_density,
+        kind=1,
+        factor=factor,
+        ping=ping,
+        rows=rows,
+        rx=ping.rx[rows],
+        target_z=config.target_z,
+        difference=difference,
+    )

@@ -47,8 +47,9 @@ class SmoothingDiverTracker(DiverTracker):
         Tracks, ids and states are those of the filter; ``nis`` stays the filter's too.
         """
         scans = [self._passed[stamp] for stamp in sorted(self._passed)]
-        smooth = [evolve(scan, x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy())
-                  for scan in scans]
+        smooth = [
+            evolve(scan, x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
+        ]
         for track_id, one in self._passes(scans).items():
             result = imm_smooth(*self._arrays(one))
             for scan, x, P, mu in zip(one.scans, result.x, result.P, result.mu):
@@ -70,17 +71,29 @@ class SmoothingDiverTracker(DiverTracker):
                 one.dt.append(dt)
         return passes
 
-    def _ways(self, before: Divers, now: Divers,
-              dt: float) -> Iterator[tuple[int, int, FloatArray]]:
+    def _ways(
+        self, before: Divers, now: Divers, dt: float
+    ) -> Iterator[tuple[int, int, FloatArray]]:
         """Row, id and the transition matrix that led into `now`, for each of its tracks."""
         matrices = self._chain.transition(before.learnt, dt)
         for row, track_id in enumerate(now.life.track_id.tolist()):
             came = np.flatnonzero(before.life.track_id == track_id)
-            yield row, track_id, matrices[came[0] if len(came) and len(matrices) > 1 else 0] \
-                if len(matrices) else self.models.chain.matrix
+            yield (
+                row,
+                track_id,
+                matrices[came[0] if len(came) and len(matrices) > 1 else 0]
+                if len(matrices)
+                else self.models.chain.matrix,
+            )
 
     def _arrays(self, one: _Pass) -> tuple[FloatArray, ...]:
         moves = [self.models.motion(dt) for dt in one.dt]
-        return (np.stack(one.x), np.stack(one.P), np.stack(one.mu), np.stack(one.transition),
-                np.stack([move.F for move in moves]), np.stack([move.Q for move in moves]),
-                np.stack([move.B for move in moves]))
+        return (
+            np.stack(one.x),
+            np.stack(one.P),
+            np.stack(one.mu),
+            np.stack(one.transition),
+            np.stack([move.F for move in moves]),
+            np.stack([move.Q for move in moves]),
+            np.stack([move.B for move in moves]),
+        )

@@ -1,0 +1,484 @@
+"""The IMM filter: independent reference, closed forms, invariances, and the kernels' twin."""
+
+import json
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from sonar_imm.estimation import imm, imm_kernels, kalman, markov
+from sonar_imm.estimation.adaptation import AdaptiveChain
+
+ENGINES = [imm, imm_kernels]
+CASES = [
+    'A1_cv_cv',
+    'A2_cv_ct',
+    'A4_world16',
+    'A6_world16_adaptA_guard',
+    'A10_speedstate16',
+    'A12_speedstate16_hover',
+    'A13_ref_only_missed',
+    'A14_ref_only_EM_N0_1',
+]
+ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
+EYE2 = np.eye(2)
+
+
+class FixedChain:
+    """A chain whose matrix is the same at every step: what the reference cases assume."""
+
+    step = 1.0
+
+    def __init__(self, matrix):
+        self.matrix = matrix
+
+    def transition(self, dt):
+        return self.matrix
+
+
+def cycle(engine, x, P, mu, transition, F, Q, B, z, H, R):
+    """Mix, predict, update; z (m,) for one target, or None when missed."""
+    x, P, c = engine.mix(x, P, mu, transition)
+    x, P = engine.predict(x, P, F, Q, B)
+    if z is None:
+        return x, P, c, 0.0, np.nan
+    innovation = np.ascontiguousarray(z - np.einsum('jmn,tjn->tjm', H, x))
+    x, P, mu, log_likelihood, nis, ok = engine.update(x, P, c, innovation, H[None], R[None])
+    assert ok.all()
+    return x, P, mu, log_likelihood[0], nis[0]
+
+
+def run_case(engine, get, case):
+    """Outputs of a reference case, stacked over time: x, P, mu, xj, Pj, Pi."""
+    F, B, Q, E, P0, Z, R = (get(case, key) for key in ('F', 'B', 'Q', 'E', 'Pi', 'Z', 'R'))
+    options = json.loads(str(get(case, 'opts')))
+    valid = get(case, 'valid') if 'valid' in get(case) else np.ones(len(Z), bool)
+    form = {'product': 'paper', 'em': 'counts', None: 'fixed'}[options.get('form')]
+    # The reference starts its counts at N0 P0 and adds N0 P0 again: worth two N0 in all.
+    chain = AdaptiveChain(
+        FixedChain(P0), form, weight=2.0 * options.get('N0', 1.0), guard=options.get('eps', 0.0)
+    )
+    x, P, mu = (get(case, key)[None].copy() for key in ('x0', 'P0', 'mu0'))
+    learnt, H = chain.fresh(1), np.ascontiguousarray(E[:, :2])
+    rows = []
+    for k in range(len(Z)):
+        transition, before = chain.transition(learnt, 1.0), mu
+        x, P, mu, *_ = cycle(
+            engine, x, P, mu, transition, F, Q, B, Z[k] if valid[k] else None, H, R[k]
+        )
+        if valid[k]:
+            learnt = chain.learn(learnt, transition, before, mu, 1.0)
+        mean, covariance = engine.combine(x, P, mu, E)
+        rows.append((mean[0], covariance[0], mu[0], x[0], P[0], chain.transition(learnt, 1.0)[0]))
+    return [np.stack(column) for column in zip(*rows)]
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+@pytest.mark.parametrize('case', CASES)
+def test_matches_the_independent_reference(engine, case, diver_reference):
+    ours = run_case(engine, diver_reference, case)
+    for key, value in zip(('out_x', 'out_P', 'out_mu', 'out_xj', 'out_Pj', 'out_Pi'), ours):
+        np.testing.assert_allclose(value, diver_reference(case, key), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_the_reference_sees_a_transposed_matrix(engine, diver_reference):
+    """A12 has an asymmetric matrix: reading it the other way round must not pass."""
+
+    def get(case, key=None):
+        value = diver_reference(case, key)
+        return np.ascontiguousarray(value.T) if key == 'Pi' else value
+
+    ours = run_case(engine, get, 'A12_speedstate16_hover')
+    assert np.abs(ours[2] - diver_reference('A12_speedstate16_hover', 'out_mu')).max() > 1e-3
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+@pytest.mark.parametrize('scene', range(5))
+def test_equals_full_enumeration_at_the_first_step_and_the_imm_after(engine, scene):
+    with np.load(Path(__file__).parents[1] / 'vectors/diver/exact_mode_tree.npz') as archive:
+        model = {key: archive[f'cvct/{key}'] for key in ('F', 'B', 'Q', 'Pi', 'mu0')}
+        data = {
+            name.split('/')[2]: archive[name]
+            for name in archive.files
+            if name.startswith(f'cvct/{scene}/')
+        }
+    x, P, mu = data['x0'][None], data['P0'][None], model['mu0'][None]
+    E = np.tile(np.eye(4), (3, 1, 1))
+    total = 0.0
+    for k in range(7):
+        x, P, mu, log_likelihood, _ = cycle(
+            engine,
+            x,
+            P,
+            mu,
+            model['Pi'][None],
+            model['F'],
+            model['Q'],
+            model['B'],
+            data['Z'][k],
+            np.ascontiguousarray(E[:, :2]),
+            data['R'][k],
+        )
+        mean, covariance = engine.combine(x, P, mu, E)
+        total += log_likelihood
+        if k == 0:
+            np.testing.assert_allclose(mean[0], data['exact_x'][0], atol=1e-10)
+            np.testing.assert_allclose(covariance[0], data['exact_P'][0], atol=1e-10)
+            np.testing.assert_allclose(mu[0], data['exact_mu'][0], atol=1e-12)
+            np.testing.assert_allclose(total, data['exact_loglik'][0], atol=1e-10)
+        np.testing.assert_allclose(mean[0], data['imm_x'][k], atol=1e-9)
+        np.testing.assert_allclose(covariance[0], data['imm_P'][k], atol=1e-9)
+        np.testing.assert_allclose(mu[0], data['imm_mu'][k], atol=1e-9)
+
+
+def random_bank(rng, T=3, M=4, n=3, m=2):
+    """Random but sane arrays of a bank of models."""
+
+    def spd(*shape):
+        A = rng.normal(size=(*shape, shape[-1]))
+        return A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(shape[-1])
+
+    return {
+        'x': rng.normal(size=(T, M, n)) * 3.0,
+        'P': spd(T, M, n),
+        'mu': rng.dirichlet(np.ones(M), T),
+        'transition': rng.dirichlet(np.ones(M), (T, M)),
+        'F': rng.normal(size=(M, n, n)),
+        'Q': spd(M, n),
+        'B': rng.normal(size=(M, n)),
+        'H': rng.normal(size=(1, M, m, n)),
+        'R': spd(T, m),
+        'innovation': rng.normal(size=(T, M, m)) * 2.0,
+        'E': rng.normal(size=(M, 4, n)),
+    }
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 5),
+    st.integers(1, 6),
+    st.integers(1, 5),
+    st.integers(1, 4),
+)
+def test_kernels_and_numpy_are_twins(seed, T, M, n, m):
+    bank = random_bank(np.random.default_rng(seed), T, M, n, m)
+    bank['mu'][0] = np.eye(M)[seed % M]  # dead models too
+    bank['transition'][:, :, 0] = 0.0
+    bank['transition'][:, :, -1] = 1.0 - bank['transition'][:, :, :-1].sum(axis=2)
+    results = []
+    for engine in ENGINES:
+        x, P, c = engine.mix(bank['x'], bank['P'], bank['mu'], bank['transition'])
+        x, P = engine.predict(x, P, bank['F'], bank['Q'], bank['B'])
+        updated = engine.update(x, P, c, bank['innovation'], bank['H'], bank['R'])
+        results.append((x, P, c, *updated, *engine.combine(*updated[:3], bank['E'])))
+    for ours, theirs in zip(*results):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-9)
+
+
+def test_the_whole_cycle_is_its_verbs(diver_reference):
+    case = 'A12_speedstate16_hover'
+    F, B, Q, E, Pi, Z, R = (
+        diver_reference(case, key) for key in ('F', 'B', 'Q', 'E', 'Pi', 'Z', 'R')
+    )
+    x, P, mu = (diver_reference(case, key)[None] for key in ('x0', 'P0', 'mu0'))
+    H = np.ascontiguousarray(E[:, :2])
+    whole = imm_kernels.linear_cycle(x, P, mu, Pi[None], F, Q, B, Z[:1], H, R[:1].copy(), E)
+    parts = cycle(imm_kernels, x, P, mu, Pi[None], F, Q, B, Z[0], H, R[0])
+    for ours, theirs in zip(whole[:3], parts[:3]):
+        np.testing.assert_array_equal(ours, theirs)
+    missed = imm_kernels.linear_cycle(
+        x, P, mu, Pi[None], F, Q, B, np.full((1, 2), np.nan), H, R[:1].copy(), E
+    )
+    assert not missed[-1][0] and np.isfinite(missed[3]).all()
+    np.testing.assert_allclose(missed[2][0], mu[0] @ Pi, atol=1e-15)
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_one_model_is_the_kalman_filter(engine):
+    rng = np.random.default_rng(5)
+    bank = random_bank(rng, T=1, M=1)
+    x, P = bank['x'][0, 0], bank['P'][0, 0]
+    state = bank['x'], bank['P'], np.ones((1, 1))
+    for z in rng.normal(size=(20, 2)):
+        *state, log_likelihood, nis = cycle(
+            engine,
+            *state,
+            np.ones((1, 1, 1)),
+            bank['F'],
+            bank['Q'],
+            bank['B'],
+            z,
+            bank['H'][0],
+            bank['R'][0],
+        )
+        x, P = kalman.predict(x, P, bank['F'][0], bank['Q'][0], bank['B'][0])
+        expected = kalman.update(x, P, z - bank['H'][0, 0] @ x, bank['H'][0, 0], bank['R'][0])
+        x, P = expected.x, expected.P
+        np.testing.assert_allclose(state[0][0, 0], x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(state[1][0, 0], P, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            [log_likelihood, nis], [expected.log_likelihood, expected.nis], rtol=1e-9, atol=1e-9
+        )
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_identical_models_are_one_filter_and_the_chain_runs_free(engine):
+    rng = np.random.default_rng(6)
+    one = random_bank(rng, T=1, M=1)
+    bank = {key: np.repeat(one[key], 3, axis=0) for key in ('F', 'Q', 'B')}
+    H = np.repeat(one['H'], 3, axis=1)
+    state = (
+        np.repeat(one['x'], 3, axis=1),
+        np.repeat(one['P'], 3, axis=1),
+        np.array([[0.2, 0.5, 0.3]]),
+    )
+    single = one['x'], one['P'], np.ones((1, 1))
+    law = np.array([0.2, 0.5, 0.3])
+    for z in rng.normal(size=(200, 2)):
+        *state, _, _ = cycle(
+            engine,
+            *state,
+            ASYMMETRIC[None],
+            bank['F'] * 0.9,
+            bank['Q'],
+            bank['B'],
+            z,
+            H[0],
+            one['R'][0],
+        )
+        *single, _, _ = cycle(
+            engine,
+            *single,
+            np.ones((1, 1, 1)),
+            one['F'] * 0.9,
+            one['Q'],
+            one['B'],
+            z,
+            one['H'][0],
+            one['R'][0],
+        )
+        law = law @ ASYMMETRIC
+        np.testing.assert_allclose(state[2][0], law, atol=1e-11)
+        np.testing.assert_allclose(state[0][0, 1], single[0][0, 0], rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(state[2][0], markov.stationary_law(ASYMMETRIC), atol=1e-11)
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_missed_scans_move_the_chain_and_nothing_else(engine):
+    bank = random_bank(np.random.default_rng(7), T=1, M=3)
+    state = bank['x'], bank['P'], np.array([[1.0, 0.0, 0.0]])
+    for _ in range(200):
+        *state, _, _ = cycle(
+            engine,
+            *state,
+            ASYMMETRIC[None],
+            0.5 * np.tile(np.eye(3), (3, 1, 1)),
+            bank['Q'],
+            bank['B'],
+            None,
+            bank['H'][0],
+            bank['R'][0],
+        )
+    np.testing.assert_allclose(state[2][0], markov.stationary_law(ASYMMETRIC), atol=1e-12)
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_identical_rows_are_a_gpb1(engine):
+    """Whatever came before, each model starts from the one overall mixture."""
+    bank = random_bank(np.random.default_rng(8))
+    rows = np.tile([0.1, 0.2, 0.3, 0.4], (1, 4, 1))
+    x, P, c = engine.mix(bank['x'], bank['P'], bank['mu'], rows)
+    mean, covariance = engine.combine(
+        bank['x'], bank['P'], bank['mu'], np.tile(np.eye(3), (4, 1, 1))
+    )
+    for j in range(4):
+        np.testing.assert_allclose(x[:, j], mean, atol=1e-12)
+        np.testing.assert_allclose(P[:, j], covariance, atol=1e-12)
+    np.testing.assert_allclose(c, np.tile(rows[0, 0], (3, 1)), atol=1e-14)
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_the_order_of_models_does_not_matter(engine):
+    bank = random_bank(np.random.default_rng(9), T=1)
+    order = np.array([2, 0, 3, 1])
+
+    def run(p):
+        transition = np.ascontiguousarray(bank['transition'][:, p][:, :, p])
+        x, P, c = engine.mix(
+            bank['x'][:, p].copy(), bank['P'][:, p].copy(), bank['mu'][:, p].copy(), transition
+        )
+        x, P = engine.predict(x, P, bank['F'][p], bank['Q'][p], bank['B'][p])
+        updated = engine.update(
+            x, P, c, bank['innovation'][:, p].copy(), bank['H'][:, p].copy(), bank['R']
+        )
+        return engine.combine(*updated[:3], bank['E'][p]), updated[2]
+
+    (mean, covariance), mu = run(np.arange(4))
+    (mean_p, covariance_p), mu_p = run(order)
+    np.testing.assert_allclose(mean_p, mean, atol=1e-10)
+    np.testing.assert_allclose(covariance_p, covariance, atol=1e-10)
+    np.testing.assert_allclose(mu_p, mu[:, order], atol=1e-12)
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+@pytest.mark.parametrize('far', [1e2, 1e4, 1e8])
+def test_an_outlier_favours_the_wider_model(engine, far):
+    """Both likelihoods underflow; their logarithms do not."""
+    x, P = np.zeros((1, 2, 1)), np.array([[[[1.0]], [[4.0]]]])
+    _, _, mu, _, _, ok = engine.update(
+        x,
+        P,
+        np.full((1, 2), 0.5),
+        np.full((1, 2, 1), far),
+        np.ones((1, 2, 1, 1)),
+        np.ones((1, 1, 1)),
+    )
+    assert ok[0] and mu[0, 1] > 0.999
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_a_model_nothing_can_become_stays_finite_and_comes_back(engine):
+    bank = random_bank(np.random.default_rng(10), T=1, M=2)
+    absorbing = np.array([[[1.0, 0.0], [1.0, 0.0]]])
+    x, P, c = engine.mix(bank['x'], bank['P'], bank['mu'], absorbing)
+    assert c[0, 1] == 0.0 and np.isfinite(x).all() and np.isfinite(P).all()
+    x, P, mu, *_ = engine.update(x, P, c, np.zeros((1, 2, 2)), bank['H'], bank['R'])
+    np.testing.assert_array_equal(mu[0], [1.0, 0.0])
+    _, _, c = engine.mix(x, P, mu, np.array([[[0.7, 0.3], [0.4, 0.6]]]))
+    np.testing.assert_allclose(c[0], [0.7, 0.3])
+
+
+@pytest.mark.parametrize('engine', ENGINES)
+def test_a_measurement_that_no_model_can_use_changes_nothing(engine):
+    bank = random_bank(np.random.default_rng(11), T=2)
+    bank['R'][1] = np.nan
+    x, P, c = engine.mix(bank['x'], bank['P'], bank['mu'], bank['transition'][:2])
+    with np.errstate(invalid='ignore'):
+        try:
+            out = engine.update(x, P, c, bank['innovation'], bank['H'], bank['R'])
+        except np.linalg.LinAlgError:
+            pytest.skip('numpy refuses NaN in eigvalsh; the kernel is what runs live')
+    assert out[5].tolist() == [True, False]
+    np.testing.assert_array_equal(out[0][1], x[1])
+    np.testing.assert_array_equal(out[2][1], c[1])
+
+
+def test_unequal_members_by_embedding_equal_a_filter_that_carries_both_sizes():
+    """A walker (position) beside a cruiser (position, velocity): the embedded filter against one
+    written out by hand, in which the walker has no velocity and lends the prior when mixed."""
+    dt, fill = 1.0, 0.25
+    F = np.array([[1.0, dt], [0.0, 1.0]])
+    Q = np.array([[0.1, 0.02], [0.02, 0.05]])
+    walker = imm.embed([[1.0]], [[0.4]], [0.0], [0], 2, fill_mean=0.5, fill_variance=fill)
+    bank = [np.stack(pair) for pair in zip((F, Q, np.zeros(2)), walker)]
+    transition = np.array([[0.8, 0.2], [0.3, 0.7]])
+    H, R = np.array([[[1.0, 0.0]], [[1.0, 0.0]]]), np.array([[0.3]])
+    state = (
+        np.array([[[0.0, 1.0], [0.2, 0.5]]]),
+        np.array([[np.eye(2), np.diag([2.0, fill])]]),
+        np.array([[0.6, 0.4]]),
+    )
+    cruiser_x, cruiser_P = state[0][0, 0], state[1][0, 0]
+    walker_x, walker_P, mu = 0.2, 2.0, np.array([0.6, 0.4])
+    for z in (0.7, 1.9, 2.4, 2.2):
+        *state, _, _ = cycle(imm, *state, transition[None], *bank, np.array([z]), H, R)
+        c = mu @ transition
+        W = transition * mu[:, None] / c
+        means = [cruiser_x, np.array([walker_x, 0.5])]
+        covariances = [cruiser_P, np.diag([walker_P, fill])]
+        mixed = sum(w * mean for w, mean in zip(W[:, 0], means))
+        mixed_P = sum(
+            w * (C + np.outer(mean - mixed, mean - mixed))
+            for w, mean, C in zip(W[:, 0], means, covariances)
+        )
+        small = W[0, 1] * cruiser_x[0] + W[1, 1] * walker_x
+        small_P = (
+            W[0, 1] * (cruiser_P[0, 0] + (cruiser_x[0] - small) ** 2)
+            + W[1, 1] * (walker_P + (walker_x - small) ** 2)
+            + 0.4
+        )
+        cruiser_x, cruiser_P = F @ mixed, F @ mixed_P @ F.T + Q
+        S, s = cruiser_P[0, 0] + 0.3, small_P + 0.3
+        weight = c * np.array(
+            [
+                np.exp(-0.5 * (z - cruiser_x[0]) ** 2 / S) / np.sqrt(S),
+                np.exp(-0.5 * (z - small) ** 2 / s) / np.sqrt(s),
+            ]
+        )
+        mu = weight / weight.sum()
+        gain = cruiser_P[:, 0] / S
+        cruiser_x, cruiser_P = (
+            cruiser_x + gain * (z - cruiser_x[0]),
+            cruiser_P - np.outer(gain, gain) * S,
+        )
+        walker_x, walker_P = small + small_P / s * (z - small), small_P - small_P**2 / s
+        np.testing.assert_allclose(state[2][0], mu, atol=1e-12)
+        np.testing.assert_allclose(state[0][0, 0], cruiser_x, atol=1e-12)
+        np.testing.assert_allclose(state[1][0, 0], cruiser_P, atol=1e-12)
+        np.testing.assert_allclose(state[0][0, 1], [walker_x, 0.5], atol=1e-12)
+        np.testing.assert_allclose(state[1][0, 1], np.diag([walker_P, fill]), atol=1e-12)
+
+
+def test_embedding_names_a_bad_index():
+    with pytest.raises(ValueError, match='distinct'):
+        imm.embed(EYE2, EYE2, [0.0, 0.0], [1, 1], 3)
+
+
+def test_gates_of_kernel_and_numpy_agree_and_a_sharp_turn_is_inside():
+    rng = np.random.default_rng(12)
+    bank = random_bank(rng, T=5, M=4)
+    z = rng.normal(size=(40, 2)) * 4.0
+    R = np.tile(0.3 * EYE2, (40, 1, 1))
+    h = np.einsum('jmn,tjn->tjm', bank['H'][0], bank['x'])
+    answers = [engine.gate(h, bank['H'], bank['P'], bank['mu'], z, R, 3.0) for engine in ENGINES]
+    for ours, theirs in zip(*answers):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-10)
+    assert 0 < len(answers[0][0]) < 5 * 40
+    # Two models 10 m apart, the improbable one right: outside of 5 sigma of the mixture? No:
+    # inside.
+    x = np.array([[[0.0, 0.0], [0.0, 10.0]]])
+    P, c = np.tile(0.01 * EYE2, (1, 2, 1, 1)), np.array([[0.99, 0.01]])
+    H = np.tile(EYE2, (1, 2, 1, 1))
+    for engine in ENGINES:
+        target, detection, _ = engine.gate(
+            x, H, P, c, np.array([[0.0, 10.0], [0.0, 5.0]]), np.tile(0.01 * EYE2, (2, 1, 1)), 9.0
+        )
+        assert target.tolist() == [0] and detection.tolist() == [0]
+
+
+def test_filterpy_agrees_where_it_is_right():
+    """Same recursion with measurements at every step: FilterPy 2.0.0 as an oracle."""
+    filterpy = pytest.importorskip('filterpy.kalman')
+    rng = np.random.default_rng(13)
+    bank = random_bank(rng, T=1, M=3)
+    members = []
+    for j in range(3):
+        member = filterpy.KalmanFilter(3, 2, dim_u=1)
+        member.x, member.P = bank['x'][0, j][:, None].copy(), bank['P'][0, j].copy()
+        member.F, member.Q, member.R = 0.8 * bank['F'][j], bank['Q'][j], bank['R'][0]
+        member.H, member.B = bank['H'][0, j], bank['B'][j][:, None]
+        members.append(member)
+    theirs = filterpy.IMMEstimator(members, bank['mu'][0].copy(), ASYMMETRIC)
+    state = bank['x'], bank['P'], bank['mu'].copy()
+    for z in rng.normal(size=(30, 2)):
+        *state, _, _ = cycle(
+            imm_kernels,
+            *state,
+            ASYMMETRIC[None],
+            0.8 * bank['F'],
+            bank['Q'],
+            bank['B'],
+            z,
+            bank['H'][0],
+            bank['R'][0],
+        )
+        theirs.predict(np.ones((1, 1)))
+        theirs.update(z[:, None])
+        np.testing.assert_allclose(state[2][0], theirs.mu, atol=1e-9)
+        mean, covariance = imm_kernels.combine(*state, np.tile(np.eye(3), (3, 1, 1)))
+        np.testing.assert_allclose(mean[0], theirs.x[:, 0], atol=1e-8)
+        np.testing.assert_allclose(covariance[0], theirs.P, atol=1e-8)
