@@ -19,6 +19,8 @@ from .headers import Make, make_header, stamp_ns, to_enu
 
 UNKNOWN_VARIANCE = 1e6
 """Written for what is not estimated (m^2 or rad^2): zero would claim certainty."""
+LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e16
+"""Of a fix, in m^2: a micrometre and 100,000 km."""
 
 
 def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
@@ -33,7 +35,18 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
         block = None
     fix = Fix(stamp_ns=stamp_ns(message), position=(x, y, z if np.isfinite(z) else 0.0),
               covariance=block, frame_id=str(message.header.frame_id))
+    check_size(fix)
     return to_enu(fix, world_frame)
+
+
+def check_size(fix: Fix) -> None:
+    """Raise `Rejection` for a covariance so small or large that arithmetic with it breaks down."""
+    if fix.covariance is None:
+        return
+    least, most = np.linalg.eigvalsh(fix.covariance)
+    if least < LEAST_VARIANCE or most > MOST_VARIANCE:
+        raise Rejection('out_of_range', 'the fix states a standard deviation from '
+                                        f'{np.sqrt(least):g} m to {np.sqrt(most):g} m')
 
 
 def doubt_fix(message: Any) -> str | None:

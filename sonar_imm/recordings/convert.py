@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_adapters.fixes import write_fix
+from msg_adapters.fixes import check_size, write_fix
 from sonar_imm.measurements import Fix
 
 from .conversion import ConversionReport, Record, write_bag
@@ -46,8 +46,10 @@ def convert_fixes(path: str | Path, out: str | Path, *, options: CsvOptions | No
     report = ConversionReport(Path(out))
 
     def parse(row: Row) -> Fix:
-        return Fix(stamp_ns=row.stamp_ns(), position=frame.position(row),
-                   covariance=_covariance(row), frame_id=frame_id)
+        fix = Fix(stamp_ns=row.stamp_ns(), position=frame.position(row),
+                  covariance=_covariance(row), frame_id=frame_id)
+        check_size(fix)
+        return fix
 
     records: list[Record] = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message))
                              for _, fix in report.read_rows(table, parse)]

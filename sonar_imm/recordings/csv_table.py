@@ -160,7 +160,8 @@ class CsvTable:
             raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
         if not first or '\0' in first:
             raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
-        self.delimiter = self.options.delimiter or max(',;\t| ', key=first.count)
+        likely = max(',;\t|', key=first.count)
+        self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
         self._headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
         self.index = self._find_columns()
 
