@@ -28,8 +28,8 @@ from .common import BAG, example, progress, say
               help='Only this topic; may be given several times.')
 @click.option('-m', '--remap', 'remaps', multiple=True, metavar='OLD:=NEW',
               help='Publish under another name; may be given several times.')
-@click.option('--lockstep', default='', metavar='NODE',
-              help='Send a message when this node has answered the one before.')
+@click.option('--lockstep', is_flag=False, flag_value='auto', default='', metavar='[NODE]',
+              help='Send a message when NODE, or the only node there is, has answered the last.')
 def command(bag: Path, remaps: tuple[str, ...], **options: object) -> None:
     """Publish the recording BAG to live nodes, byte for byte, stamps included.
 

@@ -25,6 +25,28 @@ from .qos import latched_qos, lockstep_qos
 
 ANSWER_LIMIT = 15.0
 """Seconds a node may take over one message. Its kernels are warm before it listens."""
+_ANSWERS = '/processed'
+_SECOND_LOOK = 0.5
+
+
+def only_node(link: Link) -> str:
+    """Find the node to keep step with where only one runs; gives its full name.
+
+    Raises `LinkError` when there is none after 15 seconds, or more than one.
+    """
+    found: list[str] = []
+
+    def look() -> int:
+        found[:] = [topic.removesuffix(_ANSWERS) for topic, types
+                    in link.node.get_topic_names_and_types()
+                    if topic.endswith(_ANSWERS) and 'sensor_msgs/msg/PointCloud2' in types]
+        return len(found)
+
+    if not link.wait_for(look, MATCH_LIMIT):
+        raise LinkError('no node of this package runs in this ROS domain')
+    if link.wait_for(lambda: look() > 1, _SECOND_LOOK):
+        raise LinkError(f'several nodes run: say which of {", ".join(sorted(found))} to step with')
+    return found[0]
 
 
 class Counts(NamedTuple):
@@ -73,7 +95,7 @@ class LockStep:
         self._start = Counts(0, 0, 0)
         self._sent = 0
         self.delays: list[float] = []
-        link.node.create_subscription(PointCloud2, f'{node_name}/processed', self._answered,
+        link.node.create_subscription(PointCloud2, node_name + _ANSWERS, self._answered,
                                       latched_qos())
 
     @property
@@ -134,7 +156,7 @@ class LockStep:
     def _lost(self) -> str | None:
         if sentence := self._trouble():
             return sentence
-        if not self._link.node.count_publishers(f'{self._name}/processed'):
+        if not self._link.node.count_publishers(self._name + _ANSWERS):
             return f"node '{self._name}' has gone"
         return None
 

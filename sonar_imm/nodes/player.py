@@ -20,7 +20,7 @@ from ..parameters import did_you_mean
 from ..recordings.messages import typestore
 from ..recordings.reader import BagMessage, BagReader
 from .link import Link, LinkError, MATCH_LIMIT
-from .lockstep import LockStep
+from .lockstep import LockStep, only_node
 from .messages import make, message_class
 from .qos import lockstep_qos, output_qos
 
@@ -45,7 +45,8 @@ class PlayOptions:
     recording to skip; delay: seconds to wait before the first message; start_paused: wait for the
     service ``/sonar_imm_player/resume``; clock: Hz of /clock, None for none; topics: only these
     (recorded names), empty for all; remap: recorded to published topic names; lockstep: full name
-    of the node to keep step with (``/diver``), empty to keep the recorded pace.
+    of the node to keep step with (``/diver``), ``auto`` for the only one that runs, empty to keep
+    the recorded pace.
     """
 
     rate: float = field(default=1.0, validator=_positive)
@@ -94,7 +95,8 @@ class Player:
         self._publishers = self._advertise()
         self._lockstep = lockstep
         if options.lockstep and not lockstep:
-            self._lockstep = LockStep(link, options.lockstep)
+            name = only_node(link) if options.lockstep == 'auto' else options.lockstep
+            self._lockstep = LockStep(link, name)
         self._clock = Ticker(link, options.clock) if options.clock else None
         self._pause = Pause(link, options.start_paused)
         self._published = 0

@@ -70,3 +70,17 @@ def test_a_diver_is_tracked_from_fixes(rig):
     assert odometry[-1].twist.twist.linear.x == pytest.approx(1.0, abs=0.2)
     best = int(np.argmax(probabilities[-1].position))
     assert probabilities[-1].name[best] == 'heading_000'
+
+
+def test_a_bag_that_starts_over_is_tracked_again_without_a_clock(rig):
+    bench, node, odometry, _ = rig
+    publisher = bench.peer.create_publisher(
+        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10)
+    bench.spin_until(publisher.get_subscription_count)
+    for count, second in enumerate((*range(1, 41), *range(1, 21)), start=1):
+        publisher.publish(write_fix(Fix(
+            stamp_ns=second * 10**9, position=(0.0, 2.0 * second, 0.0),
+            covariance=0.01 * np.eye(2), frame_id='map'), make))
+        bench.spin_until(lambda want=count: node._meter.received['fix'] == want)
+    bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 20)
+    assert odometry[-1].pose.pose.position.y == pytest.approx(40.0, abs=0.5)

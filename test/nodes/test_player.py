@@ -172,10 +172,10 @@ def test_what_cannot_be_played_is_said(bag, domain, options, sentence):
 class Live:
     """A walker node that runs in a thread, as if it were a process of its own."""
 
-    def __init__(self, domain_id, *parameters):
-        self.link = Link('unused', domain_id=domain_id)
-        self.node = TrackerNode('walker', context=self.link.context, cli_args=[
-            '--ros-args', *(word for p in parameters for word in ('-p', p))])
+    def __init__(self, domain_id, *arguments):
+        self.link = Link(f'beside_{len(arguments)}', domain_id=domain_id)
+        self.node = TrackerNode('walker', context=self.link.context,
+                                cli_args=['--ros-args', *arguments])
         self.executor = SingleThreadedExecutor(context=self.link.context)
         self.executor.add_node(self.node)
         self.thread = threading.Thread(target=self.executor.spin)
@@ -188,8 +188,8 @@ class Live:
         self.link.__exit__()
 
 
-RELIABLE = ('qos_overrides./fix.subscription.reliability:=reliable',
-            'qos_overrides./fix.subscription.history:=keep_all')
+RELIABLE = ('-p', 'qos_overrides./fix.subscription.reliability:=reliable',
+            '-p', 'qos_overrides./fix.subscription.history:=keep_all')
 
 
 @pytest.fixture
@@ -235,6 +235,17 @@ def test_a_second_player_counts_from_where_the_node_stands(bag, link, start):
     assert len(recorder) == 0
 
 
+def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(bag, start, domain,
+                                                                    monkeypatch):
+    start(*RELIABLE)
+    result = play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
+    assert len(result.delays) == COUNT - 1
+    start('-r', '__node:=other')
+    monkeypatch.setattr(lockstep_module, '_SECOND_LOOK', 15.0)
+    with pytest.raises(LinkError, match='several nodes run: say which of /other, /walker'):
+        play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
+
+
 def test_lockstep_without_a_node_says_so(bag, link):
     player, _, _ = stepping(bag, link)
     with pytest.raises(LinkError, match="no answer from a node '/walker'"):
@@ -243,7 +254,7 @@ def test_lockstep_without_a_node_says_so(bag, link):
 
 def test_lockstep_names_the_type_the_node_expects(bag, link, start, monkeypatch):
     monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 3.0)
-    start('fix_type:=geometry_msgs/msg/PointStamped')
+    start('-p', 'fix_type:=geometry_msgs/msg/PointStamped')
     player, _, _ = stepping(bag, link, topics=('/fix',))
     with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
         player.run()
