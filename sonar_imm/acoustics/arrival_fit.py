@@ -29,7 +29,7 @@ GRID_RADII = 24
 GRID_ANGLES = 36
 MAX_STARTS = 32
 MAX_ITERATIONS = 60
-SMALLEST_GAIN = 1e-7
+SMALLEST_GAIN = 1e-5
 """A step ends the iteration when it promises to lower chi-square by less than this share of it (or
 1e-10)."""
 FAR = 10.0
@@ -95,6 +95,18 @@ class ArrivalFit:
         if len(self.bearing_rx):
             cost = cost + np.square(self._bearing_residual(position)) @ weight[len(self.rx):]
         return cost
+
+    def curvature(self, position: FloatArray, pull: FloatArray) -> FloatArray:
+        """Second derivative of the ranges at positions (k, 2), summed over the rows with the
+        weights `pull` (k, m): (k, 2, 2). Bearings are left out: their part is small."""
+        total = np.zeros((len(position), 2, 2))
+        for points, share in ((self.rx, np.ones(len(self.rx))), (self.tx, self.active)):
+            if share.any():
+                distance, direction = slant_range(position, points, self.target_z)
+                bend = share * pull[:, :len(points)] / np.maximum(distance, 1e-3)
+                along = np.swapaxes(direction * bend[..., None], -1, -2) @ direction
+                total += bend.sum(axis=-1)[:, None, None] * np.eye(2) - along
+        return total
 
     def _bearing_residual(self, position: FloatArray) -> FloatArray:
         return wrap_angle(self.observed[len(self.rx):] - bearing(position, self.bearing_rx))
@@ -190,46 +202,58 @@ class Minima:
 
 
 def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
-    """Levenberg-Marquardt from every start (k, 2) at once; `weight` (m,), or (k, m) by start."""
+    """Damped Newton iteration from every start (k, 2) at once; `weight` (m,), or (k, m) by start.
+
+    The Hessian holds the second derivative of the ranges too: without it (Gauss-Newton,
+    Levenberg-Marquardt) runs towards a minimum with large residuals, a ghost or a ping with a
+    reflection, take hundreds of steps.
+    """
     weight = np.broadcast_to(weight, (len(starts), len(fit.weight)))
     position, damping = starts.copy(), np.full(len(starts), 1e-3)
-    residual, jacobian = fit.residuals(position, weight)
-    cost = (weight * np.square(residual)).sum(axis=-1)
-    information, gradient = _normal_equations(residual, jacobian, weight)
+    cost, gradient, hessian, information = _expansion(fit, position, weight)
     converged = np.zeros(len(starts), bool)
     for _ in range(MAX_ITERATIONS):
-        step = _damped_step(information, gradient, damping)
-        trial = position + step
-        residual, jacobian = fit.residuals(trial, weight)
-        trial_cost = (weight * np.square(residual)).sum(axis=-1)
-        better = (trial_cost <= cost) & ~converged
+        step = _damped_step(hessian, information, gradient, damping)
+        step = np.clip(step, -fit.max_range, fit.max_range)
+        trial = _expansion(fit, position + step, weight)
+        better = (trial[0] <= cost) & ~converged
         # Little gain counts when damping is not the cause, or when no step at all goes downhill.
         gain = (gradient * step).sum(axis=-1)
         converged |= (gain < SMALLEST_GAIN * cost + 1e-10) & (~better | (damping <= 1.0))
-        position = np.where(better[:, None], trial, position)
+        position = np.where(better[:, None], position + step, position)
         # Hyperbolas lead some runs to infinity: nothing plausible lies there, so they end.
         away = np.abs(position - fit.centre).max(axis=-1)
         converged |= away > FAR * fit.max_range
-        cost = np.where(better, trial_cost, cost)
-        trial_information, trial_gradient = _normal_equations(residual, jacobian, weight)
-        information = np.where(better[:, None, None], trial_information, information)
-        gradient = np.where(better[:, None], trial_gradient, gradient)
+        cost = np.where(better, trial[0], cost)
+        gradient = np.where(better[:, None], trial[1], gradient)
+        hessian = np.where(better[:, None, None], trial[2], hessian)
+        information = np.where(better[:, None, None], trial[3], information)
         damping = np.where(better, np.maximum(0.1 * damping, 1e-12), 10.0 * damping)
         if converged.all():
             break
     return Minima(position, cost, information, converged)
 
 
-def _normal_equations(residual: FloatArray, jacobian: FloatArray,
-                      weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
-    return weighted @ jacobian, (weighted @ residual[..., None])[..., 0]
+def _expansion(fit: ArrivalFit, position: FloatArray,
+               weight: FloatArray) -> tuple[FloatArray, ...]:
+    """Cost (k,), half its downhill gradient (k, 2), half its Hessian and the information."""
+    residual, jacobian = fit.residuals(position, weight)
+    pull = weight * residual
+    transposed = np.swapaxes(jacobian, -1, -2)
+    information = (transposed * weight[:, None, :]) @ jacobian
+    gradient = (transposed @ pull[..., None])[..., 0]
+    hessian = information - fit.curvature(position, pull)
+    return (pull * residual).sum(axis=-1), gradient, hessian, information
 
 
-def _damped_step(information: FloatArray, gradient: FloatArray, damping: FloatArray) -> FloatArray:
-    """Solve (A + damping tr(A) I) step = gradient for symmetric 2 x 2 matrices, in closed form."""
-    a, b, d = information[:, 0, 0], information[:, 0, 1], information[:, 1, 1]
-    lift = damping * (a + d) + 1e-300
+def _damped_step(hessian: FloatArray, information: FloatArray, gradient: FloatArray,
+                 damping: FloatArray) -> FloatArray:
+    """Solve (H + lift I) step = gradient for 2 x 2 matrices in closed form, the lift making H
+    positive definite."""
+    a, b, d = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]
+    trace = information[:, 0, 0] + information[:, 1, 1]
+    smallest = 0.5 * (a + d) - np.hypot(0.5 * (a - d), b)
+    lift = damping * trace + np.maximum(-2.0 * smallest, 0.0) + 1e-300
     a, d = a + lift, d + lift
     x, y = gradient.T
     step = np.stack([d * x - b * y, a * y - b * x], axis=-1)

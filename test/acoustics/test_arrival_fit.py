@@ -79,6 +79,29 @@ def test_search_finds_the_lowest_point_of_a_fine_grid(kind):
     assert np.linalg.norm(grid[best.argmin()] - minima.position[0]) < 1.0
 
 
+# With the first seeds the grid alone misses the lowest minimum, with the others the closed form.
+@pytest.mark.parametrize('seed', [333, 399, 435, 468, 570, 9, 24, 81, 117, 183, 228, 294, 297])
+def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
+    rng = np.random.default_rng(seed)
+    n, sigma = 4 + seed % 2, 0.15 * (1 if seed % 3 else 60)
+    rx = np.column_stack([rng.uniform(-100, 100, (n, 2)), rng.uniform(-9, -1, n)])
+    truth = rng.uniform(-150, 150, 2)
+    noise = sigma * np.random.default_rng(seed).standard_normal(n)
+    fit = ArrivalFit(tx=rx, rx=rx, active=np.zeros(n, bool), bearing_rx=np.empty((0, 3)),
+                     observed=multistatic.pseudo_range(truth, rx, -5.0) + noise,
+                     weight=np.full(n, 0.15**-2), target_z=-5.0, max_range=1e4)
+    found = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
+    begun = minimise(fit, truth[None], fit.weight)
+    assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3
+
+
+def test_runs_that_leave_for_infinity_end():
+    fit = problem(KINDS['passive'], offset=40.0, bearings=0)
+    minima = minimise(fit, np.array([TRUTH, [5e3, 8e3]]), fit.weight)
+    assert minima.converged.all()
+    assert_allclose(minima.position[0], TRUTH, atol=1e-6)
+
+
 def test_each_start_may_have_its_own_weights():
     fit = problem(KINDS['active'], bearings=0)
     fit.observed[2] += 30.0

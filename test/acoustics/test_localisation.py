@@ -272,10 +272,24 @@ def test_late_reflections_are_left_out(make, n, late):
         scene['toa'][late] += np.linspace(4e-3, 9e-3, len(late))
         fix = localise(**scene)
         assert_array_equal(np.flatnonzero(~fix.used), late)
+        assert not fix.ambiguous
         assert distance2(fix, TRUTH) < 25.0
         assert fix.dof == n - len(late) - (2 if make is active else 3)
         alone = localise(**{**scene, 'var_toa': np.where(fix.used, SIGMA**2, np.nan)})
         assert_allclose(fix.position, alone.position, atol=1e-4)
+
+
+@pytest.mark.parametrize('seed', [56, 65, 74, 214, 248])
+def test_the_search_starts_afresh_without_a_reflection(seed):
+    """In these scenes the reflection bends the sum of squares so far that no old minimum helps."""
+    rng = np.random.default_rng(seed)
+    rx = np.column_stack([rng.uniform(-100, 100, (5, 2)), rng.uniform(-9, -1, 5)])
+    truth = rng.uniform(-150, 150, 2)
+    scene = active(5, truth, rx=rx, sigma=SIGMA, seed=seed)
+    scene['toa'][0] += [0.02, 0.05, 0.1][seed % 3]
+    fix = localise(**scene)
+    assert_array_equal(fix.used, [False, True, True, True, True])
+    assert np.linalg.norm(fix.position - truth) < 1.0
 
 
 def test_a_wrong_bearing_is_left_out():
@@ -323,6 +337,15 @@ def test_rows_that_are_not_measured_are_not_used():
     fix = localise(**scene)
     assert_array_equal(fix.used, [True] * 4 + [False] * 2)
     assert_allclose(fix.position, good.position, atol=1e-4)
+
+
+@pytest.mark.parametrize('place', [np.inf, -1e300])
+def test_a_transmitter_at_infinity_is_not_used(place):
+    scene = active(5, sigma=SIGMA, seed=4)
+    scene['tx'][1, 0] = place
+    fix = localise(**scene)
+    assert_array_equal(fix.used, [True, False, True, True, True])
+    assert fix.emission_time is None and distance2(fix, TRUTH) < 25.0
 
 
 @pytest.mark.parametrize('change', [
