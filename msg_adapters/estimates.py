@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
@@ -50,7 +50,7 @@ def write_truth(position: ArrayLike, velocity: ArrayLike, track_id: ArrayLike, *
     speed = np.asarray(velocity, np.float64)
     xyz = np.zeros((len(place), 3), np.float32)
     xyz[:, :place.shape[1]] = place
-    columns = dict(zip('xyz', xyz.T))
+    columns: dict[str, NDArray] = dict(zip('xyz', xyz.T))
     columns.update(px=place[:, 0], py=place[:, 1], vx=speed[:, 0], vy=speed[:, 1],
                    track_id=np.asarray(track_id, np.uint32))
     return encode_table(columns, stamp_ns=stamp_ns, frame_id=frame_id, make=make)

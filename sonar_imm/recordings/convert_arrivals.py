@@ -80,14 +80,14 @@ def convert_arrivals(path: str | Path, out: str | Path, receivers: str | Path, *
     numbers = number_names(list(places))
     sender_numbers = numbers if senders is places else number_names(list(senders))
     records: list[Record] = []
-    for key, ping in pings.items():
+    for label, ping in pings.items():
         try:
             measurement = _one_ping(ping, passive, places, senders, numbers, sender_numbers,
                                     frame_id)
             records.append((measurement.stamp_ns, '/arrivals',
                             write_arrivals(measurement, ros_message)))
         except Rejection as error:
-            report.bad_row(table.path, f'ping {key}', error)
+            report.bad_row(table.path, f'ping {label}', error)
     if truth is not None and records:
         records += truth_records(truth, report, truth_options, frame_id, origin)
     if any(name != str(number) for name, number in numbers.items()):

@@ -14,6 +14,7 @@ from decimal import Decimal
 import math
 from pathlib import Path
 import re
+from typing import Any, TextIO
 
 from attrs import field, frozen
 
@@ -205,10 +206,10 @@ class CsvTable:
         return TIME_UNITS[suffix.group(1) if suffix else 's']
 
     @property
-    def _dialect(self) -> dict:
+    def _dialect(self) -> dict[str, Any]:
         return {'delimiter': self.delimiter, 'skipinitialspace': True}
 
-    def _open(self):
+    def _open(self) -> TextIO:
         return self.path.open(encoding='utf-8-sig', errors='replace', newline='')
 
     def _find_columns(self) -> dict[str, int]:

@@ -57,4 +57,5 @@ def _checked(origin: tuple[float, ...]) -> tuple[float, float, float]:
     """Complete an origin with height 0."""
     if len(origin) not in (2, 3) or not all(map(math.isfinite, origin)) or abs(origin[0]) > 90.0:
         raise BagError(f'an origin is latitude, longitude and perhaps height, got {origin}')
-    return (*map(float, origin), 0.0)[:3]
+    latitude, longitude, height = (*map(float, origin), 0.0)[:3]
+    return latitude, longitude, height

@@ -15,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from heapq import merge
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+from attrs import evolve, frozen
 
 from msg_adapters.headers import stamp_ns
 from sonar_imm.measurements import Rejection
@@ -27,7 +29,8 @@ __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
 ORDERS = ('recorded', 'stamp')
 
 
-class BagMessage(NamedTuple):
+@frozen
+class BagMessage:
     """One recorded message.
 
     index: running number of the message in the selection it was read with, in recorded order;
@@ -114,7 +117,7 @@ class BagReader:
         if order == 'stamp':
             recorded = iter(sorted(recorded, key=lambda item: (_stamp(item), item.index)))
         for item in recorded:
-            yield item if decode else item._replace(message=None)
+            yield item if decode else evolve(item, message=None)
 
     def _recorded(self, topics: Collection[str] | None, decode: bool) -> Iterator[BagMessage]:
         streams = [self._guarded(source, topics) for source in self._sources]
@@ -156,8 +159,9 @@ def _merged(sources: list[Source]) -> list[TopicInfo]:
         for topic in source.topics():
             key = (topic.name, topic.type_name)
             known = joined.get(key)
-            joined[key] = topic if known is None else known._replace(
-                count=known.count + topic.count, decodable=known.decodable and topic.decodable)
+            joined[key] = topic if known is None else evolve(
+                known, count=known.count + topic.count,
+                decodable=known.decodable and topic.decodable)
     return [joined[key] for key in sorted(joined)]
 
 

@@ -6,10 +6,11 @@ it raises becomes a `BagError` or a problem of one sentence here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from attrs import frozen
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
@@ -28,7 +29,8 @@ class BagError(Exception):
         super().__init__(sentence)
 
 
-class TopicInfo(NamedTuple):
+@frozen
+class TopicInfo:
     """One topic of a recording.
 
     `decodable` is False when the message definition is neither in the bag nor known;
@@ -154,9 +156,8 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
         if path.name == 'metadata.yaml':
             return open_sources(path.parent)
         if path.suffix not in SUFFIXES:
-            hint = '; unpack it with zstd first' if path.suffix == '.zstd' else ''
             raise BagError(f'{path} is no recording: the file names of recordings end in '
-                           f'{", ".join(SUFFIXES)}{hint}')
+                           f'{", ".join(SUFFIXES)}{_packed_hint([path])}')
         return _open_files([path], [])
     return _open_directory(path)
 
@@ -178,7 +179,7 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
     if not files:
         raise BagError(problems[0] if problems else
                        f'{path} is no recording: it holds neither metadata.yaml nor a file that '
-                       f'ends in {", ".join(SUFFIXES)}')
+                       f'ends in {", ".join(SUFFIXES)}{_packed_hint(path.iterdir())}')
     if not problems and not (path / 'metadata.yaml').exists():
         problems.append(f'{path} has no metadata.yaml, its files are read one by one')
     return _open_files(files, problems)
@@ -234,6 +235,11 @@ def _leftovers(path: Path) -> list[str]:
 
 def _advice(file: Path) -> str:
     return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
+
+
+def _packed_hint(files: Iterable[Path]) -> str:
+    packed = [file.name for file in files if file.suffix in ('.zstd', '.zst')]
+    return f'; {packed[0]} is compressed, unpack it with zstd first' if packed else ''
 
 
 def _split_order(file: Path) -> tuple[int, str]:

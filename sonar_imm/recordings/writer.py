@@ -46,8 +46,8 @@ class BagWriter:
         try:
             self._writer = Writer(self.path, version=8,
                                   storage_plugin=StoragePlugin[storage.upper()])
-            for key in sorted(custom_data or {}):
-                self._writer.set_custom_data(key, str(custom_data[key]))
+            for key, note in sorted((custom_data or {}).items()):
+                self._writer.set_custom_data(key, str(note))
             self._writer.open()
         except WriterError:
             raise BagError(f'{path} exists already; remove it or choose another name') from None

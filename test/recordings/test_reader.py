@@ -56,6 +56,25 @@ class TestWhole:
         items, problems = read(path)
         assert len(items) == 50 and len(problems) == 1 and 'no metadata.yaml' in problems[0]
 
+    @pytest.mark.parametrize('plugin', list(StoragePlugin))
+    def test_compressed_messages_without_the_metadata_that_tell_of_it(self, tmp_path, fix_message,
+                                                                      plugin):
+        writer = Writer(tmp_path / 'bag', version=8, storage_plugin=plugin)
+        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+        with writer:
+            link = writer.add_connection('/fix', FIX, typestore=typestore())
+            writer.write(link, 1, typestore().serialize_cdr(fix_message(7), FIX))
+        (tmp_path / 'bag' / 'metadata.yaml').unlink()
+        items, _ = read(tmp_path / 'bag')
+        assert items[0].message.pose.pose.position.x == 7
+
+    def test_a_compressed_file_without_metadata_is_one_sentence(self, write_fixes):
+        path = write_fixes()
+        storage_file(path).rename(path / 'bag.mcap.zstd')
+        (path / 'metadata.yaml').unlink()
+        with pytest.raises(BagError, match='bag.mcap.zstd.*unpack'):
+            read(path)
+
     def test_a_ros_1_bag(self, tmp_path):
         store = get_typestore(Stores.ROS1_NOETIC)
         types = store.types
