@@ -16,6 +16,9 @@ MODEL_SETS = (
     'cv_cv',
     'cv_ct',
 )
+BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
+"""The single-direction sets and how many models they have."""
+
 ADAPTATIONS = ('counts', 'paper', 'fixed')
 
 
@@ -132,9 +135,10 @@ class DiverConfig(Config):
         high=10.0,
     )
     acceleration_noise: tuple[float, ...] = parameter(
-        (0.05, 0.6),
-        'acceleration noise of the baselines: cv uses the first, '
-        'cv_cv both, cv_ct the first for CV and the second for CT',
+        (),
+        'acceleration noise of each model of cv, cv_cv or cv_ct over a reference step; empty: '
+        'values tuned for divers',
+        kind='float[]',
         unit='m/s^2',
         low=0.0,
         high=100.0,
@@ -288,11 +292,12 @@ class DiverConfig(Config):
                 f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '
                 f'({self.confirm_window})'
             )
-        if self.model_set in ('cv_cv', 'cv_ct') and len(self.acceleration_noise) < 2:
-            problems.append(f'model_set {self.model_set} needs two values in acceleration_noise')
-        if not self.acceleration_noise:
-            problems.append('acceleration_noise must not be empty')
         models = self.model_count()
+        if self.model_set in BASELINES and len(self.acceleration_noise) not in (0, models):
+            problems.append(
+                f'acceleration_noise needs one value for each of the {models} models of '
+                f'{self.model_set}, got {len(self.acceleration_noise)}'
+            )
         if self.transition_matrix:
             if len(self.transition_matrix) != models * models:
                 problems.append(
@@ -320,9 +325,8 @@ class DiverConfig(Config):
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""
-        small = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
-        if self.model_set in small:
-            return small[self.model_set]
+        if self.model_set in BASELINES:
+            return BASELINES[self.model_set]
         return self.directions + (
             1 if self.hover and self.model_set.startswith('heading_speed') else 0
         )

@@ -39,6 +39,9 @@ from .diver_config import DiverConfig
 OUTPUTS = ('px', 'py', 'vx', 'vy')
 _CACHED_STEPS = 64
 
+BASELINE_NOISE = {'cv': (0.25,), 'cv_cv': (0.05, 0.6), 'cv_ct': (0.1, 0.3, 0.3)}
+"""Acceleration noise, m/s^2, that suits divers: tuned on the scene of the paper's Table 1."""
+
 
 class Motion(NamedTuple):
     """One step of all models: x <- F x + B + N(0, Q). F, Q (M, n, n), B (M, n)."""
@@ -257,7 +260,7 @@ def _relative_headings(config: DiverConfig) -> ModelSet:
     rate = config.velocity_noise**2 / T
 
     def motion(dt: float) -> Motion:
-        F, Q = np.tile(np.eye(4), (M, 1, 1)), _white_acceleration(rate, dt)
+        F, Q = np.tile(np.eye(4), (M, 1, 1)), _white_acceleration(rate, 0.0, dt)
         F[:, :2, 2:], F[:, 2:, 2:] = dt * R, R
         return Motion(F, np.tile(Q, (M, 1, 1)), np.zeros((M, 4)))
 
@@ -272,34 +275,38 @@ def _relative_headings(config: DiverConfig) -> ModelSet:
     )
 
 
-def _white_acceleration(rate: float, dt: float) -> FloatArray:
-    """Process noise of a velocity random walk of `rate` (m/s)^2 a second: exact, so steps
-    compose."""
-    return np.asarray(
-        np.kron(rate * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]]), np.eye(2))
-    )
+def _white_acceleration(rate: float, turn: float, dt: float) -> FloatArray:
+    """Process noise of a velocity that walks at random, `rate` (m/s)^2 a second, while it turns by
+    `turn` rad/s: the exact integral, so steps compose."""
+    angle = turn * dt
+    lag = (angle - np.sin(angle)) / angle**3 if abs(angle) > 1e-2 else 1.0 / 6.0 - angle**2 / 120.0
+    along, across = 0.5 * dt**2 * np.sinc(0.5 * angle / np.pi) ** 2, dt**2 * angle * lag
+    Q = np.empty((4, 4))
+    Q[:2, :2] = 2.0 * rate * dt**3 * lag * np.eye(2)
+    Q[:2, 2:] = rate * np.array([[along, across], [-across, along]])
+    Q[2:, :2] = Q[:2, 2:].T
+    Q[2:, 2:] = rate * dt * np.eye(2)
+    return Q
 
 
 def _single_direction(config: DiverConfig) -> ModelSet:
-    rates = [value**2 * config.reference_step for value in config.acceleration_noise]
-    names, noise, turns = {
-        'cv': (('cv',), rates[:1], [0.0]),
-        'cv_cv': (('cv_quiet', 'cv_lively'), rates[:2], [0.0, 0.0]),
-        'cv_ct': (
-            ('cv', 'ct_left', 'ct_right'),
-            [rates[0], rates[-1], rates[-1]],
-            [0.0, np.deg2rad(config.turn_rate_deg), -np.deg2rad(config.turn_rate_deg)],
-        ),
+    turn = np.deg2rad(config.turn_rate_deg)
+    names, turns = {
+        'cv': (('cv',), (0.0,)),
+        'cv_cv': (('cv_quiet', 'cv_lively'), (0.0, 0.0)),
+        'cv_ct': (('cv', 'ct_left', 'ct_right'), (0.0, turn, -turn)),
     }[config.model_set]
     M = len(names)
+    noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
+    rates = [value**2 * config.reference_step for value in noise]
     stay = config.baseline_stay_probability
     P = np.full((M, M), (1.0 - stay) / max(M - 1, 1))
     np.fill_diagonal(P, stay if M > 1 else 1.0)
 
     def motion(dt: float) -> Motion:
         return Motion(
-            np.stack([_turning(rate, dt) for rate in turns]),
-            np.stack([_white_acceleration(rate, dt) for rate in noise]),
+            np.stack([_turning(turn, dt) for turn in turns]),
+            np.stack([_white_acceleration(*both, dt) for both in zip(rates, turns)]),
             np.zeros((M, 4)),
         )
 

@@ -1,0 +1,414 @@
+"""The diver tracker as its users see it: measurements in, estimates out."""
+
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+from sonar_imm.estimation.consistency import average_bounds
+from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.simulation.diver import RECEIVERS, scenario, simulate
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.diver import DiverConfig, DiverTracker
+from sonar_imm.trackers.diver_config import ADAPTATIONS, MODEL_SETS
+from sonar_imm.trackers.diver_smoothing import SmoothingDiverTracker
+
+SECOND = 10**9
+
+
+def fix(second, x, y, covariance=None, frame_id='map'):
+    return Fix(
+        stamp_ns=round(second * SECOND),
+        position=[x, y, 0.0],
+        covariance=np.eye(2) if covariance is None else covariance,
+        frame_id=frame_id,
+    )
+
+
+def run(tracker, measurements):
+    """The last word on every stamp."""
+    final = {}
+    for measurement in measurements:
+        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(measurement))
+    return [final[stamp] for stamp in sorted(final)]
+
+
+def same(one, other):
+    """Equal to the last bit."""
+    ours, theirs = one.columns(), other.columns()
+    return (
+        one.stamp_ns == other.stamp_ns
+        and list(ours) == list(theirs)
+        and all(
+            ours[name].dtype == theirs[name].dtype
+            and ours[name].tobytes() == theirs[name].tobytes()
+            for name in ours
+        )
+    )
+
+
+def errors(estimates, track):
+    """Position error (k, 2) and covariance (k, 2, 2) of the confirmed row of each stamp."""
+    at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
+    found = []
+    for estimate in estimates:
+        rows = np.flatnonzero(estimate.extras['track_state'] > 0)
+        if len(rows):
+            truth = track.position[at[estimate.stamp_ns], :2]
+            found.append(
+                (estimate.state[rows[0], :2] - truth, estimate.covariance[rows[0], :2, :2])
+            )
+    return [np.array(column) for column in zip(*found)]
+
+
+@pytest.mark.parametrize('model_set', MODEL_SETS)
+@pytest.mark.parametrize('adaptation', ADAPTATIONS)
+def test_every_set_follows_a_diver_better_than_its_fixes(model_set, adaptation):
+    scene = simulate(scenario('zigzag'), seed=3)
+    tracker = SYSTEMS['diver'].build(
+        DiverConfig(
+            model_set=model_set,
+            adaptation=adaptation,
+            max_tracks=1,
+            fixed_speed=0.75,
+            gate_probability=0.999999,
+        )
+    )
+    estimates = run(tracker, [one.measurement for one in scene.measurements])
+    error, _ = errors(estimates, scene.truth[0])
+    raw = (
+        np.array([one.measurement.position[:2] for one in scene.measurements])
+        - scene.truth[0].position[:, :2]
+    )
+    assert len(error) >= 98  # confirmed at the third fix, never lost
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.9 * np.sqrt(
+        np.mean(np.sum(raw**2, axis=1))
+    )
+    for estimate in estimates:
+        assert np.isfinite(estimate.state).all()
+        np.testing.assert_allclose(estimate.probabilities.sum(axis=1), 1.0)
+
+
+def test_the_estimate_is_the_contract():
+    tracker = DiverTracker(DiverConfig())
+    estimate = tracker.process(fix(1, 2.0, 3.0))[0]
+    columns = estimate.columns()
+    assert list(columns)[:8] == ['x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px']
+    assert [name for name in columns if name.startswith('prob_')][0] == 'prob_heading_000'
+    assert list(columns)[-4:] == ['track_id', 'track_state', 'nis', 'nis_dof']
+    assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64
+    assert columns['track_id'].dtype == np.uint32 and columns['track_state'].dtype == np.uint8
+    assert estimate.stamp_ns == SECOND and estimate.frame_id == 'map'
+
+
+def test_consistency_where_the_models_hold():
+    """A diver drawn from the models themselves: NEES within its bounds."""
+    rng = np.random.default_rng(4)
+    config = DiverConfig(
+        adaptation='fixed', max_tracks=1, confirm_hits=1, hover=False, gate_probability=0.9999999
+    )
+    models = SYSTEMS['diver'].build(config).models
+    runs, steps, squared = 100, 40, []
+    for _ in range(runs):
+        tracker = DiverTracker(config)
+        mode = rng.integers(16)
+        state = np.array([0.0, 0.0, max(rng.normal(0.75, 0.4), 0.05)])
+        for k in range(steps):
+            if k:
+                mode = rng.choice(16, p=models.chain.matrix[mode])
+                motion = models.motion(1.0)
+                state = rng.multivariate_normal(motion.F[mode] @ state, motion.Q[mode])
+            z = state[:2] + 0.5 * rng.normal(size=2)
+            estimate = tracker.process(fix(k + 1, *z, 0.25 * np.eye(2)))[-1]
+        d = estimate.state[0] - np.concatenate([state[:2], models.E[mode, 2:, 2] * state[2]])
+        squared.append(d[:2] @ np.linalg.solve(estimate.covariance[0, :2, :2], d[:2]))
+    low, high = average_bounds(runs, 2, 0.999)
+    assert low < np.mean(squared) < high
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.randoms(use_true_random=False))
+def test_shuffled_input_gives_the_same_bits(random):
+    scene = simulate(scenario('irregular', {'duration': 25.0, 'clutter': 1.0}), seed=8)
+    ordered = sorted((one.measurement for one in scene.measurements), key=lambda m: m.stamp_ns)
+    shuffled = sorted(ordered, key=lambda m: m.stamp_ns + random.uniform(0.0, 9.0) * SECOND)
+    expected, late = (run(DiverTracker(DiverConfig()), items) for items in (ordered, shuffled))
+    assert len(expected) == len(late)
+    assert all(same(*pair) for pair in zip(expected, late))
+
+
+def test_a_late_fix_revises_everything_after_it():
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    for second in (1, 2, 4, 5):
+        tracker.process(fix(second, second, 0.0))
+    revised = tracker.process(fix(3, 3.0, 0.0))
+    assert [estimate.stamp_ns // SECOND for estimate in revised] == [3, 4, 5]
+    assert tracker.counts == {'used': 5, 'late': 1, 'doubted': 0}
+
+
+def test_bad_timing_is_counted_and_harmless():
+    tracker = DiverTracker(DiverConfig(history=2.0, max_tracks=1))
+    for second in range(1, 20):
+        tracker.process(fix(second, second, 0.0))
+    assert tracker.process(fix(5, 5.0, 0.0)) == []
+    assert tracker.counts['too_late'] == 1
+    assert tracker.process(fix(19, 19.0, 0.0)) == []
+    assert tracker.counts['duplicate'] == 1
+    assert tracker.process(fix(10**6, 0.0, 0.0)) == []  # a wild stamp far ahead
+    assert len(tracker.process(fix(20, 20.0, 0.0))) == 1
+    assert tracker.counts['doubted'] == 1
+
+
+def test_a_restarted_clock_is_noticed_and_loses_nothing():
+    tracker = DiverTracker(DiverConfig(restart_after=4, max_tracks=1))
+    first = run(tracker, [fix(second, second, 0.0) for second in range(1000, 1020)])
+    again = run(tracker, [fix(second, second, 0.0) for second in range(10, 30)])
+    assert tracker.counts['restarts'] == 1 and tracker.counts['too_late'] == 0
+    assert [estimate.stamp_ns // SECOND for estimate in again] == list(range(10, 30))
+    assert first[-1].extras['track_id'][0] != again[-1].extras['track_id'][0]
+
+
+def test_reset_equals_a_fresh_tracker():
+    scene = simulate(scenario('several', {'duration': 20.0}), seed=1)
+    items = [one.measurement for one in scene.measurements]
+    tracker = DiverTracker(DiverConfig())
+    first = run(tracker, items)
+    tracker.reset()
+    assert not tracker.counts
+    assert all(same(*pair) for pair in zip(first, run(tracker, items)))
+
+
+def test_another_frame_is_refused_by_name():
+    tracker = DiverTracker(DiverConfig())
+    tracker.process(fix(1, 0.0, 0.0))
+    assert tracker.process(fix(2, 0.0, 0.0, frame_id='odom')) == []
+    assert tracker.counts['other_frame'] == 1
+
+
+def test_an_outlier_is_not_believed():
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    clean = DiverTracker(DiverConfig(max_tracks=1))
+    for second in range(1, 30):
+        wild = second == 20
+        last = tracker.process(fix(second, 0.5 * second + 500.0 * wild, 0.0))[-1]
+        if not wild:
+            clean.process(fix(second, 0.5 * second, 0.0))
+    assert abs(last.state[0, 0] - 14.5) < 0.5
+    assert last.extras['track_id'][0] == 1
+
+
+def test_a_turned_and_shifted_scene_gives_the_turned_and_shifted_answer():
+    turn = 2.0 * np.pi * 3 / 16
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    shift = np.array([1000.0, -500.0])
+    scene = simulate(scenario('zigzag', {'duration': 30.0}), seed=5)
+    plain, turned = DiverTracker(DiverConfig()), DiverTracker(DiverConfig())
+    for one in scene.measurements:
+        z, C = one.measurement.position[:2], one.measurement.covariance
+        a = plain.process(one.measurement)[-1]
+        b = turned.process(
+            Fix(
+                stamp_ns=one.measurement.stamp_ns,
+                frame_id='map',
+                position=np.append(R @ z + shift, 0.0),
+                covariance=R @ C @ R.T,
+            )
+        )[-1]
+    np.testing.assert_allclose(b.state[0, :2], R @ a.state[0, :2] + shift, atol=1e-6)
+    np.testing.assert_allclose(
+        b.covariance[0, :2, :2], R @ a.covariance[0, :2, :2] @ R.T, atol=1e-6
+    )
+    np.testing.assert_allclose(b.probabilities[0, 3:16], a.probabilities[0, :13], atol=1e-6)
+
+
+def test_several_divers_keep_their_names():
+    scene = simulate(scenario('several', {'spacing': 25.0}), seed=2)
+    tracker = DiverTracker(DiverConfig(clutter_density=2.0 / 200.0**2))
+    estimates = run(tracker, [one.measurement for one in scene.measurements])
+    confirmed = [
+        estimate.extras['track_id'][estimate.extras['track_state'] > 0]
+        for estimate in estimates[10:]
+    ]
+    assert np.mean([len(ids) for ids in confirmed]) == pytest.approx(4.0, abs=0.35)
+    assert len(set(np.concatenate(confirmed).tolist())) <= 7
+
+
+def test_arrivals_are_better_than_fixes_made_of_them():
+    squared = {'arrivals': [], 'multistatic_fixes': []}
+    for sensor, found in squared.items():
+        for seed in range(4):
+            scene = simulate(
+                scenario(
+                    'multistatic', {'sensor': sensor, 'outlier_probability': 0.0, 'duration': 60.0}
+                ),
+                seed,
+            )
+            tracker = DiverTracker(DiverConfig(max_tracks=1))
+            error, _ = errors(
+                run(tracker, [one.measurement for one in scene.measurements]), scene.truth[0]
+            )
+            found += np.sum(error**2, axis=1).tolist()
+    rmse = {sensor: np.sqrt(np.mean(found)) for sensor, found in squared.items()}
+    assert rmse['arrivals'] < 0.9 * rmse['multistatic_fixes']
+    assert rmse['arrivals'] < 0.35
+
+
+def tag_ping(second, position, rng, receivers=RECEIVERS, emitted=0.123, std=1e-4):
+    distance = np.linalg.norm(np.append(position, 0.0) - receivers, axis=1)
+    n = len(receivers)
+    nothing = np.full(n, np.nan)
+    return Arrivals(
+        stamp_ns=round(second * SECOND),
+        tx_id=np.zeros(n),
+        rx_id=np.arange(n),
+        tx=np.full((n, 3), np.nan),
+        rx=receivers,
+        toa=emitted + distance / 1500.0 + std * rng.normal(size=n),
+        var_toa=np.full(n, std**2),
+        bearing=nothing,
+        var_bearing=nothing,
+        frame_id='map',
+    )
+
+
+def test_a_tag_of_unknown_emission_time_is_followed_also_by_two_receivers():
+    """Two receivers give one time difference: no fix, but it does hold a track."""
+    rng = np.random.default_rng(6)
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    for second in range(1, 60):
+        position = np.array([0.6 * second - 20.0, 30.0])
+        heard = RECEIVERS if second < 25 or second % 3 == 0 else RECEIVERS[[1, 2]]
+        estimate = tracker.process(tag_ping(second, position, rng, heard, rng.uniform(0, 5)))[-1]
+    assert np.hypot(*(estimate.state[0, :2] - position)) < 1.0
+    assert estimate.extras['track_id'].tolist() == [1]
+    assert tracker.health()['confirmed'] == 1
+
+
+def test_a_late_reflection_in_a_tag_ping_is_left_out():
+    rng = np.random.default_rng(7)
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    receivers = np.vstack([RECEIVERS, [[80.0, 80.0, 0.0], [-30.0, -40.0, 0.0]]])
+    for second in range(1, 30):
+        ping = tag_ping(second, np.array([0.5 * second, 30.0]), rng, receivers)
+        if second == 29:
+            toa = ping.toa.copy()
+            toa[2] += 0.02
+            ping = Arrivals(
+                stamp_ns=ping.stamp_ns,
+                tx_id=ping.tx_id,
+                rx_id=ping.rx_id,
+                tx=ping.tx,
+                rx=ping.rx,
+                toa=toa,
+                var_toa=ping.var_toa,
+                bearing=ping.bearing,
+                var_bearing=ping.var_bearing,
+                frame_id='map',
+            )
+        estimate = tracker.process(ping)[-1]
+    assert estimate.extras['nis_dof'][0] == 4  # five of six receivers, less the emission time
+    assert np.hypot(*(estimate.state[0, :2] - [14.5, 30.0])) < 0.5
+
+
+def test_bearings_help_a_single_receiver():
+    rng = np.random.default_rng(8)
+
+    def final_error(with_bearing):
+        tracker = DiverTracker(DiverConfig(max_tracks=1))
+        for second in range(1, 40):
+            p = np.array([-20.0 + 0.6 * second, 30.0])
+            heard = RECEIVERS if second < 8 else RECEIVERS[:1]
+            path = np.linalg.norm(p) + np.linalg.norm(p - heard[:, :2], axis=1)
+            n = len(heard)
+            bearing = np.arctan2(*(p - heard[:, :2]).T[::-1]) + 0.01 * rng.normal(size=n)
+            tracker_out = tracker.process(
+                Arrivals(
+                    stamp_ns=second * SECOND,
+                    tx_id=np.zeros(n),
+                    rx_id=np.arange(n),
+                    tx=np.zeros((n, 3)),
+                    rx=heard,
+                    toa=path / 1500.0 + 1e-4 * rng.normal(size=n),
+                    var_toa=np.full(n, 1e-8),
+                    bearing=bearing if with_bearing else np.full(n, np.nan),
+                    var_bearing=np.full(n, 1e-4),
+                    frame_id='map',
+                )
+            )
+        return np.hypot(*(tracker_out[-1].state[0, :2] - p))
+
+    assert final_error(True) < 0.4 < final_error(False) + 0.4
+
+
+def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
+    receivers = np.vstack([RECEIVERS, [[60.0, 70.0, 0.0]]])
+    rng = np.random.default_rng(9)
+    tracker = DiverTracker(DiverConfig())
+    for second in range(1, 25):
+        divers = np.array([[0.5 * second - 10.0, 30.0], [30.0 - 0.4 * second, 55.0]])
+        path = np.linalg.norm(divers, axis=1)[:, None] + np.linalg.norm(
+            divers[:, None] - receivers[None, :, :2], axis=2
+        )
+        n = path.size
+        order = rng.permutation(n)
+        receiver = np.tile(np.arange(5), 2)[order]
+        estimate = tracker.process(
+            Arrivals(
+                stamp_ns=second * SECOND,
+                tx_id=np.zeros(n),
+                rx_id=receiver,
+                tx=np.zeros((n, 3)),
+                rx=receivers[receiver],
+                toa=path.ravel()[order] / 1500.0 + 1e-4 * rng.normal(size=n),
+                var_toa=np.full(n, 1e-8),
+                bearing=np.full(n, np.nan),
+                var_bearing=np.full(n, np.nan),
+                frame_id='map',
+            )
+        )[-1]
+    confirmed = estimate.state[estimate.extras['track_state'] > 0, :2]
+    assert len(confirmed) == 2
+    for diver in divers:
+        assert np.hypot(*(confirmed - diver).T).min() < 0.5
+
+
+def test_optimistic_covariances_can_be_found_out():
+    rng = np.random.default_rng(10)
+    tracker = DiverTracker(
+        DiverConfig(estimate_covariance_scale=True, max_tracks=1, gate_probability=0.9999999)
+    )
+    for second in range(1, 400):
+        z = np.array([0.4 * second, 0.0]) + 3.0 * rng.normal(size=2)
+        tracker.process(fix(second, *z))  # stated: 1 m, true: 3 m
+    assert 5.0 < tracker.health()['scale_fixes'] < 14.0
+
+
+def test_polled_divers_are_not_missed_when_another_one_answers():
+    tracker = DiverTracker(DiverConfig(fixes_are_scans=False, confirm_hits=2))
+    for second in range(1, 80):
+        diver = second % 8
+        last = tracker.process(fix(second, 60.0 * diver + 0.05 * second, 0.0))[-1]
+    assert sorted(last.extras['track_id'].tolist()) == list(range(1, 9))
+    assert (last.extras['track_state'] == 1).all()
+
+
+def test_parameters_that_may_change_do_and_others_do_not():
+    tracker = DiverTracker(DiverConfig())
+    tracker.process(fix(1, 0.0, 0.0))
+    tracker.reconfigure(DiverConfig(gate_probability=0.99))
+    assert tracker.config.gate_probability == 0.99
+    assert len(tracker.process(fix(2, 0.0, 0.0))[-1]) == 1
+    with pytest.raises(ValueError, match='directions'):
+        tracker.reconfigure(DiverConfig(directions=8))
+
+
+def test_smoothing_lowers_the_error_and_keeps_the_tracks():
+    filtered, smooth = [], []
+    for seed in range(3):
+        scene = simulate(scenario('table1', {'duration': 60.0}), seed)
+        tracker = SmoothingDiverTracker(DiverConfig(max_tracks=1))
+        estimates = run(tracker, [one.measurement for one in scene.measurements])
+        back = tracker.smoothed()
+        assert [one.stamp_ns for one in back] == [one.stamp_ns for one in estimates]
+        assert same(back[-1], estimates[-1])
+        for series, found in ((estimates, filtered), (back, smooth)):
+            found += np.sum(errors(series, scene.truth[0])[0] ** 2, axis=1).tolist()
+    assert np.sqrt(np.mean(smooth)) < 0.75 * np.sqrt(np.mean(filtered))
