@@ -9,6 +9,7 @@ really there before a byte is touched.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 import math
 from typing import Any
 
@@ -80,15 +81,22 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
                                       for name, array in arrays.items()]))
     for name, array in arrays.items():
         packed[name] = array
-    fields = [make('sensor_msgs/msg/PointField', name=name, offset=packed.dtype.fields[name][1],
-                   datatype=_CODES[array.dtype.str[1:]], count=math.prod(array.shape[1:]))
-              for name, array in arrays.items()]
+    fields = _point_fields(make, tuple(
+        (name, packed.dtype.fields[name][1], _CODES[array.dtype.str[1:]],
+         math.prod(array.shape[1:])) for name, array in arrays.items()))
     step = packed.dtype.itemsize if arrays else 0
     finite = all(np.isfinite(array).all() for array in arrays.values())
     return make('sensor_msgs/msg/PointCloud2', header=make_header(stamp_ns, frame_id, make),
-                height=1, width=rows, fields=fields, is_bigendian=False, point_step=step,
+                height=1, width=rows, fields=list(fields), is_bigendian=False, point_step=step,
                 row_step=step * rows, data=np.frombuffer(packed.tobytes(), np.uint8),
                 is_dense=bool(finite))
+
+
+@lru_cache(maxsize=64)
+def _point_fields(make: Make, layout: tuple[tuple[str, int, int, int], ...]) -> tuple[Any, ...]:
+    """Build the PointFields of a layout once: they are most of the work of a small live table."""
+    return tuple(make('sensor_msgs/msg/PointField', name=name, offset=offset, datatype=datatype,
+                      count=count) for name, offset, datatype, count in layout)
 
 
 def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 MATCH_LIMIT = 15.0
 """Seconds to wait for peers. Discovery is usually instant but now and then takes three seconds."""
+_LOOK = 0.1
 
 
 class LinkError(RuntimeError):
@@ -54,13 +55,13 @@ class Link:
         `trouble` is asked ten times a second; a sentence from it is raised as `LinkError`.
         """
         now = time.monotonic()
-        end, next_look = now + limit, now
+        end, next_look = now + limit, now + _LOOK
         while not predicate():
             now = time.monotonic()
             if now >= next_look:
                 if sentence := trouble():
                     raise LinkError(sentence)
-                next_look = now + 0.1
+                next_look = now + _LOOK
             if now >= end:
                 return False
             self.spin(min(end - now, 0.1))
