@@ -29,6 +29,7 @@ GRID_RADII = 24
 GRID_ANGLES = 36
 MAX_STARTS = 32
 MAX_ITERATIONS = 60
+CURVED_AFTER = 8
 SMALLEST_GAIN = 1e-5
 """A step ends the iteration when it promises to lower chi-square by less than this share of it (or
 1e-10)."""
@@ -202,20 +203,20 @@ class Minima:
 
 
 def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
-    """Damped Newton iteration from every start (k, 2) at once; `weight` (m,), or (k, m) by start.
+    """Levenberg-Marquardt from every start (k, 2) at once; `weight` (m,), or (k, m) by start.
 
-    The Hessian holds the second derivative of the ranges too: without it (Gauss-Newton,
-    Levenberg-Marquardt) runs towards a minimum with large residuals, a ghost or a ping with a
-    reflection, take hundreds of steps.
+    Runs towards a minimum with large residuals, a ghost or a ping with a reflection, would take
+    hundreds of such steps. After `CURVED_AFTER` of them the Hessian therefore gets the second
+    derivative of the ranges too (Newton), which costs more a step.
     """
     weight = np.broadcast_to(weight, (len(starts), len(fit.weight)))
     position, damping = starts.copy(), np.full(len(starts), 1e-3)
-    cost, gradient, hessian, information = _expansion(fit, position, weight)
+    cost, gradient, hessian, information = _expansion(fit, position, weight, False)
     converged = np.zeros(len(starts), bool)
-    for _ in range(MAX_ITERATIONS):
+    for iteration in range(MAX_ITERATIONS):
         step = _damped_step(hessian, information, gradient, damping)
         step = np.clip(step, -fit.max_range, fit.max_range)
-        trial = _expansion(fit, position + step, weight)
+        trial = _expansion(fit, position + step, weight, iteration >= CURVED_AFTER)
         better = (trial[0] <= cost) & ~converged
         # Little gain counts when damping is not the cause, or when no step at all goes downhill.
         gain = (gradient * step).sum(axis=-1)
@@ -234,15 +235,16 @@ def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
     return Minima(position, cost, information, converged)
 
 
-def _expansion(fit: ArrivalFit, position: FloatArray,
-               weight: FloatArray) -> tuple[FloatArray, ...]:
-    """Cost (k,), half its downhill gradient (k, 2), half its Hessian and the information."""
+def _expansion(fit: ArrivalFit, position: FloatArray, weight: FloatArray,
+               curved: bool) -> tuple[FloatArray, ...]:
+    """Cost (k,), half its downhill gradient (k, 2), half its Hessian, whole where `curved`, and
+    the information (k, 2, 2)."""
     residual, jacobian = fit.residuals(position, weight)
     pull = weight * residual
     transposed = np.swapaxes(jacobian, -1, -2)
     information = (transposed * weight[:, None, :]) @ jacobian
     gradient = (transposed @ pull[..., None])[..., 0]
-    hessian = information - fit.curvature(position, pull)
+    hessian = information - fit.curvature(position, pull) if curved else information
     return (pull * residual).sum(axis=-1), gradient, hessian, information
 
 
