@@ -8,21 +8,23 @@ from sonar_imm.measurements import Rejection
 
 
 class FrameGuard:
-    """Lets one frame pass: the one it is told, or else that of the first measurement it sees."""
+    """Lets one frame pass: the one it is told, or else the first that a measurement names."""
 
     def __init__(self, frame_id: str = ''):
-        """Expect `frame_id`; empty means that the first measurement decides."""
-        self._expected = frame_id
-        self._frame_id: str | None = frame_id or None
+        """Expect `frame_id`; empty means that the measurements decide."""
+        self._told = self._frame_id = frame_id
 
     def check(self, measurement: Any) -> None:
-        """Raise `Rejection` when `measurement` is in another frame; an empty name is one too."""
-        if self._frame_id is None:
+        """Raise `Rejection` when `measurement` is in another frame.
+
+        One without a frame passes only until a frame is known.
+        """
+        if not self._frame_id:
             self._frame_id = measurement.frame_id
         elif measurement.frame_id != self._frame_id:
             raise Rejection('frame', f"the frame '{measurement.frame_id}' is not the frame "
                                      f"'{self._frame_id}' of the tracks")
 
     def reset(self) -> None:
-        """Let the next measurement decide again, unless a frame was told."""
-        self._frame_id = self._expected or None
+        """Let the measurements decide again, unless a frame was told."""
+        self._frame_id = self._told

@@ -49,7 +49,7 @@ from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
-_PATIENCE = 1.5
+_PATIENCE = 3.0
 
 
 class TrackerNode(Node):

@@ -3,13 +3,15 @@
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, PointCloud2
 
+from msg_adapters.estimates import read_estimate
 from msg_adapters.fixes import write_fix
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.qos import lockstep_qos
 
 
 @pytest.fixture
@@ -84,3 +86,42 @@ def test_a_bag_that_starts_over_is_tracked_again_without_a_clock(rig):
         bench.spin_until(lambda want=count: node._meter.received['fix'] == want)
     bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 20)
     assert odometry[-1].pose.pose.position.y == pytest.approx(40.0, abs=0.5)
+
+
+def test_a_storm_of_garbage_is_answered_and_leaves_no_garbage_behind(rig):
+    bench, node, _, _ = rig
+    tables = bench.listen(PointCloud2, '/diver/estimate', lockstep_qos())
+    publisher = bench.peer.create_publisher(
+        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', lockstep_qos())
+    bench.spin_until(publisher.get_subscription_count)
+    rng = np.random.default_rng(7)
+    odd = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 5e-324, 1e-30, 1e30, 1.7e308])
+
+    def some(size):
+        values = rng.normal(scale=10.0, size=size)
+        hit = rng.random(size) < 0.15
+        values[hit] = rng.choice(odd, size=hit.sum())
+        return values
+
+    count = 500
+    for k in range(1, count + 1):
+        x, y, z = some(3)
+        message = make('geometry_msgs/msg/PoseWithCovarianceStamped')
+        message.pose.pose.position = make('geometry_msgs/msg/Point', x=x, y=y, z=z)
+        message.pose.covariance = some(36) if k % 3 == 0 else np.diag(np.abs(some(6))).ravel()
+        message.header.stamp.sec = int(rng.choice([k, k, k, k - 3, 0, -k, 2**31 - 1]))
+        message.header.stamp.nanosec = int(rng.choice([0, 5, 10**9 - 1, 10**9, 2**32 - 1]))
+        message.header.frame_id = str(rng.choice(['map'] * 8 + ['', 'map_ned', 'a' * 300]))
+        publisher.publish(message)
+        bench.spin_until(lambda want=k: node._meter.received['fix'] == want)
+    bench.spin_until(lambda: len(tables) == node._published)
+    refused = node._meter.refused
+    assert {'nan', 'bad_stamp', 'bad_covariance'} <= set(refused)
+    assert 0 < refused.total() < count
+    assert not node._errors
+    for table in tables:
+        estimate = read_estimate(table)
+        assert np.isfinite(estimate.state).all()
+        assert np.isfinite(estimate.covariance).all()
+        assert np.isfinite(estimate.probabilities).all()
+    assert len(tables) > 10

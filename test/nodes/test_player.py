@@ -3,7 +3,7 @@
 import threading
 import time
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
@@ -301,3 +301,24 @@ def test_recorded_estimates_read_back(bag, link, start):
     estimate = recorder.estimates()[0]
     assert estimate.frame_id == 'map'
     assert estimate.model_names == ('slow', 'fast')
+
+
+def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import get_typestore, Stores
+    types = get_typestore(Stores.ROS1_NOETIC)
+    make_of = types.types
+    with Writer(tmp_path / 'old.bag') as writer:
+        name = 'geometry_msgs/msg/PointStamped'
+        topic = writer.add_connection('/fix', name, typestore=types)
+        for k in range(3):
+            stamp = make_of['builtin_interfaces/msg/Time'](sec=100 + k, nanosec=5)
+            header = make_of['std_msgs/msg/Header'](seq=k, stamp=stamp, frame_id='map')
+            point = make_of['geometry_msgs/msg/Point'](x=float(k), y=2.0, z=3.0)
+            message = make_of[name](header=header, point=point)
+            writer.write(topic, (100 + k) * 10**9, types.serialize_ros1(message, name))
+    ear = Ear(link, PointStamped, '/fix')
+    assert play(tmp_path / 'old.bag', PlayOptions(rate=100.0), domain_id=domain).published == 3
+    assert link.wait_for(lambda: len(ear.heard) == 3, 10.0)
+    assert [(m.header.stamp.sec, m.header.frame_id, m.point.x) for m in ear.heard] == [
+        (100, 'map', 0.0), (101, 'map', 1.0), (102, 'map', 2.0)]
