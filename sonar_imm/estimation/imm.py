@@ -157,14 +157,14 @@ def gate(
     z: FloatArray,
     R: FloatArray,
     threshold: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Which detections (D, m) with covariances R (D, m, m) may belong to which target.
+) -> FloatArray:
+    """How well each detection (D, m) with covariance R (D, m, m) fits each target: (T, D)
+    log-likelihoods ln sum_j c_j N(nu_j; 0, S_j), -inf outside the gate.
 
-    h (T, M, m): what each model expects; H (T or 1, M, m, n) its Jacobian; P (T, M, n, n), c (T,
-    M) predicted. A detection is inside when it is inside the gate of *some* model that is not
-    impossible: the moment-matched gate of the mixture is too small for a sharp turn seen by a
-    sensor that is accurate in one direction, and loses the track there. Gives target, detection
-    and log-likelihood ln sum_j c_j N(nu_j; 0, S_j), each (pairs,), in order.
+    h (T, M, m): what each model expects; H (T or 1, M, m, n) its Jacobian; P (T, M, n, n) and
+    c (T, M) predicted. A detection is inside when it is inside the gate of *some* model that is
+    not impossible: the moment-matched gate of the mixture is too small for a sharp turn seen by a
+    sensor that is accurate in one direction, and loses the track there.
     """
     possible = c >= MIN_GATE_PROBABILITY
     S = (H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None]
@@ -172,9 +172,9 @@ def gate(
     nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
     log_density = -0.5 * (nis + h.shape[-1] * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1])
     inside = ((nis <= threshold) & possible[:, None]).any(axis=-1)
-    target, detection = np.nonzero(inside)
-    weight = np.where(possible, c, 0.0)[target]
-    return target, detection, np.log(np.sum(weight * np.exp(log_density[inside]), axis=-1))
+    weight = np.where(possible, c, 0.0)[:, None]
+    with np.errstate(divide='ignore'):
+        return np.where(inside, np.log(np.sum(weight * np.exp(log_density), axis=-1)), -np.inf)
 
 
 def embed(

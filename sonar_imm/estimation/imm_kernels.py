@@ -104,35 +104,39 @@ def update(
     """See `imm.update`: x, P, mu, log_likelihood, nis, ok."""
     T, M, n = x.shape
     m = innovation.shape[2]
-    x1, P1, mu = x.copy(), P.copy(), c.copy()
-    log_likelihood = np.full(T, -np.inf)
-    nis = np.full(T, np.nan)
-    ok = np.zeros(T, dtype=np.bool_)
+    x1, P1, mu = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
+    log_likelihood, nis, ok = np.empty(T), np.empty(T), np.zeros(T, dtype=np.bool_)
     PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
     A, AP = np.empty((n, n)), np.empty((n, n))
     S, L, S_mix = np.empty((m, m)), np.zeros((m, m)), np.empty((m, m))
     scratch, mean = np.empty(m), np.empty(m)
     log_weight = np.empty(M)
     for t in range(T):
-        r_t, h_t = t % R.shape[0], t % H.shape[0]
-        mean[:] = 0.0
-        for j in range(M):
-            for r in range(m):
+        R_t, h_t = R[t % R.shape[0]], t % H.shape[0]
+        log_likelihood[t], nis[t] = -np.inf, np.nan
+        for r in range(m):
+            mean[r] = 0.0
+            for j in range(M):
                 mean[r] += c[t, j] * innovation[t, j, r]
-        S_mix[:] = 0.0
+            for s in range(m):
+                S_mix[r, s] = 0.0
         best = -np.inf
         for j in range(M):
             log_weight[j] = -np.inf
-            innovation_covariance(P[t, j], H[h_t, j], R[r_t], PHt, S)
+            mu[t, j] = c[t, j]
+            P_j, H_j, v_j, P1_j = P[t, j], H[h_t, j], innovation[t, j], P1[t, j]
+            for a in range(n):
+                x1[t, j, a] = x[t, j, a]
+                for b in range(n):
+                    P1_j[a, b] = P_j[a, b]
+            innovation_covariance(P_j, H_j, R_t, PHt, S)
             for r in range(m):
                 for s in range(m):
-                    S_mix[r, s] += c[t, j] * (
-                        S[r, s] + (innovation[t, j, r] - mean[r]) * (innovation[t, j, s] - mean[s])
-                    )
+                    S_mix[r, s] += c[t, j] * (S[r, s] + (v_j[r] - mean[r]) * (v_j[s] - mean[s]))
             if not cholesky(S, L):
                 continue
             gain(PHt, L, K)
-            value = -0.5 * (whitened_square(L, innovation[t, j], scratch) + m * LOG_2PI)
+            value = -0.5 * (whitened_square(L, v_j, scratch) + m * LOG_2PI)
             for r in range(m):
                 value -= math.log(L[r, r])
             if c[t, j] > 0.0 and math.isfinite(value):
@@ -140,11 +144,14 @@ def update(
                 best = max(best, log_weight[j])
             for a in range(n):
                 for r in range(m):
-                    x1[t, j, a] += K[a, r] * innovation[t, j, r]
-            joseph(P[t, j], K, H[h_t, j], R[r_t], A, AP, KR, P1[t, j])
+                    x1[t, j, a] += K[a, r] * v_j[r]
+            joseph(P_j, K, H_j, R_t, A, AP, KR, P1_j)
         if not math.isfinite(best):
-            x1[t] = x[t]
-            P1[t] = P[t]
+            for j in range(M):
+                for a in range(n):
+                    x1[t, j, a] = x[t, j, a]
+                    for b in range(n):
+                        P1[t, j, a, b] = P[t, j, a, b]
             continue
         ok[t] = True
         total = 0.0
@@ -168,31 +175,29 @@ def gate(
     z: FloatArray,
     R: FloatArray,
     threshold: float,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """See `imm.gate`: target, detection, log_likelihood, each (pairs,)."""
+) -> FloatArray:
+    """See `imm.gate`."""
     T, M, m = h.shape
     D, n = len(z), P.shape[2]
-    S0, PHt = np.empty((M, m, m)), np.empty((n, m))
-    S, L, nothing = np.empty((m, m)), np.zeros((m, m)), np.zeros((m, m))
-    v, w, low, high = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
-    widest = np.zeros(m)
+    out = np.empty((T, D))
+    S0, PHt, nothing = np.empty((M, m, m)), np.empty((n, m)), np.zeros((m, m))
+    S, L = np.empty((m, m)), np.zeros((m, m))
+    v, w, low, high, widest = np.empty(m), np.empty(m), np.empty(m), np.empty(m), np.zeros(m)
     for d in range(D):
         for r in range(m):
             widest[r] = max(widest[r], R[d, r, r])
-    size, capacity = 0, max(T, D) + 16
-    target, detection = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
-    log_likelihood = np.empty(capacity)
     for t in range(T):
-        low[:], high[:] = np.inf, -np.inf
+        for r in range(m):
+            low[r], high[r] = np.inf, -np.inf
         for j in range(M):
-            if c[t, j] < MIN_GATE_PROBABILITY:
-                continue
-            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
-            for r in range(m):
-                reach = math.sqrt(threshold * max(S0[j, r, r] + widest[r], 0.0))
-                low[r] = min(low[r], h[t, j, r] - reach)
-                high[r] = max(high[r], h[t, j, r] + reach)
+            if c[t, j] >= MIN_GATE_PROBABILITY:
+                innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
+                for r in range(m):
+                    reach = math.sqrt(threshold * max(S0[j, r, r] + widest[r], 0.0))
+                    low[r] = min(low[r], h[t, j, r] - reach)
+                    high[r] = max(high[r], h[t, j, r] + reach)
         for d in range(D):
+            out[t, d] = -np.inf
             near = True
             for r in range(m):
                 near = near and low[r] <= z[d, r] <= high[r]
@@ -206,29 +211,15 @@ def gate(
                     v[r] = z[d, r] - h[t, j, r]
                     for s in range(m):
                         S[r, s] = S0[j, r, s] + R[d, r, s]
-                if not cholesky(S, L):
-                    continue
-                nis = whitened_square(L, v, w)
-                inside = inside or nis <= threshold
-                value = -0.5 * (nis + m * LOG_2PI)
-                for r in range(m):
-                    value -= math.log(L[r, r])
-                total += c[t, j] * math.exp(value)
-            if not inside:
-                continue
-            if size == capacity:
-                capacity *= 2
-                target, detection = _grown(target, capacity), _grown(detection, capacity)
-                log_likelihood = _grown(log_likelihood, capacity)
-            target[size], detection[size], log_likelihood[size] = t, d, math.log(total)
-            size += 1
-    return target[:size].copy(), detection[:size].copy(), log_likelihood[:size].copy()
-
-
-@kernel
-def _grown(array: NDArray, capacity: int) -> NDArray:
-    out = np.empty(capacity, array.dtype)
-    out[: len(array)] = array
+                if cholesky(S, L):
+                    nis = whitened_square(L, v, w)
+                    inside = inside or nis <= threshold
+                    value = -0.5 * (nis + m * LOG_2PI)
+                    for r in range(m):
+                        value -= math.log(L[r, r])
+                    total += c[t, j] * math.exp(value)
+            if inside:
+                out[t, d] = math.log(total)
     return out
 
 
@@ -318,8 +309,8 @@ def linear_cycle(
 
 
 def warm() -> None:
-    """Run every kernel once on tiny input: compiled or loaded from the cache, ready for the first
-    measurement."""
+    """Run the kernels once on tiny input: compiled or loaded from the cache, ready for the first
+    measurement. (`linear_cycle`, for batches of known assignment, compiles on its first call.)"""
     x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
     F, B, E = np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1))
     transition, z, R = np.full((1, 2, 2), 0.5), np.zeros((1, 2)), np.eye(2)[None]
@@ -328,4 +319,3 @@ def warm() -> None:
     update(x, P, mu, np.zeros((1, 2, 2)), E[None], R)
     gate(np.zeros((1, 2, 2)), E[None], P, mu, z, R, 9.0)
     combine(x, P, mu, E)
-    linear_cycle(x, P, mu, transition, F, F, B, z, E, R, E)

@@ -117,10 +117,13 @@ class Scan:
         tentative = self.before.life.status == TrackStatus.TENTATIVE
         h, H = group.linearise(self.x, self.models.E)
         threshold = gate_threshold(self.config.gate_probability, group.z.shape[1])
-        target, detection, log_likelihood = imm_kernels.gate(
+        fit = imm_kernels.gate(
             h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold
         )
-        cost = association_cost(log_likelihood, self.config.detection_probability, group.clutter)
+        target, detection = np.nonzero(np.isfinite(fit))
+        cost = association_cost(
+            fit[target, detection], self.config.detection_probability, group.clutter
+        )
         for own in (~tentative, tentative):
             pairs = own[target] & free[detection]
             found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))

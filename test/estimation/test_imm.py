@@ -434,20 +434,20 @@ def test_gates_of_kernel_and_numpy_agree_and_a_sharp_turn_is_inside():
     z = rng.normal(size=(40, 2)) * 4.0
     R = np.tile(0.3 * EYE2, (40, 1, 1))
     h = np.einsum('jmn,tjn->tjm', bank['H'][0], bank['x'])
-    answers = [engine.gate(h, bank['H'], bank['P'], bank['mu'], z, R, 3.0) for engine in ENGINES]
-    for ours, theirs in zip(*answers):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-10)
-    assert 0 < len(answers[0][0]) < 5 * 40
-    # Two models 10 m apart, the improbable one right: outside of 5 sigma of the mixture? No:
-    # inside.
+    kernel, numpy = (
+        engine.gate(h, bank['H'], bank['P'], bank['mu'], z, R, 3.0) for engine in ENGINES
+    )
+    np.testing.assert_allclose(kernel, numpy, rtol=1e-9)
+    assert 0 < np.isfinite(kernel).sum() < kernel.size
+    # Two models 10 m apart, the improbable one right: it opens its own gate, and no other.
     x = np.array([[[0.0, 0.0], [0.0, 10.0]]])
     P, c = np.tile(0.01 * EYE2, (1, 2, 1, 1)), np.array([[0.99, 0.01]])
     H = np.tile(EYE2, (1, 2, 1, 1))
+    places = np.array([[0.0, 10.0], [0.0, 5.0]])
     for engine in ENGINES:
-        target, detection, _ = engine.gate(
-            x, H, P, c, np.array([[0.0, 10.0], [0.0, 5.0]]), np.tile(0.01 * EYE2, (2, 1, 1)), 9.0
-        )
-        assert target.tolist() == [0] and detection.tolist() == [0]
+        fit = engine.gate(x, H, P, c, places, np.tile(0.01 * EYE2, (2, 1, 1)), 9.0)
+        np.testing.assert_array_equal(np.isfinite(fit), [[True, False]])
+        np.testing.assert_allclose(fit[0, 0], np.log(0.01 / (2.0 * np.pi * 0.02)))
 
 
 def test_filterpy_agrees_where_it_is_right():

@@ -1,8 +1,10 @@
 """The diver tracker as its users see it: measurements in, estimates out."""
 
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
+
 from sonar_imm.estimation.consistency import average_bounds
 from sonar_imm.measurements import Arrivals, Fix
 from sonar_imm.simulation.diver import RECEIVERS, scenario, simulate

@@ -3,6 +3,7 @@
 from attrs import evolve
 import numpy as np
 import pytest
+
 from sonar_imm.estimation import imm
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver_config import DiverConfig, MODEL_SETS
