@@ -89,6 +89,14 @@ def largest_sine(spacing: float) -> float:
     return min(1.0, 0.5 / spacing)
 
 
+def direction_grid(staves: int, spacing: float, *, oversampling: int = 8) -> FloatArray:
+    """Even grid (m,) of direction sines up to `largest_sine`, `oversampling` points a beam
+    width."""
+    largest = largest_sine(spacing)
+    points = math.ceil(2.0 * largest * spacing * staves * oversampling)
+    return np.linspace(-largest, largest, max(points, 8) + 1)
+
+
 def multipath_sines(
     depth: ArrayLike, slant_range: ArrayLike, tilt: float, surface: float
 ) -> FloatArray:

@@ -1,0 +1,116 @@
+"""Is there an echo in this bin at all? Coherence across the array says so, energy does not.
+
+In a shadow the staves hear independent noise; an echo is one plane wave. The **coherence**
+
+    gamma = max_u |a(u)^H y|^2 / (P |y|^2)
+
+is 1 for a wave without noise. It does not depend on the level, so the heavy tails of the echo,
+which ruin energy detectors, cancel, and its law under noise is known: y / |y| is then uniform on
+the complex unit sphere. For one direction gamma would be Beta(1, P - 1). The maximum over all
+directions exceeds t when the path u -> gamma(u) starts above t or crosses it upwards, and the mean
+number of upcrossings follows from Rice's formula on the sphere::
+
+    Pr(gamma > t) <= (1 - t)^(P-1) [1 - s]+ + min(1, s) E(t)
+    E(t) = 2 sqrt(pi) sqrt((P^2 - 1) / 12) Gamma(P) / Gamma(P - 1/2) sqrt(t) (1 - t)^(P - 3/2)
+
+where s = 2 spacing is the share of the circle of phases that directions reach. At levels that
+only one excursion can pass, which all useful thresholds are, this is an equality (for P = 2 at all
+levels). Thresholds for the mean of several bins come from convolving this law.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from .array import direction_grid, steering
+from .variances import moving_mean
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+GATE_BINS = 5
+FALSE_ALARM = 1e-3
+"""Probability that the gate takes a bin of noise for an echo, for one bin and for the mean."""
+_LEVELS = 4096
+
+
+def coherence(
+    iq: NDArray, spacing: float, *, conjugate: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Coherence (n,) of snapshots iq (n, P) and the direction sine (n,) where it is reached; NaN
+    for bins that are not finite or silent."""
+    staves = iq.shape[1]
+    sines = direction_grid(staves, spacing)
+    matrix = steering(sines, staves, spacing, conjugate=conjugate).conj().T
+    norm = np.sqrt(np.square(np.abs(iq)).sum(axis=1, keepdims=True))
+    known = (np.isfinite(norm) & (norm > 0.0))[:, 0]
+    unit = np.where(known[:, None], iq, 1.0) / np.where(known[:, None], norm, math.sqrt(staves))
+    beams = unit @ matrix.astype(unit.dtype)
+    spectrum = (np.square(beams.real) + np.square(beams.imag)).astype(np.float64) / staves
+    peak, sine = refined_peak(spectrum, sines)
+    peak = np.minimum(peak, 1.0)
+    return np.where(known, peak, np.nan), np.where(known, sine, np.nan)
+
+
+def refined_peak(spectrum: FloatArray, grid: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Largest value (n,) of spectra (n, m) over an even `grid` (m,) and where it is, by a parabola
+    through the highest point and its neighbours."""
+    rows = np.arange(len(spectrum))
+    best = np.clip(spectrum.argmax(axis=1), 1, len(grid) - 2)
+    below, top, above = (spectrum[rows, best + k] for k in (-1, 0, 1))
+    bend = below - 2.0 * top + above
+    shift = np.where(bend < 0.0, 0.5 * (below - above) / np.where(bend < 0.0, bend, -1.0), 0.0)
+    shift = np.clip(shift, -1.0, 1.0)
+    peak = top + shift * (0.5 * (above - below) + 0.5 * shift * bend)
+    return peak, grid[best] + shift * (grid[1] - grid[0])
+
+
+def false_alarm_probability(threshold: ArrayLike, staves: int, spacing: float = 0.5) -> FloatArray:
+    """Probability that noise alone has a coherence above `threshold`, at most 1."""
+    t = np.asarray(threshold, np.float64)
+    share = 2.0 * spacing
+    scale = 2.0 * math.sqrt(math.pi * (staves**2 - 1) / 12.0)
+    scale *= math.exp(math.lgamma(staves) - math.lgamma(staves - 0.5))
+    crossings = scale * np.sqrt(t) * (1.0 - t) ** (staves - 1.5)
+    begins = max(1.0 - share, 0.0) * (1.0 - t) ** (staves - 1)
+    # The number of crossings falls with t only above its maximum; below, it says nothing.
+    certain = t < 1.0 / (2.0 * staves - 2.0)
+    return np.where(certain, 1.0, np.minimum(1.0, begins + min(1.0, share) * crossings))
+
+
+@lru_cache(maxsize=128)
+def coherence_threshold(
+    staves: int, bins: int = 1, false_alarm: float = FALSE_ALARM, spacing: float = 0.5
+) -> float:
+    """Level that the mean coherence of `bins` bins of noise passes with probability
+    `false_alarm`."""
+    if bins == 1:
+
+        def excess(level: float) -> float:
+            return float(false_alarm_probability(level, staves, spacing)) - false_alarm
+
+        return float(brentq(excess, 1.0 / staves, 1.0, xtol=1e-12))
+    levels = np.linspace(0.0, 1.0, _LEVELS + 1)
+    mass = -np.diff(false_alarm_probability(levels, staves, spacing))
+    length = bins * _LEVELS
+    total = np.fft.irfft(np.fft.rfft(mass, length) ** bins, length)
+    tail = np.cumsum(np.maximum(total, 0.0)[::-1])[::-1]
+    # The mass of each cell stands at its lower end, half a cell too low on average.
+    return (int(np.argmax(tail <= false_alarm)) + 0.5 * (bins - 1)) / length
+
+
+def silent_bins(
+    gamma: ArrayLike, staves: int, *, spacing: float = 0.5, false_alarm: float = FALSE_ALARM
+) -> BoolArray:
+    """Bins (n,) in which no echo is to be believed: `gamma` (n,) below the threshold of one bin,
+    or its mean over `GATE_BINS` below that of the mean. NaN counts as silent."""
+    values = np.asarray(gamma, np.float64)
+    alone = coherence_threshold(staves, 1, false_alarm, spacing)
+    together = coherence_threshold(staves, GATE_BINS, false_alarm, spacing)
+    mean = moving_mean(values, GATE_BINS // 2, np.isfinite(values))
+    return ~((values >= alone) & (mean >= together))

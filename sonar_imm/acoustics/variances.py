@@ -1,0 +1,91 @@
+"""How strong echo and noise are in each range bin: the two numbers the observation law needs.
+
+The noise is best measured where no echo can be, in the water above the first return
+(`noise_variance`); failing that, the smaller eigenvalues of local sample covariances give it
+blindly (`blind_noise_variance`), 1 to 3 dB low on a rough floor, where the direction moves within
+the window. The signal is what a moving mean of the power has above the noise. A few decibels of
+error in the signal hardly matter; the noise sets the width of the likelihood and does.
+
+Conventions
+    iq (n, P) complex, one row a range bin; usable (n,) bool; variances are per stave, in the
+    squared units of iq: E|y_p|^2 = signal + noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+HALF_WIDTH = 10
+"""Bins to either side that share one signal variance."""
+LEAST_SNR = 0.01
+"""Signal variances are kept above this many noise variances: a silent bin then says little."""
+
+
+def usable_bins(iq: NDArray) -> BoolArray:
+    """Bins (n,) whose samples are all finite and not all zero."""
+    power = np.abs(iq).max(axis=1, initial=0.0)
+    return np.isfinite(iq).all(axis=1) & (power > 0.0) & (power < 1e18)
+
+
+def mean_power(iq: NDArray) -> FloatArray:
+    """|y|^2 / P (n,) of every bin, in double precision."""
+    parts = np.square(iq.real, dtype=np.float64) + np.square(iq.imag, dtype=np.float64)
+    return parts.mean(axis=1)
+
+
+def moving_mean(values: ArrayLike, half_width: int, usable: BoolArray | None = None) -> FloatArray:
+    """Mean (n, ...) over the usable ones of 2 half_width + 1 rows, fewer at the ends; NaN where
+    there is none."""
+    values = np.asarray(values)
+    rows = len(values)
+    kept = np.ones(rows, bool) if usable is None else usable
+    shape = (rows,) + (1,) * (values.ndim - 1)
+    sums = np.zeros((rows + 1, *values.shape[1:]), np.result_type(values, np.float64))
+    np.cumsum(np.where(kept.reshape(shape), values, 0.0), axis=0, out=sums[1:])
+    counts = np.concatenate([[0], np.cumsum(kept)])
+    first = np.maximum(np.arange(rows) - half_width, 0)
+    last = np.minimum(np.arange(rows) + half_width + 1, rows)
+    count = (counts[last] - counts[first]).reshape(shape)
+    return np.where(count > 0, (sums[last] - sums[first]) / np.maximum(count, 1), np.nan)
+
+
+def noise_variance(iq: NDArray, quiet: BoolArray) -> float:
+    """Mean power of the bins marked `quiet` (n,), where no echo is; NaN when none is usable."""
+    chosen = quiet & usable_bins(iq)
+    return float(mean_power(iq[chosen]).mean()) if chosen.any() else float('nan')
+
+
+def blind_noise_variance(iq: NDArray, half_width: int = 4) -> float:
+    """Noise variance from the echoes themselves: what local covariances have beside their largest
+    eigenvalue.
+
+    One eigenvector of K snapshots takes a share of the noise of the others with it; for powers
+    that are exponentially distributed the share is about 2 / K. NaN for too few usable bins.
+    """
+    rows = iq[usable_bins(iq)]
+    window = 2 * half_width + 1
+    if len(rows) < window:
+        return float('nan')
+    blocks = rows[: len(rows) // window * window].reshape(-1, window, rows.shape[1])
+    covariance = np.swapaxes(blocks, 1, 2) @ blocks.conj() / window
+    eigenvalues = np.linalg.eigvalsh(covariance.astype(np.complex128))
+    small = np.maximum(eigenvalues[:, :-1], 0.0).mean(axis=1)
+    return float(np.median(small) / (1.0 - 2.0 / window))
+
+
+def signal_variance(
+    power: ArrayLike,
+    noise: ArrayLike,
+    *,
+    half_width: int = HALF_WIDTH,
+    usable: BoolArray | None = None,
+) -> FloatArray:
+    """Signal variance (n,) of every bin: the moving mean of `power` (n,), from `mean_power`, less
+    the noise (n,) or one number; at least `LEAST_SNR` of the noise."""
+    noise_ = np.asarray(noise, np.float64)
+    level = moving_mean(power, half_width, usable)
+    return np.fmax(level - noise_, LEAST_SNR * noise_)
