@@ -1,0 +1,94 @@
+"""The observation law beside known interferers: echoes by way of the surface, other sonars.
+
+An interferer of variance sb2 from a known direction b is noise with a structure. With several of
+them the noise covariance is R = sn2 I + sum_b sb2 a_b a_b^H, and Gamma = ss2 a a^H + R. Whitening
+by R would send the steering vector out of its family; instead, with w = R^-1 y,
+
+    q(u) = y^H w - ss2 |a^H w|^2 / (1 + ss2 a^H R^-1 a)
+    |Gamma| = |R| (1 + ss2 a^H R^-1 a)
+
+where |a^H w|^2 (**beam**) and a^H R^-1 a (**spread**) are again trigonometric polynomials in the
+direction sine u, so one candidate direction costs two Horner sums. The determinant now depends on
+the direction and belongs to the likelihood: near an interferer the spread vanishes, echo and
+interference cannot be told apart, and the likelihood is flat rather than wrong. (Merely raising
+the white noise does not help: it blurs all directions alike.)
+"""
+
+from __future__ import annotations
+
+import math
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..estimation.jit import kernel
+from .laplace import autocorrelation, form_of, log_density_of
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@frozen(eq=False)
+class InterferenceForm:
+    """What the likelihood of n bins needs: base (n,) = y^H R^-1 y, beam (n, P) and spread (n, P),
+    coefficients of polynomials as in `laplace.form_of`, and log_determinant (n,) of R."""
+
+    base: FloatArray
+    beam: ComplexArray
+    spread: ComplexArray
+    log_determinant: FloatArray
+
+
+def noise_covariance(
+    sines: ArrayLike, variances: ArrayLike, noise_variance: ArrayLike, staves: int, step: float
+) -> ComplexArray:
+    """R (n, P, P) of interferers at `sines` (n, m) with `variances` (n, m) in white noise (n,). A
+    direction that is NaN, or a variance that is not positive, is no interferer.
+
+    `step` is from `array.phase_step`.
+    """
+    u, variance = np.broadcast_arrays(np.asarray(sines, float), np.asarray(variances, float))
+    there = np.isfinite(u) & (variance > 0.0)
+    phase = step * np.where(there, u, 0.0)[..., None] * np.arange(staves)
+    scaled = np.sqrt(np.where(there, variance, 0.0))[..., None] * np.exp(1j * phase)
+    white = np.asarray(noise_variance, float)[..., None, None] * np.eye(staves)
+    return white + np.swapaxes(scaled, -1, -2) @ scaled.conj()
+
+
+def interference_form(iq: ArrayLike, covariance: ComplexArray) -> InterferenceForm:
+    """Fold snapshots iq (n, P) and noise covariances (n, P, P) into an `InterferenceForm`."""
+    y = np.asarray(iq, np.complex128)
+    inverse = np.linalg.inv(covariance)
+    whitened = (inverse @ y[..., None])[..., 0]
+    beam = autocorrelation(whitened)
+    beam[..., 1:] *= 2.0
+    spread = np.stack(
+        [
+            np.trace(inverse, offset=-lag, axis1=-2, axis2=-1) * (2.0 if lag else 1.0)
+            for lag in range(y.shape[-1])
+        ],
+        axis=-1,
+    )
+    base = (y.conj() * whitened).sum(axis=-1).real
+    return InterferenceForm(base, beam, spread, np.linalg.slogdet(covariance)[1])
+
+
+@kernel
+def interfered_log_likelihoods(
+    sines: FloatArray,
+    base: float,
+    beam: ComplexArray,
+    spread: ComplexArray,
+    signal_variance: float,
+    step: float,
+    table: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Log likelihood of every direction in `sines` (k,) into `out` (k,), for one bin of an
+    `InterferenceForm`: f(q) - log(1 + ss2 a^H R^-1 a). The arguments are as in
+    `laplace.log_likelihoods`."""
+    for i in range(sines.shape[0]):
+        gain = 1.0 + signal_variance * form_of(sines[i], spread, step)
+        q = base - signal_variance * form_of(sines[i], beam, step) / gain
+        out[i] = log_density_of(q, beam.shape[0], table) - math.log(max(gain, 1.0))
