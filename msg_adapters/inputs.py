@@ -13,6 +13,7 @@ from attrs import frozen
 
 from .arrivals import read_arrivals
 from .fixes import doubt_fix, read_fix
+from .snapshots import read_snapshot
 
 
 @frozen
@@ -38,6 +39,11 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         }, doubt=doubt_fix),
         InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
+        }),
+    ),
+    'bathymetry': (
+        InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
+            'sensor_msgs/msg/PointCloud2': read_snapshot,
         }),
     ),
 }
