@@ -44,10 +44,13 @@ def direction_sine(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> Flo
 
 
 @kernel
-def direction_sine_of(depth: float, slant_range: float, cos_tilt: float, sin_tilt: float) -> float:
-    """Compiled `direction_sine` of one point; NaN where it cannot be."""
-    ratio = depth / slant_range
-    return ratio * cos_tilt - math.sqrt(1.0 - ratio * ratio) * sin_tilt
+def direction_sines(
+    depth: FloatArray, slant_range: float, cos_tilt: float, sin_tilt: float, out: FloatArray
+) -> None:
+    """Compiled `direction_sine` of many depths (n,) at one range into `out` (n,)."""
+    for i in range(depth.shape[0]):
+        ratio = depth[i] / slant_range
+        out[i] = ratio * cos_tilt - math.sqrt(1.0 - ratio * ratio) * sin_tilt
 
 
 def angle_of_depth(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> FloatArray:

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..estimation.jit import kernel
-from .laplace import autocorrelation, form_of, log_density_of
+from .laplace import autocorrelation, log_densities
+from .phasors import phasors, trigonometric_sums
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -31,8 +32,8 @@ ComplexArray = NDArray[np.complex128]
 
 @frozen(eq=False)
 class InterferenceForm:
-    """What the likelihood of n bins needs: base (n,) = y^H R^-1 y, beam (n, P) and spread (n, P),
-    coefficients of polynomials as in `laplace.form_of`, and log_determinant (n,) of R."""
+    """What the likelihood of n bins needs: base (n,) = y^H R^-1 y; the coefficients beam (n, P)
+    and spread (n, P) for `phasors.trigonometric_sums`; log_determinant (n,) of R."""
 
     base: FloatArray
     beam: ComplexArray
@@ -83,12 +84,19 @@ def interfered_log_likelihoods(
     signal_variance: float,
     step: float,
     table: FloatArray,
+    scratch: FloatArray,
     out: FloatArray,
 ) -> None:
     """Log likelihood of every direction in `sines` (k,) into `out` (k,), for one bin of an
     `InterferenceForm`: f(q) - log(1 + ss2 a^H R^-1 a). The arguments are as in
-    `laplace.log_likelihoods`."""
+    `laplace.log_likelihoods`, but scratch (5, k)."""
+    cosine, sine, q, imaginary, gain = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    phasors(sines, step, cosine, sine)
+    trigonometric_sums(spread, cosine, sine, gain, imaginary)
+    trigonometric_sums(beam, cosine, sine, q, imaginary)
     for i in range(sines.shape[0]):
-        gain = 1.0 + signal_variance * form_of(sines[i], spread, step)
-        q = base - signal_variance * form_of(sines[i], beam, step) / gain
-        out[i] = log_density_of(q, beam.shape[0], table) - math.log(max(gain, 1.0))
+        gain[i] = max(1.0 + signal_variance * gain[i], 1.0)
+        q[i] = base - signal_variance * q[i] / gain[i]
+    log_densities(q, table, out)
+    for i in range(sines.shape[0]):
+        out[i] = out[i] - math.log(gain[i]) if sines[i] == sines[i] else -math.inf

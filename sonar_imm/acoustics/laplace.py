@@ -22,9 +22,10 @@ autocorrelation c_k = sum_p y_{p+k} conj(y_p) of the snapshot. `form_coefficient
 this into P complex numbers g with q(u) = Re sum_k g_k exp(-i k w u), w = 2 pi spacing, which
 Horner's rule sums in O(P) for each of thousands of candidate directions.
 
-In compiled loops the Bessel function is a table (`log_density_table`): cubic Hermite interpolation
-in ln q with the exact slope -sqrt(q) K_P / K_{P-1}, and the asymptotes outside. An empty table
-stands for the Gaussian law, whose log density is -q.
+In compiled loops the law is a table (`log_density_table`): a cubic in q, with exact values and
+slopes at its ends, for every part of an octave in 32. The bits of a floating-point number are its
+octave and its place therein, so that finding the cell needs no logarithm and the loop no branch.
+The Gaussian law, whose log density is -q, is a table of the same form.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import kve
 
 from ..estimation.jit import kernel
+from .phasors import phasors, trigonometric_sums
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -44,9 +46,15 @@ ComplexArray = NDArray[np.complex128]
 LAWS = ('laplace', 'gaussian')
 MAX_STAVES = 64
 
-TABLE_STEP = 1.0 / 16.0
-TABLE_LOWEST, TABLE_HIGHEST = math.log(1e-6), math.log(1e9)
-"""Span of the table in ln q: from bins 60 dB weaker than expected to spikes 90 dB stronger."""
+LOWEST_OCTAVE, HIGHEST_OCTAVE = -20, 50
+"""The table spans q from 2^-20 to 2^50; the law is held constant outside."""
+_CELL_BITS = 5
+_MANTISSA_BITS = 52
+_CELL_SHIFT = _MANTISSA_BITS - _CELL_BITS
+_FIRST_CELL = (1023 + LOWEST_OCTAVE) << _CELL_BITS
+_MANTISSA_MASK = (1 << _MANTISSA_BITS) - 1
+_ONE = 1023 << _MANTISSA_BITS
+_LOWEST, _HIGHEST = 2.0**LOWEST_OCTAVE, 2.0**HIGHEST_OCTAVE * (1.0 - 2.0**-53)
 
 IMPOSSIBLE = -math.inf
 
@@ -101,46 +109,44 @@ def moments_of_q(staves: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=32)
 def log_density_table(staves: int, law: str = 'laplace') -> FloatArray:
-    """The law as compiled loops want it: (m, 2) values and slopes (times `TABLE_STEP`) at equal
-    steps of ln q; (0, 2) for the Gaussian law. Read-only.
+    """The law as compiled loops want it: coefficients (4, cells) of a cubic in each cell.
 
-    Raises ValueError for a number of staves or a law that is not known.
+    Raises ValueError for a number of staves or a law that is not known. Read-only.
     """
     if not 1 < staves <= MAX_STAVES:
         raise ValueError(f'the law is tabulated for 2 to {MAX_STAVES} staves, not {staves}')
     if law not in LAWS:
         raise ValueError(f"there is no law '{law}'; there are {' and '.join(LAWS)}")
-    table = np.empty((0, 2))
+    octaves = 2.0 ** np.arange(LOWEST_OCTAVE, HIGHEST_OCTAVE)
+    starts = np.outer(octaves, 1.0 + np.arange(2**_CELL_BITS) / 2**_CELL_BITS).ravel()
+    q = np.append(starts, 2.0 * octaves[-1])
     if law == 'laplace':
-        nodes = math.ceil((TABLE_HIGHEST - TABLE_LOWEST) / TABLE_STEP) + 1
-        q = np.exp(TABLE_LOWEST + TABLE_STEP * np.arange(nodes))
-        slope = TABLE_STEP * log_density_slope(q, staves)
-        table = np.column_stack([log_density(q, staves), slope])
+        value, slope = log_density(q, staves), log_density_slope(q, staves) / q
+    else:
+        value, slope = gaussian_log_density(q, staves), np.full(len(q), -1.0)
+    width, rise = np.diff(q), np.diff(value)
+    first, last = slope[:-1] * width, slope[1:] * width
+    table = np.stack([value[:-1], first, 3.0 * rise - 2.0 * first - last, first + last - 2 * rise])
     table.flags.writeable = False
     return table
 
 
 @kernel
-def log_density_of(q: float, staves: int, table: FloatArray) -> float:
-    """Compiled log density of one q from the table of its law; `IMPOSSIBLE` for NaN and
-    below 0."""
-    if not q >= 0.0:
-        return -math.inf
-    nodes = table.shape[0]
-    if nodes == 0:
-        return -q
-    position = (math.log(max(q, 1e-300)) - TABLE_LOWEST) / TABLE_STEP
-    if position <= 0.0:
-        return table[0, 0] + position * table[0, 1]
-    cell = int(min(position, nodes - 2.0))
-    t = position - cell
-    if t > 1.0:  # beyond the table: exp(-2 sqrt(q)) q^(1/4 - P/2)
-        last = math.exp(TABLE_LOWEST + TABLE_STEP * (nodes - 1))
-        far = 2.0 * (math.sqrt(last) - math.sqrt(q)) - (0.5 * staves - 0.25) * math.log(q / last)
-        return table[nodes - 1, 0] + far
-    rise = table[cell + 1, 0] - table[cell, 0]
-    first, second = table[cell, 1] - rise, rise - table[cell + 1, 1]
-    return table[cell, 0] + t * (rise + (1.0 - t) * (first * (1.0 - t) + second * t))
+def log_densities(q: FloatArray, table: FloatArray, out: FloatArray) -> None:
+    """Log densities of all q (n,) from the table of the law into `out` (n,); q is brought into the
+    span of the table in place."""
+    n = q.shape[0]
+    for i in range(n):
+        q[i] = min(max(q[i], _LOWEST), _HIGHEST)
+    bits, places = q.view(np.int64), out.view(np.int64)
+    for i in range(n):
+        # The bits below the cell number become the mantissa of a number from 1 to 2.
+        places[i] = ((bits[i] << _CELL_BITS) & _MANTISSA_MASK) | _ONE
+    constant, linear, square, cube = table[0], table[1], table[2], table[3]
+    for i in range(n):
+        t = out[i] - 1.0
+        cell = np.uint64((bits[i] >> _CELL_SHIFT) - _FIRST_CELL)
+        out[i] = constant[cell] + t * (linear[cell] + t * (square[cell] + t * cube[cell]))
 
 
 def autocorrelation(y: ArrayLike) -> ComplexArray:
@@ -191,30 +197,26 @@ def form_coefficients_of(
 
 
 @kernel
-def form_of(sine: float, g: ComplexArray, step: float) -> float:
-    """q(u) = Re sum_k g_k exp(-i k step u) by Horner's rule; `step` from `array.phase_step`."""
-    cosine, minus_sine = math.cos(step * sine), -math.sin(step * sine)
-    real, imaginary = g[-1].real, g[-1].imag
-    for k in range(g.shape[0] - 2, -1, -1):
-        real, imaginary = (
-            real * cosine - imaginary * minus_sine + g[k].real,
-            real * minus_sine + imaginary * cosine + g[k].imag,
-        )
-    return real
-
-
-@kernel
 def log_likelihoods(
-    sines: FloatArray, g: ComplexArray, step: float, table: FloatArray, out: FloatArray
+    sines: FloatArray,
+    g: ComplexArray,
+    step: float,
+    table: FloatArray,
+    scratch: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Log likelihood of every direction sine in `sines` (n,) into `out` (n,), for one bin.
 
     g (P,) from `form_coefficients`, `step` from `array.phase_step`, `table` from
-    `log_density_table`. What does not depend on the direction is left out; a NaN direction is
-    impossible: -inf.
+    `log_density_table`; scratch (4, n). What does not depend on the direction is left out; a NaN
+    direction is impossible: -inf.
     """
+    cosine, sine, q, imaginary = scratch[0], scratch[1], scratch[2], scratch[3]
+    phasors(sines, step, cosine, sine)
+    trigonometric_sums(g, cosine, sine, q, imaginary)
+    log_densities(q, table, out)
     for i in range(sines.shape[0]):
-        out[i] = log_density_of(form_of(sines[i], g, step), g.shape[0], table)
+        out[i] = out[i] if sines[i] == sines[i] else -math.inf
 
 
 def log_likelihood(
