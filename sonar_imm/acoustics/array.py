@@ -27,8 +27,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..estimation.jit import kernel
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
@@ -41,16 +39,6 @@ def direction_sine(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> Flo
     ratio = np.where(possible, ratio, 0.0)
     sine = ratio * math.cos(tilt) - np.sqrt(1.0 - ratio * ratio) * math.sin(tilt)
     return np.where(possible, sine, np.nan)
-
-
-@kernel
-def direction_sines(
-    depth: FloatArray, slant_range: float, cos_tilt: float, sin_tilt: float, out: FloatArray
-) -> None:
-    """Compiled `direction_sine` of many depths (n,) at one range into `out` (n,)."""
-    for i in range(depth.shape[0]):
-        ratio = depth[i] / slant_range
-        out[i] = ratio * cos_tilt - math.sqrt(1.0 - ratio * ratio) * sin_tilt
 
 
 def angle_of_depth(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> FloatArray:

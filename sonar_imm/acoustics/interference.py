@@ -16,15 +16,11 @@ the white noise does not help: it blurs all directions alike.)
 
 from __future__ import annotations
 
-import math
-
 from attrs import frozen
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..estimation.jit import kernel
-from .laplace import autocorrelation, log_densities
-from .phasors import phasors, trigonometric_sums
+from .laplace import autocorrelation, gaussian_log_density, IMPOSSIBLE, log_density
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -33,7 +29,7 @@ ComplexArray = NDArray[np.complex128]
 @frozen(eq=False)
 class InterferenceForm:
     """What the likelihood of n bins needs: base (n,) = y^H R^-1 y; the coefficients beam (n, P)
-    and spread (n, P) for `phasors.trigonometric_sums`; log_determinant (n,) of R."""
+    and spread (n, P) of polynomials, as in `laplace.form_coefficients`; log_determinant (n,)."""
 
     base: FloatArray
     beam: ComplexArray
@@ -75,28 +71,26 @@ def interference_form(iq: ArrayLike, covariance: ComplexArray) -> InterferenceFo
     return InterferenceForm(base, beam, spread, np.linalg.slogdet(covariance)[1])
 
 
-@kernel
-def interfered_log_likelihoods(
-    sines: FloatArray,
-    base: float,
-    beam: ComplexArray,
-    spread: ComplexArray,
+def interfered_log_likelihood(
+    sines: ArrayLike,
+    y: ArrayLike,
     signal_variance: float,
+    covariance: ComplexArray,
     step: float,
-    table: FloatArray,
-    scratch: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Log likelihood of every direction in `sines` (k,) into `out` (k,), for one bin of an
-    `InterferenceForm`: f(q) - log(1 + ss2 a^H R^-1 a). The arguments are as in
-    `laplace.log_likelihoods`, but scratch (5, k)."""
-    cosine, sine, q, imaginary, gain = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
-    phasors(sines, step, cosine, sine)
-    trigonometric_sums(spread, cosine, sine, gain, imaginary)
-    trigonometric_sums(beam, cosine, sine, q, imaginary)
-    for i in range(sines.shape[0]):
-        gain[i] = max(1.0 + signal_variance * gain[i], 1.0)
-        q[i] = base - signal_variance * q[i] / gain[i]
-    log_densities(q, table, out)
-    for i in range(sines.shape[0]):
-        out[i] = out[i] - math.log(gain[i]) if sines[i] == sines[i] else -math.inf
+    law: str = 'laplace',
+) -> FloatArray:
+    """Log likelihood of direction sines (...) given one snapshot y (P,) and its noise covariance
+    (P, P), less what does not depend on the direction; -inf for NaN.
+
+    By linear algebra from the definition: slow, and what the kernels are tested against.
+    """
+    y = np.asarray(y, np.complex128)
+    u = np.asarray(sines, np.float64)
+    staves = len(y)
+    a = np.exp(1j * step * np.nan_to_num(u)[..., None] * np.arange(staves))
+    gamma = covariance + signal_variance * a[..., :, None] * a[..., None, :].conj()
+    solved = np.linalg.solve(gamma, np.broadcast_to(y[:, None], (*u.shape, staves, 1)))[..., 0]
+    q = (y.conj() * solved).sum(axis=-1).real
+    density = log_density(q, staves) if law == 'laplace' else gaussian_log_density(q, staves)
+    determinant = np.linalg.slogdet(gamma)[1] - np.linalg.slogdet(covariance)[1]
+    return np.where(np.isnan(u), IMPOSSIBLE, density - determinant)

@@ -22,39 +22,22 @@ autocorrelation c_k = sum_p y_{p+k} conj(y_p) of the snapshot. `form_coefficient
 this into P complex numbers g with q(u) = Re sum_k g_k exp(-i k w u), w = 2 pi spacing, which
 Horner's rule sums in O(P) for each of thousands of candidate directions.
 
-In compiled loops the law is a table (`log_density_table`): a cubic in q, with exact values and
-slopes at its ends, for every part of an octave in 32. The bits of a floating-point number are its
-octave and its place therein, so that finding the cell needs no logarithm and the loop no branch.
-The Gaussian law, whose log density is -q, is a table of the same form.
+Compiled loops take the law from a table: see `law_kernels`.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import kve
 
-from ..estimation.jit import kernel
-from .phasors import phasors, trigonometric_sums
-
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 LAWS = ('laplace', 'gaussian')
 MAX_STAVES = 64
-
-LOWEST_OCTAVE, HIGHEST_OCTAVE = -20, 50
-"""The table spans q from 2^-20 to 2^50; the law is held constant outside."""
-_CELL_BITS = 5
-_MANTISSA_BITS = 52
-_CELL_SHIFT = _MANTISSA_BITS - _CELL_BITS
-_FIRST_CELL = (1023 + LOWEST_OCTAVE) << _CELL_BITS
-_MANTISSA_MASK = (1 << _MANTISSA_BITS) - 1
-_ONE = 1023 << _MANTISSA_BITS
-_LOWEST, _HIGHEST = 2.0**LOWEST_OCTAVE, 2.0**HIGHEST_OCTAVE * (1.0 - 2.0**-53)
 
 IMPOSSIBLE = -math.inf
 
@@ -107,48 +90,6 @@ def moments_of_q(staves: int) -> tuple[float, float]:
     return float(staves), float(2 * staves * (staves + 1) - staves**2)
 
 
-@lru_cache(maxsize=32)
-def log_density_table(staves: int, law: str = 'laplace') -> FloatArray:
-    """The law as compiled loops want it: coefficients (4, cells) of a cubic in each cell.
-
-    Raises ValueError for a number of staves or a law that is not known. Read-only.
-    """
-    if not 1 < staves <= MAX_STAVES:
-        raise ValueError(f'the law is tabulated for 2 to {MAX_STAVES} staves, not {staves}')
-    if law not in LAWS:
-        raise ValueError(f"there is no law '{law}'; there are {' and '.join(LAWS)}")
-    octaves = 2.0 ** np.arange(LOWEST_OCTAVE, HIGHEST_OCTAVE)
-    starts = np.outer(octaves, 1.0 + np.arange(2**_CELL_BITS) / 2**_CELL_BITS).ravel()
-    q = np.append(starts, 2.0 * octaves[-1])
-    if law == 'laplace':
-        value, slope = log_density(q, staves), log_density_slope(q, staves) / q
-    else:
-        value, slope = gaussian_log_density(q, staves), np.full(len(q), -1.0)
-    width, rise = np.diff(q), np.diff(value)
-    first, last = slope[:-1] * width, slope[1:] * width
-    table = np.stack([value[:-1], first, 3.0 * rise - 2.0 * first - last, first + last - 2 * rise])
-    table.flags.writeable = False
-    return table
-
-
-@kernel
-def log_densities(q: FloatArray, table: FloatArray, out: FloatArray) -> None:
-    """Log densities of all q (n,) from the table of the law into `out` (n,); q is brought into the
-    span of the table in place."""
-    n = q.shape[0]
-    for i in range(n):
-        q[i] = min(max(q[i], _LOWEST), _HIGHEST)
-    bits, places = q.view(np.int64), out.view(np.int64)
-    for i in range(n):
-        # The bits below the cell number become the mantissa of a number from 1 to 2.
-        places[i] = ((bits[i] << _CELL_BITS) & _MANTISSA_MASK) | _ONE
-    constant, linear, square, cube = table[0], table[1], table[2], table[3]
-    for i in range(n):
-        t = out[i] - 1.0
-        cell = np.uint64((bits[i] >> _CELL_SHIFT) - _FIRST_CELL)
-        out[i] = constant[cell] + t * (linear[cell] + t * (square[cell] + t * cube[cell]))
-
-
 def autocorrelation(y: ArrayLike) -> ComplexArray:
     """c_k = sum_p y_{p+k} conj(y_p) (..., P) of snapshots y (..., P), k = 0 .. P-1.
 
@@ -179,46 +120,6 @@ def form_coefficients(
     return coefficients / noise[..., None]
 
 
-@kernel
-def form_coefficients_of(
-    y: ComplexArray, signal_variance: float, noise_variance: float, g: ComplexArray
-) -> None:
-    """Compiled `form_coefficients` of one snapshot y (P,) into g (P,)."""
-    staves = y.shape[0]
-    kappa = signal_variance / (noise_variance + staves * signal_variance)
-    for lag in range(staves):
-        real, imaginary = 0.0, 0.0
-        for p in range(staves - lag):
-            a, b = y[p + lag], y[p]
-            real += a.real * b.real + a.imag * b.imag
-            imaginary += a.imag * b.real - a.real * b.imag
-        scale = (1.0 - kappa if lag == 0 else -2.0 * kappa) / noise_variance
-        g[lag] = complex(scale * real, scale * imaginary)
-
-
-@kernel
-def log_likelihoods(
-    sines: FloatArray,
-    g: ComplexArray,
-    step: float,
-    table: FloatArray,
-    scratch: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Log likelihood of every direction sine in `sines` (n,) into `out` (n,), for one bin.
-
-    g (P,) from `form_coefficients`, `step` from `array.phase_step`, `table` from
-    `log_density_table`; scratch (4, n). What does not depend on the direction is left out; a NaN
-    direction is impossible: -inf.
-    """
-    cosine, sine, q, imaginary = scratch[0], scratch[1], scratch[2], scratch[3]
-    phasors(sines, step, cosine, sine)
-    trigonometric_sums(g, cosine, sine, q, imaginary)
-    log_densities(q, table, out)
-    for i in range(sines.shape[0]):
-        out[i] = out[i] if sines[i] == sines[i] else -math.inf
-
-
 def log_likelihood(
     sines: ArrayLike,
     y: ArrayLike,
@@ -227,9 +128,10 @@ def log_likelihood(
     step: float,
     law: str = 'laplace',
 ) -> FloatArray:
-    """The same as `log_likelihoods` in numpy, for one snapshot y (P,) and any shape of `sines`.
+    """Log likelihood of direction sines (...) given one snapshot y (P,), less what does not depend
+    on the direction; -inf for NaN. `step` is from `array.phase_step`.
 
-    It builds q from the definition, so it is slow, and what the kernels are tested against.
+    It builds q from the definition: slow, and what the kernels are tested against.
     """
     y = np.asarray(y, np.complex128)
     u = np.asarray(sines, np.float64)
