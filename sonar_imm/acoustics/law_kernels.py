@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.jit import kernel
+from ..estimation.rows import ROUND
 from .laplace import LAWS, log_density, log_density_slope, MAX_STAVES
 
 FloatArray = NDArray[np.float64]
@@ -37,8 +38,6 @@ _SHIFT = 52 - _CELL_BITS
 _FIRST_CELL = (1023 + _OCTAVES[0]) << _CELL_BITS
 _REST = (1 << _SHIFT) - 1
 _ONE = 1023 << 52
-# Adding this to a double and taking it away again rounds it to a whole number.
-_ROUND = 1.5 * 2.0**52
 
 
 def _even_polynomial(function: str) -> tuple[float, ...]:
@@ -83,7 +82,7 @@ def phasors(values: FloatArray, factor: float, cosine: FloatArray, sine: FloatAr
     """cos and sin of 2 pi factor values (n,); NaN stays NaN."""
     for i in range(values.shape[0]):
         turns = factor * values[i]
-        f = turns - ((turns + _ROUND) - _ROUND)
+        f = turns - ((turns + ROUND) - ROUND)
         t = f * f
         s = _S[8] + t * (_S[9] + t * _S[10])
         s = _S[4] + t * (_S[5] + t * (_S[6] + t * (_S[7] + t * s)))

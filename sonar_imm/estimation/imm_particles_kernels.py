@@ -1,0 +1,172 @@
+"""The verbs of `imm_particles` compiled, bit for bit the same, writing into arrays of the caller.
+
+Loops over particles are written so that the compiler can run them several at a time: no branch,
+no running sum, one array written. What cannot be is kept apart.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .jit import kernel
+from .rows import exponentials
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+@kernel
+def mix(
+    x: FloatArray,
+    w: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+    uniform: FloatArray,
+    running: FloatArray,
+    points: FloatArray,
+    origin: IndexArray,
+    mixed: FloatArray,
+    c: FloatArray,
+) -> None:
+    """See `imm_particles.mix`, into mixed (M, n, N) and c (M,); running (M, N), points (N,) and
+    origin (N + 1,) are scratch.
+
+    The obvious walk along the cumulative weights has a branch that no processor can predict.
+    Instead every particle writes its number where its copies begin, the last one to write at a
+    place being the one that has copies there, and a running maximum fills the places between.
+    """
+    M, n, N = x.shape
+    for i in range(M):
+        total = 0.0
+        for s in range(N):
+            total += w[i, s]
+            running[i, s] = total
+    for j in range(M):
+        c[j], total = 0.0, 0.0
+        for i in range(M):
+            c[j] += transition[i, j] * mu[i]
+        for i in range(M):
+            share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
+            total += share * running[i, N - 1]
+        for k in range(N + 1):
+            origin[k] = 0
+        begin, before = 0, 0.0
+        for i in range(M):
+            share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
+            row = running[i]
+            for s in range(N):
+                points[s] = np.ceil((before + share * row[s]) / total * N - uniform[j])
+            before += share * running[i, N - 1]
+            for s in range(N):
+                origin[begin] = i * N + s
+                begin = min(int(points[s]), N)
+        source = 0
+        for k in range(N):
+            source = max(source, origin[k])
+            i = source // N
+            for a in range(n):
+                mixed[j, a, k] = x[i, a, source - i * N]
+
+
+@kernel
+def predict(
+    x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray, moved: FloatArray
+) -> None:
+    """See `imm_particles.predict`, for one model: x (n, N), F (n, n), G (n, k), noise (k, N) into
+    moved (n, N)."""
+    n, N = x.shape
+    for a in range(n):
+        out = moved[a]
+        for s in range(N):
+            out[s] = 0.0
+        for b in range(n):
+            if F[a, b] != 0.0:
+                factor, source = F[a, b], x[b]
+                for s in range(N):
+                    out[s] += factor * source[s]
+        for b in range(G.shape[1]):
+            if G[a, b] != 0.0:
+                factor, source = G[a, b], noise[b]
+                for s in range(N):
+                    out[s] += factor * source[s]
+
+
+@kernel
+def update(
+    log_likelihood: FloatArray, c: FloatArray, w: FloatArray, mu: FloatArray, work: FloatArray
+) -> float:
+    """See `imm_particles.update`: w (M, N) is read and replaced, mu (M,) written; work (2, N) is
+    scratch, log_likelihood (M, N) is left shifted. Gives the log likelihood of the measurement,
+    -inf when the prediction was kept."""
+    M, N = w.shape
+    best, everything = -math.inf, 0.0
+    for j in range(M):
+        mu[j] = c[j]
+        row = log_likelihood[j]
+        for s in range(N):
+            best = row[s] if row[s] > best else best
+    if not math.isfinite(best):
+        return -math.inf
+    for j in range(M):
+        row, prior = log_likelihood[j], w[j]
+        for s in range(N):
+            row[s] -= best
+        exponentials(row, work[0], work[1])
+        total = 0.0
+        for s in range(N):
+            row[s] = prior[s] * work[1, s]
+            total += row[s]
+        mu[j] = c[j] * total
+        everything += mu[j]
+        for s in range(N):
+            row[s] = row[s] / total if total > 0.0 else prior[s]
+    if not everything > 0.0:
+        for j in range(M):
+            mu[j] = c[j]
+        return -math.inf
+    for j in range(M):
+        mu[j] /= everything
+        for s in range(N):
+            w[j, s] = log_likelihood[j, s]
+    return best + math.log(everything)
+
+
+@kernel
+def combine(
+    x: FloatArray, w: FloatArray, mu: FloatArray, mean: FloatArray, covariance: FloatArray
+) -> None:
+    """See `imm_particles.combine`, into mean (n,) and covariance (n, n)."""
+    M, n, N = x.shape
+    for a in range(n):
+        mean[a] = 0.0
+        for b in range(n):
+            covariance[a, b] = 0.0
+    for j in range(M):
+        for a in range(n):
+            total = 0.0
+            for s in range(N):
+                total += w[j, s] * x[j, a, s]
+            mean[a] += mu[j] * total
+    for j in range(M):
+        for a in range(n):
+            for b in range(a + 1):
+                total = 0.0
+                for s in range(N):
+                    total += w[j, s] * (x[j, a, s] - mean[a]) * (x[j, b, s] - mean[b])
+                covariance[a, b] += mu[j] * total
+                covariance[b, a] = covariance[a, b]
+
+
+@kernel
+def effective_sample_size(w: FloatArray, mu: FloatArray) -> float:
+    """sum_j mu_j / sum_n w_jn^2: how many particles of the likely models count."""
+    total = 0.0
+    for j in range(w.shape[0]):
+        squares = 0.0
+        for s in range(w.shape[1]):
+            squares += w[j, s] * w[j, s]
+        total += mu[j] / squares
+    return total

@@ -1,0 +1,95 @@
+"""Two ways to run the terrain models along a ping: particles, and a grid.
+
+Both take the same models and the same likelihood, and give the same answer up to the Monte Carlo
+noise of the particles.
+"""
+
+from __future__ import annotations
+
+from attrs import evolve, frozen
+import numpy as np
+
+from ..measurements import FloatArray
+from .bathymetry_kernels import filter_block
+from .bathymetry_law import PingLaw
+from .bathymetry_models import TerrainModels
+
+# Random numbers are drawn for so many at a time, which still fit into the cache.
+_BLOCK = 32768
+
+
+@frozen(eq=False)
+class Track:
+    """The floor along one ping: mean (T, n), covariance (T, n, n), probability (T, M) of each
+    model, log_likelihood (T,) of each bin given those before it, sample_size (T,) effective."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    probability: FloatArray
+    log_likelihood: FloatArray
+    sample_size: FloatArray
+
+
+def run_particles(
+    models: TerrainModels,
+    law: PingLaw,
+    particles: int,
+    entropy: tuple[int, ...],
+    *,
+    redraw: bool = False,
+) -> Track:
+    """The IMM particle filter along a ping.
+
+    entropy: integers that name this ping; the same ones give the same bits, whatever other pings
+    there were. redraw: resample each model after the update, as the paper's effective sample size
+    of always one demands.
+    """
+    seeds = np.random.SeedSequence(entropy).spawn(3)
+    start, uniforms, normals = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)
+    T, M = models.scale.shape
+    n, k = models.F.shape[1], models.G.shape[2]
+    x, w = models.draw(particles, start), np.full((M, particles), 1.0 / particles)
+    mu = models.initial.copy()
+    track = _empty(T, M, n)
+    block = max(1, min(_BLOCK // (M * k * particles), T))
+    noise = np.empty((block, M, k, particles))
+    for first in range(0, T, block):
+        count = min(block, T - first)
+        filter_block(
+            first,
+            x,
+            w,
+            mu,
+            models.transition,
+            models.F,
+            models.G,
+            models.scale,
+            models.coast,
+            redraw,
+            uniforms.random((count, 2, M)),
+            normals.standard_normal(out=noise[:count]),
+            law.ranges,
+            law.heard,
+            law.form,
+            law.base,
+            law.spread,
+            law.signal,
+            law.geometry,
+            law.table,
+            track.mean,
+            track.covariance,
+            track.probability,
+            track.log_likelihood,
+            track.sample_size,
+        )
+    return _with_constants(track, law)
+
+
+def _empty(T: int, M: int, n: int) -> Track:
+    return Track(np.empty((T, n)), np.empty((T, n, n)), np.empty((T, M)), np.empty(T), np.empty(T))
+
+
+def _with_constants(track: Track, law: PingLaw) -> Track:
+    """The same with log likelihoods of the samples, not only of what depends on the state."""
+    constant = np.where(law.heard, law.constant, 0.0)
+    return evolve(track, log_likelihood=track.log_likelihood + constant)
