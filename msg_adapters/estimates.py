@@ -7,6 +7,7 @@ covariance between position and velocity.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,17 @@ def write_truth(position: ArrayLike, velocity: ArrayLike, track_id: ArrayLike, *
     columns.update(px=place[:, 0], py=place[:, 1], vx=speed[:, 0], vy=speed[:, 1],
                    track_id=np.asarray(track_id, np.uint32))
     return encode_table(columns, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
+
+
+def write_true_profile(xyz: ArrayLike, columns: Mapping[str, ArrayLike], *, stamp_ns: int,
+                       frame_id: str, make: Make) -> Any:
+    """Write the true floor under one ping, one row a range bin: ``x y z``, then `columns`.
+
+    xyz: (n, 3) metres; columns: (n,) each, ``range height angle`` as f8, ``patch valid`` as u1.
+    """
+    table: dict[str, NDArray] = dict(zip('xyz', np.asarray(xyz, np.float32).reshape(-1, 3).T))
+    table.update((name, np.asarray(values)) for name, values in columns.items())
+    return encode_table(table, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
 
 
 def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:

@@ -227,8 +227,8 @@ class Snapshot:
 
     @property
     def bin_width(self) -> float:
-        """Median distance between bins, metres."""
-        return float(np.median(np.diff(self.range)))
+        """Mean distance between bins, metres: single differences suffer from single precision."""
+        return float(self.range[-1] - self.range[0]) / (len(self) - 1)
 
     @property
     def spacing_wavelengths(self) -> float | None:

@@ -6,16 +6,21 @@ from typing import Any
 
 from attrs import frozen
 import numpy as np
+from numpy.typing import NDArray
 
 from ..measurements import FloatArray
 
 
 @frozen(eq=False)
 class Received:
-    """A measurement and when it reached the computer, which may be long after its stamp."""
+    """A measurement and when it reached the computer, which may be long after its stamp.
+
+    namespace: put before its topic when several instruments of one kind are on board.
+    """
 
     received_ns: int
     measurement: Any
+    namespace: str = ''
 
 
 @frozen(eq=False)
@@ -29,9 +34,30 @@ class TrueTrack:
 
 
 @frozen(eq=False)
+class TrueProfile:
+    """The floor that one ping really saw, one row a range bin.
+
+    range (n,) m; height (n,) m above the reference floor; angle (n,) rad from broadside; patch
+    (n,) rough floor; valid (n,) False in shadow and water column; xyz (n, 3) m in `frame_id`.
+    Where the floor cannot answer, angle and xyz are NaN. `namespace` is that of the snapshot.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    range: FloatArray
+    height: FloatArray
+    angle: FloatArray
+    patch: NDArray[np.bool_]
+    valid: NDArray[np.bool_]
+    xyz: FloatArray
+    namespace: str = ''
+
+
+@frozen(eq=False)
 class Scene:
-    """measurements in the order in which they were received; truth, one track a target."""
+    """measurements in the order in which they were received; truth, one track a target or one
+    profile a ping."""
 
     measurements: tuple[Received, ...]
-    truth: tuple[TrueTrack, ...]
+    truth: tuple[TrueTrack | TrueProfile, ...]
     frame_id: str = 'map'
