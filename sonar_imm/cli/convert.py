@@ -43,6 +43,16 @@ def _nanoseconds(_ctx: click.Context, _param: click.Parameter, value: str) -> in
         raise click.BadParameter(f"'{value}' is not a number of seconds") from None
 
 
+def _staves(_ctx: click.Context, _param: click.Parameter,
+            value: str | None) -> list[list[int]] | None:
+    if value is None:
+        return None
+    try:
+        return [[int(channel) for channel in stave.split('+')] for stave in value.split(',')]
+    except ValueError:
+        raise click.BadParameter(f"'{value}' is not of the form 0+3,1+2") from None
+
+
 def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]:
     """The options that describe a CSV file; `prefix` tells several files apart."""
     dashed, name = (f'{prefix}-', f'{prefix}_') if prefix else ('', '')
@@ -193,3 +203,27 @@ def truth(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
 def autoferry(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     """Detections of the Autoferry data set (JSON) to /fix: boats in clutter."""
     _convert('autoferry', source, out_bag, as_json, **values)
+
+
+@command.command('snapshots', epilog=example(
+    'sonar-imm convert snapshots pings.npz survey.bag --name iq=data',
+    'sonar-imm convert snapshots ping.npz ping.bag --staves 0+3,1+2'))
+@click.argument('source', metavar='IN', type=FILE)
+@click.argument('out_bag', type=BAG_OUT)
+@pairs_option('--name', 'names', metavar='WHAT=ARRAY',
+              help='What an array is called here, e.g. iq=data.')
+@click.option('--staves', callback=_staves, metavar='CHANNELS',
+              help='Channels, from 0, that make each stave; those joined by + are added up.')
+@click.option('--ping-rate', type=click.FloatRange(min=0.001, max=1000.0), default=10.0,
+              show_default=True, help='Pings a second, where there are no stamps.')
+@click.option('--frame-id', default='sonar', show_default=True, help='Frame of the array.')
+@storage_option
+@json_option
+def snapshots(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
+    """Array snapshots in a numpy archive (npz) to /snapshot.
+
+    Arrays: iq, complex, (bins, staves) or (pings, bins, staves), and range [m] or time [s];
+    optional sound_speed, frequency, element_spacing or spacing_wavelengths, stamp, noise_variance,
+    signal_variance. Usual names are recognised.
+    """
+    _convert('snapshots', source, out_bag, as_json, **values)
