@@ -146,24 +146,25 @@ def log_likelihoods(
     White noise: form (P,) from `laplace.form_coefficients`, base 0, spread (0,). Beside
     interferers: base, form = -ss2 beam and spread (P,) of one bin of an
     `interference.InterferenceForm`. spacing in wavelengths, negative for a conjugated array; work
-    (4, n) is scratch. What does not depend on the direction is left out.
+    (4, n or more) is scratch. What does not depend on the direction is left out.
     """
-    cosine, sine, q, other = work[0], work[1], work[2], work[3]
+    n = sines.shape[0]
+    cosine, sine, q, other = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
     phasors(sines, spacing, cosine, sine)
     if spread.shape[0] > 0:
         horner(spread, cosine, sine, out, other)
         horner(form, cosine, sine, q, other)
-        for i in range(out.shape[0]):
+        for i in range(n):
             gain = max(1.0 + signal_variance * out[i], 1.0)
             q[i] = base + q[i] / gain
             sine[i] = math.log(gain)
         log_densities(q, cosine, table, out)
-        for i in range(out.shape[0]):
+        for i in range(n):
             out[i] -= sine[i]
     else:
         horner(form, cosine, sine, q, other)
         log_densities(q, cosine, table, out)
-    for i in range(out.shape[0]):
+    for i in range(n):
         if not sines[i] == sines[i]:
             out[i] = -math.inf
 

@@ -66,6 +66,13 @@ class System:
 
 
 SYSTEMS = {
+    'bathymetry': System(
+        'bathymetry',
+        'sonar_imm.trackers.bathymetry',
+        'BathymetryConfig',
+        'BathymetryTracker',
+        'sea floor from side-scan array snapshots, IMM particle filter along each ping',
+    ),
     'diver': System(
         'diver',
         'sonar_imm.trackers.diver',

@@ -172,7 +172,7 @@ class BathymetryConfig(Config):
     particles_per_model: int = parameter(100, 'particles of each model', low=2, high=100_000)
     grid_step: float = parameter(
         0.0,
-        'distance of grid points, m or rad; 0: the smallest noise, 0.02 m or 0.1 deg at most',
+        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most',
         low=0.0,
         high=100.0,
     )

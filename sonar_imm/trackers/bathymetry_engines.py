@@ -10,6 +10,7 @@ from attrs import evolve, frozen
 import numpy as np
 
 from ..measurements import FloatArray
+from .bathymetry_grid_kernels import filter_ping, smooth_ping
 from .bathymetry_kernels import filter_block
 from .bathymetry_law import PingLaw
 from .bathymetry_models import TerrainModels
@@ -82,6 +83,34 @@ def run_particles(
             track.log_likelihood,
             track.sample_size,
         )
+    return _with_constants(track, law)
+
+
+def run_grid(models: TerrainModels, law: PingLaw, cells: FloatArray, *, smooth: bool) -> Track:
+    """The exact filter along a ping for models of one state, on `cells` (G,), evenly spaced; with
+    `smooth` the exact smoother."""
+    T, M = models.scale.shape
+    track = _empty(T, M, 1)
+    track.sample_size[:] = np.nan
+    shape = np.exp(-0.5 * np.square((cells - models.mean[0]) / models.std[0]))
+    p = models.initial[:, None] * (shape / shape.sum())
+    sigma = models.scale / (cells[1] - cells[0])
+    window = np.empty((T, 2), np.int64)
+    ping = (
+        law.ranges,
+        law.heard,
+        law.form,
+        law.base,
+        law.spread,
+        law.signal,
+        law.geometry,
+        law.table,
+    )
+    moments = track.mean, track.covariance, track.probability
+    motion = cells, models.transition, sigma, models.coast
+    kept = filter_ping(p, *motion, *ping, window, *moments, track.log_likelihood, smooth)
+    if smooth:
+        smooth_ping(kept, window, *motion, *ping, *moments)
     return _with_constants(track, law)
 
 

@@ -29,7 +29,7 @@ _CHUNK = 4096
 @frozen(eq=False)
 class PingLaw:
     """The likelihood of each of T bins; see `law_kernels.log_likelihoods` for form (T, P), base
-    (T,), spread (T, P or 0), signal (T,) and table.
+    (T,), spread (T, P or 0), signal (T,) and table; noise (T,) is the variance it was made for.
 
     heard (T,): bins that say something; constant (T,): what the kernels leave out of the log
     likelihood; geometry: see `bathymetry_kernels.sines_of`.
@@ -41,6 +41,7 @@ class PingLaw:
     base: FloatArray
     spread: ComplexArray
     signal: FloatArray
+    noise: FloatArray
     constant: FloatArray
     table: FloatArray
     geometry: FloatArray
@@ -90,6 +91,7 @@ def ping_law(snapshot: Snapshot, config: BathymetryConfig) -> PingLaw:
         base=np.ascontiguousarray(base),
         spread=np.ascontiguousarray(spread),
         signal=signal,
+        noise=noise,
         constant=constant(P, log_determinant),
         table=law_kernels.law_table(P, config.likelihood),
         geometry=np.array([height, math.cos(tilt), math.sin(tilt), spacing]),

@@ -35,6 +35,9 @@ from ..measurements import FloatArray
 from .bathymetry_config import BathymetryConfig, DEFAULT_SIGMAS, DEFAULT_SIGMAS_DEG
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
+HEIGHT_STEP, ANGLE_STEP = 0.01, math.radians(0.05)
+MOST_CELLS = 20_000
+"""The grid has at most so many cells to either side of its middle."""
 
 
 @frozen(eq=False)
@@ -166,3 +169,16 @@ def _start(config: BathymetryConfig, first_range: float) -> tuple[float, float]:
         return config.initial_mean, HEIGHT_STD
     depth = min(config.sonar_height, first_range)
     return float(angle_of_depth(depth, first_range, math.radians(config.tilt_deg))), ANGLE_STD
+
+
+def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
+    """Cells (G,) for the grid engine: even, one of them at the mean of the start."""
+    angle = config.model_set == 'angle_two_rw'
+    step = config.grid_step
+    if not step > 0.0:
+        noises = models.scale[models.scale > 0.0]
+        step = min(noises.min(initial=np.inf), ANGLE_STEP if angle else HEIGHT_STEP)
+    extent = math.pi if angle else config.grid_extent
+    count = min(math.ceil(extent / step), MOST_CELLS)
+    cells = models.mean[0] + extent * np.arange(-count, count + 1) / count
+    return cells[np.abs(cells) <= 0.5 * math.pi] if angle else cells
