@@ -78,3 +78,12 @@ def test_a_shadow_is_silent_and_an_echo_is_not():
     assert silent[signal == 0.0].mean() > 0.99
     # A coherent echo fades below the noise now and then.
     assert silent[signal > 0.0].mean() < 0.3
+
+
+def test_for_two_staves_the_mean_decides():
+    iq = noise(np.random.default_rng(5), 3000, 2)
+    silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
+    assert silent.mean() > 0.99
+    iq += 20.0 * noise(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
+    silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
+    assert silent.mean() < 0.3
