@@ -43,7 +43,8 @@ def test_noise_passes_as_often_as_the_formula_says(staves, spacing):
     for probability in (0.05, 0.01):
         level = coherence.coherence_threshold(staves, 1, probability, spacing)
         assert coherence.false_alarm_probability(level, staves, spacing) == pytest.approx(
-            probability)  # fmt: skip
+            probability
+        )
         assert (gamma > level).mean() == pytest.approx(probability, rel=0.15, abs=2e-3)
 
 
@@ -73,8 +74,7 @@ def test_a_shadow_is_silent_and_an_echo_is_not():
     fading = rng.exponential(size=2000)
     iq = noise(rng, 2000, 8) / np.sqrt(2.0)
     iq += np.sqrt(signal / 2)[:, None] * noise(rng, 2000, 1) * array.steering(0.3, 8, 0.5)
-    silent = coherence.silent_bins(
-        coherence.coherence(np.sqrt(fading)[:, None] * iq, 0.5)[0], 8)  # fmt: skip
+    silent = coherence.silent_bins(coherence.coherence(np.sqrt(fading)[:, None] * iq, 0.5)[0], 8)
     assert silent[signal == 0.0].mean() > 0.99
     # A coherent echo fades below the noise now and then.
     assert silent[signal > 0.0].mean() < 0.3

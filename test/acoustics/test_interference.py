@@ -35,10 +35,19 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, law):
     out = np.empty(len(u))
     for n in range(3):
         law_kernels.log_likelihoods(
-            u, SPACING, -signal * form.beam[n], form.base[n], form.spread[n], signal,
-            law_kernels.law_table(STAVES, law), np.empty((4, len(u))), out)  # fmt: skip
+            u,
+            SPACING,
+            -signal * form.beam[n],
+            form.base[n],
+            form.spread[n],
+            signal,
+            law_kernels.law_table(STAVES, law),
+            np.empty((4, len(u))),
+            out,
+        )
         expected = interference.interfered_log_likelihood(
-            u, y[n], signal, covariance[n], STEP, law)  # fmt: skip
+            u, y[n], signal, covariance[n], STEP, law
+        )
         assert out[-1] == expected[-1] == -np.inf
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
 

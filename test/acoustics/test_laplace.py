@@ -14,9 +14,15 @@ def complex_normal(rng, *shape):
     return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / math.sqrt(2.0)
 
 
-@pytest.mark.parametrize('staves, q, value', [
-    (8, 1.0, 5.7220742150), (8, 8.0, -9.8732948088), (8, 1e4, -234.5379989984),
-    (4, 1.0, -0.4348135035)])  # fmt: skip
+@pytest.mark.parametrize(
+    'staves, q, value',
+    [
+        (8, 1.0, 5.7220742150),
+        (8, 8.0, -9.8732948088),
+        (8, 1e4, -234.5379989984),
+        (4, 1.0, -0.4348135035),
+    ],
+)
 def test_golden_values(staves, q, value):
     assert laplace.log_density(q, staves) == pytest.approx(value, abs=1e-9)
 
@@ -33,7 +39,8 @@ def test_the_law_is_the_mixture_it_is_derived_from(staves, q):
 
     total = quad(mixture, 0.0, peak)[0] + quad(mixture, peak, np.inf, limit=200)[0]
     assert laplace.log_density(q, staves) + math.log(2.0) == pytest.approx(
-        math.log(total) + height, abs=1e-6)  # fmt: skip
+        math.log(total) + height, abs=1e-6
+    )
 
 
 @pytest.mark.parametrize('staves', range(2, 17))
@@ -131,8 +138,16 @@ def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, law):
     y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
     out = np.empty(len(u))
     law_kernels.log_likelihoods(
-        u, spacing, laplace.form_coefficients(y, signal, noise), 0.0, np.empty(0, complex), 0.0,
-        law_kernels.law_table(staves, law), np.empty((4, len(u))), out)  # fmt: skip
+        u,
+        spacing,
+        laplace.form_coefficients(y, signal, noise),
+        0.0,
+        np.empty(0, complex),
+        0.0,
+        law_kernels.law_table(staves, law),
+        np.empty((4, len(u))),
+        out,
+    )
     expected = laplace.log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, law)
     assert out[300] == expected[300] == -np.inf
     fine = np.arange(len(u)) != 300

@@ -117,7 +117,8 @@ def test_errors_are_what_is_attainable(pings, method):
         height = HEIGHT - array.depth_of_angle(angle, ping.range, TILT)
         error = np.square(height - true.height)
         turn = np.square(np.degrees(angle - true.angle))
-        squares.append([error[~true.patch].mean(), error[true.patch].mean(), error.mean(),
-                        turn.mean()])  # fmt: skip
+        squares.append(
+            [error[~true.patch].mean(), error[true.patch].mean(), error.mean(), turn.mean()]
+        )
     rms = np.sqrt(np.mean(squares, axis=0))
     assert rms == pytest.approx(ATTAINABLE[method], rel=0.1)
