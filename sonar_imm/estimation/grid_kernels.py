@@ -23,7 +23,7 @@ from .rows import exponentials
 FloatArray = NDArray[np.float64]
 
 TAIL = 1e-13
-COARSE_SIGMA = 6
+COARSE_SIGMA = 8
 REACH = 7.0
 """A walk goes no further than so many sigma."""
 
