@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics import array, coherence
+from sonar_imm.acoustics import array, coherence, interference, laplace, law_kernels
 
 
 def noise(rng, *shape):
@@ -87,3 +87,42 @@ def test_for_two_staves_the_mean_decides():
     iq += 20.0 * noise(np.random.default_rng(6), 3000, 1) * array.steering(0.3, 2, 0.5)
     silent = coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 2)
     assert silent.mean() < 0.3
+
+
+def test_the_compiled_peaks_are_those_of_numpy():
+    iq = noise(np.random.default_rng(7), 300, 8)
+    gamma, sine = coherence.coherence(iq, 0.5)
+    form = laplace.autocorrelation(iq)
+    form[:, 1:] *= 2.0
+    grid = array.direction_grid(8, 0.5)
+    cosine, sines = np.cos(np.pi * grid), np.sin(np.pi * grid)
+    height, place = np.empty(300), np.empty(300)
+    law_kernels.beam_peaks(
+        form, cosine, sines, np.empty(len(grid)), np.empty(len(grid)), height, place
+    )
+    power = np.square(np.abs(iq)).sum(axis=1)
+    assert np.allclose(height / (8.0 * power), gamma, atol=1e-12)
+    assert np.allclose(grid[0] + place * (grid[1] - grid[0]), sine, atol=1e-9)
+
+
+def test_coherence_beside_an_interferer_is_that_of_what_it_leaves():
+    rng = np.random.default_rng(8)
+    iq = noise(rng, 4000, 8) + 30.0 * noise(rng, 4000, 1) * array.steering(-0.6, 8, 0.5)
+    assert not coherence.silent_bins(coherence.coherence(iq, 0.5)[0], 8)[10:].all()
+    step = array.phase_step(0.5)
+
+    def silent(samples):
+        R = interference.noise_covariance(
+            np.full((4000, 1), -0.6), 1800.0, np.full(4000, 2.0), 8, step
+        )
+        form = interference.interference_form(samples, R)
+        return coherence.silent_bins(interference.coherence_beside(form, 0.5), 8)
+
+    assert silent(iq).mean() > 0.98
+    iq += 20.0 * noise(rng, 4000, 1) * array.steering(0.2, 8, 0.5)
+    assert silent(iq).mean() < 0.1
+    assert np.isnan(
+        interference.coherence_beside(
+            interference.interference_form(np.zeros((1, 8)), np.eye(8)[None]), 0.5
+        )
+    ).all()

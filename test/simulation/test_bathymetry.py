@@ -52,8 +52,8 @@ def test_patch_heights_have_their_deviation_and_correlation():
     assert white.std() == pytest.approx(0.5, rel=0.05)
     smooth = [true.height[true.patch] for _, true in run('correlated', pings=200)]
     assert np.std(smooth) == pytest.approx(0.5, rel=0.1)
-    # A Gaussian kernel of 0.5 m correlates neighbours 0.5 m apart by exp(-1/4).
-    lag = np.mean([h[10:] * h[:-10] for h in smooth]) / np.mean(np.square(smooth))
+    # A Gaussian kernel of 1 m correlates neighbours 1 m apart by exp(-1/4).
+    lag = np.mean([h[20:] * h[:-20] for h in smooth]) / np.mean(np.square(smooth))
     assert lag == pytest.approx(np.exp(-0.25), abs=0.05)
     assert abs(np.mean([h[1:] * h[:-1] for h in np.split(white, 30)]) / 0.25) < 0.05
 
