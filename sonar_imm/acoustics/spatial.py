@@ -26,8 +26,10 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 HALF_WIDTH = 5
-LOADING = 1e-3
-"""Share of the mean power added to the diagonal before a sample covariance is inverted."""
+LOADING = 3e-4
+"""Share of the mean power added to the diagonal before a sample covariance is inverted: 35 dB
+below the echo. Without it 11 bins of 8 staves fail now and then; more of it (1e-2) lowers the
+error on a flat floor by a quarter, and gives up the resolution that the method is for."""
 
 
 def sample_covariance(iq: NDArray, half_width: int = HALF_WIDTH) -> ComplexArray:
