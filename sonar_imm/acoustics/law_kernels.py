@@ -11,7 +11,7 @@ a logarithm would prevent; that makes them nine times faster.
 * `law_table` and `log_densities`: a double holds its own logarithm. Its exponent and its first
   five bits number the cells of a table, 32 to the octave, and the remaining bits say where in the
   cell it lies, so that cubic interpolation needs no logarithm. From 2^-20 to 2^50; outside, q is
-  put to the nearest end. The relative error is 2e-7 at most. The Gaussian law is a table too.
+  put to the nearest end. The relative error is 3e-7 at most. The Gaussian law is a table too.
 
 Everything is elementwise: a row gives the same bits however it is cut.
 """
