@@ -63,10 +63,11 @@ def mix(
             for s in range(N):
                 origin[begin] = i * N + s
                 begin = min(int(points[s]), N)
-        source = 0
+        source, i = 0, 0
         for k in range(N):
             source = max(source, origin[k])
-            i = source // N
+            while source >= (i + 1) * N:
+                i += 1
             for a in range(n):
                 mixed[j, a, k] = x[i, a, source - i * N]
 
