@@ -37,9 +37,14 @@ def _positive(instance: PlayOptions, attribute: object, value: float | None) -> 
         raise LinkError(f'the {attribute.name} must be positive, got {value:g}')
 
 
+def _not_negative(instance: PlayOptions, attribute: object, value: float) -> None:
+    if not 0.0 <= value < float('inf'):
+        raise LinkError(f'the {attribute.name} must not be negative, got {value:g}')
+
+
 @frozen(kw_only=True)
 class PlayOptions:
-    """How to play. Raises `LinkError` for a rate that is not positive.
+    """How to play. Raises `LinkError` for a number that makes no sense.
 
     rate: speed, 2 is twice as fast; loop: start over at the end; start_offset: seconds of the
     recording to skip; delay: seconds to wait before the first message; start_paused: wait for the
@@ -51,8 +56,8 @@ class PlayOptions:
 
     rate: float = field(default=1.0, validator=_positive)
     loop: bool = False
-    start_offset: float = 0.0
-    delay: float = 0.0
+    start_offset: float = field(default=0.0, validator=_not_negative)
+    delay: float = field(default=0.0, validator=_not_negative)
     start_paused: bool = False
     clock: float | None = field(default=None, validator=_positive)
     topics: tuple[str, ...] = ()

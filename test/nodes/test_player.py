@@ -162,6 +162,8 @@ def test_a_paused_player_waits_for_resume(bag, link, domain):
     ({'remap': {'/fxi': '/x'}}, "has no topic '/fxi'"),
     ({'rate': 0.0}, 'the rate must be positive, got 0'),
     ({'rate': float('nan')}, 'the rate must be positive, got nan'),
+    ({'start_offset': float('nan')}, 'the start_offset must not be negative, got nan'),
+    ({'delay': -1.0}, 'the delay must not be negative, got -1'),
     ({'clock': -1.0}, 'the clock must be positive, got -1'),
 ])
 def test_what_cannot_be_played_is_said(bag, domain, options, sentence):
