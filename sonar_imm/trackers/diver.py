@@ -142,7 +142,11 @@ class DiverTracker:
         """The state after all measurements of one stamp. Pure."""
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
         scan = Scan(self.config, self.models, self._chain, before, stamp_ns)
-        left = [(group, ~scan.take(group)) for group in groups_of(items, self.config, factor)]
+        left = [
+            (group, ~taken)
+            for groups in groups_of(items, self.config, factor)
+            for group, taken in zip(groups, scan.take(groups))
+        ]
         return self._census(scan.result(), self._births(items, left, float(factor[1])))
 
     def _births(

@@ -3,6 +3,8 @@ after it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from attrs import evolve, frozen
 import numpy as np
 
@@ -70,20 +72,37 @@ class Scan:
         self.nis_dof = np.zeros(len(x), np.uint16)
         self.scale = before.scale.copy()
 
-    def take(self, group: Group) -> np.ndarray:
-        """Update the tracks with what the group holds for them; True (D,) for what was taken."""
-        taken = np.zeros(len(group.z), bool)
+    def take(self, groups: Sequence[Group]) -> list[np.ndarray]:
+        """Update the tracks with what one message holds for them, group after group. Gives for
+        each group True (D,) where a detection was taken.
+
+        A track that agrees with fewer than half of the groups is not what the message shows, but
+        a ghost or a neighbour that one arrival happens to fit: for it nothing happened.
+        """
+        untouched = self.x.copy(), self.P.copy(), self.mu.copy(), self.nis, self.nis_dof
+        self.nis, self.nis_dof = self.nis.copy(), self.nis_dof.copy()
+        chosen = [self._take_group(group) for group in groups]
+        agreeing = np.sum([choice >= 0 for choice in chosen], axis=0)
+        doubtful = 2 * agreeing < len(groups)
+        for now, before in zip((self.x, self.P, self.mu, self.nis, self.nis_dof), untouched):
+            now[doubtful] = before[doubtful]
+        return [
+            np.isin(np.arange(len(group.z)), choice[~doubtful])
+            for group, choice in zip(groups, chosen)
+        ]
+
+    def _take_group(self, group: Group) -> np.ndarray:
+        """Associate and update; the detection (T,) each track took, -1 for none."""
         chosen = self._associate(group)
         if isinstance(group, TagPing) and not (chosen >= 0).any():
             group = reduced(group, self.config)
             chosen = self._associate(group)
         tracks = np.flatnonzero(chosen >= 0)
         if len(tracks):
-            taken[chosen[tracks]] = True
             self._update(group, tracks, chosen[tracks])
             if isinstance(group, RangeSums):
                 self._take_bearings(group.bearings(), tracks, chosen[tracks])
-        return taken
+        return chosen
 
     def result(self) -> Divers:
         """What is known now; the transitions have learnt from the tracks that were hit."""

@@ -122,23 +122,24 @@ class TagPing(Group):
 
 def groups_of(
     items: Sequence[Measurement], config: DiverConfig, factor: FloatArray
-) -> list[Group]:
-    """The groups of one stamp, in an order that depends on content only.
+) -> list[Sequence[Group]]:
+    """The groups of one stamp, message by message (all fixes are one), in an order that depends on
+    content only.
 
     factor (2,): learnt factor on the covariances of fixes and of arrivals.
     """
     scale = config.covariance_scale * factor
-    groups: list[Group] = []
+    said: list[Sequence[Group]] = []
     fixes = [item for item in items if isinstance(item, Fix)]
     if fixes:
-        groups.append(_positions(fixes, config, scale[0]))
+        said.append([_positions(fixes, config, scale[0])])
     for ping in (item for item in items if isinstance(item, Arrivals)):
         if ping.passive:
             usable = np.flatnonzero(np.isfinite(ping.toa))
-            groups += [_tag_ping(ping, usable, config, scale[1])] if len(usable) > 1 else []
+            said += [[_tag_ping(ping, usable, config, scale[1])]] if len(usable) > 1 else []
         else:
-            groups += _range_sums(ping, config, scale[1])
-    return groups
+            said.append(list(_range_sums(ping, config, scale[1])))
+    return said
 
 
 def reduced(group: TagPing, config: DiverConfig) -> TagPing:
