@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .imm import MIN_GATE_PROBABILITY
+from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import cholesky, gain, innovation_covariance, joseph, whitened_square
 
@@ -42,9 +42,9 @@ def mix(
                 W[i] = transition[p, i, j] * mu[t, i]
                 total += W[i]
             c[t, j] = total
-            scale = 1.0 / total if total > 0.0 else 0.0
+            scale = 1.0 / total if total > DEAD else 0.0
             for i in range(M):
-                W[i] = W[i] * scale if total > 0.0 else mu[t, i]
+                W[i] = W[i] * scale if total > DEAD else mu[t, i]
                 for a in range(n):
                     x0[t, j, a] += W[i] * x[t, i, a]
             for i in range(M):

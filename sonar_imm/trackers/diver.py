@@ -69,11 +69,13 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
-        tracker = DiverTracker(evolve(self.config, max_gap=3600.0, history=10.0))
+        # A contested scan and a ping, in which nothing is left to be loaded at the first real one.
+        tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
         for second in (1, 2):
-            tracker.process(
-                Fix(stamp_ns=second * 10**9, position=np.zeros(3), covariance=np.eye(2))
-            )
+            for x in (0.0, 0.1):
+                position = np.array([x, 0.0, 0.0])
+                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
+                tracker.process(fix)
 
     def health(self) -> dict[str, float]:
         now = self._history.state
