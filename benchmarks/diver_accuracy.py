@@ -62,21 +62,37 @@ def load(names: list[str], seeds: range) -> tuple[np.ndarray, np.ndarray, np.nda
 def forward(config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarray | None = None):
     """Filter N runs of K fixes at once: yields mean, covariance and the arrays of each step."""
     models = build_models(config)
-    chain = AdaptiveChain(models.chain, config.adaptation, weight=config.adaptation_prior,
-                          guard=config.adaptation_guard)
+    chain = AdaptiveChain(
+        models.chain,
+        config.adaptation,
+        weight=config.adaptation_prior,
+        guard=config.adaptation_guard,
+    )
     if matrix is not None:
         models.chain.matrix = matrix
         models.chain.transition = lambda dt: matrix
-    x, P, mu = (np.array(part) for part in
-                zip(*(models.new_track(*first) for first in zip(z[:, 0], R[:, 0]))))
+    x, P, mu = (
+        np.array(part)
+        for part in zip(*(models.new_track(*first) for first in zip(z[:, 0], R[:, 0])))
+    )
     H, motion = np.ascontiguousarray(models.E[:, :2]), models.motion(1.0)
     learnt = chain.fresh(len(z))
     yield (*imm_kernels.combine(x, P, mu, models.E), x, P, mu, None, motion, models)
     for k in range(1, z.shape[1]):
         transition, before = np.ascontiguousarray(chain.transition(learnt, 1.0)), mu
         x, P, mu, mean, covariance, *_ = imm_kernels.linear_cycle(
-            x, P, mu, transition, motion.F, motion.Q, motion.B, np.ascontiguousarray(z[:, k]), H,
-            np.ascontiguousarray(R[:, k]), models.E)
+            x,
+            P,
+            mu,
+            transition,
+            motion.F,
+            motion.Q,
+            motion.B,
+            np.ascontiguousarray(z[:, k]),
+            H,
+            np.ascontiguousarray(R[:, k]),
+            models.E,
+        )
         learnt = chain.learn(learnt, transition, before, mu, 1.0)
         yield mean, covariance, x, P, mu, transition, motion, models
 
@@ -89,14 +105,18 @@ def track(config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarray 
 
 def rmse(estimate: np.ndarray, truth: np.ndarray, columns: slice = slice(0, 2)) -> float:
     error = estimate[..., columns] - truth[..., columns]
-    return float(np.sqrt(np.mean(np.sum(error ** 2, axis=-1))))
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
 
 
 def tuned(model_set: str, names: list[str]) -> DiverConfig:
     """The baseline with the noise that does best on 100 scenes of other seeds."""
     truth, z, R = load(names, range(10_000, 10_100))
-    candidates = [DiverConfig(model_set=model_set, acceleration_noise=noise, adaptation='fixed',
-                              velocity_std=0.7) for noise in NOISES[model_set]]
+    candidates = [
+        DiverConfig(
+            model_set=model_set, acceleration_noise=noise, adaptation='fixed', velocity_std=0.7
+        )
+        for noise in NOISES[model_set]
+    ]
     return min(candidates, key=lambda config: rmse(track(config, z, R)[0], truth))
 
 
@@ -113,8 +133,11 @@ def main_table(runs: int) -> dict[str, dict[str, float]]:
         truth, z, R = load(names, range(runs))
         put = lambda row, value: table.setdefault(row, {}).__setitem__(column, value)  # noqa: E731
         put('raw fix', rmse(z, truth))
-        for model_set, label in (('cv', 'CV Kalman, tuned'), ('cv_cv', 'IMM CV+CV, tuned'),
-                                 ('cv_ct', 'IMM CV+CT+-, tuned')):
+        for model_set, label in (
+            ('cv', 'CV Kalman, tuned'),
+            ('cv_cv', 'IMM CV+CV, tuned'),
+            ('cv_ct', 'IMM CV+CT+-, tuned'),
+        ):
             put(label, rmse(track(tuned(model_set, names), z, R)[0], truth))
         for label, values in TRACKERS.items():
             put(label, rmse(track(DiverConfig(**values), z, R)[0], truth))
@@ -140,13 +163,25 @@ def losses(runs: int) -> dict[str, dict[str, float]]:
 def consistency(runs: int) -> dict[str, dict[str, float]]:
     """Mean NEES of the position, 2 degrees of freedom, and coverage of the 95 % ellipse."""
     table = {}
-    for name in ('table1', 'random_heading', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still'):
+    for name in (
+        'table1',
+        'random_heading',
+        'straight',
+        'circle',
+        'zigzag',
+        'stop_and_go',
+        'still',
+    ):
         truth, z, R = load([name], range(runs))
         estimate, covariance = track(DiverConfig(), z, R)
         squared = nees((estimate - truth)[..., :2], covariance[..., :2, :2])[:, 5:]
         low, high = average_bounds(squared.size // 10, 2)
-        table[name] = {'NEES': float(squared.mean()), 'low': low, 'high': high,
-                       'coverage 95 %': float(np.mean(squared < 5.991))}
+        table[name] = {
+            'NEES': float(squared.mean()),
+            'low': low,
+            'high': high,
+            'coverage 95 %': float(np.mean(squared < 5.991)),
+        }
     return table
 
 
@@ -163,8 +198,10 @@ def smoothing(runs: int) -> dict[str, dict[str, float]]:
             x, P, mu = (np.stack([step[part][run] for step in steps]) for part in (2, 3, 4))
             into = np.stack([steps[max(k, 1)][5][run % len(steps[1][5])] for k in range(K)])
             smooth[run] = imm_smooth(x, P, mu, into, F, Q, B).combine(E)[0]
-        table[label] = {'filter': rmse(np.stack([step[0] for step in steps], axis=1), truth),
-                        'smoother': rmse(smooth, truth)}
+        table[label] = {
+            'filter': rmse(np.stack([step[0] for step in steps], axis=1), truth),
+            'smoother': rmse(smooth, truth),
+        }
     return table
 
 
@@ -190,22 +227,28 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
                     error = estimate.state[row, :2] - scene.truth[0].position[at[stamp], :2]
                     squared.append(error @ error)
             names.append(len(ids))
-        table[name] = {'RMSE': float(np.sqrt(np.mean(squared))), 'unconfirmed scans': absent / total,
-                       'identities': float(np.mean(names))}
+        table[name] = {
+            'RMSE': float(np.sqrt(np.mean(squared))),
+            'unconfirmed scans': absent / total,
+            'identities': float(np.mean(names)),
+        }
     return table
 
 
 def markdown(table: dict[str, dict[str, float]]) -> str:
     columns = list(next(iter(table.values())))
     lines = ['| | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 1) + '|']
-    lines += [f'| {row} | ' + ' | '.join(f'{values[column]:.3f}' for column in columns) + ' |'
-              for row, values in table.items()]
+    lines += [
+        f'| {row} | ' + ' | '.join(f'{values[column]:.3f}' for column in columns) + ' |'
+        for row, values in table.items()
+    ]
     return '\n'.join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('--runs', type=int, default=500)
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()

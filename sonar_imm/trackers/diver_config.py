@@ -223,7 +223,7 @@ class DiverConfig(Config):
         read_only=False,
     )
     clutter_density: float = parameter(
-        1e-4,
+        1e-6,
         'false fixes expected in a scan, for each square metre',
         unit='1/m^2',
         low=1e-12,

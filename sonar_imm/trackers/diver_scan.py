@@ -14,7 +14,7 @@ from ..estimation.association import assign, association_cost, gate_threshold, T
 from ..measurements import FloatArray
 from .diver_config import DiverConfig
 from .diver_models import ModelSet
-from .diver_sensing import Bearings, Group, Positions, RangeSums, reduced, TagPing
+from .diver_sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing
 
 SCALE_PRIOR = 20.0
 """Numbers measured that the stated covariances are worth when their scale is being learnt."""
@@ -95,8 +95,10 @@ class Scan:
         """Associate and update; the detection (T,) each track took, -1 for none."""
         chosen = self._associate(group)
         if isinstance(group, TagPing) and not (chosen >= 0).any():
-            group = reduced(group, self.config)
-            chosen = self._associate(group)
+            # A late reflection among the arrivals, or a prediction too uncertain to linearise at.
+            fixed = as_fix(group, self.config)
+            if fixed is not None:
+                group, chosen = fixed, self._associate(fixed)
         tracks = np.flatnonzero(chosen >= 0)
         if len(tracks):
             self._update(group, tracks, chosen[tracks])
@@ -140,9 +142,12 @@ class Scan:
             h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold
         )
         target, detection = np.nonzero(np.isfinite(fit))
-        cost = association_cost(
-            fit[target, detection], self.config.detection_probability, group.clutter
-        )
+        likelihood = fit[target, detection]
+        if group.clutter == 0.0:
+            cost = -1e6 - likelihood  # nothing to compare with but the other tracks
+        else:
+            p_detection = self.config.detection_probability
+            cost = association_cost(likelihood, p_detection, group.clutter)
         for own in (~tentative, tentative):
             pairs = own[target] & free[detection]
             found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
