@@ -18,7 +18,7 @@ from .truth import Truth
 INK, GRID, GREY, AMBER = '#1b2733', '#e4e9ee', '#8593a1', '#E69F00'
 TRACK_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 MOST_POINTS = 20_000
-MOST_ELLIPSES = 120
+MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12
 FONT = 'Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif'
 

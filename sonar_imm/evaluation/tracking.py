@@ -76,6 +76,18 @@ class Revisions:
         return [self._held.pop(stamp) for stamp in stamps]
 
 
+def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
+    """The last word on each stamp out of everything a live tracker of `config` published."""
+    revisions = Revisions(window_ns(config))
+    return [*(final for estimate in estimates for final in revisions.add([estimate])),
+            *revisions.finish()]
+
+
+def window_ns(config: Config) -> int:
+    """How far back late input can change the estimates of a tracker."""
+    return round(getattr(config, 'history', 0.0) * SECOND)
+
+
 class OfflineRun:
     """One pass of a tracker over an open recording. The counters are complete after `estimates`.
 
@@ -94,7 +106,7 @@ class OfflineRun:
         self.refused: dict[str, Refused] = {}
         self.messages = 0
         self.durations = array('d')
-        self._window_ns = round(getattr(config, 'history', 0.0) * SECOND)
+        self._window_ns = window_ns(config)
 
     @property
     def total(self) -> int:
