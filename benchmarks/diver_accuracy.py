@@ -15,6 +15,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+
 from sonar_imm.estimation import imm_kernels
 from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.consistency import average_bounds, nees
@@ -30,8 +31,14 @@ COLUMNS = {
 }
 NOISES = {
     'cv': [(q,) for q in (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)],
-    'cv_cv': [(a, b) for a in (0.02, 0.05, 0.1) for b in (0.3, 0.45, 0.6, 0.8)],
+    'cv_cv': [(a, b) for a in (0.01, 0.03, 0.06, 0.1) for b in (0.45, 0.6, 0.8, 1.0)],
     'cv_ct': [(a, b, b) for a in (0.05, 0.1, 0.2) for b in (0.2, 0.3, 0.5)],
+}
+STAYS = {'cv': (1.0,), 'cv_cv': (0.7, 0.8, 0.85, 0.9, 0.95), 'cv_ct': (0.8, 0.9)}
+BASELINES = {
+    'cv': 'CV Kalman, tuned',
+    'cv_cv': 'IMM CV+CV, tuned',
+    'cv_ct': 'IMM CV+CT+-, tuned',
 }
 TRACKERS = {
     'world_headings, 1 m/s given': {
@@ -113,15 +120,19 @@ def tuned(model_set: str, names: list[str]) -> DiverConfig:
     truth, z, R = load(names, range(10_000, 10_100))
     candidates = [
         DiverConfig(
-            model_set=model_set, acceleration_noise=noise, adaptation='fixed', velocity_std=0.7
+            model_set=model_set,
+            acceleration_noise=noise,
+            baseline_stay_probability=stay,
+            adaptation='fixed',
         )
         for noise in NOISES[model_set]
+        for stay in STAYS[model_set]
     ]
     return min(candidates, key=lambda config: rmse(track(config, z, R)[0], truth))
 
 
 def paper_literal(z: np.ndarray, R: np.ndarray, rng: np.random.Generator, uniform: bool):
-    """Eq. (1) unguarded, from a matrix of uniform random numbers (rows normalised) or a flat one."""
+    """Eq. (1) unguarded, from a matrix of uniform random numbers, or a flat one."""
     config = DiverConfig(model_set='world_headings', adaptation='paper', adaptation_guard=0.0)
     matrix = np.full((16, 16), 1.0 / 16.0) if uniform else rng.uniform(size=(16, 16))
     return track(config, z, R, matrix / matrix.sum(axis=1, keepdims=True))[0]
@@ -131,19 +142,16 @@ def main_table(runs: int) -> dict[str, dict[str, float]]:
     table: dict[str, dict[str, float]] = {}
     for column, names in COLUMNS.items():
         truth, z, R = load(names, range(runs))
-        put = lambda row, value: table.setdefault(row, {}).__setitem__(column, value)  # noqa: E731
-        put('raw fix', rmse(z, truth))
-        for model_set, label in (
-            ('cv', 'CV Kalman, tuned'),
-            ('cv_cv', 'IMM CV+CV, tuned'),
-            ('cv_ct', 'IMM CV+CT+-, tuned'),
-        ):
-            put(label, rmse(track(tuned(model_set, names), z, R)[0], truth))
-        for label, values in TRACKERS.items():
-            put(label, rmse(track(DiverConfig(**values), z, R)[0], truth))
         rng = np.random.default_rng(1)
-        put('paper literal, random P0', rmse(paper_literal(z, R, rng, False), truth))
-        put('paper literal, flat P0', rmse(paper_literal(z, R, rng, True), truth))
+        estimates = {'raw fix': z}
+        for model_set, label in BASELINES.items():
+            estimates[label] = track(tuned(model_set, names), z, R)[0]
+        for label, values in TRACKERS.items():
+            estimates[label] = track(DiverConfig(**values), z, R)[0]
+        estimates['paper literal, random P0'] = paper_literal(z, R, rng, False)
+        estimates['paper literal, flat P0'] = paper_literal(z, R, rng, True)
+        for label, estimate in estimates.items():
+            table.setdefault(label, {})[column] = rmse(estimate, truth)
     return table
 
 

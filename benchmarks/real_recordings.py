@@ -14,13 +14,16 @@ from pathlib import Path
 import tempfile
 
 import numpy as np
+
+from msg_adapters.estimates import read_estimate
+from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.recordings.convert import convert_arrivals, convert_autoferry, convert_fixes
 from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.reader import BagReader
 from sonar_imm.trackers.diver import DiverConfig, DiverTracker
-from sonar_imm.trackers.diver_births import _fix as fix_of_rows
+from sonar_imm.trackers.diver_sensing import locate
 from sonar_imm.trackers.diver_smoothing import SmoothingDiverTracker
 
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
@@ -54,8 +57,6 @@ SETS = {
 
 def load(bag: Path) -> tuple[list, np.ndarray]:
     """Measurements of a bag, and truth as rows (stamp s, id, x, y)."""
-    from msg_adapters.estimates import read_estimate
-
     with BagReader(bag) as reader:
         heard = [one.measurement for one in measurements_of(reader, 'diver')]
     truth = []
@@ -121,19 +122,23 @@ def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[floa
         if isinstance(item, Fix):
             rows.append((item.stamp_ns * 1e-9, item.position[:2], item.covariance))
         elif isinstance(item, Arrivals):
-            births, _ = fix_of_rows(item, np.arange(len(item)), config, 1.0)
-            rows += [(item.stamp_ns * 1e-9, *births[0])] if births else []
+            fix = locate(item, np.arange(len(item)), config, config.covariance_scale)
+            rows += [(item.stamp_ns * 1e-9, fix.position, fix.covariance)] if fix else []
 
-    class Row:
-        pass
-
-    estimates = []
-    for stamp, place, covariance in rows:
-        one = Row()
-        one.stamp_ns, one.state, one.covariance = stamp * 1e9, place[None], covariance[None]
-        estimates.append(one)
-        Row.__len__ = lambda self: 1
-    return tag_scores(estimates, truth)
+    return tag_scores(
+        [
+            Estimate(
+                stamp_ns=round(stamp * 1e9),
+                frame_id='map',
+                xyz=np.zeros((1, 3), np.float32),
+                state_names=('px', 'py'),
+                state=place[None, :2],
+                covariance=covariance[None],
+            )
+            for stamp, place, covariance in rows
+        ],
+        truth,
+    )
 
 
 def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
@@ -167,18 +172,21 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
 
 def tag_table(title: str, items: list, truth: np.ndarray, **extra) -> None:
     print(f'\n### {title} ({len(items)} messages)\n')
-    print(
-        '| | RMSE m | RMSE, GPS 3.4 s later | median | NEES (2) | compared |\n|---|---|---|---|---|---|'
-    )
+    header('RMSE m', 'RMSE, GPS 3.4 s later', 'median', 'NEES (2)', 'compared')
     config = DiverConfig(**{**TAG, **extra})
-    line = lambda name, s: print(
-        f'| {name} | ' + ' | '.join(f'{v:.2f}' for v in s[:4]) + f' | {s[4]} |'
-    )  # noqa: E731
-    line('each ping or fix by itself', raw_scores(items, truth, config))
+    row('each ping or fix by itself', raw_scores(items, truth, config))
     for name, values in SETS.items():
         filtered, smooth = follow(DiverConfig(**{**TAG, **extra, **values}), items)
-        line(name, tag_scores(filtered, truth))
-        line(f'{name}, smoothed', tag_scores(smooth, truth))
+        row(name, tag_scores(filtered, truth))
+        row(f'{name}, smoothed', tag_scores(smooth, truth))
+
+
+def header(*columns: str) -> None:
+    print(f'| | {" | ".join(columns)} |\n{"|---" * (len(columns) + 1)}|')
+
+
+def row(name: str, values: list[float]) -> None:
+    print(f'| {name} | {" | ".join(f"{v:.2f}".removesuffix(".00") for v in values)} |')
 
 
 def boats(folder: Path) -> None:
@@ -193,9 +201,7 @@ def boats(folder: Path) -> None:
             )
             items, truth = load(out)
             print(f'\n### Autoferry scenario 13, {sensor}: {len(items)} fixes\n')
-            print(
-                '| | GOSPA (20 m, 2) | missed | false | tracks | position RMSE m |\n|---|---|---|---|---|---|'
-            )
+            header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
             for name, values in {
                 'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
                 'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
@@ -211,11 +217,7 @@ def boats(folder: Path) -> None:
                 tracker, final = DiverTracker(config), {}
                 for item in items:
                     final.update((e.stamp_ns, e) for e in tracker.process(item))
-                print(
-                    f'| {name} | '
-                    + ' | '.join(f'{v:.2f}' for v in boat_scores(final, truth))
-                    + ' |'
-                )
+                row(name, boat_scores(final, truth))
 
 
 def boat_scores(final: dict, truth: np.ndarray) -> list[float]:

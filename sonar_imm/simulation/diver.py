@@ -2,7 +2,7 @@
 
 How a diver moves is a `motion`, what the sensors see of it a `sensor`; a scenario is a choice of
 both with a name (`SCENARIOS`). The paper's Table 1 gives start, speed, sampling and accuracy but
-not the path; `table1` swims legs of 5 to 15 s whose headings lie within 90 degrees of a general
+not the path; `table1` swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
 one: zigzag with general consistent direction, as the paper puts it.
 """
 
@@ -45,9 +45,9 @@ class DiverScenario(Config):
         False, 'turn the scene, start and heading, about the sonar by an angle drawn at random'
     )
     turn_deg: float = parameter(
-        90.0, 'legs head within this of the general heading', unit='deg', low=0.0, high=180.0
+        85.0, 'legs head within this of the general heading', unit='deg', low=0.0, high=180.0
     )
-    leg_min: float = parameter(5.0, 'shortest leg', unit='s', low=0.1)
+    leg_min: float = parameter(7.0, 'shortest leg', unit='s', low=0.1)
     leg_max: float = parameter(15.0, 'longest leg', unit='s', low=0.1)
     duration: float = parameter(100.0, 'length of the scene', unit='s', low=1.0, high=1e6)
     step: float = parameter(1.0, 'time between scans', unit='s', low=1e-3, high=1e4)
