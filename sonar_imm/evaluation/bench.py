@@ -135,10 +135,11 @@ def _scan(p: Problem, x: FloatArray, P: FloatArray, mu: FloatArray, z: FloatArra
     x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
     x, P = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
     expected = np.ascontiguousarray(x[:, :, :2])
-    target, detection, log_likelihood = imm_kernels.gate(
-        expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2))
-    chosen = assign(target, detection, association_cost(log_likelihood, 0.95, 1e-4), targets,
-                    len(z))
+    fit = imm_kernels.gate(expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)),
+                           gate_threshold(0.999, 2))
+    target, detection = np.nonzero(np.isfinite(fit))
+    cost = association_cost(fit[target, detection], 0.95, 1e-4)
+    chosen = assign(target, detection, cost, targets, len(z))
     innovation = z[chosen][:, None] - expected
     innovation[chosen < 0] = np.nan
     x, P, mu, *_ = imm_kernels.update(x, P, c, innovation, H, p.R[None])

@@ -199,7 +199,8 @@ def _about(run: Mapping[str, Any]) -> list[Section]:
                                 'of each kind.', html=table(('reason', 'messages', 'why'), rows)))
     parameters = folded('Show them', mapping_table(('parameter', 'value'),
                                                    run.get('parameters', {})))
-    about = {key: run[key] for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'topics')
+    about = {key: run[key] for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed',
+                                     'topics')
              if key in run} | dict(run.get('versions', {}))
     return [*sections, Section('Parameters', 'What the tracker was told.', html=parameters),
             Section('Where this comes from', 'Input and versions, to do it again.',
