@@ -202,6 +202,7 @@ def _about(run: Mapping[str, Any]) -> list[Section]:
     about = {key: run[key] for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed',
                                      'topics')
              if key in run} | dict(run.get('versions', {}))
+    about['topics'] = [f'{topic} as {name}' for topic, name in run['topics'].items()]
     return [*sections, Section('Parameters', 'What the tracker was told.', html=parameters),
             Section('Where this comes from', 'Input and versions, to do it again.',
                     html=mapping_table(('what', 'value'), about))]

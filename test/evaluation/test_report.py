@@ -9,9 +9,10 @@ from scipy.stats import chi2
 
 from sonar_imm.evaluation import figures
 from sonar_imm.evaluation.report import belief_sentence, report_html, ReportInput
-from sonar_imm.evaluation.scoring import score
+from sonar_imm.evaluation.scoring import fix_series, score
 from sonar_imm.evaluation.series import series_of
 from sonar_imm.evaluation.truth import Truth
+from sonar_imm.measurements import Fix
 
 RUN = {'system': 'diver', 'bag': '/data/my <dive>.bag', 'topics': {'/fix': 'fix'},
        'parameters': {'model_set': 'heading_speed', 'speed_mean': 0.75},
@@ -115,3 +116,18 @@ def test_models_are_ordered_by_heading_with_the_others_below():
 def test_thinning_keeps_at_most_what_it_says(count, most):
     left = len(np.arange(count)[figures.thin(count, most)])
     assert left <= most and left >= min(count, most // 2)
+
+
+def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
+    estimates, true_rows, _ = single_run(count=60)
+    truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
+    series = series_of(estimates)
+    fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
+    figure = figures.map_figure(series, truth, fixes)
+    low, high = figure.layout.xaxis.range
+    assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0
+    assert figure.layout.yaxis.scaleanchor == 'x'
+
+
+def test_no_points_leave_the_view_open():
+    assert figures.view_of(np.empty((0, 2))) == (None, None)
