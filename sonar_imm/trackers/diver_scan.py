@@ -3,7 +3,9 @@ after it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+import math
+from typing import NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
@@ -18,6 +20,9 @@ from .diver_sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPin
 
 SCALE_PRIOR = 20.0
 """Numbers measured that the stated covariances are worth when their scale is being learnt."""
+
+MOST_STEPS = 300
+"""A gap is crossed in no more steps than this, however long it is."""
 
 EXCLUDED = -1
 """Rank of a track that takes no part in a message."""
@@ -57,6 +62,40 @@ class Divers:
         return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
 
 
+class Step(NamedTuple):
+    """Tracks after a step of dt seconds without a measurement, and the transitions (T or 1, M, M)
+    of that step."""
+
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+    transition: FloatArray
+    dt: float
+
+    def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+        """The step as one track took it."""
+        shared = len(self.transition) == 1
+        transition = self.transition[0 if shared else track]
+        return self.x[track], self.P[track], self.mu[track], transition, self.dt
+
+
+def cross(
+    models: ModelSet, chain: AdaptiveChain, before: Divers, dt: float, longest: float
+) -> Iterator[Step]:
+    """Mix and predict over dt seconds, in equal steps of at most `longest`.
+
+    A model holds for a whole step, so one step over a long gap says that the diver swam straight
+    all the while: the prediction is a ring, and the diver, who turned, is inside it.
+    """
+    count = min(max(math.ceil(dt / longest), 1), MOST_STEPS)
+    transition, motion = chain.transition(before.learnt, dt / count), models.motion(dt / count)
+    x, P, mu = before.x, before.P, before.mu
+    for _ in range(count):
+        x, P, mu = imm_kernels.mix(x, P, mu, transition)
+        x, P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        yield Step(x, P, mu, transition, dt / count)
+
+
 class Scan:
     """The tracks in the middle of a scan: predicted when made, updated by `take`, done with
     `result`."""
@@ -72,15 +111,14 @@ class Scan:
         self.config, self.models, self.chain, self.before = config, models, chain, before
         self.stamp_ns = stamp_ns
         self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        self.transition = chain.transition(before.learnt, self.dt)
-        motion = models.motion(self.dt)
-        x, P, self.mu = imm_kernels.mix(before.x, before.P, before.mu, self.transition)
-        self.x, self.P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-        self.nis = np.zeros(len(x))
-        self.nis_dof = np.zeros(len(x), np.uint16)
+        steps = list(cross(models, chain, before, self.dt, config.longest_step))
+        self.x, self.P, self.mu, transition, _ = steps[-1]
+        self.transition = np.linalg.matrix_power(transition, len(steps))
+        self.nis = np.zeros(len(self.x))
+        self.nis_dof = np.zeros(len(self.x), np.uint16)
         self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
-        self.rank = np.zeros(len(x), np.int64)
+        self.rank = np.zeros(len(self.x), np.int64)
 
     def take(self, groups: Sequence[Group]) -> list[np.ndarray]:
         """Update the tracks with what one message holds for them, group after group. Gives for
