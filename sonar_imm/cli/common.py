@@ -72,6 +72,12 @@ def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
                         )(function)
 
 
+def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
+    """Texts of ``--set`` as the types the parameters want; others stay, for Config to refuse."""
+    specs = {spec.name: spec for spec in config_type.specs()}
+    return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
+
+
 def _typed(text: str, spec: ParameterSpec | None) -> Any:
     if spec is None:
         return text

@@ -9,6 +9,8 @@ import click
 
 from .common import BAG, example, json_option, print_json, say
 
+TRUTH_GAP, CUTOFF = 60.0, 10.0
+
 
 @click.command(epilog=example('sonar-imm evaluate out',
                               'sonar-imm evaluate out --truth gps.bag --report gps.html'))
@@ -17,9 +19,9 @@ from .common import BAG, example, json_option, print_json, say
               help='Bag with /truth/estimate; by default the tracked bag itself.')
 @click.option('--truth-lag', type=float, default=0.0, show_default=True, metavar='SECONDS',
               help='Compare an estimate with truth this much later.')
-@click.option('--truth-gap', type=click.FloatRange(min=0.0), default=60.0, show_default=True,
+@click.option('--truth-gap', type=click.FloatRange(min=0.0), default=TRUTH_GAP, show_default=True,
               metavar='SECONDS', help='Truth is not interpolated across longer gaps.')
-@click.option('--cutoff', type=click.FloatRange(min=0.0, min_open=True), default=10.0,
+@click.option('--cutoff', type=click.FloatRange(min=0.0, min_open=True), default=CUTOFF,
               show_default=True, metavar='METRES',
               help='With several targets, an estimate further away is on none.')
 @click.option('--report', type=click.Path(path_type=Path, dir_okay=False),
@@ -40,7 +42,7 @@ def command(out_dir: Path, truth_bag: Path | None, truth_lag: float, truth_gap: 
 
 
 def evaluate_run(out_dir: Path, *, truth_bag: Path | None = None, truth_lag: float = 0.0,
-                 truth_gap: float = 60.0, cutoff: float = 10.0, report: Path | None = None
+                 truth_gap: float = TRUTH_GAP, cutoff: float = CUTOFF, report: Path | None = None
                  ) -> tuple[dict[str, Any], Path | None]:
     """Metrics of a run, written to its folder, and the report if one is wanted.
 

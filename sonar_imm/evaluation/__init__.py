@@ -1,0 +1,1 @@
+"""Runs of recordings: tracked offline, scored against truth, shown in a report, timed."""

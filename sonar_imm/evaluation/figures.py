@@ -18,7 +18,7 @@ from .truth import Truth
 INK, GRID, GREY, AMBER = '#1b2733', '#e4e9ee', '#8593a1', '#E69F00'
 TRACK_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 MOST_POINTS = 20_000
-MOST_ELLIPSES = 120
+MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12
 FONT = 'Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif'
 
@@ -35,13 +35,28 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
     for path in truth.paths if truth else ():
         shown = thin(len(path.stamp_ns), MOST_POINTS)
         figure.add_scatter(x=path.state[shown, 0], y=path.state[shown, 1], mode='lines',
-                           name='truth' if len(truth) == 1 else f'truth {path.track_id}',
+                           name='truth', legendgroup='truth',
+                           showlegend=path is truth.paths[0],
+                           hovertemplate=f'target {path.track_id}: x %{{x:.2f}}, y %{{y:.2f}}',
                            line={'color': INK, 'width': 1.5, 'dash': 'dot'})
     for order, track_id in enumerate(_tracks_by_length(series)):
         _add_track(figure, series.pick(series.track_id == track_id), order)
-    figure.update_xaxes(title='x [m]')
-    figure.update_yaxes(title='y [m]', scaleanchor='x', scaleratio=1)
+    # Clutter can lie anywhere: the first view is of the tracks and the truth, the rest by zoom.
+    paths = truth.paths if truth else ()
+    x_range, y_range = view_of(np.concatenate(
+        [series.state[:, :2], *(path.state[:, :2] for path in paths)]))
+    figure.update_xaxes(title='x [m]', range=x_range)
+    figure.update_yaxes(title='y [m]', range=y_range, scaleanchor='x', scaleratio=1)
     return _styled(figure, height=640)
+
+
+def view_of(points: FloatArray) -> tuple[list[float] | None, list[float] | None]:
+    """Ranges of x and y with some room around `points` (n, 2); None, None without points."""
+    if not len(points):
+        return None, None
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = 0.08 * max(float((high - low).max()), 1.0)
+    return tuple([float(a - room), float(b + room)] for a, b in zip(low, high))
 
 
 def _add_track(figure: go.Figure, track: Series, order: int) -> None:
@@ -76,6 +91,7 @@ def error_figure(matching: Matching, track_id: int) -> go.Figure:
                              showlegend=axis == 0, row=axis + 1, col=1,
                              line={'color': TRACK_COLOURS[0], 'width': 1.2}, marker={'size': 3})
         figure.update_yaxes(title=f'{name} error [m]', row=axis + 1, col=1)
+    figure.update_xaxes(zeroline=False)
     figure.update_xaxes(title='time [s]', row=2, col=1)
     return _styled(figure, height=460)
 
@@ -88,7 +104,7 @@ def sigma_figure(series: Series, track_id: int) -> go.Figure:
         figure.add_scattergl(x=seconds(track.stamp_ns, track.scan_ns), mode='lines', name=name,
                              y=np.sqrt(track.covariance[:, axis, axis]),
                              line={'color': TRACK_COLOURS[axis], 'width': 1.5})
-    figure.update_xaxes(title='time [s]')
+    figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='stated sigma [m]', rangemode='tozero')
     return _styled(figure, height=320)
 
@@ -128,7 +144,7 @@ def models_figure(series: Series, track_id: int, truth_course: tuple[FloatArray,
     figure.update_yaxes(tickvals=np.arange(len(order)), showgrid=False, zeroline=False,
                         ticktext=[model_label(track.model_names[index]) for index in order],
                         range=[-0.5, len(order) - 0.5])
-    figure.update_xaxes(title='time [s]', showgrid=False)
+    figure.update_xaxes(title='time [s]', showgrid=False, zeroline=False)
     return _styled(figure, height=180 + 18 * len(order))
 
 
@@ -157,7 +173,7 @@ def nis_figure(series: Series) -> go.Figure:
     if dof:
         figure.add_hline(y=chi2.ppf(0.95, dof), line={'color': TRACK_COLOURS[1], 'dash': 'dash'},
                          annotation_text='95 % of hits should lie below')
-    figure.update_xaxes(title='time [s]')
+    figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='NIS' if same else 'NIS / degrees of freedom', rangemode='tozero')
     return _styled(figure, height=340)
 

@@ -14,36 +14,40 @@ import numpy as np
 
 from . import figures
 from .matching import match
-from .page import Card, folded, mapping_table, render, Section, table
+from .page import Card, folded, mapping_table, Part, render, Section, table
 from .series import Series
 from .truth import Truth
 
 
 @frozen(eq=False, kw_only=True)
 class ReportInput:
-    """What a report is made from. run: content of ``run.json``; metrics: of ``metrics.json``."""
+    """What a report is made from. run: content of ``run.json``; metrics: of ``metrics.json``.
+
+    checks: what was compared with a live node: mappings with name, result, wanted and good.
+    """
 
     run: Mapping[str, Any]
     metrics: Mapping[str, Any]
     series: Series
     truth: Truth | None = None
     fixes: Series | None = None
+    checks: tuple[Mapping[str, Any], ...] = ()
 
 
-def write_report(path: Path, material: ReportInput) -> None:
-    """Write the report to `path`."""
-    path.write_text(report_html(material), encoding='utf-8')
+def write_report(path: Path, *materials: ReportInput) -> None:
+    """Write one report of one or several runs to `path`."""
+    path.write_text(report_html(*materials), encoding='utf-8')
 
 
-def report_html(material: ReportInput) -> str:
+def report_html(*materials: ReportInput) -> str:
     """The report as text; the same material gives the same bytes."""
-    run = material.run
-    return render(kicker=f'sonar_imm · {run.get("system", "")} tracker',
-                  title=Path(str(run.get('bag', 'recording'))).name,
-                  summary=summary_sentence(material.metrics), cards=_cards(material.metrics),
-                  sections=_sections(material),
-                  footer=f'Made by sonar_imm {run.get("versions", {}).get("sonar_imm", "")}. '
-                         'Times are seconds since the first estimate.')
+    parts = [Part(f'sonar_imm · {one.run["system"]} tracker', Path(one.run['bag']).name,
+                  summary_sentence(one.metrics), tuple(_cards(one.metrics)),
+                  tuple(_sections(one))) for one in materials]
+    version = materials[0].run.get('versions', {}).get('sonar_imm', '')
+    return render(', '.join(part.title for part in parts), parts,
+                  footer=f'Made by sonar_imm {version}. Times are seconds since the first '
+                         'estimate of a run.')
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
@@ -124,6 +128,13 @@ def _sections(material: ReportInput) -> list[Section]:
         'Map', 'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: the ellipses that '
         'should hold the target 95 times in a hundred.',
         figures.map_figure(series, material.truth, material.fixes))]
+    if material.checks:
+        rows = [(check['name'], check['result'], check['wanted'], 'yes' if check['good'] else 'NO')
+                for check in material.checks]
+        sections.insert(0, Section(
+            'Live node against offline tracker', 'The recording was played to a real ROS 2 node, '
+            'message by message, and what the node published was compared with the offline run.',
+            html=table(('check', 'result', 'wanted', 'good'), rows)))
     if track_id is not None:
         sections += _track_sections(material, series, track_id)
     return [*sections, _numbers(material.metrics), *_about(material.run)]
@@ -188,8 +199,10 @@ def _about(run: Mapping[str, Any]) -> list[Section]:
                                 'of each kind.', html=table(('reason', 'messages', 'why'), rows)))
     parameters = folded('Show them', mapping_table(('parameter', 'value'),
                                                    run.get('parameters', {})))
-    about = {key: run[key] for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'topics')
+    about = {key: run[key] for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed',
+                                     'topics')
              if key in run} | dict(run.get('versions', {}))
+    about['topics'] = [f'{topic} as {name}' for topic, name in run['topics'].items()]
     return [*sections, Section('Parameters', 'What the tracker was told.', html=parameters),
             Section('Where this comes from', 'Input and versions, to do it again.',
                     html=mapping_table(('what', 'value'), about))]

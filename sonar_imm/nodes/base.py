@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
 import functools
+from pathlib import Path
 import sys
 import threading
 import time
@@ -248,7 +249,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ConfigError as error:
-        print(error, file=sys.stderr)
+        print(f'{Path(sys.argv[0]).stem}: {error}', file=sys.stderr)
         return 2
     except RuntimeError:  # RCLError, when the context vanished in the middle of a call
         if rclpy.ok():
