@@ -66,7 +66,7 @@ def test_the_walk_on_windows_is_the_walk_on_all_cells(sigma, low, high):
     p = np.zeros(801)
     p[low:high] = np.random.default_rng(3).random(high - low)
     exact = p @ grid.walk_matrix(801, sigma)
-    out, scratch = np.full(801, np.nan), np.full((3, 900), np.nan)
+    out, scratch = np.full(801, np.nan), np.full((7, 900), np.nan)
     out_low, out_high = 1, 797
     source = np.where((np.arange(801) >= low) & (np.arange(801) < high), p, np.nan)
     grid_kernels.walk(source, low, high, sigma, scratch, out, out_low, out_high)
@@ -82,7 +82,7 @@ def test_mix_update_and_combine_are_the_dense_ones():
     mixed, work, probability = np.empty_like(p), np.empty((2, 801)), np.empty(2)
     grid_kernels.mix(p, 0, 801, ASYMMETRIC, mixed)
     for j, sigma in enumerate((2.0, 9.0)):
-        grid_kernels.walk(mixed[j], 0, 801, sigma, np.empty((3, 900)), p[j], 0, 801)
+        grid_kernels.walk(mixed[j], 0, 801, sigma, np.empty((7, 900)), p[j], 0, 801)
     log_sum = grid_kernels.update(p, 0, 801, log_likelihood[0].copy(), work)
     assert p == pytest.approx(dense.density[0], abs=1e-9)
     assert log_sum == pytest.approx(dense.log_likelihood[0], abs=1e-6)
