@@ -65,13 +65,18 @@ def mix(
             for s in range(N):
                 origin[begin] = i * N + s
                 begin = min(int(points[s]), N)
-        source, i = 0, 0
+        source = 0
         for k in range(N):
             source = max(source, origin[k])
-            while source >= (i + 1) * N:
-                i += 1
-            for a in range(n):
-                mixed[j, a, k] = x[i, a, source - i * N]
+            origin[k] = source
+        for a in range(n):
+            out, i = mixed[j, a], 0
+            from_model = x[0, a]
+            for k in range(N):
+                while origin[k] >= (i + 1) * N:
+                    i += 1
+                    from_model = x[i, a]
+                out[k] = from_model[origin[k] - i * N]
 
 
 @kernel
