@@ -4,9 +4,6 @@
 processor runs several directions at a time, which calls of the C library for a cosine, a sine and
 a logarithm would prevent; that makes them nine times faster.
 
-* `phasors`: cos and sin of 2 pi t. Taking the nearest whole number from t leaves f in
-  [-1/2, 1/2], where sin(pi f) and cos(pi f) are polynomials to 1e-15; doubling the angle does the
-  rest.
 * `horner`: Re and Im of a trigonometric polynomial, term after term over the whole row.
 * `law_table` and `log_densities`: a double holds its own logarithm. Its exponent and its first
   five bits number the cells of a table, 32 to the octave, and the remaining bits say where in the
@@ -25,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.jit import kernel
-from ..estimation.rows import ROUND
+from ..estimation.rows import phasors
 from .laplace import LAWS, log_density, log_density_slope, MAX_STAVES
 
 FloatArray = NDArray[np.float64]
@@ -38,18 +35,6 @@ _SHIFT = 52 - _CELL_BITS
 _FIRST_CELL = (1023 + _OCTAVES[0]) << _CELL_BITS
 _REST = (1 << _SHIFT) - 1
 _ONE = 1023 << 52
-
-
-def _even_polynomial(function: str) -> tuple[float, ...]:
-    """Coefficients in f^2 of sin(pi f) / f or cos(pi f) for abs(f) <= 1/2: their Taylor series."""
-    first = 1 if function == 'sin' else 0
-    return tuple(
-        (-1.0) ** k * math.pi ** (2 * k + first) / math.factorial(2 * k + first) for k in range(11)
-    )
-
-
-_S = _even_polynomial('sin')
-_C = _even_polynomial('cos')
 
 
 @lru_cache(maxsize=32)
@@ -75,23 +60,6 @@ def law_table(staves: int, law: str = 'laplace') -> FloatArray:
     )
     table.flags.writeable = False
     return table
-
-
-@kernel
-def phasors(values: FloatArray, factor: float, cosine: FloatArray, sine: FloatArray) -> None:
-    """cos and sin of 2 pi factor values (n,); NaN stays NaN."""
-    for i in range(values.shape[0]):
-        turns = factor * values[i]
-        f = turns - ((turns + ROUND) - ROUND)
-        t = f * f
-        s = _S[8] + t * (_S[9] + t * _S[10])
-        s = _S[4] + t * (_S[5] + t * (_S[6] + t * (_S[7] + t * s)))
-        s = f * (_S[0] + t * (_S[1] + t * (_S[2] + t * (_S[3] + t * s))))
-        c = _C[8] + t * (_C[9] + t * _C[10])
-        c = _C[4] + t * (_C[5] + t * (_C[6] + t * (_C[7] + t * c)))
-        c = _C[0] + t * (_C[1] + t * (_C[2] + t * (_C[3] + t * c)))
-        cosine[i] = c * c - s * s
-        sine[i] = 2.0 * s * c
 
 
 @kernel
