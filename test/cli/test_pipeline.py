@@ -168,3 +168,13 @@ def test_info_on_what_no_tracker_knows_exits_with_1(tmp_path, capsys):
         bag.write('/note', ros_message('std_msgs/msg/String', data='hello'), 10**9)
     assert main(['info', str(tmp_path / 'bag')]) == 1
     assert 'no tracker can use it' in capsys.readouterr().out
+
+
+def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_path, capsys):
+    params = tmp_path / 'diver.yaml'
+    params.write_text('fix_type: geometry_msgs/msg/PointStamped\nqueue_depth: 7\n')
+    run = call('track', dive, tmp_path / 'out', '--params', params)
+    assert 'fix_type' not in run['parameters'] and run['estimates'] == 118
+    params.write_text('fix_type: geometry_msgs/msg/PointStampd\n')
+    assert main(['track', str(dive), str(tmp_path / 'no'), '--params', str(params)]) == 2
+    assert "did you mean 'geometry_msgs/msg/PointStamped'?" in capsys.readouterr().err

@@ -3,16 +3,14 @@
 from html.parser import HTMLParser
 
 from dive_scenes import single_run
-import numpy as np
-import pytest
-from scipy.stats import chi2
 
-from sonar_imm.evaluation import figures
-from sonar_imm.evaluation.report import belief_sentence, report_html, ReportInput
-from sonar_imm.evaluation.scoring import fix_series, score
-from sonar_imm.evaluation.series import series_of
-from sonar_imm.evaluation.truth import Truth
-from sonar_imm.measurements import Fix
+from sonar_imm.evaluation.diver.scoring import score
+from sonar_imm.evaluation.diver.sections import diver_part, Material
+from sonar_imm.evaluation.diver.series import series_of
+from sonar_imm.evaluation.diver.truth import Truth
+from sonar_imm.evaluation.judging import Check
+from sonar_imm.evaluation.page import Card, Section
+from sonar_imm.evaluation.report import report_html, run_part
 
 RUN = {'system': 'diver', 'bag': '/data/my <dive>.bag', 'topics': {'/fix': 'fix'},
        'parameters': {'model_set': 'heading_speed', 'speed_mean': 0.75},
@@ -24,8 +22,12 @@ def material(truth=True, count=60, **changes):
     estimates, true_rows, _ = single_run(count=count)
     series = series_of(estimates)
     known = Truth.from_series(series_of(true_rows)) if truth else None
-    return ReportInput(run={**RUN, **changes}, metrics=score(series, known), series=series,
+    return Material(run={**RUN, **changes}, metrics=score(series, known), series=series,
                        truth=known)
+
+
+def html(*materials):
+    return report_html([diver_part(one) for one in materials])
 
 
 class Page(HTMLParser):
@@ -49,7 +51,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_whole_and_loads_nothing():
-    text = report_html(material())
+    text = html(material())
     page = Page(text)
     assert page.loads == []
     assert page.headings[:5] == ['my <dive>.bag', 'Map', 'Error, and the error it predicted',
@@ -59,17 +61,17 @@ def test_the_page_is_whole_and_loads_nothing():
 
 
 def test_the_same_material_makes_the_same_bytes():
-    assert report_html(material()) == report_html(material())
+    assert html(material()) == html(material())
 
 
 def test_without_truth_the_stated_uncertainty_is_shown():
-    page = Page(report_html(material(truth=False)))
+    page = Page(html(material(truth=False)))
     assert 'Stated uncertainty' in page.headings
     assert 'Error, and the error it predicted' not in page.headings
 
 
 def test_several_runs_share_a_page_without_sharing_ids():
-    page = Page(report_html(material(), material(bag='other.bag')))
+    page = Page(html(material(), material(bag='other.bag')))
     assert 'other.bag' in page.headings
     figure_ids = [one for one in page.ids if one.startswith('figure-')]
     assert len(figure_ids) == len(set(figure_ids)) == 8
@@ -77,57 +79,22 @@ def test_several_runs_share_a_page_without_sharing_ids():
 
 def test_a_run_without_tracks_still_makes_a_page():
     series = series_of([])
-    page = Page(report_html(ReportInput(run=RUN, metrics=score(series), series=series)))
+    page = Page(html(Material(run=RUN, metrics=score(series), series=series)))
     assert 'Map' in page.headings
 
 
 def test_checks_against_the_live_node_come_first():
-    one = material()
-    checks = ({'name': 'bytes', 'result': 'equal', 'wanted': 'equal', 'good': True},)
-    page = Page(report_html(ReportInput(run=one.run, metrics=one.metrics, series=one.series,
-                                        checks=checks)))
+    checks = [Check('bytes', 'equal', 'equal', True)]
+    page = Page(report_html([diver_part(material(), checks)]))
     assert page.headings[1] == 'Live node against offline tracker'
 
 
-@pytest.mark.parametrize('coverage, words', [(0.6, 'more sure'), (0.95, 'can be believed'),
-                                             (1.0, 'more careful')])
-def test_belief_is_put_in_words(coverage, words):
-    assert words in belief_sentence(coverage)
-
-
-def test_ellipses_hold_the_probability_they_claim():
-    covariance = np.array([[[4.0, 1.2], [1.2, 1.0]]])
-    mean = np.array([[3.0, -2.0]])
-    outline = figures.outlines(mean, covariance, probability=0.9)
-    assert np.isnan(outline[-1]).all()
-    offset = outline[:-1] - mean
-    distance = np.einsum('ni,ij,nj->n', offset, np.linalg.inv(covariance[0]), offset)
-    np.testing.assert_allclose(distance, chi2.ppf(0.9, 2), rtol=1e-12)
-
-
-def test_models_are_ordered_by_heading_with_the_others_below():
-    names = ('heading_090', 'hover', 'heading_000')
-    assert [names[i] for i in figures.model_order(names)] == ['hover', 'heading_000',
-                                                              'heading_090']
-    assert figures.model_label('heading_022') == '22°'
-
-
-@pytest.mark.parametrize('count, most', [(0, 10), (10, 10), (11, 10), (99, 10)])
-def test_thinning_keeps_at_most_what_it_says(count, most):
-    left = len(np.arange(count)[figures.thin(count, most)])
-    assert left <= most and left >= min(count, most // 2)
-
-
-def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
-    estimates, true_rows, _ = single_run(count=60)
-    truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
-    series = series_of(estimates)
-    fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
-    figure = figures.map_figure(series, truth, fixes)
-    low, high = figure.layout.xaxis.range
-    assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0
-    assert figure.layout.yaxis.scaleanchor == 'x'
-
-
-def test_no_points_leave_the_view_open():
-    assert figures.view_of(np.empty((0, 2))) == (None, None)
+def test_runs_of_several_systems_share_a_page():
+    other = run_part({**RUN, 'system': 'whale', 'bag': 'whale.bag'}, {'size': {'rmse_m': 2.0}}, [],
+                     summary='A whale.', cards=[Card('30 m', 'Length')],
+                     sections=[Section('Whale', 'Seen from the side.')])
+    text = report_html([diver_part(material()), other])
+    page = Page(text)
+    assert page.headings.index('whale.bag') < page.headings.index('Whale')
+    assert 'sonar_imm · diver tracker' in text and 'sonar_imm · whale tracker' in text
+    assert 'size.rmse_m' in text

@@ -4,8 +4,8 @@ from dive_scenes import SECOND, START_NS, truth_estimate
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.series import series_of
-from sonar_imm.evaluation.truth import Truth, TruthPath
+from sonar_imm.evaluation.diver.series import series_of
+from sonar_imm.evaluation.diver.truth import Truth, TruthPath
 
 PATH = TruthPath(1, START_NS + np.array([0, 2, 100]) * SECOND,
                  np.array([[0.0, 0.0, 1.0, 0.0], [4.0, -2.0, 3.0, 1.0], [9.0, 9.0, 0.0, 0.0]]))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation import bench
+from sonar_imm.evaluation.diver import bench
 
 
 def test_turns_compose_and_keep_the_speed():

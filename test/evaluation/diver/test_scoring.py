@@ -15,10 +15,10 @@ from dive_scenes import (
 import numpy as np
 import pytest
 
+from sonar_imm.evaluation.diver.scoring import fix_series, score
+from sonar_imm.evaluation.diver.series import series_of
+from sonar_imm.evaluation.diver.truth import Truth
 from sonar_imm.evaluation.run_folder import finite
-from sonar_imm.evaluation.scoring import fix_series, score
-from sonar_imm.evaluation.series import series_of
-from sonar_imm.evaluation.truth import Truth
 from sonar_imm.measurements import Fix
 
 
