@@ -36,6 +36,11 @@ class InputTopic:
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
+    'bathymetry': (
+        InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
+            'sensor_msgs/msg/PointCloud2': read_snapshot,
+        }, one_topic=True),
+    ),
     'diver': (
         InputTopic('fix', 'position fixes in a local metric frame', {
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
@@ -44,10 +49,5 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
         }),
-    ),
-    'bathymetry': (
-        InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
-            'sensor_msgs/msg/PointCloud2': read_snapshot,
-        }, one_topic=True),
     ),
 }
