@@ -71,7 +71,9 @@ def flip_pose(pose: Pose) -> Pose:
 
 def rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> FloatArray:
     """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians."""
-    roll, pitch, yaw = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (roll, pitch, yaw)))
+    roll, pitch, yaw = np.broadcast_arrays(
+        *(np.asarray(a, np.float64) for a in (roll, pitch, yaw))
+    )
     sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
     sy, cy = np.sin(yaw), np.cos(yaw)
     rows = [

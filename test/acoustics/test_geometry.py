@@ -50,7 +50,9 @@ def test_rotations_of_both_worlds():
     angles = np.radians(columns(rows, 'roll_deg', 'pitch_deg', 'yaw_deg'))
     R = geometry.rotation(*angles.T)
     expected = {
-        world: np.stack([columns(rows, *(f'R{world}{i}{j}' for j in range(3))) for i in range(3)], 1)
+        world: np.stack(
+            [columns(rows, *(f'R{world}{i}{j}' for j in range(3))) for i in range(3)], 1
+        )
         for world in ('ned', 'enu')
     }
     assert_allclose(R, expected['ned'], **EXACT)
@@ -66,7 +68,9 @@ def test_rotations_of_both_worlds():
 
 
 def test_sonar_pose_from_vehicle_lever_and_mount(seen):
-    assert_allclose(sonar_pose(seen).position, columns(seen, 'sonar_n', 'sonar_e', 'sonar_d'), **EXACT)
+    assert_allclose(
+        sonar_pose(seen).position, columns(seen, 'sonar_n', 'sonar_e', 'sonar_d'), **EXACT
+    )
     assert_allclose(sonar_pose(seen).R[:, 2], columns(seen, 'n_x', 'n_y', 'n_z'), **EXACT)
 
 
@@ -200,7 +204,9 @@ def test_slerp_against_scipy():
     for _ in range(20):
         q0, q1 = rng.normal(size=(2, 4))
         between = Slerp([0.0, 1.0], Rotation.from_quat([q0, q1]))(0.3).as_matrix()
-        assert_allclose(geometry.rotation_of_quaternion(geometry.slerp(q0, q1, 0.3)), between, **EXACT)
+        assert_allclose(
+            geometry.rotation_of_quaternion(geometry.slerp(q0, q1, 0.3)), between, **EXACT
+        )
     q = rng.normal(size=4)
     for same in (q, -q, q + 1e-14):
         assert_allclose(
