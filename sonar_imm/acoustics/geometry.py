@@ -1,4 +1,4 @@
-"""Where an echo on a forward-looking sonar comes from, and where it will be after the vehicle moved.
+"""Where an echo on a forward-looking sonar comes from, and where it will be from elsewhere.
 
 A forward-looking sonar measures range and azimuth and nothing in the vertical: all points of an
 arc, from the top of the beam to its bottom, give the same echo. What picks the point on the arc is
@@ -209,10 +209,10 @@ def rates(
 ) -> Rates:
     """How the echo of a fixed point m (..., 3) changes while the sonar moves: eq. (3), (4).
 
-    velocity (..., 3) and turn_rate (..., 3) are the sonar's own, in its frame: ``dm/dt = -V - omega
-    x m``. Kept as documentation and to test `predict`, with which it agrees to first order: the
-    Euler step the paper takes with it is off by 0.003, 0.011, 0.07 and 0.27 degrees rms of azimuth
-    at 0.1, 0.2, 0.5 and 1 s, which is more than an obstacle's vertical offset shows.
+    velocity (..., 3) and turn_rate (..., 3) are the sonar's own, in its frame: ``dm/dt = -V -
+    omega x m``. Kept as documentation and to test `predict`, with which it agrees to first order:
+    the Euler step the paper takes with it is off by 0.003, 0.011, 0.07 and 0.27 degrees rms of
+    azimuth at 0.1, 0.2, 0.5 and 1 s, which is more than an obstacle's vertical offset shows.
     """
     moving = -velocity - np.cross(turn_rate, m)
     d = np.linalg.norm(m, axis=-1)

@@ -124,7 +124,8 @@ class ObstacleScenario(Config):
     # -- obstacles -------------------------------------------------------------------------------
     placement: str = parameter(
         'offset',
-        'how deep they are: a vertical offset from the sonar at the first ping, on tethers, on the sea floor, at the surface',
+        'how deep they are: a vertical offset from the sonar at the first ping, on tethers, on '
+        'the sea floor, at the surface',
         choices=PLACEMENTS,
     )
     obstacles: int = parameter(1, 'number of obstacles', low=1, high=200)

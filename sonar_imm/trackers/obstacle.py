@@ -42,8 +42,10 @@ __all__ = ['ObstacleConfig', 'Obstacles', 'ObstacleTracker']
 
 STATES = ('range', 'bearing', 'vertical_offset')
 MODELS = ('above', 'below')
-IN_BEAM = 0.5
-"""An obstacle less probable than this to be in the beam is not missed when it gives no echo."""
+IN_BEAM = 0.9
+"""A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
+echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
+approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
 _TINY = 1e-12
 
 
@@ -103,19 +105,17 @@ class ObstacleTracker:
         self.config = config
 
     def warm(self) -> None:
-        # Three pings in which everything happens once: birth, contested hits, confirmation.
-        tracker = ObstacleTracker(evolve(self.config, confirm_hits=1, max_navigation_gap=10.0))
-        for second in (1, 2, 3):
+        # Pings in which everything happens once: births, contested hits, a pose to wait for.
+        tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0))
+        for second in (1, 2, 3, 4):
             stamp = second * 10**9
-            tracker.process(Altitude(stamp_ns=stamp, altitude=20.0))
-            tracker.process(
-                Navigation(stamp_ns=stamp, position=[0.0, second, -20.0], orientation=_EAST)
+            east = Navigation(
+                stamp_ns=stamp, position=[second, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
             )
             echoes = np.array([50.0, 50.1]) - second
+            tracker.process(Altitude(stamp_ns=stamp, altitude=20.0))
+            tracker.process(east)
             tracker.process(Detections(stamp_ns=stamp, range=echoes, bearing=[0.0, 0.001]))
-        tracker.process(
-            Navigation(stamp_ns=4 * 10**9, position=[0.0, 4.0, -20.0], orientation=_EAST)
-        )
 
     def health(self) -> dict[str, float]:
         state = self._history.state
@@ -307,7 +307,8 @@ class ObstacleTracker:
     def _census(self, now: Ping, hit: np.ndarray, z: FloatArray, R: FloatArray) -> Ping:
         """End the tracks that are over or passed, begin one at each detection left."""
         rules = _rules(self.config)
-        looked = self.filter.in_beam(now.known, now.sonar) > IN_BEAM
+        tentative = now.life.status == TrackStatus.TENTATIVE
+        looked = tentative | (self.filter.in_beam(now.known, now.sonar) > IN_BEAM)
         ahead = self.filter.ahead(now.known, now.sonar)
         life, kept = now.life.scan(hit, now.stamp_ns, rules, looked=looked)
         now = evolve(now, life=life, known=now.known.rows(kept), nis=now.nis[kept])
@@ -362,9 +363,6 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
-
-
-_EAST = (0.0, 0.0, 0.0, 1.0)
 
 
 def _rules(config: ObstacleConfig) -> TrackRules:
