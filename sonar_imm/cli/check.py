@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 @click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
 @click.option('--params', type=click.Path(path_type=Path, dir_okay=False),
               help='Parameter file, for the node and offline alike.')
-@click.option('--limit', type=click.FloatRange(min=0.0), metavar='METRES',
-              help='Position RMSE to stay within.')
+@click.option('--limit', type=click.FloatRange(min=0.0), metavar='ERROR',
+              help='Error to stay within, of the kind and in the unit that the check prints: '
+                   'position RMSE in metres for the diver.')
 @click.option('--out', type=click.Path(path_type=Path, file_okay=False),
               help='Keep both runs in this folder.')
 @json_option

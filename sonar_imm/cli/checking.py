@@ -11,6 +11,7 @@ from typing import Any
 
 from attrs import asdict, frozen
 
+from ..evaluation.judging import Check, Judgement
 from ..evaluation.run_folder import BAG, CSV, RunFolder
 from ..evaluation.tracking import final_estimates, InputOptions
 from ..nodes.harness import LockstepResult, run_lockstep
@@ -21,30 +22,20 @@ from .common import load_config, progress
 from .evaluate import evaluate_run
 from .track import track_recording
 
-LIMITS = {'diver': 1.25}
-"""Position RMSE in metres that a shipped recording must stay within. The raw fixes of Table 1 have
-1.71 m and its best tracker 0.85 m on average; one recording is not an average."""
-
-
-@frozen
-class Check:
-    """One thing that was checked: what came out, and what was wanted."""
-
-    name: str
-    result: str
-    wanted: str
-    good: bool
-
 
 @frozen
 class Outcome:
-    """All checks of one recording; `folder` holds the runs ``offline`` and ``live``."""
+    """All checks of one recording, and what is said of the offline run.
+
+    `folder` holds the runs ``offline`` and ``live``.
+    """
 
     system: str
     bag: Path
     folder: Path
     checks: tuple[Check, ...]
     latency_ms: dict[str, float]
+    judgement: Judgement
 
     @property
     def good(self) -> bool:
@@ -70,7 +61,8 @@ def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None
                     limit: float | None = None, quiet: bool = False) -> Outcome:
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
-    limit: position RMSE in metres to stay within; None for that of the shipped recordings.
+    limit: error to stay within, in the unit of the system; None for that of the shipped
+    recordings.
     Raises `BagError`, `ConfigError` and `LinkError`.
     """
     config, node = load_config(SYSTEMS[system], params, {})
@@ -80,11 +72,11 @@ def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None
     with progress('playing to the node', run['messages'], quiet=quiet) as advance:
         live = run_lockstep(bag, system, params_file=params, progress=advance)
     _keep(live, config, system, folder / 'live')
-    metrics, _ = evaluate_run(folder / 'offline')
+    judgement = evaluate_run(folder / 'offline')
     checks = [_answered(live, run), _equal(folder), _ended(live)]
-    if metrics.get('position', {}).get('n'):
-        checks.append(_accurate(metrics, LIMITS[system] if limit is None else limit))
-    return Outcome(system, bag, folder, tuple(checks), live.latency_ms())
+    if (accuracy := judgement.accuracy(limit)) is not None:
+        checks.append(accuracy)
+    return Outcome(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
 
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
@@ -123,11 +115,3 @@ def _ended(live: LockstepResult) -> Check:
     return Check('end of the node after Ctrl-C',
                  f'exit code {live.exit_code}{"" if clean else ", see its log"}', 'exit code 0',
                  clean)
-
-
-def _accurate(metrics: dict[str, Any], limit: float) -> Check:
-    error = metrics['position']['rmse_m']
-    raw = metrics.get('raw_fix', {}).get('rmse_m')
-    beside = f' (raw fixes {raw:.2f} m)' if raw else ''
-    return Check('position RMSE against truth', f'{error:.2f} m{beside}', f'at most {limit:g} m',
-                 error <= limit)

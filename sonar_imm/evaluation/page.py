@@ -23,13 +23,14 @@ header small { letter-spacing: .08em; text-transform: uppercase; opacity: .75; f
 h1 { margin: 4px 0 12px; font-size: 30px; font-weight: 650; overflow-wrap: anywhere; }
 header p { margin: 0; max-width: 820px; font-size: 17px; opacity: .95; }
 .wrap { max-width: 1180px; margin: 0 auto; padding: 0 24px; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(164px, 1fr)); gap: 14px;
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(140px, 1fr)); gap: 14px;
   margin-top: -54px; }
 .card, section { background: white; border: 1px solid var(--line); border-radius: 10px;
   box-shadow: 0 1px 3px rgba(20, 40, 60, .06); }
 .card { padding: 16px 18px; }
 .card b { display: block; font-size: 27px; font-weight: 650; font-variant-numeric: tabular-nums; }
-.card span { font-size: 13px; font-weight: 600; }
+.card span { display: block; font-size: 13px; font-weight: 600; line-height: 1.3;
+  min-height: 2.6em; }
 .card i { display: block; font-style: normal; font-size: 12.5px; color: var(--soft); }
 section { margin: 18px 0; padding: 22px 26px; overflow-x: auto; }
 h2 { margin: 0 0 2px; font-size: 19px; }
@@ -94,12 +95,12 @@ def render(title: str, parts: Sequence[Part], *, footer: str) -> str:
 
 def _part(part: Part, name: str) -> str:
     boxes = '\n'.join(f'<div class="card"><span>{escape(card.title)}</span>'
-                      f'<b>{escape(card.value)}</b><i>{escape(card.remark)}</i></div>'
+                      f'<b>{escape(card.value)}</b><i>{_prose(card.remark)}</i></div>'
                       for card in part.cards)
     body = '\n'.join(_section(section, f'{name}-{index}')
                      for index, section in enumerate(part.sections))
     return (f'<header><div class="wrap"><small>{escape(part.kicker)}</small>'
-            f'<h1>{escape(part.title)}</h1><p>{escape(part.summary)}</p></div></header>\n'
+            f'<h1>{escape(part.title)}</h1><p>{_prose(part.summary)}</p></div></header>\n'
             f'<main class="wrap"><div class="cards">{boxes}</div>\n{body}</main>')
 
 
@@ -120,6 +121,11 @@ def mapping_table(header: tuple[str, str], values: Mapping[str, object]) -> str:
     return table(header, values.items())
 
 
+def _prose(text: str) -> str:
+    """Running text; a number and its per cent sign stay on one line."""
+    return escape(text.replace(' %', '\u00a0%'))
+
+
 def _cell(value: object) -> str:
     if isinstance(value, float):
         return f'<td class="number">{value:.6g}</td>'
@@ -133,5 +139,5 @@ def _section(section: Section, name: str) -> str:
         full_html=False, include_plotlyjs=False, div_id=name,
         config={'displaylogo': False, 'responsive': True,
                 'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d']})
-    return (f'<section><h2>{escape(section.title)}</h2><p>{escape(section.text)}</p>'
+    return (f'<section><h2>{escape(section.title)}</h2><p>{_prose(section.text)}</p>'
             f'{figure}{section.html}</section>')

@@ -23,7 +23,7 @@ from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
 from ..trackers import System
-from .series import SECOND
+from . import SECOND
 
 
 @frozen(kw_only=True)

@@ -30,8 +30,11 @@ class TrueTrack:
 
 @frozen(eq=False)
 class Scene:
-    """measurements in the order in which they were received; truth, one track a target."""
+    """measurements in the order in which they were received; truth, e.g. one track a target.
+
+    How a measurement or a truth of some class is recorded: `recordings.scenes`.
+    """
 
     measurements: tuple[Received, ...]
-    truth: tuple[TrueTrack, ...]
+    truth: tuple[Any, ...]
     frame_id: str = 'map'

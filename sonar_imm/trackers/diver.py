@@ -134,6 +134,7 @@ class DiverTracker:
             learnt=self._chain.fresh(0),
             nis=np.empty(0),
             nis_dof=np.empty(0, np.uint16),
+            score=np.empty(0),
             scale=np.zeros((2, 2)),
         )
         return ReplayHistory(nobody, _ns(self.config.history))
@@ -178,12 +179,13 @@ class DiverTracker:
             looked=np.full(len(sound), config.fixes_are_scans),
         )
         life, kept = life.only(sound[kept]), kept & sound
-        confirmed = life.status != TrackStatus.TENTATIVE
-        if confirmed.sum() >= config.max_tracks:
-            # No room for more: the tentative ones have lost.
-            room = confirmed & (np.cumsum(confirmed) <= config.max_tracks)
+        confirmed = np.flatnonzero(life.status != TrackStatus.TENTATIVE)
+        if len(confirmed) > config.max_tracks:
+            best = np.argsort(-now.score[kept][confirmed], kind='stable')[: config.max_tracks]
+            room = life.status == TrackStatus.TENTATIVE
+            room[confirmed[best]] = True
             kept[kept] = room
-            life, births = life.only(room), []
+            life = life.only(room)
         births = births[: max(0, 10 + 5 * config.max_tracks - len(life))]
         if not births and kept.all():
             return evolve(now, life=life)
@@ -198,6 +200,7 @@ class DiverTracker:
             learnt=np.concatenate([now.learnt[kept], self._chain.fresh(count)]),
             nis=np.append(now.nis[kept], np.full(count, np.nan)),
             nis_dof=np.append(now.nis_dof[kept], np.zeros(count, np.uint16)),
+            score=np.append(now.score[kept], np.zeros(count)),
             scale=now.scale,
             broken=now.broken + int((~sound).sum()),
         )

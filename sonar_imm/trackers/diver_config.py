@@ -41,6 +41,13 @@ class DiverConfig(Config):
         low=1e-3,
         high=3600.0,
     )
+    longest_step: float = parameter(
+        2.0,
+        'longer gaps are crossed in steps of this, so that the diver may turn inside them',
+        unit='s',
+        low=1e-3,
+        high=3600.0,
+    )
     stay_probability: float = parameter(
         0.86, 'probability of keeping the heading over a reference step', low=0.0, high=1.0
     )

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation.consistency import average_bounds
+from sonar_imm.estimation.imm_kernels import combine
 from sonar_imm.measurements import Fix
 from sonar_imm.simulation.diver import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver import DiverConfig, DiverTracker
 from sonar_imm.trackers.diver_config import ADAPTATIONS, MODEL_SETS
+from sonar_imm.trackers.diver_scan import cross
 from sonar_imm.trackers.diver_smoothing import SmoothingDiverTracker
 
 
@@ -229,3 +231,30 @@ def test_smoothing_lowers_the_error_and_keeps_the_tracks():
         for series, found in ((estimates, filtered), (back, smooth)):
             found += np.sum(errors(series, scene.truth[0])[0] ** 2, axis=1).tolist()
     assert np.sqrt(np.mean(smooth)) < 0.75 * np.sqrt(np.mean(filtered))
+
+
+def test_a_long_gap_is_no_straight_line():
+    """The spread predicted over half a minute is that of divers who turn as the chain says, not
+    that of divers who pick a heading and keep it."""
+    rng = np.random.default_rng(11)
+    config = DiverConfig(hover=False, adaptation='fixed', speed_noise=0.0, lateral_noise=0.0)
+    tracker = DiverTracker(config)
+    tracker.process(fix(1, 0.0, 0.0, 1e-6 * np.eye(2)))
+    before, dt = tracker._history.state, 30.0
+    P = tracker.models.chain.matrix
+    mode = rng.integers(16, size=4000)
+    speed = rng.normal(config.speed_mean, config.speed_std, size=4000)
+    place = np.zeros((4000, 2))
+    for _ in range(30):
+        mode = (rng.uniform(size=(4000, 1)) > np.cumsum(P[mode], axis=1)).sum(axis=1)
+        place += speed[:, None] * tracker.models.E[mode, 2:, 2]
+    walked = np.mean(np.sum(place**2, axis=1))
+
+    def spread(longest):
+        *_, last = cross(tracker.models, tracker._chain, before, dt, longest)
+        _, covariance = combine(last.x, last.P, last.mu, tracker.models.E)
+        return np.trace(covariance[0, :2, :2])
+
+    assert spread(1.0) == pytest.approx(walked, rel=0.1)
+    assert spread(config.longest_step) == pytest.approx(walked, rel=0.2)
+    assert spread(60.0) > 1.3 * walked
