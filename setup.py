@@ -10,7 +10,7 @@ PACKAGE = 'sonar_imm'
 ROOT = Path(__file__).resolve().parent
 
 # As in sonar_imm/trackers/__init__.py, which cannot be imported before its dependencies are here.
-SYSTEMS = ['diver']
+SYSTEMS = ['diver', 'obstacle']
 
 REQUIRES = [
     'attrs>=23.1',

@@ -47,6 +47,19 @@ class ObstacleConfig(Config):
     bearing_positive: str = parameter(
         'port', 'side to which bearings of detections count up', choices=('port', 'starboard')
     )
+    beam_axes: str = parameter(
+        'auto',
+        'axes of the beam vectors of SonarRanges and sonar images: marine (z forward, y to '
+        'starboard, as their definition says), rep103 (x forward, y to port), or by which of the '
+        'two the beams point along',
+        choices=('marine', 'rep103', 'auto'),
+    )
+    nav_twist_frame: str = parameter(
+        'child',
+        'axes of the twist of the navigation: those of the vehicle, as Odometry defines it, or '
+        'those of the world',
+        choices=('child', 'world'),
+    )
     ping_timing: str = parameter(
         'instant',
         'instant: an echo belongs to the pose at its stamp; two_way: bearing belongs to the pose '
@@ -54,7 +67,11 @@ class ObstacleConfig(Config):
         choices=('instant', 'two_way'),
     )
     sound_speed: float = parameter(
-        1500.0, 'speed of sound (two_way)', unit='m/s', low=1300.0, high=1700.0
+        1500.0,
+        'speed of sound: for two_way, and for travel times that come without one',
+        unit='m/s',
+        low=1300.0,
+        high=1700.0,
     )
     world_frame_convention: str = parameter(
         'enu',

@@ -81,12 +81,13 @@ def deferred(
         return Deferred(offsets, curve, np.nan, np.nan)
     from scipy.optimize import minimize_scalar
 
+    def at(offset: float) -> float:
+        value = _rmsd(np.array([offset]), z, poses, config, refit)[0]
+        return float(value) if np.isfinite(value) else np.inf
+
     lowest = int(np.nanargmin(curve))
-    low, high = offsets[max(lowest - 1, 0)], offsets[min(lowest + 1, len(offsets) - 1)]
-    found = minimize_scalar(
-        lambda offset: float(np.nan_to_num(_rmsd(np.array([offset]), z, poses, config, refit), nan=1e9)[0]),
-        bounds=(low, high), method='bounded', options={'xatol': 1e-9},
-    )  # fmt: skip
+    between = offsets[max(lowest - 1, 0)], offsets[min(lowest + 1, len(offsets) - 1)]
+    found = minimize_scalar(at, bounds=between, method='bounded', options={'xatol': 1e-9})
     return Deferred(offsets, curve, float(found.x), float(found.fun))
 
 
@@ -115,8 +116,9 @@ def _residuals(
         Pose(start.position + travelled * scale, poses.R), geometry.to_world(start, m)[:, None]
     )
     d, delta = geometry.project(seen, config.azimuth_model)
-    pixel = (config.range_step or config.range_std), np.radians(
-        config.bearing_step_deg or config.bearing_std_deg
+    pixel = (
+        (config.range_step or config.range_std),
+        np.radians(config.bearing_step_deg or config.bearing_std_deg),
     )
     parts = (d - z[:, 0]) / pixel[0], wrap_angle(delta - z[:, 1]) / pixel[1]
     prior = first[:, 2:] / max(config.scale_std, 1e-9)
@@ -126,7 +128,7 @@ def _residuals(
 def _refit(
     first: FloatArray, offsets: FloatArray, z: FloatArray, poses: Pose, config: ObstacleConfig
 ) -> FloatArray:
-    """Gauss-Newton for range and azimuth of the first echo and the scale, each offset by itself."""
+    """Gauss-Newton for range and azimuth of the first echo and the scale, offset by offset."""
     for _ in range(6):
         residual = _residuals(first, offsets, z, poses, config)
         slope = np.stack(

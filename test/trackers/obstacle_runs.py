@@ -8,6 +8,8 @@ import numpy as np
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.simulation.obstacle import scenario, simulate
 from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+from sonar_imm.trackers.obstacle_filters import build_filter, Sonar
+from sonar_imm.trackers.obstacle_navigation import Mount, NavigationBuffer
 
 SECOND = 10**9
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'
@@ -132,3 +134,26 @@ def mean_nis(final):
     """Mean normalised innovation squared over all hits; 2 when all is right."""
     values = np.concatenate([estimate.extras['nis'] for estimate in final.values()])
     return float(np.nanmean(values))
+
+
+def follow(measurements, config):
+    """A vector file's obstacle without gate or track logic: NIS (n,) of each echo, and the last
+    view."""
+    tracker, mount = ObstacleTracker(config), Mount(config)
+    filter_, known, before, nis = build_filter(config), None, None, []
+    for i in range(0, len(measurements), 3):
+        altitude, pose, ping = measurements[i : i + 3]
+        sonar = Sonar(
+            mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
+        )
+        z, R = tracker._detections(ping)
+        if known is None:
+            known = filter_.begin(z, R, sonar)
+        else:
+            known = filter_.advance(known, before, sonar, 0.5)
+            if len(z):
+                h, _ = filter_.expected(known, sonar)
+                known, squared = filter_.update(known, h, z, R, sonar)
+                nis.append(squared[0])
+        before = sonar
+    return np.array(nis), filter_.view(known, sonar)
