@@ -207,7 +207,8 @@ def _navigate(
     log = geometry.apply(np.swapaxes(true_R, -1, -2), velocity)
     log = log * (1.0 + exact * config.log_scale_error * rng.normal())
     log = log + exact * config.log_bias * rng.normal(size=3)
-    log = log + exact * config.log_std * rng.normal(size=log.shape)
+    noise = config.log_noise * np.sqrt(config.navigation_rate)
+    log = log + exact * noise * rng.normal(size=log.shape)
     if not config.ideal_navigation:
         over_ground = geometry.apply(R, log)
         steps = 0.5 * (over_ground[1:] + over_ground[:-1]) * np.diff(t)[:, None]

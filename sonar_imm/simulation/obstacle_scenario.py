@@ -49,8 +49,12 @@ class ObstacleScenario(Config):
     log_bias: float = parameter(
         0.003, 'bias of each axis of the log, 1 sigma', unit='m/s', low=0.0, high=1.0
     )
-    log_std: float = parameter(
-        0.005, 'noise of each axis of the log', unit='m/s', low=0.0, high=1.0
+    log_noise: float = parameter(
+        0.005,
+        'random walk of the position that the noise of the log makes',
+        unit='m/sqrt(s)',
+        low=0.0,
+        high=1.0,
     )
     attitude_std_deg: float = parameter(
         0.02, 'noise of roll, pitch and yaw', unit='deg', low=0.0, high=10.0

@@ -22,9 +22,8 @@ import numpy as np
 
 from ..acoustics import geometry
 from ..acoustics.geometry import Pose
-from ..estimation import unscented
+from ..estimation import kalman, unscented
 from ..estimation.association import gate_threshold
-from ..estimation.kalman import symmetrise
 from ..measurements import FloatArray
 from . import obstacle_kernels as kernels
 from .obstacle_config import ObstacleConfig
@@ -145,7 +144,7 @@ class DepthSlices:
         std = np.sqrt(P[..., 2, 2])
         low, high, above = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
         place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
-        return View(mean, symmetrise(covariance), low, high, above, *place)
+        return View(mean, kalman.symmetrise(covariance), low, high, above, *place)
 
     def in_beam(self, known: Mixture, sonar: Sonar) -> FloatArray:
         """Probability (T,) that the beam holds the target."""
@@ -180,10 +179,10 @@ class DepthSlices:
 
 
 class Landmark:
-    """One Gaussian a target over its place in the world, north, east, depth: the unscented filter
-    a navigator would write first."""
+    """One Gaussian a target over its place in the world, north, east, depth, and the scale of the
+    navigation: the unscented filter a navigator would write first."""
 
-    n = 3
+    n = 4
     K = 1
 
     def __init__(self, config: ObstacleConfig):
@@ -196,23 +195,29 @@ class Landmark:
 
     def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
         lowest, highest = depth_span(z, sonar, self.config)
-        seen = np.column_stack([z, 0.5 * (lowest + highest)])
-        covariance = np.zeros((len(z), 3, 3))
+        seen = np.zeros((len(z), 4))
+        seen[:, :2], seen[:, 2] = z, 0.5 * (lowest + highest)
+        covariance = np.zeros((len(z), 4, 4))
         covariance[:, :2, :2] = R
         covariance[:, 2, 2] = np.square(highest - lowest) / 12.0
+        covariance[:, 3, 3] = self.config.scale_std**2
 
         def place(points: FloatArray) -> FloatArray:
-            d, delta, d_st = np.moveaxis(points, -1, 0)
+            d, delta, d_st, scale = np.moveaxis(points, -1, 0)
             d_st = np.clip(d_st, -0.99 * d, 0.99 * d)
             m = geometry.reconstruct(d, delta, d_st, sonar.pose.R, self.model)
-            return geometry.to_world(sonar.pose, m)
+            return np.concatenate([geometry.to_world(sonar.pose, m), scale[..., None]], axis=-1)
 
         moved = unscented.unscented_transform(place, seen, covariance)
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
 
     def advance(self, known: Mixture, before: Sonar, after: Sonar, dt: float) -> Mixture:
+        """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
         level, depth = (part * dt for part in self._noise)
-        return known._replace(P=known.P + np.diag([level, level, depth]))
+        F = np.eye(4)
+        F[:2, 3] = (before.pose.position - after.pose.position)[:2]
+        x, P = kalman.predict(known.x, known.P, F, np.diag([level, level, depth, 0.0]))
+        return Mixture(x, P, known.mu)
 
     def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         seen = unscented.unscented_transform(
@@ -233,7 +238,7 @@ class Landmark:
         x, P = known.x[:, 0], known.P[:, 0]
 
         def words(points: FloatArray) -> FloatArray:
-            m = geometry.to_body(sonar.pose, points)
+            m = geometry.to_body(sonar.pose, points[..., :3])
             offset = points[..., 2] - sonar.pose.position[2]
             return np.stack([*geometry.project(m, self.model), offset], axis=-1)
 
@@ -242,18 +247,18 @@ class Landmark:
         low, high, above = kernels.bands(
             np.ascontiguousarray(seen.mean[:, 2:]), std, known.mu, 0.5 * (1.0 - BAND)
         )
-        return View(seen.mean, seen.covariance, low, high, above, x, P)
+        return View(seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3])
 
     def in_beam(self, known: Mixture, sonar: Sonar) -> FloatArray:
-        m = geometry.to_body(sonar.pose, known.x[:, 0])
+        m = geometry.to_body(sonar.pose, known.x[:, 0, :3])
         spread = np.sqrt(known.P[:, 0, 2, 2]) / np.linalg.norm(m, axis=-1)
         return _in_beam(m, spread, self.config)
 
     def ahead(self, known: Mixture, sonar: Sonar) -> np.ndarray:
-        return _ahead(geometry.to_body(sonar.pose, known.x[:, 0]))
+        return _ahead(geometry.to_body(sonar.pose, known.x[:, 0, :3]))
 
     def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
-        out = geometry.to_body(sonar.pose, points)
+        out = geometry.to_body(sonar.pose, points[..., :3])
         if sonar.late is None:
             return np.stack(geometry.project(out, self.model), axis=-1)
         return _two_way(out, sonar, self.config)
