@@ -308,8 +308,8 @@ class ObstacleTracker:
         """End the tracks that are over or passed, begin one at each detection left."""
         rules = _rules(self.config)
         tentative = now.life.status == TrackStatus.TENTATIVE
-        looked = tentative | (self.filter.in_beam(now.known, now.sonar) > IN_BEAM)
-        ahead = self.filter.ahead(now.known, now.sonar)
+        in_beam, ahead = self.filter.outlook(now.known, now.sonar)
+        looked = tentative | (in_beam > IN_BEAM)
         life, kept = now.life.scan(hit, now.stamp_ns, rules, looked=looked)
         now = evolve(now, life=life, known=now.known.rows(kept), nis=now.nis[kept])
         now = self._only(now, ahead[kept])

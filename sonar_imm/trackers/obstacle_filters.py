@@ -146,18 +146,12 @@ class DepthSlices:
         place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
         return View(mean, kalman.symmetrise(covariance), low, high, above, *place)
 
-    def in_beam(self, known: Mixture, sonar: Sonar) -> FloatArray:
-        """Probability (T,) that the beam holds the target."""
+    def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+        """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
         m = kernels.points(known.x, *sonar.pose, self.cone)
-        d = known.x[..., 0]
-        return np.einsum(
-            'tk,tk->t', known.mu, _in_beam(m, np.sqrt(known.P[..., 2, 2]) / d, self.config)
-        )
-
-    def ahead(self, known: Mixture, sonar: Sonar) -> np.ndarray:
-        """True (T,) while the target lies in front of the sonar."""
-        m = kernels.points(known.x, *sonar.pose, self.cone)
-        return _ahead(np.einsum('tk,tki->ti', known.mu, m))
+        spread = np.sqrt(known.P[..., 2, 2]) / known.x[..., 0]
+        inside = np.einsum('tk,tk->t', known.mu, _in_beam(m, spread, self.config))
+        return inside, _ahead(np.einsum('tk,tki->ti', known.mu, m))
 
     def _echo(self, known: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -249,13 +243,10 @@ class Landmark:
         )
         return View(seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3])
 
-    def in_beam(self, known: Mixture, sonar: Sonar) -> FloatArray:
+    def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         m = geometry.to_body(sonar.pose, known.x[:, 0, :3])
         spread = np.sqrt(known.P[:, 0, 2, 2]) / np.linalg.norm(m, axis=-1)
-        return _in_beam(m, spread, self.config)
-
-    def ahead(self, known: Mixture, sonar: Sonar) -> np.ndarray:
-        return _ahead(geometry.to_body(sonar.pose, known.x[:, 0, :3]))
+        return _in_beam(m, spread, self.config), _ahead(m)
 
     def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
         out = geometry.to_body(sonar.pose, points[..., :3])

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 
 KAPPA = 1.0
 NEGLIGIBLE = 1e-12
-"""A component that weighs less plays no part in a quantile."""
+"""A component that weighs less plays no part in a quantile or a place."""
 
 
 @kernel
@@ -172,6 +172,8 @@ def locate(
     centre = KAPPA / (n + KAPPA)
     for t in range(T):
         for j in range(K):
+            if mu[t, j] <= NEGLIGIBLE:
+                continue
             root(P[t, j], L)
             for number in range(2 * n + 1):
                 _sigma_point(x[t, j], L, number, y)
@@ -181,6 +183,8 @@ def locate(
                 for i in range(3):
                     mean[t, i] += share * world[j, number, i]
         for j in range(K):
+            if mu[t, j] <= NEGLIGIBLE:
+                continue
             for number in range(2 * n + 1):
                 share = mu[t, j] * (centre if number == 0 else weight)
                 for a in range(3):
