@@ -14,6 +14,7 @@ from attrs import frozen
 
 BENCHES = {
     'diver': 'sonar_imm.evaluation.diver.bench',
+    'obstacle': 'sonar_imm.evaluation.obstacle.bench',
 }
 """Module by system. A new system adds its line here."""
 

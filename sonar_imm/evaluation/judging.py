@@ -26,6 +26,7 @@ TRUTH_GAP = 60.0
 
 JUDGES = {
     'diver': 'sonar_imm.evaluation.diver',
+    'obstacle': 'sonar_imm.evaluation.obstacle',
 }
 """Module by system. A new system adds its line here."""
 
