@@ -104,7 +104,9 @@ class DepthSlices:
         P[..., 3, 3] = self.scale**2
         lowest, highest = depth_span(z, sonar, self.config)
         width = (highest - lowest) / self.K
-        slices = lowest[:, None] + (np.arange(self.K) + 0.5) * width[:, None]
+        # Slices above and below the sonar in pairs: on a level path they stay equally probable.
+        first = np.round((2.0 * lowest + width) / width) * 0.5 * width
+        slices = first[:, None] + np.arange(self.K) * width[:, None]
         x[..., 2] = sonar.pose.position[2] + slices
         P[..., 2, 2] = np.square(0.5 * width)[:, None]
         fresh = self._nailed(Mixture(x, P, np.full((B, self.K), 1.0 / self.K)), sonar)
