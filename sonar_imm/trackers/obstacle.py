@@ -46,7 +46,9 @@ IN_BEAM = 0.9
 """A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
 echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
 approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
-_TINY = 1e-12
+_TINY, _WIDEST = 1e-12, 0.25
+"""Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
+nothing."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -249,23 +251,18 @@ class ObstacleTracker:
         return self._census(now, chosen >= 0, z[free], R[free]), int((~sound).sum())
 
     def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray]:
-        """z (D, 2) and R (D, 2, 2) of the rows that are echoes, azimuth positive to starboard."""
+        """z (D, 2) and R (D, 2, 2) of the rows that are echoes, azimuth positive to starboard. A
+        row that is as uncertain as it is far says nothing and is left out."""
         config = self.config
         side = -1.0 if config.bearing_positive == 'port' else 1.0
-        real = np.isfinite(ping.range) & np.isfinite(ping.bearing)
-        real &= (ping.range > 0.0) & (np.abs(ping.bearing) < 0.5 * np.pi)
-        z = np.column_stack([ping.range[real], side * ping.bearing[real]])
-        R = np.zeros((len(z), 2, 2))
-        stated = (ping.var_range[real], ping.var_bearing[real])
-        own = (
-            config.range_std**2 + config.range_step**2 / 12.0,
-            np.radians(config.bearing_std_deg) ** 2
-            + np.radians(config.bearing_step_deg) ** 2 / 12.0,
-        )
-        for i in range(2):
-            known = np.isfinite(stated[i]) & (stated[i] > _TINY)
-            R[:, i, i] = np.where(known, stated[i], own[i])
-        return z, R
+        z = np.column_stack([ping.range, side * ping.bearing])
+        stated = np.column_stack([ping.var_range, ping.var_bearing])
+        own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
+        own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
+        variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, own)
+        real = np.isfinite(z).all(axis=1) & (z[:, 0] > 2.0 * np.sqrt(variance[:, 0]))
+        real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
+        return z[real], variance[real, :, None] * np.eye(2)
 
     def _associate(self, now: Ping, z: FloatArray, R: FloatArray) -> tuple[np.ndarray, FloatArray]:
         """The detection of each track (T,), -1 for none, and what was expected (T, K, 2);

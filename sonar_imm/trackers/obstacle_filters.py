@@ -192,17 +192,15 @@ class Landmark:
     def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
         lowest, highest = depth_span(z, sonar, self.config)
         seen = np.zeros((len(z), 4))
-        seen[:, :2], seen[:, 2] = z, 0.5 * (lowest + highest)
+        seen[:, :2], seen[:, 2] = z, sonar.pose.position[2] + 0.5 * (lowest + highest)
         covariance = np.zeros((len(z), 4, 4))
         covariance[:, :2, :2] = R
         covariance[:, 2, 2] = np.square(highest - lowest) / 12.0
         covariance[:, 3, 3] = self.config.scale_std**2
 
         def place(points: FloatArray) -> FloatArray:
-            d, delta, d_st, scale = np.moveaxis(points, -1, 0)
-            d_st = np.clip(d_st, -0.99 * d, 0.99 * d)
-            m = geometry.reconstruct(d, delta, d_st, sonar.pose.R, self.model)
-            return np.concatenate([geometry.to_world(sonar.pose, m), scale[..., None]], axis=-1)
+            m = kernels.points(points, *sonar.pose, self.model == 'cone')
+            return np.concatenate([geometry.to_world(sonar.pose, m), points[..., 3:]], axis=-1)
 
         moved = unscented.unscented_transform(place, seen, covariance)
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))

@@ -397,3 +397,43 @@ def test_rules_may_change_while_running():
     assert tracker.config.delete_misses == 20
     with pytest.raises(ValueError, match='components'):
         tracker.reconfigure(ObstacleConfig(components=5))
+
+
+@pytest.mark.parametrize('timing', ['instant', 'two_way'])
+@pytest.mark.parametrize('model', ['plane', 'cone'])
+@pytest.mark.parametrize('method', ['gaussian_sum', 'seafloor', 'landmark'])
+@pytest.mark.filterwarnings('error')
+def test_nonsense_gives_finite_numbers(method, model, timing):
+    """A vehicle that tumbles and leaps, wild ranges, bearings and variances."""
+    rng = np.random.default_rng(1)
+    tracker = ObstacleTracker(
+        ObstacleConfig(
+            method=method,
+            azimuth_model=model,
+            ping_timing=timing,
+            confirm_hits=1,
+            max_navigation_gap=5.0,
+        )
+    )
+    estimates = []
+    for k in range(1, 60):
+        q = rng.normal(size=4)
+        pose = Navigation(
+            stamp_ns=k * SECOND,
+            position=rng.normal(size=3) * 10 ** rng.uniform(-2.0, 6.0),
+            orientation=q / np.linalg.norm(q),
+        )
+        D = int(rng.integers(0, 40))
+        ping = Detections(
+            stamp_ns=k * SECOND + 1000,
+            range=10 ** rng.uniform(-6.0, 5.0, D),
+            bearing=rng.uniform(-1.7, 1.7, D),
+            var_range=10 ** rng.uniform(-14.0, 6.0, D),
+            var_bearing=10 ** rng.uniform(-14.0, 2.0, D),
+        )
+        height = Altitude(stamp_ns=k * SECOND, altitude=float(10 ** rng.uniform(-3.0, 4.0)))
+        estimates += [one for item in (height, pose, ping) for one in tracker.process(item)]
+    assert sum(map(len, estimates)) > 100
+    for estimate in estimates:
+        for name, column in estimate.columns().items():
+            assert name == 'nis' or np.isfinite(column).all()
