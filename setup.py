@@ -77,6 +77,7 @@ setup(
     entry_points={
         'console_scripts': [
             'sonar-imm = sonar_imm.cli:main',
+            'fls_detector_node = sonar_imm.nodes.fls_detector:main',
             *(f'{system}_node = sonar_imm.nodes.{system}:main' for system in SYSTEMS),
         ],
     },

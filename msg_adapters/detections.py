@@ -29,7 +29,10 @@ from .table import decode_table, encode_table, require_columns, scalar_column
 MAX_DETECTIONS = 10_000
 SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
-LEAST_VAR_RANGE, LEAST_VAR_BEARING = 1e-12, 1e-12
+NEAREST, FARTHEST = 0.01, 1e5
+"""Metres: no echo comes from nearer or farther."""
+LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
+"""A stated variance outside is a field that was not filled in."""
 BEAM_AXES = ('marine', 'rep103', 'auto')
 
 
@@ -47,9 +50,11 @@ def read_detections(message: Any, **_: Any) -> Detections:
         distance, bearing = _polar(*(scalar_column(columns, name) for name in 'xyz'))
     else:
         distance = bearing = np.empty(0)
-    least = {'var_range': LEAST_VAR_RANGE, 'var_bearing': LEAST_VAR_BEARING, 'intensity': -np.inf}
-    optional = {name: _known(scalar_column(columns, name), least[name])
-                for name in least if name in columns}
+    optional = {name: scalar_column(columns, name)
+                for name in ('var_range', 'var_bearing', 'intensity') if name in columns}
+    for name in ('var_range', 'var_bearing'):
+        if name in optional:
+            optional[name] = _variances(optional[name])
     return _detections(message, distance, bearing, **optional)
 
 
@@ -138,7 +143,8 @@ def _detections(message: Any, distance: FloatArray, bearing: FloatArray, **optio
     if len(seen) and seen.max() > 2.0 * np.pi:
         raise Rejection('out_of_range', f'detections: a bearing of {seen.max():g} is beyond 2 pi; '
                                         'bearings are in radians')
-    keep = np.isfinite(distance) & np.isfinite(bearing) & (distance > 0.0) & (distance < 1e6)
+    keep = np.isfinite(distance) & np.isfinite(bearing) & (distance >= NEAREST)
+    keep &= distance <= FARTHEST
     return Detections(
         stamp_ns=stamp_ns(message), frame_id=str(message.header.frame_id), range=distance[keep],
         bearing=bearing[keep], **{name: column[keep] for name, column in optional.items()})
@@ -149,8 +155,8 @@ def _polar(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, Flo
         return np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x)
 
 
-def _known(values: FloatArray, least: float) -> FloatArray:
-    return np.where(np.isfinite(values) & (values >= least), values, np.nan)
+def _variances(values: FloatArray) -> FloatArray:
+    return np.where((values >= LEAST_VARIANCE) & (values <= MOST_VARIANCE), values, np.nan)
 
 
 def _good(distance: FloatArray, flags: Any) -> FloatArray:

@@ -1,5 +1,6 @@
 """The obstacle node: three inputs, and displays that say how unsure the height is."""
 
+from attrs import evolve
 from geometry_msgs.msg import PoseArray
 import numpy as np
 import pytest
@@ -110,11 +111,15 @@ def test_reset_deletes_all_markers(rig):
 
 
 def test_the_node_says_what_the_tracker_says(rig):
-    received = simulate(scenario('late', {'last_range': 60.0}), 3).measurements
+    received = [one.measurement for one in
+                simulate(scenario('late', {'last_range': 60.0}), 3).measurements]
+    # A Range holds the altitude as a float32.
+    received = [evolve(one, altitude=float(np.float32(one.altitude)))
+                if isinstance(one, Altitude) else one for one in received]
     tracker = ObstacleTracker(ObstacleConfig())
-    wanted = [one for each in received for one in tracker.process(each.measurement)]
+    wanted = [one for each in received for one in tracker.process(each)]
     for each in received:
-        rig.send(each.measurement)
+        rig.send(each)
     rig.bench.spin_until(lambda: len(rig.tables) == len(wanted))
     assert len(wanted) > 40 and not rig.node._meter.refused and not rig.node._errors
     for table, estimate in zip(rig.tables, wanted):
