@@ -69,11 +69,12 @@ def rmsd_figure(back: LookingBack) -> go.Figure:
         _add_curve(figure, curve, name, colour, back.altitude)
     figure.add_vrect(x0=back.band[0], x1=back.band[1], fillcolor=AMBER, opacity=0.25, line_width=0,
                      annotation_text='90 % band, online')
-    for value, name, dash in ((back.online, 'online', 'dash'), (back.truth, 'truth', 'dot'),
-                              (back.altitude, 'sea floor', 'dashdot')):
+    for value, name, dash, side in (
+            (back.online, 'online', 'dash', 'right'), (back.truth, 'truth', 'dot', 'left'),
+            (back.altitude, 'sea floor', 'dashdot', 'right')):
         if np.isfinite(value):
             figure.add_vline(x=value, line={'color': INK, 'width': 1.5, 'dash': dash},
-                             annotation_text=name, annotation_position='bottom right')
+                             annotation_text=name, annotation_position=f'bottom {side}')
     figure.update_xaxes(title='vertical offset at the first echo, below the sonar [m]')
     figure.update_yaxes(title='RMSD [pixels of range and bearing]', type='log')
     return styled(figure, height=440)
