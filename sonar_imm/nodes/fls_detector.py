@@ -1,7 +1,7 @@
 """Echoes in live sonar images: ``ros2 run sonar_imm fls_detector_node``.
 
-Hears ``image`` (marine_acoustic_msgs, which has to be installed) and publishes ``detections``, what
-the obstacle node hears. It is a convenience: a detector that knows the sonar is better.
+Hears ``image`` (marine_acoustic_msgs, which has to be installed) and publishes ``detections``,
+what the obstacle node hears. It is a convenience: a detector that knows the sonar is better.
 """
 
 from __future__ import annotations

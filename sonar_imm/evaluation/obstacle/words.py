@@ -42,7 +42,8 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
               *chi2_line('NEES, whole state', consistency.get('nees_state', {})),
               *chi2_line('NIS', consistency['nis'])]
     if metrics.get('vertical_offset', {}).get('n'):
-        result.append(('truth inside the 90 % band', f'{100 * consistency["band_coverage"]:.0f} %'))
+        held = consistency['band_coverage']
+        result.append(('truth inside the 90 % band', f'{100 * held:.0f} %'))
         result.append(('Brier score of P(above)', f'{metrics["above"]["brier"]:.3f}'))
         result.append(('GOSPA', f'{metrics["gospa"]["mean_m"]:.2f} m'))
     if back := metrics.get('looking_back'):

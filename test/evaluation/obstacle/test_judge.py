@@ -11,7 +11,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.evaluation.judging import judge, JudgeOptions
 from sonar_imm.evaluation.obstacle.bench import bench_ping
 from sonar_imm.evaluation.obstacle.scoring import score
-from sonar_imm.evaluation.obstacle.series import series_of, truth_of, TruePath
+from sonar_imm.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm.evaluation.run_folder import RunFolder
 
 SECOND = 10**9
