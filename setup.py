@@ -10,7 +10,7 @@ PACKAGE = 'sonar_imm'
 ROOT = Path(__file__).resolve().parent
 
 # As in sonar_imm/trackers/__init__.py, which cannot be imported before its dependencies are here.
-SYSTEMS = ['bathymetry', 'diver']
+SYSTEMS = ['bathymetry', 'diver', 'obstacle']
 
 REQUIRES = [
     'attrs>=23.1',
@@ -77,6 +77,7 @@ setup(
     entry_points={
         'console_scripts': [
             'sonar-imm = sonar_imm.cli:main',
+            'fls_detector_node = sonar_imm.nodes.fls_detector:main',
             *(f'{system}_node = sonar_imm.nodes.{system}:main' for system in SYSTEMS),
         ],
     },

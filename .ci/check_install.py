@@ -32,6 +32,9 @@ def main(prefix: Path) -> None:
     command = prefix / 'lib' / 'sonar_imm' / 'sonar-imm'
     said = subprocess.run([command, '--version'], capture_output=True, text=True, check=True)
     expect(sonar_imm.__version__ in said.stdout, f'sonar-imm says {said.stdout.strip()!r}')
+    # It needs marine_acoustic_msgs, which are not on PyPI, so it is not started.
+    expect((prefix / 'lib' / 'sonar_imm' / 'fls_detector_node').is_file(),
+           'fls_detector_node is installed')
     for system in SYSTEMS:
         start_and_interrupt(prefix / 'lib' / 'sonar_imm' / f'{system}_node')
 

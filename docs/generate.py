@@ -66,7 +66,9 @@ def parameter_file(system: System) -> str:
 
 def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     """Give what the live node of `system` can be told besides the parameters of its tracker."""
-    return (*type_specs(system.name), *node_config_type(system.name).specs())
+    own = {spec.name for spec in system.config_type().specs()}
+    specs = (*type_specs(system.name), *node_config_type(system.name).specs())
+    return tuple(spec for spec in specs if spec.name not in own)
 
 
 def _entry(spec: ParameterSpec) -> str:

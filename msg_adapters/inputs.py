@@ -7,12 +7,21 @@ data are read by the same functions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from attrs import frozen
 
 from .arrivals import read_arrivals
+from .detections import (
+    read_detections,
+    read_laser_scan,
+    read_pose_array,
+    read_sonar_detections,
+    read_sonar_ranges,
+)
 from .fixes import doubt_fix, read_fix
+from .navigation import doubt_navigation, read_dvl, read_navigation, read_range
 from .snapshots import read_snapshot
 
 
@@ -25,6 +34,8 @@ class InputTopic:
     doubt: gives a reason code to count when a message can be used but deserves a warning.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     one_topic: several topics are several instruments, each for a tracker of its own.
+    settings: parameters of the tracker that its readers take as keywords, too: how messages are to
+    be understood that do not say it themselves.
     """
 
     name: str
@@ -33,6 +44,13 @@ class InputTopic:
     doubt: Callable[[Any], str | None] = lambda message: None
     scans: bool = False
     one_topic: bool = False
+    settings: tuple[str, ...] = ()
+
+    def reader(self, type_name: str, world_frame: str, settings: Mapping[str, Any]
+               ) -> Callable[[Any], Any]:
+        """Give the reader of a message type, told everything; `settings` may hold more."""
+        told = {name: settings[name] for name in self.settings if name in settings}
+        return partial(self.readers[type_name], world_frame=world_frame, **told)
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
@@ -48,6 +66,22 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         }, doubt=doubt_fix, scans=True),
         InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
+        }),
+    ),
+    'obstacle': (
+        InputTopic('detections', 'echoes of one ping of a forward-looking sonar, also none', {
+            'sensor_msgs/msg/PointCloud2': read_detections,
+            'sensor_msgs/msg/LaserScan': read_laser_scan,
+            'geometry_msgs/msg/PoseArray': read_pose_array,
+            'marine_acoustic_msgs/msg/SonarDetections': read_sonar_detections,
+            'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
+        }, settings=('beam_axes', 'sound_speed')),
+        InputTopic('nav', 'pose of the vehicle', {
+            'nav_msgs/msg/Odometry': read_navigation,
+        }, doubt=doubt_navigation, settings=('nav_twist_frame',)),
+        InputTopic('altitude', 'height above the sea floor', {
+            'sensor_msgs/msg/Range': read_range,
+            'marine_acoustic_msgs/msg/Dvl': read_dvl,
         }),
     ),
 }

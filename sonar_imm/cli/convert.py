@@ -9,7 +9,16 @@ from typing import Any
 
 import click
 
-from .common import example, json_option, pairs_option, print_json, say
+from .common import (
+    BAG,
+    example,
+    json_option,
+    pairs_option,
+    print_json,
+    say,
+    set_option,
+    typed_overrides,
+)
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 BAG_OUT = click.Path(path_type=Path)
@@ -227,3 +236,23 @@ def snapshots(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None
     signal_variance. Usual names are recognised.
     """
     _convert('snapshots', source, out_bag, as_json, **values)
+
+
+@command.command('images', epilog=example(
+    'sonar-imm convert images survey.bag detections.bag --set image_order=beam_major'))
+@click.argument('source', metavar='IN', type=BAG)
+@click.argument('out_bag', type=BAG_OUT)
+@set_option
+@storage_option
+@json_option
+def images(source: Path, out_bag: Path, overrides: dict[str, str], as_json: bool,
+           **values: Any) -> None:
+    """Bag with images of a forward-looking sonar to /detections, for the obstacle tracker.
+
+    Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage; navigation and altitudes come
+    along. --set changes the detector: image_order, beam_axes, sound_speed, guard, training,
+    false_alarm, min_range, max_detections.
+    """
+    from msg_adapters.sonar_images import DetectorConfig
+    _convert('images', source, out_bag, as_json,
+             parameters=typed_overrides(DetectorConfig, overrides), **values)

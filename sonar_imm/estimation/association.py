@@ -310,5 +310,7 @@ class Tracks:
 
 def _window(seen: BoolArray, length: int) -> BoolArray:
     """The newest `length` columns; the rules may change while tracks live."""
+    if seen.shape[1] == length:
+        return seen
     missing = max(length - seen.shape[1], 0)
     return np.pad(seen[:, seen.shape[1] - length + missing :], ((0, 0), (missing, 0)))

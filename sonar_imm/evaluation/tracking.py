@@ -140,7 +140,8 @@ class OfflineRun:
         guard = FrameGuard(self.options.frame_id)
         for heard in measurements_of(self._bag, self._system.name, self.topics,
                                      world_frame=self.options.world_frame,
-                                     order=self.options.order):
+                                     order=self.options.order,
+                                     settings=self.tracker.config.as_dict()):
             self.messages += 1
             advance(1)
             try:

@@ -103,6 +103,9 @@ class TrackerNode(Node):
     def show(self, newest: Estimate) -> None:
         """Publish the newest state for displays."""
 
+    def forget(self) -> None:
+        """Tell displays that all tracks are forgotten."""
+
     @property
     def _node_config(self) -> NodeConfig:
         return self._settings[self._node_config_type]
@@ -130,8 +133,8 @@ class TrackerNode(Node):
         """Subscribe to one input and give the resolved name of its topic."""
         spec = type_spec(topic)
         type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
-        reader = functools.partial(topic.readers[type_name],
-                                   world_frame=self._node_config.world_frame_convention)
+        reader = topic.reader(type_name, self._node_config.world_frame_convention,
+                              self.tracker.config.as_dict())
         subscription = self._endpoints.subscribe(
             message_class(type_name), topic.name,
             functools.partial(self._receive, topic, reader),
@@ -222,6 +225,7 @@ class TrackerNode(Node):
     def _start_afresh(self) -> None:
         self.tracker.reset()
         self._guard.reset()
+        self.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self._start_afresh()
@@ -289,10 +293,10 @@ def _init(args: list[str] | None) -> None:
 
 @contextlib.contextmanager
 def _explained_overrides(node: Node) -> Iterator[None]:
-    """Turn what rclpy raises for a bad qos_overrides parameter into a `ConfigError`."""
+    """Turn what is raised for a bad qos_overrides or type parameter into a `ConfigError`."""
     try:
         yield
-    except (InvalidParameterTypeException, InvalidQoSProfileException) as error:
+    except (ImportError, InvalidParameterTypeException, InvalidQoSProfileException) as error:
         raise ConfigError(str(error)) from None
     except RuntimeError as error:
         if not node.context.ok():

@@ -33,7 +33,7 @@ _TYPES = {
 
 
 class NodeParameters:
-    """The parameters of one node, spread over several `Config` classes with distinct names."""
+    """The parameters of one node, spread over several `Config` classes."""
 
     def __init__(self, node: Node, config_types: Iterable[type[Config]],
                  choices: Iterable[ParameterSpec] = ()):
@@ -45,7 +45,8 @@ class NodeParameters:
         self._node = node
         self._types = tuple(config_types)
         self._choices = {spec.name: spec for spec in choices}
-        self._specs = {spec.name: spec for config_type in self._types
+        # Where two classes share a parameter, the first one, the tracker's, describes it.
+        self._specs = {spec.name: spec for config_type in reversed(self._types)
                        for spec in config_type.specs()} | self._choices
         values = self._start_values()
         self._configs = self._build(values)

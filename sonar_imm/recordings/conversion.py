@@ -66,12 +66,13 @@ def write_bag(out: str | Path, records: Iterable[Record], report: ConversionRepo
     if not ordered:
         first = f' (the first problem: {report.problems[0]})' if report.problems else ''
         raise BagError(f'{source} has nothing that could be converted{first}')
-    with BagWriter(out, storage=storage, custom_data=_provenance(source, report.notes)) as bag:
+    with BagWriter(out, storage=storage, custom_data=provenance(source, report.notes)) as bag:
         for stamp_ns, topic, message in ordered:
             bag.write(topic, message, stamp_ns)
             report.messages[topic] = report.messages.get(topic, 0) + 1
     return report
 
 
-def _provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
+def provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
+    """What a converted bag notes beside its messages."""
     return {'source': source, 'converted_by': 'sonar-imm convert', **notes}

@@ -13,7 +13,8 @@ from sonar_imm.parameters import did_you_mean
 from .reader import BagReader
 from .sources import BagError, TopicInfo
 
-DOUBTS = {'zero_covariance': 'have a covariance of zeros, which is taken as unknown'}
+DOUBTS = {'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
+          'no_frame': 'have no frame_id'}
 
 
 class Heard(NamedTuple):
@@ -49,14 +50,18 @@ def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None
 
 
 def measurements_of(bag: BagReader, system: str, topics: Mapping[str, str] | None = None, *,
-                    world_frame: str = 'enu', order: str = 'recorded') -> Iterator[Heard]:
+                    world_frame: str = 'enu', order: str = 'recorded',
+                    settings: Mapping[str, Any] | None = None) -> Iterator[Heard]:
     """Yield what the tracker `system` hears in an open recording, in replay order.
 
     `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
-    recording uses, `order` is as in `BagReader.messages`. Messages that deserve a warning are
+    recording uses, `order` is as in `BagReader.messages`, `settings` holds the parameters of the
+    tracker by name, of which readers take what concerns them. Messages that deserve a warning are
     counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
     """
     chosen = fitting_topics(bag, system, topics)
+    readers = {(name, type_name): entry.reader(type_name, world_frame, settings or {})
+               for name, entry in chosen.items() for type_name in entry.readers}
     doubts: Counter[tuple[str, str]] = Counter()
     for item in bag.messages(list(chosen), order=order):
         entry = chosen[item.topic]
@@ -65,7 +70,7 @@ def measurements_of(bag: BagReader, system: str, topics: Mapping[str, str] | Non
             yield Heard(item.topic, Rejection('bad_type', sentence), item.log_ns)
             continue
         try:
-            measurement = entry.readers[item.type_name](item.message, world_frame=world_frame)
+            measurement = readers[item.topic, item.type_name](item.message)
             if (code := entry.doubt(item.message)) is not None:
                 doubts[item.topic, code] += 1
         except Rejection as rejection:

@@ -10,11 +10,24 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from msg_adapters.arrivals import write_arrivals
+from msg_adapters.detections import write_detections
 from msg_adapters.estimates import write_true_profile
 from msg_adapters.fixes import write_fix
+from msg_adapters.navigation import write_navigation, write_range
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Arrivals, Fix, Snapshot
+from msg_adapters.table import encode_table
+from sonar_imm.measurements import (
+    Altitude,
+    Arrivals,
+    Detections,
+    Fix,
+    Navigation,
+    Snapshot,
+)
+from sonar_imm.simulation.obstacle import TrueObstacle
 from sonar_imm.simulation.scene import Scene, TrueProfile, TrueTrack
 
 from .conversion import ConversionReport, Record
@@ -54,16 +67,34 @@ def _namespaced(namespace: str, topic: str) -> str:
     return f'/{namespace}{topic}' if namespace else topic
 
 
+def true_obstacle_records(true: TrueObstacle, frame_id: str) -> list[Record]:
+    """One truth message a ping: where the obstacle is on the map and seen from the sonar."""
+    place = {name: np.array([value], np.float32) for name, value in zip('xyz', true.position)}
+    records: list[Record] = []
+    for k, stamp in enumerate(true.stamp_ns):
+        columns = {**place, 'range': true.range[k:k + 1], 'bearing': true.bearing[k:k + 1],
+                   'vertical_offset': true.vertical_offset[k:k + 1],
+                   'in_beam': true.in_beam[k:k + 1],
+                   'track_id': np.array([true.track_id], np.uint32)}
+        records.append((int(stamp), TRUTH_TOPIC, encode_table(
+            columns, stamp_ns=int(stamp), frame_id=frame_id, make=ros_message)))
+    return records
+
+
 MEASUREMENTS: dict[type, tuple[str, Callable[..., Any]]] = {
     Fix: ('/fix', write_fix),
     Arrivals: ('/arrivals', write_arrivals),
     Snapshot: ('/snapshot', write_snapshot),
+    Detections: ('/detections', write_detections),
+    Navigation: ('/nav', write_navigation),
+    Altitude: ('/altitude', write_range),
 }
 """Topic and writer ``(measurement, make) -> message`` by class of measurement."""
 
 TRUTHS: dict[type, Callable[[Any, str], Iterable[Record]]] = {
     TrueTrack: true_track_records,
     TrueProfile: lambda profile, frame_id: [profile_record(profile)],
+    TrueObstacle: true_obstacle_records,
 }
 """Writer ``(truth, frame_id) -> records`` by class of truth."""
 

@@ -99,4 +99,12 @@ SYSTEMS = {
         'divers from multistatic fixes or raw arrival times, 16-direction IMM',
         smoother='sonar_imm.trackers.diver_smoothing.SmoothingDiverTracker',
     ),
+    'obstacle': System(
+        'obstacle',
+        'sonar_imm.trackers.obstacle',
+        'ObstacleConfig',
+        'ObstacleTracker',
+        'obstacles ahead of a vehicle with their height, from a forward-looking sonar and '
+        'navigation, Gaussian sum over depth',
+    ),
 }

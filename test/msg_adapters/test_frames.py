@@ -3,7 +3,7 @@
 import pytest
 
 from msg_adapters.frames import FrameGuard
-from sonar_imm.measurements import Fix, Rejection
+from sonar_imm.measurements import Altitude, Detections, Fix, Navigation, Rejection
 
 
 def fix(frame_id):
@@ -41,3 +41,20 @@ def test_a_told_frame_holds_from_the_start_and_survives_reset():
     guard.reset()
     refused(guard, '')
     guard.check(fix('harbour'))
+
+
+def test_what_sensors_on_board_say_is_in_frames_of_their_own():
+    guard = FrameGuard('odom')
+    echo = Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar')
+    height = Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter')
+    place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
+    for measurement in (echo, height, place, echo, height, place):
+        guard.check(measurement)
+    for other in (Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
+                  Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1],
+                             frame_id='map')):
+        with pytest.raises(Rejection) as caught:
+            guard.check(other)
+        assert caught.value.reason == 'frame'
+    guard.reset()
+    guard.check(Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'))

@@ -15,10 +15,12 @@ def test_every_tracker_has_inputs_whose_readers_say_no_politely():
         for topic in topics:
             assert topic.description and not topic.name.startswith('/')
             for name, read in topic.readers.items():
+                if name.startswith('marine_acoustic_msgs/'):  # see test_detections.py
+                    continue
                 assert name in typestore().types
                 with pytest.raises(Rejection):  # an empty message has no stamp
                     read(ros_message(name))
-                assert topic.doubt(ros_message(name)) in (None, 'zero_covariance')
+                assert topic.doubt(ros_message(name)) in (None, 'zero_covariance', 'no_frame')
 
 
 def test_the_adapters_load_neither_rclpy_nor_rosbags():

@@ -30,6 +30,16 @@ def test_live_lockstep_equals_offline(bag, tmp_path, capsys):
     assert (offline / 'estimate.csv').stat().st_size > 10_000
 
 
+def test_inputs_that_interleave_and_come_late_give_equal_bytes_too(tmp_path, capsys):
+    bag = tmp_path / 'approach'
+    assert main(['simulate', 'obstacle', str(bag), '--scenario', 'late', '--set',
+                 'sonar_lever=0,0,0', '--set', 'last_range=45', '--set', 'clutter=2']) == 0
+    assert main(['check', 'obstacle', '--bag', str(bag), '--limit', '8', '--out', str(tmp_path),
+                 '--json']) == 0
+    outcome, = json.loads(capsys.readouterr().out.partition('\n')[2])
+    assert outcome['good'] and len(outcome['checks']) == 4
+
+
 def test_a_limit_that_is_not_reached_exits_with_1(bag, capsys):
     assert main(['check', 'diver', '--bag', str(bag), '--limit', '0.01']) == 1
     printed = capsys.readouterr().out

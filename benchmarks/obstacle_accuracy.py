@@ -1,0 +1,234 @@
+"""Accuracy of the obstacle tracker on simulated approaches, beside the methods of the paper.
+
+    python -m benchmarks.obstacle_accuracy --runs 300 --out docs/results/obstacle_accuracy.json
+
+Each run is the whole tracker: gating, confirmation, track logic. The error of the vertical offset
+is taken from the confirmed track when the range first falls to 50, 30 and 20 m, also where the
+obstacle has left the beam by then. `deferred` is the paper's RMSD over all echoes so far, for
+offsets from 0 to 12 m below as in the paper; `refit` the same with first echo and navigation scale
+freed, 12 m to both sides. All methods see the same measurements, the others than `gaussian_sum` a
+third of the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.consistency import gospa
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.simulation.obstacle import ObstacleScenario, scenario, simulate, TrueObstacle
+from sonar_imm.simulation.scene import Scene
+from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+from sonar_imm.trackers.obstacle_deferred import deferred, sonar_poses
+
+RANGES = (50.0, 30.0, 20.0)
+CASES = {
+    'approach': ('gaussian_sum', 'landmark', 'seafloor', 'deferred', 'refit'),
+    'nearly_level': ('gaussian_sum', 'deferred', 'refit'),
+    'above': ('gaussian_sum',),
+    'rolling': ('gaussian_sum',),
+    'calm': ('gaussian_sum',),
+    'stress': ('gaussian_sum',),
+    'rough_seabed': ('gaussian_sum', 'seafloor'),
+    'diving': ('gaussian_sum',),
+}
+GOSPA_CUTOFF = 5.0
+OFFSETS = {False: np.arange(0.0, 12.1, 0.5), True: np.arange(-12.0, 12.1, 0.5)}
+"""Offsets tried by `deferred` and, refitting, by `refit`."""
+NEAR = 5.0
+"""Metres in range and bearing within which a track follows the obstacle."""
+
+
+def config_of(scene: ObstacleScenario, **values: object) -> ObstacleConfig:
+    """The tracker told what the scene's vehicle and sonar are."""
+    names = ('sonar_lever', 'sonar_mount_rpy_deg', 'azimuth_model', 'ping_timing')
+    return ObstacleConfig(**{**{name: getattr(scene, name) for name in names}, **values})
+
+
+def track(scene: Scene, config: ObstacleConfig) -> dict[int, Estimate]:
+    """The last word on every ping, by stamp."""
+    tracker, final = ObstacleTracker(config), {}
+    for one in scene.measurements:
+        final.update((each.stamp_ns, each) for each in tracker.process(one.measurement))
+    return final
+
+
+def level(estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """Where the tracks (n, 2) lie seen from the sonar, bearings laid flat, and which are
+    confirmed."""
+    r, b = estimate.state[:, 0], estimate.state[:, 1]
+    points = np.column_stack([r * np.cos(b), r * np.sin(b)])
+    return points, estimate.extras['track_state'] > 0
+
+
+def true_level(truth: TrueObstacle, ping: int) -> np.ndarray:
+    r, b = truth.range[ping], truth.bearing[ping]
+    return np.array([r * np.cos(b), r * np.sin(b)])
+
+
+def offset_at(truth: TrueObstacle, final: dict[int, Estimate], at: float) -> list[float] | None:
+    """Error, NEES and band coverage when the range falls to `at`; None when not followed."""
+    for ping in np.flatnonzero(truth.range <= at)[:6]:
+        estimate = final.get(int(truth.stamp_ns[ping]))
+        if estimate is None:  # a ping lost
+            continue
+        points, confirmed = level(estimate)
+        distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
+        distance[~confirmed] = np.inf
+        if not len(distance) or distance.min() > NEAR:
+            return None
+        row = int(np.argmin(distance))
+        true = truth.vertical_offset[ping]
+        error = estimate.state[row, 2] - true
+        low, high = (estimate.extras[f'vertical_offset_{end}'][row] for end in ('lo', 'hi'))
+        return [error, error**2 / estimate.covariance[row, 2, 2], float(low <= true <= high)]
+    return None
+
+
+def deferred_at(
+    scene: Scene, config: ObstacleConfig, at: float, refit: bool
+) -> list[float] | None:
+    """The same of the deferred estimate from the echoes so far, known for certain to be its."""
+    truth = scene.truth[0]
+    navigation = [
+        one.measurement for one in scene.measurements if isinstance(one.measurement, Navigation)
+    ]
+    last = np.flatnonzero(truth.range <= at)[0]
+    number = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}
+    pings = [
+        one.measurement
+        for one in scene.measurements
+        if isinstance(one.measurement, Detections)
+        and len(one.measurement)
+        and number[one.measurement.stamp_ns] <= last
+    ]
+    stamps = np.array([ping.stamp_ns for ping in pings] + [int(truth.stamp_ns[last])])
+    poses, _ = sonar_poses(navigation, stamps, config)
+    echoes = np.array([[ping.range[0], -ping.bearing[0]] for ping in pings])
+    seen = type(poses)(poses.position[:-1], poses.R[:-1])
+    best = deferred(echoes, seen, config, offsets=OFFSETS[refit], refit=refit).best
+    now = best + poses.position[0, 2] - poses.position[-1, 2]
+    return [now - truth.vertical_offset[last], np.nan, np.nan]
+
+
+def case(name: str, runs: int) -> dict[str, dict[str, float]]:
+    """Every method of a case: RMSE, bias, NEES, coverage of the 90 % band at each range."""
+    results: dict[str, list[list[list[float] | None]]] = {method: [] for method in CASES[name]}
+    for seed in range(runs):
+        setting = scenario(name)
+        scene = simulate(setting, seed)
+        for method, rows in results.items():
+            if method != 'gaussian_sum' and seed >= runs // 3:
+                continue
+            if method in ('deferred', 'refit'):
+                config = config_of(setting)
+                rows.append([deferred_at(scene, config, at, method == 'refit') for at in RANGES])
+            else:
+                final = track(scene, config_of(setting, method=method))
+                rows.append([offset_at(scene.truth[0], final, at) for at in RANGES])
+    return {f'{name}, {method}': summary(rows) for method, rows in results.items()}
+
+
+def summary(rows: list[list[list[float] | None]]) -> dict[str, float]:
+    table: dict[str, float] = {}
+    for column, at in enumerate(RANGES):
+        found = np.array([row[column] for row in rows if row[column] is not None])
+        error, squared, inside = found.T
+        table |= {
+            f'RMSE {at:.0f} m': float(np.sqrt(np.mean(error**2))),
+            f'bias {at:.0f} m': float(np.mean(error)),
+            f'NEES {at:.0f} m': float(np.mean(squared)),
+            f'cover {at:.0f} m': float(np.mean(inside)),
+            f'lost {at:.0f} m': float(1.0 - len(found) / len(rows)),
+        }
+    return table
+
+
+def several(runs: int) -> dict[str, dict[str, float]]:
+    """Mean GOSPA of six obstacles in clutter, as is and when a track ends with the beam."""
+    table = {}
+    for label, values in {'six': {}, 'six, ended with the beam': {'max_coast': 3.0}}.items():
+        parts = []
+        for seed in range(runs):
+            setting = scenario('six')
+            scene = simulate(setting, seed)
+            final = track(scene, config_of(setting, **values))
+            parts += [score(scene, ping, final) for ping in range(len(scene.truth[0].stamp_ns))]
+        mean = np.nanmean([part for part in parts if part is not None], axis=0)
+        names = ('GOSPA', 'localisation', 'missed', 'false', 'NEES', 'cover')
+        table[label] = dict(zip(names, map(float, mean)))
+    return table
+
+
+def score(scene: Scene, ping: int, final: dict[int, Estimate]) -> tuple[float, ...] | None:
+    """GOSPA of one ping and its parts, NEES and coverage of the matched. An obstacle is there from
+    when the beam has held it for six pings until it has been passed."""
+    stamp = int(scene.truth[0].stamp_ns[ping])
+    if stamp not in final:
+        return None
+    there = [
+        truth
+        for truth in scene.truth
+        if truth.in_beam[: ping + 1].sum() >= 6 and ahead(truth, ping)
+    ]
+    points, confirmed = level(final[stamp])
+    true = np.reshape([true_level(truth, ping) for truth in there], (-1, 2))
+    rows = np.flatnonzero(confirmed)
+    found = gospa(true, points[rows], GOSPA_CUTOFF)
+    squared, inside = [], []
+    for truth, match in zip(there, found.estimate_of):
+        if match >= 0:
+            row, true_offset = rows[match], truth.vertical_offset[ping]
+            error = final[stamp].state[row, 2] - true_offset
+            squared.append(error**2 / final[stamp].covariance[row, 2, 2])
+            low, high = (final[stamp].extras[f'vertical_offset_{e}'][row] for e in ('lo', 'hi'))
+            inside.append(low <= true_offset <= high)
+    return (
+        found.distance,
+        found.localisation,
+        found.missed,
+        found.false,
+        float(np.mean(squared)) if squared else np.nan,
+        float(np.mean(inside)) if inside else np.nan,
+    )
+
+
+def ahead(truth: TrueObstacle, ping: int) -> bool:
+    r, offset = truth.range[ping], truth.vertical_offset[ping]
+    return bool(np.sqrt(max(r**2 - offset**2, 0.0)) * np.cos(truth.bearing[ping]) > 0.2 * r)
+
+
+def markdown(table: dict[str, dict[str, float]]) -> str:
+    columns = list(next(iter(table.values())))
+    lines = ['| | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 1) + '|']
+    lines += [
+        f'| {row} | ' + ' | '.join(f'{values[column]:.2f}' for column in columns) + ' |'
+        for row, values in table.items()
+    ]
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--runs', type=int, default=300)
+    parser.add_argument('--cases', nargs='*', choices=[*CASES, 'six'], default=[*CASES, 'six'])
+    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
+    options = parser.parse_args()
+    tables: dict[str, dict[str, dict[str, float]]] = {}
+    for name in options.cases:
+        tables[name] = several(options.runs // 3) if name == 'six' else case(name, options.runs)
+        print(f'\n{markdown(tables[name])}', flush=True)
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps({'runs': options.runs, **tables}, indent=1) + '\n')
+
+
+if __name__ == '__main__':
+    main()

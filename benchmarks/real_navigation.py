@@ -1,0 +1,146 @@
+"""The obstacle tracker on the real motion of a vehicle, with simulated detections: semi-synthetic.
+
+    python -m benchmarks.real_navigation
+
+There is no public recording of forward-looking sonar detections with navigation. This takes 20
+minutes of an AUV's attitude (10 Hz) and Doppler log (1.5 Hz) in a marina, dead-reckons the path,
+takes that path as the truth, and lets a simulated sonar look at simulated obstacles from it. So
+the motion, its roll, its irregular times and its slowness are real; echoes and their noise are
+not, and navigation errors other than noise are absent. The vehicle kept its depth, which was not
+recorded.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from attrs import frozen
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+
+SECOND = 10**9
+DEPTH = 2.0
+WINDOW = 80.0
+"""Seconds of one encounter."""
+PING_STEP = 0.5
+STD = (0.15, np.radians(0.25))
+
+
+def data_folder() -> Path:
+    """Where the recording lies: below SONAR_IMM_DATA, by default ../shared/data."""
+    root = Path(__file__).resolve().parents[1]
+    return Path(os.environ.get('SONAR_IMM_DATA', root / '../shared/data')) / 'stpere_nav'
+
+
+@frozen(eq=False)
+class Path3D:
+    """The vehicle at any time: t (n,) s, position (n, 3) NED, rotations NED from FRD."""
+
+    t: np.ndarray
+    position: np.ndarray
+    attitude: Rotation
+
+    def at(self, t: np.ndarray) -> Pose:
+        place = np.column_stack([np.interp(t, self.t, axis) for axis in self.position.T])
+        return Pose(place, Slerp(self.t, self.attitude)(t).as_matrix())
+
+
+def dead_reckoned(folder: Path) -> Path3D:
+    """The path from attitude and bottom velocity (smoothed over 6 s)."""
+    attitude = np.genfromtxt(folder / 'attitude.csv', delimiter=',', names=True)
+    log = np.genfromtxt(folder / 'dvl.csv', delimiter=',', names=True)
+    log = log[log['bottom_velocity_valid'] == 1]
+    t = attitude['stamp_s']
+    keep = np.append(True, np.diff(t) > 0.0) & (t >= log['stamp_s'][0]) & (t <= log['stamp_s'][-1])
+    t = t[keep]
+    turns = Rotation.from_euler('ZYX', np.column_stack(
+        [attitude[f'{name}_deg'][keep] for name in ('yaw', 'pitch', 'roll')]), degrees=True)
+    speed = [uniform_filter1d(log[f'bottom_velocity_{axis}_cm_s'] / 100.0, 9) for axis in 'xy']
+    body = np.column_stack([*(np.interp(t, log['stamp_s'], one) for one in speed),
+                            np.zeros(len(t))])
+    over_ground = turns.apply(body)
+    over_ground[:, 2] = 0.0
+    steps = 0.5 * (over_ground[1:] + over_ground[:-1]) * np.diff(t)[:, None]
+    place = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)]) + [0.0, 0.0, DEPTH]
+    return Path3D(t - t[0] + 1.0, place, turns)
+
+
+def encounter(path: Path3D, start: float, offset: float, seed: int
+              ) -> tuple[list[Navigation | Detections], np.ndarray]:
+    """Measurements of one obstacle `offset` m below the sonar, and its true place, NED."""
+    rng = np.random.default_rng(seed)
+    here = path.at(np.array([start]))
+    first = Pose(here.position[0], here.R[0])
+    distance, azimuth = rng.uniform(15.0, 30.0), np.radians(rng.uniform(-8.0, 8.0))
+    place = geometry.to_world(first, geometry.reconstruct(distance, azimuth, offset, first.R))
+    received: list[tuple[float, Navigation | Detections]] = []
+    times = path.t[(path.t >= start - 0.5) & (path.t <= start + WINDOW + 0.5)]
+    poses = path.at(times)
+    turns = Rotation.from_matrix(geometry.flip_rotation(poses.R)).as_quat()
+    for t, position, q in zip(times, geometry.flip_world(poses.position), turns):
+        received.append((t, Navigation(stamp_ns=round(t * SECOND), position=position,
+                                       orientation=q, frame_id='odom')))
+    pings = np.arange(start, start + WINDOW, PING_STEP)
+    m = geometry.to_body(path.at(pings), place)
+    d, delta = geometry.project(m)
+    seen = (np.abs(m[:, 2]) <= d * np.sin(np.radians(7.5))) & (np.abs(delta) < np.radians(22.5))
+    seen &= rng.uniform(size=len(pings)) < 0.9
+    noise = rng.normal(size=(len(pings), 2)) * STD
+    for k, t in enumerate(pings):
+        rows = [k] if seen[k] else []
+        received.append((t, Detections(
+            stamp_ns=round(t * SECOND), range=(d + noise[:, 0])[rows],
+            bearing=-(delta + noise[:, 1])[rows], frame_id='sonar')))
+    received.sort(key=lambda one: one[0])
+    return [measurement for _, measurement in received], place
+
+
+def judged(path: Path3D, start: float, seed: int) -> tuple[float, float, bool, float] | None:
+    """Error of the offset at the last ping, its NEES, whether the band holds the truth, and the
+    width of the band in m; None when the track was lost."""
+    offset = float(np.random.default_rng(seed + 1000).uniform(-1.2, 1.2))
+    measurements, place = encounter(path, start, offset, seed)
+    tracker, last = ObstacleTracker(ObstacleConfig(range_step=0.0, bearing_step_deg=0.0)), None
+    for one in measurements:
+        for estimate in tracker.process(one):
+            if (estimate.extras['track_state'] > 0).any():
+                last = estimate
+    if last is None:
+        return None
+    row = int(np.argmax(last.extras['track_state'] > 0))
+    true = place[2] - path.at(np.array([last.stamp_ns / SECOND])).position[0, 2]
+    error = float(last.state[row, 2] - true)
+    low, high = (float(last.extras[f'vertical_offset_{end}'][row]) for end in ('lo', 'hi'))
+    return error, error**2 / float(last.covariance[row, 2, 2]), low <= true <= high, high - low
+
+
+def summary(path: Path3D, runs: int = 40) -> dict[str, float]:
+    """RMSE, NEES, coverage and mean band width over encounters all along the recording."""
+    starts = np.linspace(path.t[0] + 1.0, path.t[-1] - WINDOW - 2.0, runs)
+    found = [one for seed, start in enumerate(starts)
+             if (one := judged(path, float(start), seed)) is not None]
+    error, squared, inside, width = np.array(found, float).T
+    return {'encounters': runs, 'tracked': len(found), 'rmse_m': float(np.sqrt(np.mean(error**2))),
+            'nees': float(np.mean(squared)), 'band_coverage': float(np.mean(inside)),
+            'band_width_m': float(np.mean(width)),
+            'spread_of_truth_m': 1.2 / np.sqrt(3.0)}
+
+
+def main() -> None:
+    path = dead_reckoned(data_folder())
+    roll = np.degrees(path.attitude.as_euler('ZYX')[:, 2])
+    print(f'{path.t[-1] - path.t[0]:.0f} s, roll {roll.std():.2f} deg rms, travelled '
+          f'{np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum():.0f} m')
+    for name, value in summary(path).items():
+        print(f'{name}: {value:.2f}')
+
+
+if __name__ == '__main__':
+    main()

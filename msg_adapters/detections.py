@@ -1,0 +1,179 @@
+"""What a forward-looking sonar detected in one ping, from every message that says so.
+
+Our own is a table with one row an echo, sent once a ping, also without a row: that nothing was
+seen is evidence too. Columns: ``x y z`` f4 [m, for display]; ``range`` [m], ``bearing`` [rad,
+REP-103: positive to port]; optional ``var_range``, ``var_bearing``, ``intensity``. A table
+without range and bearing is read from x, y, z.
+
+The other messages disagree about axes, so each rule is written down here. In the messages of
+marine_acoustic_msgs receive angles count to starboard, and beams point along z with x up and y to
+starboard; some drivers and simulators publish beams with x forward and y to port all the same
+(`beam_axes`).
+
+Ranges and bearings that are not finite (REP-117: too near, nothing there, error) are dropped, so
+that the length of the result may be smaller than that of the message.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sonar_imm.measurements import Detections, FloatArray, Rejection
+
+from .headers import Make, stamp_ns
+from .table import decode_table, encode_table, require_columns, scalar_column
+
+MAX_DETECTIONS = 10_000
+SOUND_SPEEDS = (1300.0, 1700.0)
+"""m/s; outside, the field was not filled in or is something else."""
+NEAREST, FARTHEST = 0.01, 1e5
+"""Metres: no echo comes from nearer or farther."""
+LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
+"""A stated variance outside is a field that was not filled in."""
+BEAM_AXES = ('marine', 'rep103', 'auto')
+
+
+def read_detections(message: Any, **_: Any) -> Detections:
+    """Read a table of detections; with no row it is a ping in which nothing was seen.
+
+    Raises `Rejection`.
+    """
+    columns = decode_table(message)
+    if 'range' in columns or 'bearing' in columns:
+        require_columns(columns, ('range', 'bearing'), 'detections')
+        distance, bearing = scalar_column(columns, 'range'), scalar_column(columns, 'bearing')
+    elif columns or message.height * message.width:
+        require_columns(columns, ('x', 'y', 'z'), 'detections')
+        distance, bearing = _polar(*(scalar_column(columns, name) for name in 'xyz'))
+    else:
+        distance = bearing = np.empty(0)
+    optional = {name: scalar_column(columns, name)
+                for name in ('var_range', 'var_bearing', 'intensity') if name in columns}
+    for name in ('var_range', 'var_bearing'):
+        if name in optional:
+            optional[name] = _variances(optional[name])
+    return _detections(message, distance, bearing, **optional)
+
+
+def read_pose_array(message: Any, **_: Any) -> Detections:
+    """Read a PoseArray: positions in the sonar's frame, x forward, y to port, z up."""
+    places = np.array([[pose.position.x, pose.position.y, pose.position.z]
+                       for pose in message.poses], np.float64).reshape(-1, 3)
+    return _detections(message, *_polar(*places.T))
+
+
+def read_laser_scan(message: Any, **_: Any) -> Detections:
+    """Read a LaserScan: an echo for each range inside its limits; angles count to port."""
+    distance = np.array(message.ranges, np.float64)
+    bearing = float(message.angle_min) + float(message.angle_increment) * np.arange(len(distance))
+    inside = (distance >= message.range_min) & (distance <= message.range_max)
+    intensity = np.array(message.intensities, np.float64)
+    if len(intensity) != len(distance):
+        intensity = np.full(len(distance), np.nan)
+    return _detections(message, np.where(inside, distance, np.nan), bearing, intensity=intensity)
+
+
+def read_sonar_ranges(message: Any, *, beam_axes: str = 'auto', **_: Any) -> Detections:
+    """Read a SonarRanges: ranges along unit vectors whose axes are `beam_axes`.
+
+    ``'marine'``: z forward, x up, y to starboard, as the message defines; ``'rep103'``: x forward,
+    y to port; ``'auto'``: forward is the one of x and z along which the beams point more.
+    """
+    distance = np.array(message.ranges, np.float64)
+    beams = np.array([[beam.x, beam.y, beam.z] for beam in message.beam_unit_vec],
+                     np.float64).reshape(-1, 3)
+    if len(beams) != len(distance):
+        raise Rejection('bad_shape', f'SonarRanges has {len(distance)} ranges and {len(beams)} '
+                                     'beams')
+    return _detections(message, _good(distance, message.flags), beam_bearings(beams, beam_axes),
+                       intensity=_one_each(message.intensities, len(distance), 'intensities'))
+
+
+def read_sonar_detections(message: Any, *, sound_speed: float = 1500.0, **_: Any) -> Detections:
+    """Read a SonarDetections: two-way travel times and receive angles, starboard positive.
+
+    The speed of sound is that of the message, `sound_speed` [m/s] where it states none. The stamp
+    is that of the transmission, so a beam's transmit delay changes nothing of its range.
+    """
+    times = np.array(message.two_way_travel_times, np.float64)
+    angles = _one_each(message.rx_angles, len(times), 'rx_angles')
+    stated = float(message.ping_info.sound_speed)
+    speed = stated if SOUND_SPEEDS[0] <= stated <= SOUND_SPEEDS[1] else sound_speed
+    return _detections(message, _good(0.5 * speed * times, message.flags), -angles,
+                       intensity=_one_each(message.intensities, len(times), 'intensities'))
+
+
+def write_detections(detections: Detections, make: Make) -> Any:
+    """Write our table, with z = 0 for display; the optional columns only when something is known.
+    """
+    distance, bearing = detections.range, detections.bearing
+    columns: dict[str, NDArray] = {
+        'x': (distance * np.cos(bearing)).astype(np.float32),
+        'y': (distance * np.sin(bearing)).astype(np.float32),
+        'z': np.zeros(len(distance), np.float32), 'range': distance, 'bearing': bearing}
+    for name in ('var_range', 'var_bearing', 'intensity'):
+        values = getattr(detections, name)
+        if np.isfinite(values).any():
+            columns[name] = values.astype(np.float32)
+    return encode_table(columns, stamp_ns=detections.stamp_ns, frame_id=detections.frame_id,
+                        make=make)
+
+
+def beam_bearings(beams: FloatArray, beam_axes: str) -> FloatArray:
+    """Bearings (n,), positive to port, of unit vectors (n, 3); see `read_sonar_ranges`."""
+    if beam_axes not in BEAM_AXES:
+        raise ValueError(f"beam_axes must be one of {', '.join(BEAM_AXES)}, got '{beam_axes}'")
+    x, y, z = beams.T
+    if beam_axes == 'auto':
+        finite = np.isfinite(beams).all(axis=1)
+        beam_axes = 'marine' if z[finite].sum() >= x[finite].sum() else 'rep103'
+    return np.arctan2(-y, z) if beam_axes == 'marine' else np.arctan2(y, x)
+
+
+def _detections(message: Any, distance: FloatArray, bearing: FloatArray, **optional: FloatArray
+                ) -> Detections:
+    """Put columns (n,) together without the rows that are no echo."""
+    if len(distance) > MAX_DETECTIONS:
+        raise Rejection('too_large', f'a ping of {len(distance)} detections; at most '
+                                     f'{MAX_DETECTIONS} are read')
+    seen = np.abs(bearing[np.isfinite(bearing)])
+    if len(seen) and seen.max() > 2.0 * np.pi:
+        raise Rejection('out_of_range', f'detections: a bearing of {seen.max():g} is beyond 2 pi; '
+                                        'bearings are in radians')
+    keep = np.isfinite(distance) & np.isfinite(bearing) & (distance >= NEAREST)
+    keep &= distance <= FARTHEST
+    return Detections(
+        stamp_ns=stamp_ns(message), frame_id=str(message.header.frame_id), range=distance[keep],
+        bearing=bearing[keep], **{name: column[keep] for name, column in optional.items()})
+
+
+def _polar(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    with np.errstate(over='ignore', invalid='ignore'):
+        return np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x)
+
+
+def _variances(values: FloatArray) -> FloatArray:
+    return np.where((values >= LEAST_VARIANCE) & (values <= MOST_VARIANCE), values, np.nan)
+
+
+def _good(distance: FloatArray, flags: Any) -> FloatArray:
+    """NaN for detections whose flag is not OK; without flags all are good."""
+    marks = [int(flag.flag) for flag in flags]
+    if not marks:
+        return distance
+    marks = _one_each(marks, len(distance), 'flags')
+    return np.where(marks == 0, distance, np.nan)
+
+
+def _one_each(values: ArrayLike, count: int, name: str) -> FloatArray:
+    """(count,) of an array that may be empty (unknown), of length one (the same for all) or full.
+    """
+    array = np.array(values, np.float64).ravel()
+    if len(array) == count:
+        return array
+    if len(array) > 1:
+        raise Rejection('bad_shape', f'{name} has {len(array)} values for {count} detections')
+    return np.full(count, array[0] if len(array) else np.nan)

@@ -1,0 +1,92 @@
+"""Displays of obstacles: a PoseArray, and markers that show what the vertical band is.
+
+A point in a display claims to know the height. So each obstacle is drawn as a bar that reaches as
+far up and down as the 90 % band of its vertical offset, with a ball at the mean and a label.
+Markers have the track's number as their id and a lifetime: they follow the obstacle, and vanish
+when nothing is heard of it any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+
+from .headers import Make, make_header
+
+_ADD, _DELETE_ALL = 0, 3
+_CUBE, _SPHERE, _TEXT = 1, 2, 9
+LIFETIME = 5
+"""Seconds."""
+_ABOVE, _BELOW, _UNKNOWN = (0.84, 0.37, 0.0), (0.0, 0.45, 0.7), (0.6, 0.6, 0.6)
+SURE = 0.9
+"""Probability of above or below from which an obstacle has its colour."""
+
+
+def write_poses(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
+    """Write a PoseArray of the obstacles in `rows`, without orientation."""
+    poses = [_pose(make, *(float(value) for value in estimate.xyz[row])) for row in rows]
+    return make('geometry_msgs/msg/PoseArray',
+                header=make_header(estimate.stamp_ns, estimate.frame_id, make), poses=poses)
+
+
+def write_markers(estimate: Estimate, rows: Iterable[int], make: Make, *, down: bool = False
+                  ) -> Any:
+    """Write a MarkerArray of bars, balls and labels; `down`: z of the frame points down."""
+    markers = [marker for row in rows for marker in _obstacle(estimate, row, make, down)]
+    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def write_no_markers(frame_id: str, make: Make) -> Any:
+    """Write what removes every marker that was drawn before."""
+    return make('visualization_msgs/msg/MarkerArray', markers=[
+        make('visualization_msgs/msg/Marker', header=make_header(0, frame_id, make),
+             action=_DELETE_ALL)])
+
+
+def band(estimate: Estimate, row: int, *, down: bool = False) -> tuple[float, float]:
+    """Smallest and largest z of the 90 % band of one obstacle, metres in the frame."""
+    z, offset = float(estimate.xyz[row, 2]), float(estimate.state[row, 2])
+    low, high = (float(estimate.extras[f'vertical_offset_{end}'][row]) for end in ('lo', 'hi'))
+    # The offset counts down from the sonar: its largest value is the deepest.
+    return (z + low - offset, z + high - offset) if down else (z + offset - high, z + offset - low)
+
+
+def _obstacle(estimate: Estimate, row: int, make: Make, down: bool) -> list[Any]:
+    x, y, z = (float(value) for value in estimate.xyz[row])
+    bottom, top = band(estimate, row, down=down)
+    track_id = int(estimate.extras['track_id'][row])
+    colour = _colour(float(estimate.probabilities[row, estimate.model_names.index('above')]))
+    label = (f'{track_id}: {estimate.state[row, 0]:.0f} m ahead, '
+             f'{estimate.state[row, 2]:+.1f} m down')
+
+    def marker(name: str, kind: int, height: float, size: tuple[float, float, float],
+               alpha: float, **more: Any) -> Any:
+        return make('visualization_msgs/msg/Marker',
+                    header=make_header(estimate.stamp_ns, estimate.frame_id, make), ns=name,
+                    id=track_id, type=kind, action=_ADD, pose=_pose(make, x, y, height),
+                    scale=make('geometry_msgs/msg/Vector3', x=size[0], y=size[1], z=size[2]),
+                    color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgb', colour)), a=alpha),
+                    lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
+                    **more)
+
+    return [marker('band', _CUBE, 0.5 * (bottom + top), (0.4, 0.4, max(top - bottom, 0.05)), 0.5),
+            marker('obstacle', _SPHERE, z, (0.8, 0.8, 0.8), 1.0),
+            marker('label', _TEXT, (bottom - 1.0) if down else (top + 1.0), (0.0, 0.0, 1.0), 1.0,
+                   text=label)]
+
+
+def _colour(above: float) -> tuple[float, float, float]:
+    if max(above, 1.0 - above) < SURE:
+        return _UNKNOWN
+    return _ABOVE if above > 0.5 else _BELOW
+
+
+def _pose(make: Make, x: float, y: float, z: float) -> Any:
+    finite = [value if np.isfinite(value) else 0.0 for value in (x, y, z)]
+    return make('geometry_msgs/msg/Pose',
+                position=make('geometry_msgs/msg/Point', **dict(zip('xyz', finite))),
+                orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0))

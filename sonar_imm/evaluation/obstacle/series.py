@@ -1,0 +1,186 @@
+"""Obstacle estimates and truth as flat arrays, and which track is which obstacle.
+
+Tracks and obstacles are matched ping by ping where they lie in the image of the sonar, by range
+and bearing laid flat, because that is what the sonar sees; the height is what is to be judged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from ...estimates import Estimate
+from ...estimation.consistency import gospa
+from ...measurements import FloatArray
+from .. import SECOND
+
+IntArray = NDArray[np.int64]
+STATES = ('range', 'bearing', 'vertical_offset')
+PINGS_TO_SEE = 6
+"""Pings in the beam after which an obstacle ought to be known."""
+PASSED = 0.2
+"""Cosine to the axis below which range and azimuth fix nothing."""
+
+
+@frozen(eq=False, kw_only=True)
+class Series:
+    """Rows of confirmed tracks, sorted by stamp: stamp_ns, track_id (n,); state (n, 3) in the
+    order of `STATES`; covariance (n, 3, 3); low, high: the 90 % band of the offset (n,); above:
+    its probability (n,); nis (n,), NaN without a hit. ping_ns: all pings."""
+
+    ping_ns: IntArray
+    stamp_ns: IntArray
+    track_id: IntArray
+    state: FloatArray
+    covariance: FloatArray
+    low: FloatArray
+    high: FloatArray
+    above: FloatArray
+    nis: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def pick(self, rows: NDArray) -> Series:
+        """Some of the rows; `ping_ns` is kept."""
+        return Series(ping_ns=self.ping_ns, **{name: getattr(self, name)[rows] for name in _ROWS})
+
+    def longest_track(self) -> int | None:
+        """Id of the track with most hits, None without rows."""
+        ids, counts = np.unique(self.track_id[np.isfinite(self.nis)], return_counts=True)
+        return int(ids[np.argmax(counts)]) if len(ids) else None
+
+
+_ROWS = ('stamp_ns', 'track_id', 'state', 'covariance', 'low', 'high', 'above', 'nis')
+
+
+@frozen(eq=False)
+class TruePath:
+    """One obstacle as the sonar should have seen it: stamp_ns (n,); seen (n, 3) in the order of
+    `STATES`; in_beam (n,)."""
+
+    track_id: int
+    stamp_ns: IntArray
+    seen: FloatArray
+    in_beam: NDArray[np.bool_]
+
+    def at(self, stamp_ns: IntArray, gap: float) -> FloatArray:
+        """(m, 3) at other stamps; NaN outside the path and in gaps over `gap` seconds."""
+        after = np.clip(np.searchsorted(self.stamp_ns, stamp_ns), 1, len(self.stamp_ns) - 1)
+        start, end = self.stamp_ns[after - 1], self.stamp_ns[after]
+        fraction = (stamp_ns - start) / np.maximum(end - start, 1)
+        known = (fraction >= 0.0) & (fraction <= 1.0) & (end - start <= gap * SECOND)
+        between = self.seen[after - 1] + fraction[:, None] * (
+            self.seen[after] - self.seen[after - 1])
+        return np.where(known[:, None], between, np.nan)
+
+    def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
+        """True (m,) where it ought to be tracked: seen for a while and not passed yet."""
+        seen = np.cumsum(self.in_beam)[np.clip(np.searchsorted(
+            self.stamp_ns, stamp_ns, side='right') - 1, 0, len(self.stamp_ns) - 1)]
+        distance, bearing, offset = self.at(stamp_ns, gap).T
+        level = np.sqrt(np.maximum(distance**2 - offset**2, 0.0))
+        with np.errstate(invalid='ignore'):
+            return (seen >= PINGS_TO_SEE) & (level * np.cos(bearing) > PASSED * distance)
+
+
+@frozen(eq=False)
+class Matching:
+    """row (m,) of the series and the truth (m, 3) it met, by number of the obstacle (m,); gospa
+    (pings, 4): distance, localisation, missed and false parts."""
+
+    series: Series
+    row: IntArray
+    target: IntArray
+    truth: FloatArray
+    gospa: FloatArray
+
+    @property
+    def error(self) -> FloatArray:
+        """(m, 3) estimate minus truth."""
+        difference = self.series.state[self.row] - self.truth
+        difference[:, 1] = (difference[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+        return difference
+
+
+def series_of(estimates: Iterable[Estimate]) -> Series:
+    """Lay the confirmed rows end to end. Raises ValueError for estimates of something else."""
+    ordered = sorted(estimates, key=lambda one: one.stamp_ns)
+    filled = [one for one in ordered if len(one)]
+    if any(one.state_names != STATES for one in filled):
+        raise ValueError('the estimates are not those of obstacles')
+
+    def stack(parts: list[NDArray], tail: tuple[int, ...] = ()) -> NDArray:
+        return np.concatenate([np.empty((0, *tail)), *parts])
+
+    def extra(name: str) -> FloatArray:
+        return stack([np.asarray(one.extras[name], float) for one in filled])
+
+    full = Series(
+        ping_ns=np.array([one.stamp_ns for one in ordered], np.int64),
+        stamp_ns=np.repeat(np.array([one.stamp_ns for one in filled], np.int64),
+                           [len(one) for one in filled]),
+        track_id=extra('track_id').astype(np.int64),
+        state=stack([one.state for one in filled], (3,)),
+        covariance=stack([one.covariance for one in filled], (3, 3)),
+        low=extra('vertical_offset_lo'), high=extra('vertical_offset_hi'),
+        above=stack([one.probabilities[:, one.model_names.index('above')] for one in filled]),
+        nis=extra('nis'))
+    return full.pick(extra('track_state') > 0)
+
+
+def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ...]:
+    """Truth tables by obstacle, told `lag` seconds earlier. Raises ValueError for other tables."""
+    rows: dict[int, list[tuple[int, float, float, float, float]]] = {}
+    for table in tables:
+        if missing := [name for name in STATES if name not in table.extras]:
+            raise ValueError(f"the truth has no column '{missing[0]}'")
+        columns = [np.asarray(table.extras[name], float) for name in STATES]
+        columns.append(np.asarray(table.extras.get('in_beam', np.ones(len(table.xyz))), float))
+        ids = np.asarray(table.extras.get('track_id', np.ones(len(table.xyz))), int)
+        for number, values in zip(ids, zip(*columns)):
+            rows.setdefault(int(number), []).append((table.stamp_ns, *map(float, values)))
+    paths = []
+    for number, told in sorted(rows.items()):
+        by_stamp = {one[0]: one[1:] for one in told if np.isfinite(one[1:4]).all()}
+        if len(by_stamp) < 2:
+            continue
+        stamps = np.array(sorted(by_stamp), np.int64)
+        values = np.array([by_stamp[stamp] for stamp in stamps.tolist()])
+        paths.append(TruePath(number, stamps - round(lag * SECOND), values[:, :3],
+                              values[:, 3] > 0))
+    return tuple(paths)
+
+
+def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: float) -> Matching:
+    """Match tracks to obstacles at every ping for which the truth is known."""
+    pings = series.ping_ns
+    seen = np.array([path.at(pings, gap) for path in truth]).reshape(len(truth), len(pings), 3)
+    there = np.array([path.there(pings, gap) for path in truth], bool)
+    there = there.reshape(len(truth), len(pings))
+    points, flat = level(series.state), level(seen)
+    starts = np.searchsorted(series.stamp_ns, pings, side='left')
+    ends = np.searchsorted(series.stamp_ns, pings, side='right')
+    rows, targets, scores = [], [], []
+    for ping, (start, end) in enumerate(zip(starts, ends)):
+        if not np.isfinite(seen[:, ping]).any():
+            continue
+        who = np.flatnonzero(there[:, ping])
+        found = gospa(flat[who, ping], points[start:end], cutoff)
+        scores.append([found.distance, found.localisation, found.missed, found.false])
+        hit = found.estimate_of >= 0
+        rows += (start + found.estimate_of[hit]).tolist()
+        targets += who[hit].tolist()
+    row, target = np.array(rows, np.int64), np.array(targets, np.int64)
+    at = np.searchsorted(pings, series.stamp_ns[row])
+    return Matching(series, row, target, seen[target, at].reshape(-1, 3),
+                    np.reshape(scores, (-1, 4)))
+
+
+def level(seen: FloatArray) -> FloatArray:
+    """(..., 2) metres ahead and to port of states (..., 3), as if nothing lay above or below."""
+    distance, bearing = seen[..., 0], seen[..., 1]
+    return np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=-1)

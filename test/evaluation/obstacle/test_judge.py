@@ -1,0 +1,151 @@
+"""A judge of obstacle runs: against sums done by hand, and on real runs."""
+
+import json
+
+import numpy as np
+from obstacle_bags import tracked
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.estimates import Estimate
+from sonar_imm.evaluation.judging import judge, JudgeOptions
+from sonar_imm.evaluation.obstacle.bench import bench_ping
+from sonar_imm.evaluation.obstacle.scoring import score
+from sonar_imm.evaluation.obstacle.series import series_of, TruePath, truth_of
+from sonar_imm.evaluation.run_folder import RunFolder
+
+SECOND = 10**9
+
+
+def estimate(second, rows):
+    """Rows (track_id, track_state, range, bearing, offset, sigma, low, high, above)."""
+    rows = np.reshape(rows, (-1, 9)).astype(float)
+    covariance = np.zeros((len(rows), 3, 3))
+    covariance[:, [0, 1], [0, 1]] = 1e-2, 1e-4
+    covariance[:, 2, 2] = rows[:, 5] ** 2
+    return Estimate(
+        stamp_ns=second * SECOND, frame_id='odom', xyz=np.zeros((len(rows), 3), np.float32),
+        state_names=('range', 'bearing', 'vertical_offset'), state=rows[:, 2:5],
+        covariance=covariance, model_names=('above', 'below'),
+        probabilities=np.column_stack([rows[:, 8], 1.0 - rows[:, 8]]),
+        extras={'track_id': rows[:, 0].astype(np.uint32),
+                'track_state': rows[:, 1].astype(np.uint8), 'vertical_offset_lo': rows[:, 6],
+                'vertical_offset_hi': rows[:, 7], 'nis': np.full(len(rows), 2.0)})
+
+
+def straight(track_id, offset, bearing=0.0, count=20):
+    """An obstacle that comes 2 m nearer each second from 60 m, always in the beam."""
+    stamps = np.arange(1, count + 1) * SECOND
+    seen = np.column_stack([60.0 - 2.0 * np.arange(count), np.full(count, bearing),
+                            np.full(count, offset)])
+    return TruePath(track_id, stamps, seen, np.ones(count, bool))
+
+
+def test_scores_are_those_done_by_hand():
+    # At seconds 10 and 11 the range is 42 and 40 m. One track is 1 m too deep, then 2 m; the band
+    # holds the truth once; a false track and a tentative one are about.
+    estimates = [
+        estimate(10, [[4, 1, 42.3, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1],
+                      [5, 1, 20.0, 0.3, 0.0, 1.0, -1.0, 1.0, 0.5]]),
+        estimate(11, [[4, 2, 40.0, 0.01, 5.0, 1.0, 4.0, 6.0, 0.2],
+                      [6, 0, 40.0, 0.0, 3.0, 1.0, 2.0, 4.0, 0.5]])]
+    metrics, found = score(series_of(estimates), (straight(1, 3.0),), cutoff=5.0, gap=60.0)
+    assert metrics['vertical_offset']['rmse_m'] == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
+    assert metrics['range']['rmse_m'] == pytest.approx(0.3 / np.sqrt(2.0))
+    assert metrics['bearing']['rmse_deg'] == pytest.approx(np.degrees(0.01) / np.sqrt(2.0))
+    assert metrics['vertical_offset_near']['n'] == 2
+    assert metrics['consistency']['nees_offset']['mean'] == pytest.approx(2.5)
+    assert metrics['consistency']['band_coverage'] == 0.5
+    assert metrics['above']['brier'] == pytest.approx((0.01 + 0.04) / 2.0)
+    assert metrics['above']['bins']['0.1 to 0.3'] == {
+        'n': 2, 'stated': pytest.approx(0.15), 'came_true': 0.0}
+    # GOSPA: sqrt(0.3^2 + 5^2/2), sqrt((40 * 0.01)^2).
+    chord = np.hypot(40.0 * (1.0 - np.cos(0.01)), 40.0 * np.sin(0.01))
+    assert metrics['gospa']['mean_m'] == pytest.approx((np.sqrt(0.09 + 12.5) + chord) / 2.0)
+    assert metrics['gospa']['false_per_ping'] == pytest.approx(0.5)
+    assert metrics['tracks'] == {'true_obstacles': 1, 'found_obstacles': 1, 'tracks': 2,
+                                 'false_tracks': 1}
+    assert found.target.tolist() == [0, 0]
+
+
+def test_an_obstacle_is_asked_for_from_its_sixth_ping_until_it_is_passed():
+    path = straight(1, -3.0)
+    wanted = path.there(path.stamp_ns, 60.0)
+    assert wanted.tolist() == [False] * 5 + [True] * 15
+    passed = TruePath(1, path.stamp_ns, path.seen * [1.0, 0.0, 1.0] + [0.0, 1.5, 0.0],
+                      path.in_beam)
+    assert not passed.there(path.stamp_ns, 60.0).any()
+    blind = TruePath(1, path.stamp_ns, path.seen, np.zeros(20, bool))
+    assert not blind.there(path.stamp_ns, 60.0).any()
+
+
+def test_truth_between_its_stamps_is_interpolated_but_not_across_gaps():
+    path = straight(1, 3.0)
+    half = path.at(np.array([SECOND // 2, 3 * SECOND // 2, 30 * SECOND]), 60.0)
+    assert half[1].tolist() == [59.0, 0.0, 3.0]
+    assert np.isnan(half[[0, 2]]).all()
+    assert np.isnan(path.at(np.array([3 * SECOND // 2]), 0.5)).all()
+
+
+def test_estimates_and_truth_of_something_else_are_refused():
+    with pytest.raises(ValueError, match='not those of obstacles'):
+        series_of([Estimate(stamp_ns=1, frame_id='', xyz=np.zeros((1, 3), np.float32),
+                            state_names=('px',), state=np.zeros((1, 1)),
+                            covariance=np.ones((1, 1, 1)))])
+    with pytest.raises(ValueError, match="no column 'range'"):
+        truth_of([Estimate(stamp_ns=1, frame_id='', xyz=np.zeros((1, 3), np.float32),
+                           state_names=(), state=np.zeros((1, 0)),
+                           covariance=np.zeros((1, 0, 0)))])
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    return tracked(tmp_path_factory.mktemp('tethers'))
+
+
+def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
+    verdict = judge(RunFolder(run), JudgeOptions())
+    metrics = verdict.metrics
+    assert metrics['tracks']['found_obstacles'] == 2 and metrics['tracks']['false_tracks'] == 0
+    assert metrics['range']['rmse_m'] < 0.2 and metrics['bearing']['rmse_deg'] < 0.3
+    back = metrics['looking_back']
+    assert abs(back['refit_error_m']) < 2.0 and back['echoes'] > 50
+    assert abs(back['online_error_m']) < 2.0
+    assert verdict.accuracy(None).good and not verdict.accuracy(0.01).good
+    assert 'obstacles were found' in verdict.summary
+    titles = [section.title for section in verdict.part([]).sections]
+    assert {'Height over range', 'Seen by the sonar', 'Above or below'} <= set(titles)
+    assert any(title.startswith('Looking back: RMSD') for title in titles)
+    assert main(['evaluate', str(run), '--report', str(tmp_path / 'report.html')]) == 0
+    assert 'Diamonds: the least RMSD' in (tmp_path / 'report.html').read_text()
+
+
+def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):
+    run = tracked(tmp_path, 'approach', ideal_navigation='true', sound_speed_error='0',
+                  range_std='0.001', bearing_std_deg='0.001', range_step='0',
+                  bearing_step_deg='0')
+    back = judge(RunFolder(run)).metrics['looking_back']
+    assert back['truth_m'] == pytest.approx(3.0, abs=0.2)
+    assert abs(back['rmsd_error_m']) < 0.1 and abs(back['refit_error_m']) < 0.1
+
+
+def test_without_truth_and_bag_there_is_still_a_page(run, tmp_path):
+    folder = RunFolder(tmp_path / 'lonely')
+    folder.prepare()
+    folder.write_estimates(RunFolder(run).read_estimates(), 'obstacle')
+    record = json.loads((run / 'run.json').read_text())
+    folder.write_json('run.json', {**record, 'bag': str(tmp_path / 'gone')})
+    verdict = judge(folder)
+    assert verdict.accuracy(None) is None and 'no truth' in verdict.summary
+    assert verdict.part([]).sections
+
+
+def test_an_empty_run_is_no_reason_to_stop(tmp_path):
+    run = tracked(tmp_path, 'approach', detection_probability=0.0)
+    verdict = judge(RunFolder(run))
+    assert not verdict.accuracy(None).good and verdict.part([]).sections
+
+
+def test_the_bench_tracks_all_that_it_times():
+    result = bench_ping(rounds=1, pings=15, obstacles=5)
+    assert result['tracked'] == 5 and 0.0 < result['median_ms'] <= result['p99_ms']

@@ -1,0 +1,210 @@
+"""Detections from every message that carries them; the sign of the bearing above all."""
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+import marine
+import numpy as np
+import pytest
+
+from msg_adapters.detections import (
+    read_detections,
+    read_laser_scan,
+    read_pose_array,
+    read_sonar_detections,
+    read_sonar_ranges,
+    write_detections,
+)
+from msg_adapters.table import encode_table
+from sonar_imm.measurements import Detections, Rejection
+from sonar_imm.recordings.messages import ros_message
+
+PORT, STARBOARD = 0.3, -0.2
+NASTY = (0.0, -1.0, 1e-300, 1e9, 7.0, np.nan, np.inf, -np.inf, 0.25, 30.0)
+
+
+def header(stamp=100):
+    time = ros_message('builtin_interfaces/msg/Time', sec=stamp, nanosec=5)
+    return ros_message('std_msgs/msg/Header', stamp=time, frame_id='sonar')
+
+
+def table(**columns):
+    return encode_table(columns, stamp_ns=7, frame_id='sonar', make=ros_message)
+
+
+def reason(read, message, **options):
+    with pytest.raises(Rejection) as caught:
+        read(message, **options)
+    return caught.value.reason
+
+
+# -- our own table -----------------------------------------------------------------------------
+
+
+def test_writing_and_reading_gives_the_same_detections():
+    detections = Detections(stamp_ns=1_700_000_000_123_456_789, frame_id='sonar',
+                            range=[10.0, 1 / 3], bearing=[PORT, STARBOARD],
+                            var_range=[0.25, np.nan], intensity=[3.0, 4.0])
+    message = write_detections(detections, ros_message)
+    assert [field.name for field in message.fields] == [
+        'x', 'y', 'z', 'range', 'bearing', 'var_range', 'intensity']
+    again = read_detections(message)
+    assert again.stamp_ns == detections.stamp_ns and again.frame_id == 'sonar'
+    for name in ('range', 'bearing', 'var_range', 'intensity'):
+        assert np.array_equal(getattr(again, name), getattr(detections, name), equal_nan=True)
+    assert np.isnan(again.var_bearing).all()
+
+
+def test_port_is_drawn_on_the_left():
+    message = write_detections(Detections(stamp_ns=1, range=[10.0], bearing=[PORT]), ros_message)
+    x, y = np.frombuffer(bytes(message.data), '<f4')[:2]
+    assert x > 9.0 and y == pytest.approx(10.0 * np.sin(PORT))
+
+
+@pytest.mark.parametrize('message', [
+    write_detections(Detections(stamp_ns=7, range=[], bearing=[]), ros_message),
+    table(), table(range=np.empty(0), bearing=np.empty(0))])
+def test_an_empty_cloud_is_a_ping_without_detections(message):
+    message.header = header()
+    ping = read_detections(message)
+    assert len(ping) == 0 and ping.stamp_ns == 100_000_000_005
+
+
+def test_a_cloud_of_points_is_read_by_x_y_z():
+    ping = read_detections(table(x=[3.0, 0.0], y=[4.0, -2.0], z=[12.0, 0.0]))
+    assert ping.range.tolist() == [13.0, 2.0]
+    assert ping.bearing == pytest.approx([np.arctan2(4.0, 3.0), -np.pi / 2])
+
+
+def test_rows_that_are_no_echo_are_dropped_and_their_columns_with_them():
+    ping = read_detections(table(
+        range=[np.nan, np.inf, -np.inf, 0.0, -3.0, 1e30, 5.0, 6.0],
+        bearing=[0.1] * 6 + [np.nan, PORT], var_range=np.arange(1.0, 9.0),
+        var_bearing=[1.0] * 7 + [-1.0]))
+    assert ping.range.tolist() == [6.0] and ping.bearing.tolist() == [PORT]
+    assert ping.var_range.tolist() == [8.0] and np.isnan(ping.var_bearing).all()
+
+
+@pytest.mark.parametrize('message, code', [
+    (table(range=[1.0]), 'missing_column'), (table(bearing=[1.0]), 'missing_column'),
+    (table(x=[1.0], y=[1.0]), 'missing_column'),
+    (table(range=[1.0], bearing=[30.0]), 'out_of_range'),
+    (table(range=np.ones((1, 2)), bearing=[0.0]), 'bad_field'),
+    (table(range=np.ones(10_001), bearing=np.zeros(10_001)), 'too_large'),
+    (ros_message('sensor_msgs/msg/PointCloud2'), 'bad_stamp')])
+def test_a_table_that_cannot_be_used_is_refused_with_its_reason(message, code):
+    assert reason(read_detections, message) == code
+
+
+# -- common_interfaces -------------------------------------------------------------------------
+
+
+def scan(ranges, intensities=()):
+    return ros_message('sensor_msgs/msg/LaserScan', header=header(), angle_min=-0.2,
+                       angle_increment=0.1, range_min=1.0, range_max=50.0, ranges=ranges,
+                       intensities=intensities)
+
+
+def test_a_laser_scan_counts_to_port_and_keeps_what_lies_inside_its_limits():
+    ping = read_laser_scan(scan([0.5, 10.0, np.nan, np.inf, 60.0, 20.0], range(6)))
+    assert ping.range.tolist() == [10.0, 20.0]
+    assert ping.bearing == pytest.approx([-0.1, 0.3], abs=1e-7)
+    assert ping.intensity.tolist() == [1.0, 5.0]
+    assert len(read_laser_scan(scan([]))) == 0
+    assert np.isnan(read_laser_scan(scan([2.0], [1.0, 2.0])).intensity).all()
+
+
+def test_a_pose_array_is_read_by_its_places():
+    poses = [ros_message('geometry_msgs/msg/Pose',
+                         position=ros_message('geometry_msgs/msg/Point', x=x, y=y, z=z))
+             for x, y, z in [(4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0)]]
+    ping = read_pose_array(ros_message('geometry_msgs/msg/PoseArray', header=header(),
+                                       poses=poses))
+    assert ping.range.tolist() == [5.0] and ping.bearing == pytest.approx([np.arctan2(3, 4)])
+    assert len(read_pose_array(ros_message('geometry_msgs/msg/PoseArray', header=header()))) == 0
+
+
+# -- marine_acoustic_msgs ----------------------------------------------------------------------
+
+
+def beams(axes):
+    """Unit vectors of a beam to port and one to starboard, both 5 degrees down."""
+    az, down = np.array([PORT, STARBOARD]), np.radians(5.0)
+    ahead, port = np.cos(down) * np.cos(az), np.cos(down) * np.sin(az)
+    low = np.full(2, -np.sin(down))
+    return np.column_stack([low, -port, ahead] if axes == 'marine' else [ahead, port, low])
+
+
+@pytest.mark.parametrize('axes', ['marine', 'rep103'])
+@pytest.mark.parametrize('told', ['right', 'auto'])
+def test_both_beam_axes_give_port_as_positive(axes, told):
+    message = marine.sent(marine.sonar_ranges(beams(axes), [20.0, 30.0]))
+    ping = read_sonar_ranges(message, beam_axes=axes if told == 'right' else 'auto',
+                             world_frame='enu', sound_speed=1400.0)
+    assert ping.bearing == pytest.approx([PORT, STARBOARD], abs=1e-6)
+    assert ping.range.tolist() == [20.0, 30.0]
+
+
+def test_the_wrong_axes_are_not_mended_in_silence():
+    message = marine.sonar_ranges(beams('marine'), [20.0, 30.0])
+    ping = read_sonar_ranges(message, beam_axes='rep103')
+    assert np.abs(ping.bearing).min() > 1.5
+    with pytest.raises(ValueError, match='beam_axes'):
+        read_sonar_ranges(message, beam_axes='sideways')
+
+
+def test_bad_flags_and_ranges_are_dropped():
+    axes = np.repeat(beams('marine')[:1], 5, axis=0)
+    message = marine.sonar_ranges(axes, [5.0, np.inf, 7.0, np.nan, 9.0], flags=[0, 0, 2, 0, 0],
+                                  intensities=[3.0])
+    ping = read_sonar_ranges(message)
+    assert ping.range.tolist() == [5.0, 9.0] and ping.intensity.tolist() == [3.0, 3.0]
+    assert reason(read_sonar_ranges, marine.sonar_ranges(axes, [5.0])) == 'bad_shape'
+    assert reason(read_sonar_ranges, marine.sonar_ranges(axes, [5.0] * 5, [0] * 3)) == 'bad_shape'
+    assert len(read_sonar_ranges(marine.sonar_ranges([], []))) == 0
+
+
+def test_two_way_times_become_ranges_and_starboard_angles_negative_bearings():
+    message = marine.sent(marine.sonar_detections([0.04, 0.02], [-PORT, -STARBOARD],
+                                                  sound_speed=1480.0))
+    ping = read_sonar_detections(message, sound_speed=1500.0)
+    assert ping.range == pytest.approx([29.6, 14.8], rel=1e-6)
+    assert ping.bearing == pytest.approx([PORT, STARBOARD])
+
+
+@pytest.mark.parametrize('stated', [0.0, np.nan, 1.5])
+def test_a_speed_of_sound_that_is_none_gives_way_to_the_parameter(stated):
+    ping = read_sonar_detections(marine.sonar_detections([0.02], [0.0], sound_speed=stated),
+                                 sound_speed=1450.0)
+    assert ping.range == pytest.approx([14.5])
+
+
+def test_times_without_angles_are_no_detections():
+    assert len(read_sonar_detections(marine.sonar_detections([0.02, 0.03], []))) == 0
+    one = read_sonar_detections(marine.sonar_detections([0.02, 0.03], [0.1]))
+    assert one.bearing == pytest.approx([-0.1, -0.1])
+
+
+# -- hostile -----------------------------------------------------------------------------------
+
+numbers = arrays(np.float32, st.integers(0, 6), elements=st.sampled_from(NASTY).map(np.float32))
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(numbers, numbers, numbers, st.lists(st.integers(0, 255), max_size=6))
+def test_anything_gives_sound_detections_or_a_rejection(a, b, c, flags):
+    rows = np.column_stack([np.resize(one, 4) if len(one) else np.zeros(4) for one in (a, b, c)])
+    for read, message in [
+            (read_detections, table(x=rows[:, 0], range=rows[:, 1], bearing=rows[:, 2])),
+            (read_detections, table(x=rows[:, 0], y=rows[:, 1], z=rows[:, 2])),
+            (read_laser_scan, scan(a, b)),
+            (read_sonar_ranges, marine.sonar_ranges(rows, a, flags, b)),
+            (read_sonar_detections, marine.sonar_detections(a, b, flags, c))]:
+        message.header = header()
+        try:
+            ping = read(message)
+        except Rejection as rejection:
+            assert rejection.sentence and rejection.reason
+            continue
+        assert np.isfinite(ping.range).all() and np.isfinite(ping.bearing).all()
+        assert (ping.range > 0.0).all()

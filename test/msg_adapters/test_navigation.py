@@ -1,0 +1,123 @@
+"""Poses and altitudes of a vehicle."""
+
+import marine
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from msg_adapters.navigation import (
+    doubt_navigation,
+    read_dvl,
+    read_navigation,
+    read_range,
+    write_navigation,
+    write_range,
+)
+from sonar_imm.measurements import Altitude, Navigation, Rejection
+from sonar_imm.recordings.messages import ros_message
+
+TURNED = Rotation.from_euler('ZYX', [0.7, -0.2, 0.4])
+
+
+def navigation(**values):
+    return Navigation(**{
+        'stamp_ns': 1_700_000_000_123_456_789, 'position': [1 / 3, -2e5, -20.0],
+        'orientation': TURNED.as_quat(), 'velocity': [1.5, 0.1, -0.2],
+        'turn_rate': [0.01, 0.02, 0.03], 'frame_id': 'odom', 'child_frame_id': 'base_link',
+        **values})
+
+
+def odometry(**values):
+    return write_navigation(navigation(**values), ros_message)
+
+
+def reason(read, message, **options):
+    with pytest.raises(Rejection) as caught:
+        read(message, **options)
+    return caught.value.reason
+
+
+def test_writing_and_reading_gives_the_same_navigation():
+    covariance = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    covariance[0, 1] = covariance[1, 0] = 0.5
+    one = navigation(pose_covariance=covariance)
+    again = read_navigation(write_navigation(one, ros_message))
+    for name in ('stamp_ns', 'frame_id', 'child_frame_id'):
+        assert getattr(again, name) == getattr(one, name)
+    for name in ('position', 'orientation', 'velocity', 'turn_rate', 'pose_covariance'):
+        assert np.array_equal(getattr(again, name), getattr(one, name))
+    assert again.twist_covariance is None
+
+
+def test_a_twist_in_world_axes_is_turned_into_the_vehicle():
+    child = np.array([1.5, 0.1, -0.2])
+    stated = odometry(velocity=TURNED.apply(child), turn_rate=TURNED.apply([0.1, 0.0, 0.2]))
+    turned = read_navigation(stated, nav_twist_frame='world')
+    assert turned.velocity == pytest.approx(child)
+    assert turned.turn_rate == pytest.approx([0.1, 0.0, 0.2])
+    assert read_navigation(stated).velocity != pytest.approx(child)
+
+
+@pytest.mark.parametrize('diagonal', [0.0, -1.0, np.nan])
+def test_covariances_that_say_nothing_are_unknown(diagonal):
+    message = odometry()
+    message.pose.covariance[:] = np.diag(np.full(6, diagonal)).ravel()
+    assert read_navigation(message).pose_covariance is None
+
+
+def test_a_ned_frame_is_taken_only_when_it_is_expected():
+    message = odometry(frame_id='odom_ned')
+    assert reason(read_navigation, message) == 'frame_ned'
+    assert read_navigation(message, world_frame='ned').position[2] == -20.0
+
+
+@pytest.mark.parametrize('change, code', [
+    ({'orientation': [0.0, 0.0, 0.0, 0.0]}, 'bad_orientation'),
+    ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'bad_orientation'),
+    ({'orientation': [0.0, np.nan, 0.0, 1.0]}, 'nan'), ({'position': [0, 0, np.inf]}, 'nan'),
+    ({'position': [0.0, 2e8, 0.0]}, 'out_of_range')])
+def test_a_pose_that_cannot_be_used_is_refused(change, code):
+    message = odometry()
+    for name, values in change.items():
+        part = getattr(message.pose.pose, name)
+        for axis, value in zip('xyzw', values):
+            setattr(part, axis, float(value))
+    assert reason(read_navigation, message) == code
+
+
+def test_a_covariance_of_another_size_is_refused_and_a_missing_frame_doubted():
+    message = odometry(frame_id='')
+    assert doubt_navigation(message) == 'no_frame'
+    message.pose.covariance = np.zeros(35)
+    assert reason(read_navigation, message) == 'bad_shape'
+    assert doubt_navigation(odometry()) is None
+
+
+def test_an_altitude_is_written_and_read():
+    for variance in (0.25, np.nan):
+        one = Altitude(stamp_ns=12, altitude=15.5, variance=variance, frame_id='altimeter')
+        again = read_range(write_range(one, ros_message))
+        assert (again.stamp_ns, again.altitude, again.frame_id) == (12, 15.5, 'altimeter')
+        assert np.array_equal(again.variance, variance, equal_nan=True)
+
+
+@pytest.mark.parametrize('height, code', [
+    (np.inf, 'nan'), (-np.inf, 'nan'), (np.nan, 'nan'), (60.0, 'out_of_range'),
+    (0.2, 'out_of_range')])
+def test_an_altitude_out_of_limits_is_refused(height, code):
+    message = write_range(Altitude(stamp_ns=12, altitude=15.5), ros_message)
+    message.min_range, message.max_range, message.range = 0.5, 50.0, height
+    assert reason(read_range, message) == code
+
+
+class Dvl:
+    """The three fields that are read."""
+
+    def __init__(self, altitude):
+        self.header, self.altitude = marine.header(), altitude
+
+
+def test_the_altitude_of_a_doppler_log_needs_bottom_lock():
+    assert read_dvl(Dvl(12.5)).altitude == 12.5 and np.isnan(read_dvl(Dvl(12.5)).variance)
+    assert reason(read_dvl, Dvl(0.0)) == reason(read_dvl, Dvl(-1.0)) == 'no_bottom'
+    assert reason(read_dvl, Dvl(np.nan)) == 'nan' and reason(read_dvl, Dvl(2e4)) == 'out_of_range'

@@ -1,0 +1,178 @@
+"""The obstacle node: three inputs, and displays that say how unsure the height is."""
+
+from attrs import evolve
+from geometry_msgs.msg import PoseArray
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState, LaserScan, PointCloud2
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from msg_adapters.detections import write_detections
+from msg_adapters.estimates import read_estimate
+from msg_adapters.navigation import write_navigation, write_range
+from msg_adapters.obstacles import band, write_markers
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.obstacle import ObstacleNode
+from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.obstacle import scenario, simulate
+from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+
+WRITERS = {Detections: ('/detections', 'sensor_msgs/msg/PointCloud2', write_detections),
+           Navigation: ('/nav', 'nav_msgs/msg/Odometry', write_navigation),
+           Altitude: ('/altitude', 'sensor_msgs/msg/Range', write_range)}
+
+
+class Rig:
+    def __init__(self, bench):
+        self.bench = bench
+        self.node = bench.add(ObstacleNode(context=bench.context))
+        self.poses = bench.listen(PoseArray, '/obstacle/obstacles')
+        self.markers = bench.listen(MarkerArray, '/obstacle/markers')
+        self.probabilities = bench.listen(JointState, '/obstacle/model_probabilities')
+        self.tables = bench.listen(PointCloud2, '/obstacle/estimate', lockstep_qos())
+        self.publishers = {
+            kind: bench.peer.create_publisher(message_class(type_name), topic, lockstep_qos())
+            for kind, (topic, type_name, _) in WRITERS.items()}
+        displays = ('obstacles', 'markers', 'model_probabilities', 'estimate')
+        bench.spin_until(lambda: all(p.get_subscription_count()
+                                     for p in self.publishers.values())
+                         and all(self.node.count_subscribers(f'/obstacle/{name}')
+                                 for name in displays))
+        self.sent = 0
+
+    def send(self, measurement):
+        self.publish(type(measurement), WRITERS[type(measurement)][2](measurement, make))
+
+    def publish(self, kind, message):
+        self.publishers[kind].publish(message)
+        self.sent += 1
+        self.bench.spin_until(lambda: self.node._meter.received.total() == self.sent)
+
+
+@pytest.fixture
+def rig(make_bench):
+    return Rig(make_bench())
+
+
+def an_estimate(ids, states, above=0.02):
+    rows = len(ids)
+    return Estimate(
+        stamp_ns=5 * 10**9, frame_id='odom',
+        xyz=np.tile(np.float32([40.0, 5.0, -23.0]), (rows, 1)),
+        state_names=('range', 'bearing', 'vertical_offset'),
+        state=np.tile([40.0, 0.1, 3.0], (rows, 1)), covariance=np.tile(np.eye(3), (rows, 1, 1)),
+        model_names=('above', 'below'), probabilities=np.tile([above, 1.0 - above], (rows, 1)),
+        extras={'track_id': np.array(ids, np.uint32), 'track_state': np.array(states, np.uint8),
+                'vertical_offset_lo': np.full(rows, 1.0),
+                'vertical_offset_hi': np.full(rows, 4.5)})
+
+
+def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
+    one = an_estimate([7], [1])
+    # 1.0 to 4.5 m below a sonar at z = -20.
+    assert band(one, 0) == (-24.5, -21.0)
+    bar, ball, label = write_markers(one, [0], make).markers
+    assert (bar.ns, bar.type, bar.id, bar.action) == ('band', Marker.CUBE, 7, Marker.ADD)
+    assert bar.scale.z == 3.5 and bar.pose.position.z == -22.75
+    assert ball.type == Marker.SPHERE and ball.pose.position.z == -23.0
+    assert label.type == Marker.TEXT_VIEW_FACING and label.text == '7: 40 m ahead, +3.0 m down'
+    assert all(marker.lifetime.sec > 0 and marker.header.frame_id == 'odom'
+               for marker in (bar, ball, label))
+    deep = write_markers(an_estimate([7], [1]), [0], make, down=True).markers[0]
+    assert deep.pose.position.z == -23.25 and band(one, 0, down=True) == (-25.0, -21.5)
+
+
+def test_colours_tell_above_from_below_from_unknown():
+    colours = [write_markers(an_estimate([1], [1], above), [0], make).markers[0].color
+               for above in (0.02, 0.5, 0.98)]
+    assert colours[0].b > colours[0].r and colours[2].r > colours[2].b
+    assert colours[1].r == colours[1].b
+
+
+def test_confirmed_obstacles_are_shown_and_the_oldest_gives_the_probabilities(rig):
+    rig.node.show(an_estimate([9, 3, 5, 2], [1, 2, 1, 0]))
+    rig.bench.spin_until(lambda: rig.poses and rig.markers and rig.probabilities)
+    assert len(rig.poses[0].poses) == 3 and rig.poses[0].header.frame_id == 'odom'
+    assert {marker.id for marker in rig.markers[0].markers} == {9, 3, 5}
+    assert list(rig.probabilities[0].name) == ['above', 'below']
+    rig.node.show(an_estimate([2], [0]))
+    rig.bench.spin_until(lambda: len(rig.poses) == 2)
+    assert not rig.poses[1].poses and len(rig.markers) == 1
+
+
+def test_reset_deletes_all_markers(rig):
+    rig.node.show(an_estimate([1], [1]))
+    assert rig.bench.call(Trigger, '/obstacle/reset', Trigger.Request()).success
+    rig.bench.spin_until(lambda: len(rig.markers) == 2)
+    assert [marker.action for marker in rig.markers[1].markers] == [Marker.DELETEALL]
+
+
+def test_the_node_says_what_the_tracker_says(rig):
+    received = [one.measurement for one in
+                simulate(scenario('late', {'last_range': 60.0}), 3).measurements]
+    # A Range holds the altitude as a float32.
+    received = [evolve(one, altitude=float(np.float32(one.altitude)))
+                if isinstance(one, Altitude) else one for one in received]
+    tracker = ObstacleTracker(ObstacleConfig())
+    wanted = [one for each in received for one in tracker.process(each)]
+    for each in received:
+        rig.send(each)
+    rig.bench.spin_until(lambda: len(rig.tables) == len(wanted))
+    assert len(wanted) > 40 and not rig.node._meter.refused and not rig.node._errors
+    for table, estimate in zip(rig.tables, wanted):
+        again = read_estimate(table)
+        assert again.stamp_ns == estimate.stamp_ns and again.frame_id == estimate.frame_id
+        for name, column in estimate.columns().items():
+            assert np.array_equal(again.columns()[name], column, equal_nan=True), name
+    assert rig.markers and rig.poses[-1].poses
+
+
+def test_a_storm_of_garbage_is_answered_and_leaves_no_garbage_behind(rig):
+    rng = np.random.default_rng(7)
+    odd = np.array([np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30, 1e30, 50.0])
+    for k in range(1, 301):
+        stamp = int(rng.choice([k, k, k, k, k - 3, 2**30])) * 10**8
+        frame = str(rng.choice(['odom'] * 8 + ['', 'map']))
+        q = rng.normal(size=4)
+        q /= np.linalg.norm(q)
+        place = make('nav_msgs/msg/Odometry')
+        place.header.frame_id = frame
+        place.pose.pose.position.x, place.pose.pose.position.z = float(rng.choice(odd)), -20.0
+        for axis, value in zip('xyzw', q if k % 5 else rng.choice(odd, 4)):
+            setattr(place.pose.pose.orientation, axis, float(value))
+        height = make('sensor_msgs/msg/Range', range=rng.choice(odd), max_range=100.0)
+        n = int(rng.integers(0, 8))
+        ping = write_detections(Detections(
+            stamp_ns=1, range=rng.choice(odd, n), bearing=rng.normal(size=n),
+            var_range=rng.choice(odd, n), frame_id='sonar'), make)
+        for kind, message in ((Navigation, place), (Altitude, height), (Detections, ping)):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            rig.publish(kind, message)
+    rig.bench.spin_until(lambda: len(rig.tables) == rig.node._published)
+    assert rig.node._meter.refused['nan'] and not rig.node._errors
+    assert len(rig.tables) > 10
+    for table in rig.tables:
+        estimate = read_estimate(table)
+        assert np.isfinite(estimate.state).all() and np.isfinite(estimate.probabilities).all()
+
+
+def test_a_type_that_is_not_installed_is_refused_in_one_sentence(make_bench):
+    bench = make_bench('-p', 'detections_type:=marine_acoustic_msgs/msg/SonarRanges')
+    with pytest.raises(ConfigError, match='SonarRanges is not installed'):
+        bench.add(ObstacleNode(context=bench.context))
+
+
+def test_a_laser_scan_is_heard_when_it_is_asked_for(make_bench):
+    bench = make_bench('-p', 'detections_type:=sensor_msgs/msg/LaserScan')
+    node = bench.add(ObstacleNode(context=bench.context))
+    publisher = bench.peer.create_publisher(LaserScan, '/detections', 10)
+    bench.spin_until(publisher.get_subscription_count)
+    scan = make('sensor_msgs/msg/LaserScan', range_max=50.0, ranges=[10.0])
+    scan.header.stamp.sec = 5
+    publisher.publish(scan)
+    bench.spin_until(lambda: node._meter.received['detections'] == 1)
+    assert not node._meter.refused and node.tracker.health()['pings_waiting'] == 1
