@@ -154,7 +154,7 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
     with BagReader(run['bag']) as bag:
         for heard in measurements_of(bag, run['system'], run['topics'],
                                      world_frame=run.get('world_frame', 'enu'),
-                                     settings=run['parameters']):
+                                     settings=run.get('parameters')):
             if not isinstance(heard.measurement, Rejection):
                 yield heard.measurement
 
