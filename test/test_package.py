@@ -52,6 +52,8 @@ FLOORS = {
     'sonar_imm.acoustics': 1,
     'sonar_imm.parameters': 2,
     'sonar_imm.measurements': 2,
+    'sonar_imm.measurement_checks': 2,
+    'sonar_imm.obstacle_measurements': 2,
     'sonar_imm.estimates': 2,
     'msg_adapters': 3,
     'sonar_imm.trackers': 3,
