@@ -14,48 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .acoustics.variances import usable_bins
+from .fathometer_measurements import ArrayDepth, CrossSpectra, Pressure, Trace
+from .measurement_checks import check_stamp, FloatArray, floats, Rejection
 
-FloatArray = NDArray[np.float64]
-
-
-class Rejection(ValueError):
-    """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
-    tells the user."""
-
-    def __init__(self, reason: str, sentence: str):
-        self.reason = reason
-        self.sentence = sentence
-        super().__init__(sentence)
-
-
-def _floats(*shape: int | None) -> Any:
-    """Converter to a read-only float64 array; a None in `shape` matches any length."""
-
-    def convert(value: Any) -> FloatArray:
-        array = np.array(value, dtype=np.float64)
-        if len(shape) != array.ndim or any(
-            want not in (None, got) for want, got in zip(shape, array.shape)
-        ):
-            raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
-        array.flags.writeable = False
-        return array
-
-    return convert
+__all__ = [
+    'ArrayDepth',
+    'Arrivals',
+    'check_covariance',
+    'check_stamp',
+    'CrossSpectra',
+    'Fix',
+    'FloatArray',
+    'Measurement',
+    'Pressure',
+    'Rejection',
+    'Snapshot',
+    'Trace',
+]
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:
     array = np.array(value, dtype=np.uint16)
     array.flags.writeable = False
     return array
-
-
-def check_stamp(stamp_ns: int) -> None:
-    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
-    2262."""
-    if not 0 < stamp_ns < 2**63:
-        raise Rejection(
-            'bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in'
-        )
 
 
 def check_covariance(covariance: FloatArray, what: str) -> None:
@@ -78,7 +59,7 @@ class Fix:
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=_floats(3))
+    position: FloatArray = field(converter=floats(3))
     covariance: FloatArray | None = None
     frame_id: str = ''
 
@@ -92,7 +73,7 @@ class Fix:
                 f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin',
             )
         if self.covariance is not None:
-            covariance = _floats(2, 2)(self.covariance)
+            covariance = floats(2, 2)(self.covariance)
             check_covariance(covariance, 'a fix')
             object.__setattr__(self, 'covariance', covariance)
 
@@ -112,12 +93,12 @@ class Arrivals:
     stamp_ns: int
     tx_id: NDArray[np.uint16] = field(converter=_ids)
     rx_id: NDArray[np.uint16] = field(converter=_ids)
-    tx: FloatArray = field(converter=_floats(None, 3))
-    rx: FloatArray = field(converter=_floats(None, 3))
-    toa: FloatArray = field(converter=_floats(None))
-    var_toa: FloatArray = field(converter=_floats(None))
-    bearing: FloatArray = field(converter=_floats(None))
-    var_bearing: FloatArray = field(converter=_floats(None))
+    tx: FloatArray = field(converter=floats(None, 3))
+    rx: FloatArray = field(converter=floats(None, 3))
+    toa: FloatArray = field(converter=floats(None))
+    var_toa: FloatArray = field(converter=floats(None))
+    bearing: FloatArray = field(converter=floats(None))
+    var_bearing: FloatArray = field(converter=floats(None))
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
@@ -182,7 +163,7 @@ class Snapshot:
     """
 
     stamp_ns: int
-    range: FloatArray = field(converter=_floats(None))
+    range: FloatArray = field(converter=floats(None))
     iq: NDArray[np.complexfloating] = field(converter=_snapshots)
     frame_id: str = ''
     noise_variance: FloatArray | None = field(default=None, converter=_variances)
@@ -285,4 +266,4 @@ _SNAPSHOT_LIMITS = (
     ('spacing_wavelengths', 0.01, 100.0, 'wavelengths'),
 )
 
-Measurement = Fix | Arrivals | Snapshot
+Measurement = Fix | Arrivals | Snapshot | Trace | CrossSpectra | Pressure | ArrayDepth

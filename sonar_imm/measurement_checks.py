@@ -1,0 +1,44 @@
+"""What every measurement class checks with: the one way to refuse input, stamps, arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Rejection(ValueError):
+    """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
+    tells the user."""
+
+    def __init__(self, reason: str, sentence: str):
+        self.reason = reason
+        self.sentence = sentence
+        super().__init__(sentence)
+
+
+def floats(*shape: int | None) -> Any:
+    """Converter to a read-only float64 array; a None in `shape` matches any length."""
+
+    def convert(value: Any) -> FloatArray:
+        array = np.array(value, dtype=np.float64)
+        if len(shape) != array.ndim or any(
+            want not in (None, got) for want, got in zip(shape, array.shape)
+        ):
+            raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
+        array.flags.writeable = False
+        return array
+
+    return convert
+
+
+def check_stamp(stamp_ns: int) -> None:
+    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
+    2262."""
+    if not 0 < stamp_ns < 2**63:
+        raise Rejection(
+            'bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in'
+        )
