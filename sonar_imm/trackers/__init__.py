@@ -80,4 +80,11 @@ SYSTEMS = {
         'DiverTracker',
         'divers from multistatic fixes or raw arrival times, 16-direction IMM',
     ),
+    'fathometer': System(
+        'fathometer',
+        'sonar_imm.trackers.fathometer',
+        'FathometerConfig',
+        'FathometerTracker',
+        'sub-bottom reflectors from array noise or traces, multiple-model particle filter',
+    ),
 }
