@@ -9,6 +9,9 @@ PACKAGE = 'sonar_imm'
 # Resolved, because `colcon build --symlink-install` runs a link to this file.
 ROOT = Path(__file__).resolve().parent
 
+# As in sonar_imm/trackers/__init__.py, which cannot be imported before its dependencies are here.
+SYSTEMS = ['diver']
+
 REQUIRES = [
     'attrs>=23.1',
     'backports.zstd',
@@ -73,8 +76,8 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'diver_node = sonar_imm.nodes.diver:main',
             'sonar-imm = sonar_imm.cli:main',
+            *(f'{system}_node = sonar_imm.nodes.{system}:main' for system in SYSTEMS),
         ],
     },
 )

@@ -22,14 +22,18 @@ def main(prefix: Path) -> None:
 
     import sonar_imm
     from sonar_imm.resources import shared_file
+    from sonar_imm.trackers import SYSTEMS
 
     expect(Path(get_package_prefix('sonar_imm')) == prefix, 'the ament index knows the package')
     expect(prefix in Path(sonar_imm.__file__).parents, 'Python imports the installed package')
-    expect(prefix in shared_file('config/diver.yaml').parents, 'the shared files are installed')
+    for system in SYSTEMS:
+        expect(prefix in shared_file(f'config/{system}.yaml').parents,
+               f'the shared files of {system} are installed')
     command = prefix / 'lib' / 'sonar_imm' / 'sonar-imm'
     said = subprocess.run([command, '--version'], capture_output=True, text=True, check=True)
     expect(sonar_imm.__version__ in said.stdout, f'sonar-imm says {said.stdout.strip()!r}')
-    start_and_interrupt(prefix / 'lib' / 'sonar_imm' / 'diver_node')
+    for system in SYSTEMS:
+        start_and_interrupt(prefix / 'lib' / 'sonar_imm' / f'{system}_node')
 
 
 def start_and_interrupt(executable: Path) -> None:
@@ -39,17 +43,19 @@ def start_and_interrupt(executable: Path) -> None:
     lines: queue.Queue[str] = queue.Queue()
     reader = threading.Thread(target=forward, args=(node, lines), daemon=True)
     reader.start()
-    said = wait_for('ready', lines, node)
+    said = wait_for('ready', lines, node, executable)
     node.send_signal(signal.SIGINT)
     try:
         status = node.wait(STOP_LIMIT)
     except subprocess.TimeoutExpired:
         node.kill()
-        raise SystemExit(f'diver_node did not stop on SIGINT within {STOP_LIMIT} s') from None
+        raise SystemExit(
+            f'{executable.name} did not stop on SIGINT within {STOP_LIMIT} s') from None
     reader.join(STOP_LIMIT)
     while not lines.empty():
         said += lines.get()
-    expect(status == 0 and 'Traceback' not in said, f'diver_node stops on SIGINT with {status}')
+    expect(status == 0 and 'Traceback' not in said,
+           f'{executable.name} stops on SIGINT with {status}')
 
 
 def forward(node: subprocess.Popen[str], lines: queue.Queue[str]) -> None:
@@ -57,7 +63,8 @@ def forward(node: subprocess.Popen[str], lines: queue.Queue[str]) -> None:
         lines.put(line)
 
 
-def wait_for(word: str, lines: queue.Queue[str], node: subprocess.Popen[str]) -> str:
+def wait_for(word: str, lines: queue.Queue[str], node: subprocess.Popen[str],
+             executable: Path) -> str:
     """Collect what the node says until a line holds `word`; fail when it does not come."""
     said, end = '', time.monotonic() + START_LIMIT
     while time.monotonic() < end:
@@ -72,7 +79,7 @@ def wait_for(word: str, lines: queue.Queue[str], node: subprocess.Popen[str]) ->
         if word in line:
             return said
     node.kill()
-    raise SystemExit(f"diver_node never said '{word}'")
+    raise SystemExit(f"{executable.name} never said '{word}'")
 
 
 def expect(fact: bool, what: str) -> None:

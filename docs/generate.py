@@ -10,8 +10,8 @@ import textwrap
 
 import yaml
 
-from sonar_imm.nodes.config import NodeConfig
-from sonar_imm.parameters import Config, markdown_table, ParameterSpec
+from sonar_imm.nodes.config import NodeConfig, type_specs
+from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,15 +53,20 @@ def generated() -> dict[str, str]:
         files[f'config/{system.name}.yaml'] = parameter_file(system)
         files[f'docs/parameters/{system.name}.md'] = MARKDOWN.format(
             name=system.name, summary=system.summary[0].upper() + system.summary[1:],
-            tracker=markdown_table(system.config_type()), node=markdown_table(NodeConfig))
+            tracker=markdown_table(system.config_type().specs()),
+            node=markdown_table(node_specs(system)))
     return files
 
 
 def parameter_file(system: System) -> str:
     """Give the ROS 2 parameter file of `system`, every parameter with its description above."""
-    configs: tuple[type[Config], ...] = (system.config_type(), NodeConfig)
-    entries = [_entry(spec) for config in configs for spec in config.specs()]
+    entries = [_entry(spec) for spec in (*system.config_type().specs(), *node_specs(system))]
     return YAML_HEAD.format(name=system.name) + '\n'.join(entries)
+
+
+def node_specs(system: System) -> tuple[ParameterSpec, ...]:
+    """Give what the live node of `system` can be told besides the parameters of its tracker."""
+    return (*type_specs(system.name), *NodeConfig.specs())
 
 
 def _entry(spec: ParameterSpec) -> str:

@@ -23,12 +23,14 @@ class InputTopic:
     name: relative topic name; readers: measurement readers by message type. A reader takes
     ``(message, *, world_frame='enu')`` and raises `Rejection` for a message it cannot use.
     doubt: gives a reason code to count when a message can be used but deserves a warning.
+    scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     """
 
     name: str
     description: str
     readers: Mapping[str, Callable[..., Any]]
     doubt: Callable[[Any], str | None] = lambda message: None
+    scans: bool = False
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
@@ -36,7 +38,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         InputTopic('fix', 'position fixes in a local metric frame', {
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
             'geometry_msgs/msg/PointStamped': read_fix,
-        }, doubt=doubt_fix),
+        }, doubt=doubt_fix, scans=True),
         InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
         }),

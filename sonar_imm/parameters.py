@@ -247,10 +247,10 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
     return values
 
 
-def markdown_table(cls: type[Config]) -> str:
-    """The parameter table of `cls` for the documentation, one row a parameter."""
+def markdown_table(specs: Iterable[ParameterSpec]) -> str:
+    """The table of `specs` for the documentation, one row a parameter."""
     rows = ['| parameter | type | default | unit | range | what |', '|---|---|---|---|---|---|']
-    for spec in cls.specs():
+    for spec in specs:
         limits = ', '.join(f'`{choice}`' for choice in spec.choices) or spec.range_text()
         default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
         text = spec.description + ('' if spec.read_only else ' (may change while running)')

@@ -2,13 +2,14 @@
 
 The sonar is the origin of the vertical plane of one ping. The floor lies `D` metres below it (the
 height of the sonar less the elevation of the floor) and answers at the slant range r, so it is
-seen asin(D / r) below the horizon. The array looks outward and `tilt` below the horizon; its axis,
-along which the staves p = 0 .. P-1 stand `spacing` wavelengths apart, points outward and up,
-e = (-sin tilt, cos tilt). The **angle** theta = asin(D / r) - tilt is counted from the plane
-orthogonal to the axis, positive towards nadir.
+seen asin(D / r) below the horizon. The array looks outward and `tilt` below the horizon. The
+staves p = 0 .. P-1, the uppermost first, stand `spacing` wavelengths apart along the axis
+e = (-sin tilt, cos tilt), in components outward and down. The **angle** theta = asin(D / r) - tilt
+is counted from the plane orthogonal to the axis, positive towards nadir.
 
-An echo reaches stave p with the phase 2 pi spacing p u, where u = sin theta is the **direction
-sine**; u follows from D and r with one square root and no trigonometry::
+An echo reaches stave p with the phase 2 pi spacing p u, where u = sin theta, the component of its
+direction along the axis, is the **direction sine**; u follows from D and r with one square root
+and no trigonometry::
 
     u = (D / r) cos tilt - sqrt(1 - (D / r)^2) sin tilt
 
@@ -30,11 +31,14 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+FEWEST_POINTS = 64
+"""Cells of a grid of directions: the beams of two or three staves are wide, but sharp on top."""
+
 
 def direction_sine(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> FloatArray:
     """u = sin theta of a point `depth` below the sonar at `slant_range`; NaN where it cannot
     be."""
-    ratio = np.asarray(depth, np.float64) / np.asarray(slant_range, np.float64)
+    ratio = _ratio(depth, slant_range)
     possible = np.abs(ratio) <= 1.0
     ratio = np.where(possible, ratio, 0.0)
     sine = ratio * math.cos(tilt) - np.sqrt(1.0 - ratio * ratio) * math.sin(tilt)
@@ -43,7 +47,7 @@ def direction_sine(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> Flo
 
 def angle_of_depth(depth: ArrayLike, slant_range: ArrayLike, tilt: float) -> FloatArray:
     """Angle theta = asin(D / r) - tilt; NaN where abs(D) > r."""
-    ratio = np.asarray(depth, np.float64) / np.asarray(slant_range, np.float64)
+    ratio = _ratio(depth, slant_range)
     possible = np.abs(ratio) <= 1.0
     return np.where(possible, np.arcsin(np.where(possible, ratio, 0.0)) - tilt, np.nan)
 
@@ -85,7 +89,7 @@ def direction_grid(staves: int, spacing: float, *, oversampling: int = 8) -> Flo
     width."""
     largest = largest_sine(spacing)
     points = math.ceil(2.0 * largest * spacing * staves * oversampling)
-    return np.linspace(-largest, largest, max(points, 8) + 1)
+    return np.linspace(-largest, largest, max(points, FEWEST_POINTS) + 1)
 
 
 def multipath_sines(
@@ -98,3 +102,9 @@ def multipath_sines(
     floor = np.asarray(depth, np.float64)
     mirrored = np.stack(np.broadcast_arrays(np.full(floor.shape, -surface), -2 * surface - floor))
     return np.moveaxis(direction_sine(mirrored, slant_range, tilt), 0, -1)
+
+
+def _ratio(depth: ArrayLike, slant_range: ArrayLike) -> FloatArray:
+    """D / r, NaN or infinite at r = 0."""
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return np.asarray(depth, np.float64) / np.asarray(slant_range, np.float64)

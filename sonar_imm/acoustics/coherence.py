@@ -27,7 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
-from .array import direction_grid, steering
+from .array import direction_grid, phase_step
+from .laplace import autocorrelation
+from .law_kernels import beam_peaks
 from .variances import moving_mean
 
 FloatArray = NDArray[np.float64]
@@ -36,6 +38,7 @@ BoolArray = NDArray[np.bool_]
 GATE_BINS = 5
 FALSE_ALARM = 1e-3
 """Probability that the gate takes a bin of noise for an echo, for one bin and for the mean."""
+FEWEST_STAVES_ALONE = 4
 _LEVELS = 4096
 
 
@@ -45,15 +48,18 @@ def coherence(
     """Coherence (n,) of snapshots iq (n, P) and the direction sine (n,) where it is reached; NaN
     for bins that are not finite or silent."""
     staves = iq.shape[1]
-    sines = direction_grid(staves, spacing)
-    matrix = steering(sines, staves, spacing, conjugate=conjugate).conj().T
-    norm = np.sqrt(np.square(np.abs(iq)).sum(axis=1, keepdims=True))
-    known = (np.isfinite(norm) & (norm > 0.0))[:, 0]
-    unit = np.where(known[:, None], iq, 1.0) / np.where(known[:, None], norm, math.sqrt(staves))
-    beams = unit @ matrix.astype(unit.dtype)
-    spectrum = (np.square(beams.real) + np.square(beams.imag)).astype(np.float64) / staves
-    peak, sine = refined_peak(spectrum, sines)
-    peak = np.minimum(peak, 1.0)
+    grid = direction_grid(staves, spacing)
+    phase = phase_step(spacing, conjugate=conjugate) * grid
+    with np.errstate(invalid='ignore', over='ignore'):
+        form = autocorrelation(iq)
+        power = form[:, 0].real.copy()
+        form[:, 1:] *= 2.0
+    peak, place = np.empty(len(iq)), np.empty(len(iq))
+    row = np.empty(len(grid))
+    beam_peaks(form, np.cos(phase), np.sin(phase), row, row.copy(), peak, place)
+    known = np.isfinite(power) & (power > 0.0)
+    peak = np.minimum(peak / (staves * np.where(known, power, 1.0)), 1.0)
+    sine = grid[0] + place * (grid[1] - grid[0])
     return np.where(known, peak, np.nan), np.where(known, sine, np.nan)
 
 
@@ -108,9 +114,13 @@ def silent_bins(
     gamma: ArrayLike, staves: int, *, spacing: float = 0.5, false_alarm: float = FALSE_ALARM
 ) -> BoolArray:
     """Bins (n,) in which no echo is to be believed: `gamma` (n,) below the threshold of one bin,
-    or its mean over `GATE_BINS` below that of the mean. NaN counts as silent."""
+    or its mean over `GATE_BINS` below that of the mean. NaN counts as silent.
+
+    Two or three staves are coherent by chance too often for one bin to say anything (an echo would
+    need more than 50 dB): there the mean decides alone."""
     values = np.asarray(gamma, np.float64)
-    alone = coherence_threshold(staves, 1, false_alarm, spacing)
+    enough = staves >= FEWEST_STAVES_ALONE
+    alone = coherence_threshold(staves, 1, false_alarm, spacing) if enough else 0.0
     together = coherence_threshold(staves, GATE_BINS, false_alarm, spacing)
     mean = moving_mean(values, GATE_BINS // 2, np.isfinite(values))
     return ~((values >= alone) & (mean >= together))

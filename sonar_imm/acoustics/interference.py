@@ -20,6 +20,7 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .array import direction_grid, phase_step
 from .laplace import autocorrelation, gaussian_log_density, IMPOSSIBLE, log_density
 
 FloatArray = NDArray[np.float64]
@@ -94,3 +95,15 @@ def interfered_log_likelihood(
     density = log_density(q, staves) if law == 'laplace' else gaussian_log_density(q, staves)
     determinant = np.linalg.slogdet(gamma)[1] - np.linalg.slogdet(covariance)[1]
     return np.where(np.isnan(u), IMPOSSIBLE, density - determinant)
+
+
+def coherence_beside(form: InterferenceForm, spacing: float) -> FloatArray:
+    """Coherence (n,) that is left beside the interferers, max_u |a^H w|^2 / (y^H w a^H R^-1 a): as
+    `coherence.coherence`, of whitened snapshots. NaN for silent bins."""
+    staves = form.beam.shape[1]
+    phase = phase_step(spacing) * direction_grid(staves, spacing)
+    waves = np.exp(-1j * np.arange(staves)[:, None] * phase)
+    beam, spread = (form.beam @ waves).real, (form.spread @ waves).real
+    known = np.isfinite(form.base) & (form.base > 0.0)
+    share = (beam / np.maximum(spread, 1e-300)).max(axis=1) / np.where(known, form.base, 1.0)
+    return np.where(known, np.minimum(share, 1.0), np.nan)

@@ -97,10 +97,10 @@ def autocorrelation(y: ArrayLike) -> ComplexArray:
     """
     y = np.asarray(y, np.complex128)
     staves = y.shape[-1]
-    return np.stack(
-        [(y[..., lag:] * y[..., : staves - lag].conj()).sum(axis=-1) for lag in range(staves)],
-        axis=-1,
-    )
+    out = np.empty(y.shape, np.complex128)
+    for lag in range(staves):
+        out[..., lag] = np.einsum('...p,...p->...', y[..., lag:], y[..., : staves - lag].conj())
+    return out
 
 
 def form_coefficients(

@@ -26,15 +26,20 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 HALF_WIDTH = 5
-LOADING = 1e-3
-"""Share of the mean power added to the diagonal before a sample covariance is inverted."""
+LOADING = 3e-4
+"""Share of the mean power added to the diagonal before a sample covariance is inverted: 35 dB
+below the echo. Without it 11 bins of 8 staves fail now and then; more of it (1e-2) lowers the
+error on a flat floor by a quarter, and gives up the resolution that the method is for."""
 
 
 def sample_covariance(iq: NDArray, half_width: int = HALF_WIDTH) -> ComplexArray:
     """Covariances (n, P, P) of the usable bins around each bin; NaN where there is none."""
     usable = usable_bins(iq)
     y = np.where(usable[:, None], iq, 0.0).astype(np.complex128)
-    return moving_mean(y[:, :, None] * y[:, None, :].conj(), half_width, usable)
+    covariance: ComplexArray = moving_mean(
+        y[:, :, None] * y[:, None, :].conj(), half_width, usable
+    )
+    return covariance
 
 
 def bartlett_spectrum(covariance: ComplexArray, vectors: ComplexArray) -> FloatArray:
@@ -50,7 +55,8 @@ def capon_spectrum(covariance: ComplexArray, vectors: ComplexArray) -> FloatArra
     staves = vectors.shape[1]
     level = np.trace(covariance, axis1=1, axis2=2).real / staves
     loading = np.where(level > 0.0, LOADING * level, 1.0)[:, None, None]
-    inverse = np.linalg.inv(np.nan_to_num(covariance) + loading * np.eye(staves))
+    loaded: ComplexArray = np.nan_to_num(covariance) + loading * np.eye(staves)
+    inverse = np.linalg.inv(loaded)
     return 1.0 / np.maximum(_forms(inverse, vectors), 1e-300)
 
 
@@ -107,7 +113,7 @@ def ping_spectrum(
     return SPECTRA[method](sample_covariance(iq, half_width), vectors)
 
 
-def _forms(matrices: ComplexArray, vectors: ComplexArray) -> FloatArray:
+def _forms(matrices: NDArray, vectors: ComplexArray) -> FloatArray:
     """a^H M a (n, m) for Hermitian matrices (n, P, P) and vectors (m, P)."""
     return np.einsum('mp,nmp->nm', vectors.conj(), vectors @ np.swapaxes(matrices, 1, 2)).real
 

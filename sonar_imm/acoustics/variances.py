@@ -37,7 +37,7 @@ def mean_power(iq: NDArray) -> FloatArray:
     return parts.mean(axis=1)
 
 
-def moving_mean(values: ArrayLike, half_width: int, usable: BoolArray | None = None) -> FloatArray:
+def moving_mean(values: ArrayLike, half_width: int, usable: BoolArray | None = None) -> NDArray:
     """Mean (n, ...) over the usable ones of 2 half_width + 1 rows, fewer at the ends; NaN where
     there is none."""
     values = np.asarray(values)

@@ -8,12 +8,13 @@ is a bug.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import os
 import sys
 
 import click
 
 from .. import __version__
-from .lazy import LazyGroup
+from .lazy import LazyGroup, READER_GONE
 
 PROGRAM = 'sonar-imm'
 
@@ -46,6 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that turns errors into words."""
     try:
         status = command.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
+        if status == READER_GONE:
+            # What is still buffered has nowhere to go; Python would complain about it at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return status if isinstance(status, int) else 0
     except click.UsageError as error:
         path = error.ctx.command_path if error.ctx else PROGRAM
@@ -54,9 +58,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(error.format_message())
     except click.Abort:
         return _complain('interrupted', 130)
-    except SystemExit as leaving:
-        # click itself leaves this way when the reader of our output has gone, as in `... | head`.
-        return 141 if isinstance(leaving.__context__, BrokenPipeError) else int(leaving.code or 0)
     except Exception as error:
         if _replay_failed(error):
             return _complain(str(error), 1)

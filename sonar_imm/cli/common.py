@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ..nodes.config import NodeConfig
+from ..nodes.config import NodeConfig, type_specs
 from ..parameters import (
     Config,
     ConfigError,
@@ -72,6 +72,12 @@ def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
                         )(function)
 
 
+def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
+    """Texts of ``--set`` as the types the parameters want; others stay, for Config to refuse."""
+    specs = {spec.name: spec for spec in config_type.specs()}
+    return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
+
+
 def _typed(text: str, spec: ParameterSpec | None) -> Any:
     if spec is None:
         return text
@@ -99,13 +105,17 @@ def load_config(system: System, params: Path | None,
     Raises `ConfigError` with one sentence for each mistake.
     """
     types = (system.config_type(), NodeConfig)
+    choices = {spec.name: spec for spec in type_specs(system.name)}
     values = _parameters_of(params, system.name) if params else {}
-    specs = {spec.name: spec for config_type in types for spec in config_type.specs()}
+    specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     unknown = [f"unknown parameter '{name}'{did_you_mean(name, specs)}"
                for name in values if name not in specs]
-    if unknown:
-        raise ConfigError(*unknown)
+    # Which message types a live node subscribes to: checked, though a recording knows its own.
+    problems = unknown + [trouble for name, spec in choices.items()
+                          if name in values and (trouble := spec.problem(values[name]))]
+    if problems:
+        raise ConfigError(*problems)
     tracker, node = (config_type.from_mapping(values, ignore_unknown=True)
                      for config_type in types)
     return tracker, node
@@ -118,10 +128,9 @@ def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
         raise ConfigError(f'{path} is not a text file') from None
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
-    # What every ROS 2 node understands and no tracker needs, and what says which message types
-    # a live node subscribes to: a recording knows its own.
+    # What every ROS 2 node understands and no tracker needs.
     return {key: value for key, value in values.items()
-            if key not in ('use_sim_time', 'qos_overrides') and not key.endswith('_type')}
+            if key not in ('use_sim_time', 'qos_overrides')}
 
 
 def print_json(result: Any) -> None:

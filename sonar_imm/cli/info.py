@@ -36,7 +36,8 @@ def _print(found: dict[str, Any]) -> None:
     for topic in found['topics']:
         rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
         frames = f', frame {", ".join(topic["frames"])}' if any(topic['frames']) else ''
-        click.echo(f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}{frames}')
+        click.echo(f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}'
+                   f'{_scans(topic["scans"])}{frames}')
         for suited in topic['suits']:
             click.echo(f'      fits {suited}')
         for problem in topic['problems']:
@@ -47,6 +48,11 @@ def _print(found: dict[str, Any]) -> None:
         click.echo(f'to track it: {_track_line(found["bag"], system, inputs)}')
     if not found['systems']:
         click.echo('no tracker can use it')
+
+
+def _scans(scans: dict[str, int] | None) -> str:
+    several = scans is not None and scans['most'] > 1
+    return f', {scans["count"]} scans, up to {scans["most"]} a scan' if several else ''
 
 
 def _track_line(bag: str, system: str, inputs: dict[str, list[str]]) -> str:

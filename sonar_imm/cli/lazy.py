@@ -10,6 +10,9 @@ import click
 
 from ..parameters import did_you_mean
 
+READER_GONE = 141
+"""Exit code when nobody reads the output: that of the signal a shell would see."""
+
 
 class LazyGroup(click.Group):
     """Subcommand NAME is the attribute ``command`` of the module ``<package>.NAME``."""
@@ -32,6 +35,13 @@ class LazyGroup(click.Group):
         if args[0] not in self._summaries and not args[0].startswith('-'):
             ctx.fail(f"there is no command '{args[0]}'{did_you_mean(args[0], self._summaries)}")
         return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the subcommand. A reader that went away, as in ``... | head``, is not our error."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            raise click.exceptions.Exit(READER_GONE) from None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The help page, from the summaries alone: loading every module would take seconds."""

@@ -35,12 +35,14 @@ from .common import (
 @topic_option
 @click.option('--order', type=click.Choice(['recorded', 'stamp']), default='recorded',
               show_default=True, help='As the messages arrived, or sorted by their stamps.')
+@click.option('--smooth', is_flag=True,
+              help='Give each estimate what came after it, too.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
 def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
-            overrides: dict[str, str], topics: dict[str, str], order: str, overwrite: bool,
-            strict: bool, as_json: bool) -> None:
+            overrides: dict[str, str], topics: dict[str, str], order: str, smooth: bool,
+            overwrite: bool, strict: bool, as_json: bool) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
     OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
@@ -50,7 +52,7 @@ def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
     chosen = choose_system(bag, system, topics)
     config, node = load_config(chosen, params, overrides)
     options = InputOptions(topics=inputs_by_topic(topics), order=order, frame_id=node.frame_id,
-                           world_frame=node.world_frame_convention)
+                           world_frame=node.world_frame_convention, smooth=smooth)
     run = track_recording(bag, out_dir, chosen, config, options, overwrite=overwrite,
                           strict=strict, quiet=as_json)
     print_json(run) if as_json else _print(run, out_dir)
@@ -95,9 +97,9 @@ def track_recording(bag: Path, out_dir: Path, system: System, config: Any, optio
         problems = list(reader.problems)
     run = run_record(
         system=system.name, bag=str(bag.resolve()), **fingerprint(bag), topics=offline.topics,
-        order=options.order, world_frame=options.world_frame, messages=offline.messages,
-        **written, counts=offline.outcomes(), refused=offline.refusals(), problems=problems,
-        parameters=config.as_dict(),
+        order=options.order, smoothed=options.smooth, world_frame=options.world_frame,
+        messages=offline.messages, **written, counts=offline.outcomes(),
+        refused=offline.refusals(), problems=problems, parameters=config.as_dict(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()})
     folder.write_json(RUN, run)
     return run

@@ -23,7 +23,7 @@ from .rows import exponentials
 FloatArray = NDArray[np.float64]
 
 TAIL = 1e-13
-COARSE_SIGMA = 6
+COARSE_SIGMA = 8
 REACH = 7.0
 """A walk goes no further than so many sigma."""
 
@@ -46,7 +46,7 @@ def walk(
     out_high: int,
 ) -> None:
     """Spread source [low, high) by a normal law of `sigma` cells into out [out_low, out_high),
-    which is overwritten. scratch (3, G + 16)."""
+    which is overwritten. scratch (7, G + 16)."""
     for g in range(out_low, out_high):
         out[g] = 0.0
     factor = int(sigma / COARSE_SIGMA)
@@ -54,29 +54,36 @@ def walk(
         _spread(source, low, high, sigma, scratch[2], out, out_low, out_high)
         return
     inside, outside = scratch[0], scratch[1]
+    a, b, c, d = scratch[3], scratch[4], scratch[5], scratch[6]
+    for k in range(factor):
+        f = k / factor
+        a[k] = -f * (f - 1.0) * (f - 2.0) / 6.0
+        b[k] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
+        c[k] = -(f + 1.0) * f * (f - 2.0) / 2.0
+        d[k] = (f + 1.0) * f * (f - 1.0) / 6.0
     # Coarse cell m + 2 stands at the fine cell m * factor: interpolation needs one cell before it.
     first, last = low // factor, (high - 1) // factor
     for m in range(first + 1, last + 5):
         inside[m] = 0.0
     for m in range(first, last + 1):
-        for g in range(max(low, m * factor), min(high, (m + 1) * factor)):
-            f = (g - m * factor) / factor
-            inside[m + 1] -= source[g] * f * (f - 1.0) * (f - 2.0) / 6.0
-            inside[m + 2] += source[g] * (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
-            inside[m + 3] -= source[g] * (f + 1.0) * f * (f - 2.0) / 2.0
-            inside[m + 4] += source[g] * (f + 1.0) * f * (f - 1.0) / 6.0
+        shift = m * factor
+        for g in range(max(low, shift), min(high, shift + factor)):
+            k = g - shift
+            inside[m + 1] += source[g] * a[k]
+            inside[m + 2] += source[g] * b[k]
+            inside[m + 3] += source[g] * c[k]
+            inside[m + 4] += source[g] * d[k]
     to, end = out_low // factor, (out_high - 1) // factor
     for m in range(to + 1, end + 5):
         outside[m] = 0.0
     coarse = sigma / factor
     _spread(inside, first + 1, last + 5, coarse, scratch[2], outside, to + 1, end + 5)
     for m in range(to, end + 1):
-        a, b, c, d = outside[m + 1], outside[m + 2], outside[m + 3], outside[m + 4]
-        for g in range(max(out_low, m * factor), min(out_high, (m + 1) * factor)):
-            f = (g - m * factor) / factor
-            value = b * (f + 1.0) * (f - 1.0) * (f - 2.0) - c * (f + 1.0) * f * (f - 2.0)
-            value += (d * (f + 1.0) * (f - 1.0) - a * (f - 1.0) * (f - 2.0)) * f / 3.0
-            out[g] = max(0.5 * value / factor, 0.0)
+        shift = m * factor
+        va, vb = outside[m + 1] / factor, outside[m + 2] / factor
+        vc, vd = outside[m + 3] / factor, outside[m + 4] / factor
+        for k in range(max(out_low - shift, 0), min(out_high - shift, factor)):
+            out[shift + k] = max(va * a[k] + vb * b[k] + vc * c[k] + vd * d[k], 0.0)
 
 
 @kernel
@@ -137,14 +144,22 @@ def update(
         row = p[j, low:high]
         for g in range(n):
             before += row[g]
-            if possible:
-                after += row[g] * q[g]
+    if possible:
+        for g in range(n):
+            sums = 0.0
+            for j in range(M):
+                sums += p[j, low + g]
+            after += sums * q[g]
     possible = possible and after > 0.0
     total = after if possible else before
     for j in range(M):
         row = p[j, low:high]
-        for g in range(n):
-            row[g] = row[g] * q[g] / total if possible else row[g] / total
+        if possible:
+            for g in range(n):
+                row[g] *= q[g] / total
+        else:
+            for g in range(n):
+                row[g] /= total
     return best + math.log(after / before) if possible else -math.inf
 
 

@@ -30,6 +30,9 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
+DEAD = 1e-200
+"""A model that can be reached with no more than this probability counts as unreachable."""
+
 MIN_GATE_PROBABILITY = 1e-6
 """A model less probable than this opens no gate."""
 
@@ -65,7 +68,7 @@ def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray) ->
     """
     joint = transition * mu[:, :, None]
     c = joint.sum(axis=1)
-    dead = c <= 0.0
+    dead = c <= DEAD
     W = np.where(dead[:, None, :], mu[:, :, None], joint / np.where(dead, 1.0, c)[:, None, :])
     x0 = np.einsum('tij,tia->tja', W, x)
     spread = x[:, :, None, :] - x0[:, None, :, :]

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .imm import MIN_GATE_PROBABILITY
+from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import cholesky, gain, innovation_covariance, joseph, whitened_square
 
@@ -23,42 +23,49 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 @kernel
 def mix(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    transition: FloatArray,
+    x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M)."""
+    """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M).
+
+    The second moment is summed about the mean of all models, which makes the work of a pair (i, j)
+    one multiplication an entry: sum_i W_ij (P_i + d_i d_i') - e_j e_j', d_i = x_i - centre.
+    """
     T, M, n = x.shape
-    x0 = np.zeros((T, M, n))
-    P0 = np.zeros((T, M, n, n))
-    c = np.zeros((T, M))
-    d, W = np.empty(n), np.empty(M)
+    x0, P0, c = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
+    centre, e = np.empty(n), np.empty(n)
+    d, W, total, moment = np.empty((M, n)), np.empty(M), np.empty(n * n), np.empty((M, n * n))
     for t in range(T):
         p = t % transition.shape[0]
+        for a in range(n):
+            centre[a] = 0.0
+            for i in range(M):
+                centre[a] += mu[t, i] * x[t, i, a]
+        for i in range(M):
+            for a in range(n):
+                d[i, a] = x[t, i, a] - centre[a]
+            for a in range(n):
+                for b in range(n):
+                    moment[i, a * n + b] = P[t, i, a, b] + d[i, a] * d[i, b]
         for j in range(M):
-            total = 0.0
+            reach = 0.0
             for i in range(M):
                 W[i] = transition[p, i, j] * mu[t, i]
-                total += W[i]
-            c[t, j] = total
-            scale = 1.0 / total if total > 0.0 else 0.0
-            for i in range(M):
-                W[i] = W[i] * scale if total > 0.0 else mu[t, i]
-                for a in range(n):
-                    x0[t, j, a] += W[i] * x[t, i, a]
-            for i in range(M):
-                w = W[i]
-                if w == 0.0:
-                    continue
-                for a in range(n):
-                    d[a] = x[t, i, a] - x0[t, j, a]
-                for a in range(n):
-                    for b in range(a + 1):
-                        P0[t, j, a, b] += w * (P[t, i, a, b] + d[a] * d[b])
+                reach += W[i]
+            c[t, j] = reach
             for a in range(n):
-                for b in range(a):
-                    P0[t, j, b, a] = P0[t, j, a, b]
+                e[a] = 0.0
+            for k in range(n * n):
+                total[k] = 0.0
+            for i in range(M):
+                w = W[i] / reach if reach > DEAD else mu[t, i]
+                for a in range(n):
+                    e[a] += w * d[i, a]
+                for k in range(n * n):
+                    total[k] += w * moment[i, k]
+            for a in range(n):
+                x0[t, j, a] = centre[a] + e[a]
+                for b in range(n):
+                    P0[t, j, a, b] = total[a * n + b] - e[a] * e[b]
     return x0, P0, c
 
 

@@ -76,7 +76,7 @@ def mix(
         # How many of the points (k + u) / N lie below each particle's share of the whole.
         totals = np.cumsum(np.append(0.0, shares * running[:, -1]))
         cumulative = (totals[:-1, None] + shares[:, None] * running).ravel()
-        below = np.ceil(cumulative / totals[-1] * N - uniform[j])
+        below = np.ceil(cumulative * (N / totals[-1]) - uniform[j])
         copies = np.diff(np.minimum(below, N), prepend=0.0).astype(np.intp)
         mixed[j] = np.repeat(union, copies, axis=1)
     return mixed, c

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .jit import kernel
-from .rows import exponentials
+from .rows import exponentials, ROUND
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -53,12 +53,14 @@ def mix(
             total += share * running[i, N - 1]
         for k in range(N + 1):
             origin[k] = 0
-        begin, before = 0, 0.0
+        begin, before, scale = 0, 0.0, N / total
         for i in range(M):
             share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
             row = running[i]
             for s in range(N):
-                points[s] = np.ceil((before + share * row[s]) / total * N - uniform[j])
+                point = (before + share * row[s]) * scale - uniform[j]
+                whole = (point + ROUND) - ROUND
+                points[s] = whole + 1.0 if whole < point else whole
             before += share * running[i, N - 1]
             for s in range(N):
                 origin[begin] = i * N + s
@@ -66,9 +68,15 @@ def mix(
         source = 0
         for k in range(N):
             source = max(source, origin[k])
-            i = source // N
-            for a in range(n):
-                mixed[j, a, k] = x[i, a, source - i * N]
+            origin[k] = source
+        for a in range(n):
+            out, i = mixed[j, a], 0
+            from_model = x[0, a]
+            for k in range(N):
+                while origin[k] >= (i + 1) * N:
+                    i += 1
+                    from_model = x[i, a]
+                out[k] = from_model[origin[k] - i * N]
 
 
 @kernel

@@ -13,14 +13,14 @@ how much the numbers of copies scatter about it:
     One uniform draw in each of `count` equal slices of the cumulative weights.
 `systematic`
     One uniform draw for all slices together: every particle has floor(count w_n) or one more
-    copies. The fewest random numbers and, nearly always, the least scatter.
+    copies, which no scheme can better. One random number in all. (What one draw shares it also
+    shifts: all slices are read a little left or right together, by 1 / count at the most.)
 
 All have one signature, ``scheme(weights, count, rng) -> indices``: weights (n,) not negative, not
 all zero, in any scale; indices (count,) in ascending order, never one of a particle of zero
 weight. ValueError for weights that are no weights.
 
-All but `residual` invert the cumulative weights at points in [0, 1) (`invert`). Variance falls
-further when particles with like states are neighbours, as they are after systematic draws.
+All but `residual` invert the cumulative weights at points in [0, 1) (`invert`).
 
 Reference: Douc, Cappe, Moulines, *Comparison of resampling schemes for particle filtering*, ISPA
 2005.

@@ -24,6 +24,23 @@ _PER_LN2 = 1.0 / math.log(2.0)
 _LN2, _LN2_REST = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _LEAST = -700.0
 _E = tuple(1.0 / math.factorial(k) for k in range(13))
+_ROOT2 = math.sqrt(2.0)
+_MANTISSA = (1 << 52) - 1
+_ONE = 1023 << 52
+# A double with these bits and a small whole number in its lowest ones is 2^52 plus that number.
+_WHOLE = 1075 << 52
+
+
+def _even_polynomial(function: str) -> tuple[float, ...]:
+    """Coefficients in f^2 of sin(pi f) / f or cos(pi f) for abs(f) <= 1/2: their Taylor series."""
+    first = 1 if function == 'sin' else 0
+    return tuple(
+        (-1.0) ** k * math.pi ** (2 * k + first) / math.factorial(2 * k + first) for k in range(11)
+    )
+
+
+_S = _even_polynomial('sin')
+_C = _even_polynomial('cos')
 
 
 @kernel
@@ -47,3 +64,54 @@ def exponentials(values: FloatArray, scratch: FloatArray, out: FloatArray) -> No
         bits[i] = (bits[i] + 1023) << 52
     for i in range(values.shape[0]):
         out[i] = out[i] * scratch[i] if values[i] > _LEAST else 0.0
+
+
+@kernel
+def phasors(values: FloatArray, factor: float, cosine: FloatArray, sine: FloatArray) -> None:
+    """cos and sin of 2 pi factor values (n,); NaN stays NaN.
+
+    Taking the nearest whole number away leaves f in [-1/2, 1/2], where sin(pi f) and cos(pi f) are
+    polynomials to 1e-15; doubling the angle does the rest.
+    """
+    for i in range(values.shape[0]):
+        turns = factor * values[i]
+        f = turns - ((turns + ROUND) - ROUND)
+        t = f * f
+        s = _S[8] + t * (_S[9] + t * _S[10])
+        s = _S[4] + t * (_S[5] + t * (_S[6] + t * (_S[7] + t * s)))
+        s = f * (_S[0] + t * (_S[1] + t * (_S[2] + t * (_S[3] + t * s))))
+        c = _C[8] + t * (_C[9] + t * _C[10])
+        c = _C[4] + t * (_C[5] + t * (_C[6] + t * (_C[7] + t * c)))
+        c = _C[0] + t * (_C[1] + t * (_C[2] + t * (_C[3] + t * c)))
+        cosine[i] = c * c - s * s
+        sine[i] = 2.0 * s * c
+
+
+@kernel
+def normals(uniform: FloatArray, out: FloatArray) -> None:
+    """Standard normal numbers (n,) from uniform ones in [0, 1) (n,), n even; uniform is used up.
+
+    Box and Muller: sqrt(-2 ln v) times the cosine and the sine of a random angle. v = 2^e m, and
+    ln m is the series of the inverse hyperbolic tangent of (m - 1) / (m + 1).
+    """
+    half = uniform.shape[0] // 2
+    first, cosine, sine = uniform[:half], out[:half], out[half:]
+    bits, exponent = first.view(np.int64), cosine.view(np.int64)
+    for i in range(half):
+        first[i] = 1.0 - first[i]
+    for i in range(half):
+        exponent[i] = (bits[i] >> 52) | _WHOLE
+        bits[i] = (bits[i] & _MANTISSA) | _ONE
+    for i in range(half):
+        m, e = first[i], cosine[i] - (2.0**52 + 1023.0)
+        e = e + 1.0 if m > _ROOT2 else e
+        m = 0.5 * m if m > _ROOT2 else m
+        f = (m - 1.0) / (m + 1.0)
+        t = f * f
+        p = 1.0 / 11.0 + t * (1.0 / 13.0 + t * (1.0 / 15.0 + t * (1.0 / 17.0 + t / 19.0)))
+        p = 1.0 / 3.0 + t * (1.0 / 5.0 + t * (1.0 / 7.0 + t * (1.0 / 9.0 + t * p)))
+        first[i] = math.sqrt(max(-2.0 * (e * math.log(2.0) + 2.0 * f * (1.0 + t * p)), 0.0))
+    phasors(uniform[half:], 1.0, cosine, sine)
+    for i in range(half):
+        cosine[i] *= first[i]
+        sine[i] *= first[i]

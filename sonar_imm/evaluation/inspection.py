@@ -15,7 +15,7 @@ from msg_adapters.inputs import INPUTS, InputTopic
 
 from ..measurements import Rejection
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
-from .series import SECOND
+from . import SECOND
 
 LONG_GAP = 10.0
 """A gap is worth telling when it is this many times the usual time between two messages."""
@@ -39,7 +39,7 @@ class _Heard:
 def inspect(bag: BagReader, advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
     """Read a whole open recording. Gives plain values, fit for JSON.
 
-    topics: one entry each with count, rate, span, frames, which tracker input it suits and its
+    topics: one entry each with count, rate, frames, scans, which tracker input it suits and its
     problems; problems: of the recording as a whole; systems: topic by input for each tracker.
     """
     heard = {topic.name: _Heard(topic) for topic in bag.topics}
@@ -84,10 +84,14 @@ def _usable_stamp(message: Any) -> int | None:
 
 def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     """The tracker inputs a message could be for. Truth is nobody's input."""
-    if 'truth' in item.topic.split('/'):
+    if _is_truth(item.topic):
         return []
     return [(system, entry) for system, entries in INPUTS.items() for entry in entries
             if item.type_name in entry.readers]
+
+
+def _is_truth(topic: str) -> bool:
+    return 'truth' in topic.split('/')
 
 
 def _topic_entry(heard: _Heard) -> dict[str, Any]:
@@ -95,8 +99,24 @@ def _topic_entry(heard: _Heard) -> dict[str, Any]:
     suits = [f'{system} {name}' for system, name in heard.good]
     return {'name': heard.topic.name, 'type': heard.topic.type_name, 'count': heard.topic.count,
             'rate_hz': (len(heard.logs) - 1) / span if span > 0 else None,
-            'frames': list(heard.frames), 'suits': suits,
+            'frames': list(heard.frames), 'suits': suits, 'scans': _scans(heard),
             'problems': _stamp_problems(heard) + _content_problems(heard)}
+
+
+def _scans(heard: _Heard) -> dict[str, int] | None:
+    """How many stamps a topic of scans has, and how many messages share one at most; else None.
+    """
+    if not heard.stamps or not _holds_scans(heard):
+        return None
+    counts = np.unique(np.array(heard.stamps, np.int64), return_counts=True)[1]
+    return {'count': len(counts), 'most': int(counts.max())}
+
+
+def _holds_scans(heard: _Heard) -> bool:
+    """Whether equal stamps are one look at several targets, not one message twice."""
+    return _is_truth(heard.topic.name) or any(
+        entry.scans for system, name in heard.good for entry in INPUTS[system]
+        if entry.name == name)
 
 
 def _stamp_problems(heard: _Heard) -> list[str]:
@@ -107,7 +127,8 @@ def _stamp_problems(heard: _Heard) -> list[str]:
     if backward := int(np.count_nonzero(steps < 0)):
         problems.append(f'{backward} stamps older than the one before, by up to '
                         f'{-steps.min() / SECOND:.3g} s')
-    if repeated := int(np.count_nonzero(steps == 0)):
+    repeated = int(np.count_nonzero(steps == 0))
+    if repeated and not _holds_scans(heard):
         problems.append(f'{repeated} stamps equal to the one before')
     forward = steps[steps > 0]
     if len(forward) > 2 and forward.max() > LONG_GAP * np.median(forward):

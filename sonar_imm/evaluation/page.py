@@ -5,7 +5,7 @@ Everything is inside the one file, plotly.js too: a report can be mailed and ope
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 from attrs import frozen
@@ -23,13 +23,14 @@ header small { letter-spacing: .08em; text-transform: uppercase; opacity: .75; f
 h1 { margin: 4px 0 12px; font-size: 30px; font-weight: 650; overflow-wrap: anywhere; }
 header p { margin: 0; max-width: 820px; font-size: 17px; opacity: .95; }
 .wrap { max-width: 1180px; margin: 0 auto; padding: 0 24px; }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(164px, 1fr)); gap: 14px;
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(140px, 1fr)); gap: 14px;
   margin-top: -54px; }
 .card, section { background: white; border: 1px solid var(--line); border-radius: 10px;
   box-shadow: 0 1px 3px rgba(20, 40, 60, .06); }
 .card { padding: 16px 18px; }
 .card b { display: block; font-size: 27px; font-weight: 650; font-variant-numeric: tabular-nums; }
-.card span { font-size: 13px; font-weight: 600; }
+.card span { display: block; font-size: 13px; font-weight: 600; line-height: 1.3;
+  min-height: 2.6em; }
 .card i { display: block; font-style: normal; font-size: 12.5px; color: var(--soft); }
 section { margin: 18px 0; padding: 22px 26px; overflow-x: auto; }
 h2 { margin: 0 0 2px; font-size: 19px; }
@@ -41,7 +42,7 @@ th, td { padding: 5px 12px 5px 0; vertical-align: top; }
 td { border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
 td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
 details summary { cursor: pointer; color: var(--blue); font-size: 14px; padding: 4px 0; }
-footer { color: var(--soft); font-size: 12.5px; padding: 8px 0 40px; }
+footer { color: var(--soft); font-size: 12.5px; padding-bottom: 40px; }
 @media print { body { background: white; } section, .card { box-shadow: none;
   break-inside: avoid; } }
 """
@@ -66,25 +67,41 @@ class Section:
     html: str = ''
 
 
-def render(*, kicker: str, title: str, summary: str, cards: Iterable[Card],
-           sections: Iterable[Section], footer: str) -> str:
+@frozen
+class Part:
+    """One recording on the page: a band with title and result, key numbers, sections."""
+
+    kicker: str
+    title: str
+    summary: str
+    cards: tuple[Card, ...]
+    sections: tuple[Section, ...]
+
+
+def render(title: str, parts: Sequence[Part], *, footer: str) -> str:
     """The whole page as text. The same arguments give the same bytes."""
-    body = '\n'.join(_section(section, index) for index, section in enumerate(sections))
-    boxes = '\n'.join(f'<div class="card"><span>{escape(card.title)}</span>'
-                      f'<b>{escape(card.value)}</b><i>{escape(card.remark)}</i></div>'
-                      for card in cards)
+    body = '\n'.join(_part(part, f'figure-{index}') for index, part in enumerate(parts))
     return f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{escape(title)}</title>
 <style>{STYLE}</style>
 <script>{plotly.offline.get_plotlyjs()}</script></head>
-<body><header><div class="wrap"><small>{escape(kicker)}</small><h1>{escape(title)}</h1>
-<p>{escape(summary)}</p></div></header>
-<main class="wrap"><div class="cards">{boxes}</div>
+<body>
 {body}
-<footer>{escape(footer)}</footer></main></body></html>
+<footer class="wrap">{escape(footer)}</footer></body></html>
 """
+
+
+def _part(part: Part, name: str) -> str:
+    boxes = '\n'.join(f'<div class="card"><span>{escape(card.title)}</span>'
+                      f'<b>{escape(card.value)}</b><i>{_prose(card.remark)}</i></div>'
+                      for card in part.cards)
+    body = '\n'.join(_section(section, f'{name}-{index}')
+                     for index, section in enumerate(part.sections))
+    return (f'<header><div class="wrap"><small>{escape(part.kicker)}</small>'
+            f'<h1>{escape(part.title)}</h1><p>{_prose(part.summary)}</p></div></header>\n'
+            f'<main class="wrap"><div class="cards">{boxes}</div>\n{body}</main>')
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
@@ -104,6 +121,11 @@ def mapping_table(header: tuple[str, str], values: Mapping[str, object]) -> str:
     return table(header, values.items())
 
 
+def _prose(text: str) -> str:
+    """Running text; a number and its per cent sign stay on one line."""
+    return escape(text.replace(' %', '\u00a0%'))
+
+
 def _cell(value: object) -> str:
     if isinstance(value, float):
         return f'<td class="number">{value:.6g}</td>'
@@ -112,10 +134,10 @@ def _cell(value: object) -> str:
     return f'<td{kind}>{escape(text)}</td>'
 
 
-def _section(section: Section, index: int) -> str:
+def _section(section: Section, name: str) -> str:
     figure = '' if section.figure is None else section.figure.to_html(
-        full_html=False, include_plotlyjs=False, div_id=f'figure-{index}',
+        full_html=False, include_plotlyjs=False, div_id=name,
         config={'displaylogo': False, 'responsive': True,
                 'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d']})
-    return (f'<section><h2>{escape(section.title)}</h2><p>{escape(section.text)}</p>'
+    return (f'<section><h2>{escape(section.title)}</h2><p>{_prose(section.text)}</p>'
             f'{figure}{section.html}</section>')

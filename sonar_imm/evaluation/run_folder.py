@@ -11,7 +11,7 @@ the same bytes. What does depend on them is in run.json.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 import csv
 import hashlib
 from importlib.metadata import version
@@ -30,11 +30,11 @@ from msg_adapters.estimates import read_estimate, write_estimate
 
 from .. import __version__
 from ..estimates import Estimate
-from ..measurements import Fix, Rejection
+from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.writer import BagWriter, ros_message
-from .series import Series, series_of
+from .judging import JUDGES
 
 BAG, CSV, RUN, METRICS, REPORT = ('estimate', 'estimate.csv', 'run.json', 'metrics.json',
                                   'report.html')
@@ -91,16 +91,15 @@ class RunFolder:
             run = json.loads(path.read_text(encoding='utf-8'))
             if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
                 raise ValueError('keys are missing')
-        except (ValueError, AttributeError) as error:
+            if run['system'] not in JUDGES:
+                raise ValueError(f"there is no system '{run['system']}'")
+        except (ValueError, AttributeError, TypeError) as error:
             raise BagError(f'{path} cannot be understood: {error}') from None
         return run
 
-    def read_series(self) -> Series:
-        """The estimates of the run. Raises `BagError` when its bag is damaged."""
-        try:
-            return series_of(_read_estimates(self.path / BAG, None))
-        except (Rejection, ValueError) as error:
-            raise BagError(f'{self.path / BAG}: {error}') from None
+    def read_estimates(self) -> list[Estimate]:
+        """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
+        return _read_estimates(self.path / BAG)
 
 
 class CsvTable:
@@ -129,24 +128,42 @@ class CsvTable:
             self._writer.writerow([estimate.stamp_ns, *row])
 
 
-def read_truth(path: Path) -> Series | None:
-    """The truth in the bag at `path`, None when it has none. Raises `BagError`."""
-    estimates = _read_estimates(path, TRUTH_TOPIC)
-    return series_of(estimates) if estimates else None
+def read_truth(run: Mapping[str, Any], truth_bag: Path | None = None,
+               topic: str = TRUTH_TOPIC) -> list[Estimate] | None:
+    """The truth tables in `truth_bag`, by default in the recording that was tracked.
+
+    None when the recording has no truth or is gone. Raises `BagError`, also when `truth_bag` holds
+    no truth.
+    """
+    path = truth_bag or Path(run['bag'])
+    if truth_bag is None and not path.exists():
+        return None
+    estimates = _read_estimates(path, [topic])
+    if not estimates and truth_bag is not None:
+        raise BagError(f'{truth_bag} has no topic {topic}')
+    return estimates or None
 
 
-def read_fixes(run: dict[str, Any]) -> list[Fix]:
-    """The raw fixes that went into `run`. Raises `BagError`."""
+def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
+    """The measurements that went into `run`, in the order recorded, without those refused.
+
+    Nothing when the recording is gone. Raises `BagError`.
+    """
+    if not Path(run['bag']).exists():
+        return
     with BagReader(run['bag']) as bag:
-        heard = measurements_of(bag, run['system'], run['topics'],
-                                world_frame=run.get('world_frame', 'enu'))
-        return [item.measurement for item in heard if isinstance(item.measurement, Fix)]
+        for heard in measurements_of(bag, run['system'], run['topics'],
+                                     world_frame=run.get('world_frame', 'enu')):
+            if not isinstance(heard.measurement, Rejection):
+                yield heard.measurement
 
 
-def _read_estimates(path: Path, topic: str | None) -> list[Estimate]:
-    with BagReader(path) as bag:
-        return [read_estimate(item.message)
-                for item in bag.messages(None if topic is None else [topic])]
+def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimate]:
+    try:
+        with BagReader(path) as bag:
+            return [read_estimate(item.message) for item in bag.messages(topics)]
+    except Rejection as rejection:
+        raise BagError(f'{path}: {rejection}') from None
 
 
 def run_record(**facts: Any) -> dict[str, Any]:

@@ -23,17 +23,22 @@ from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
 from ..trackers import System
-from .series import SECOND
+from . import SECOND
 
 
 @frozen(kw_only=True)
 class InputOptions:
-    """How to read a recording. topics: input by topic name, None to pick what fits by name."""
+    """How to treat a recording.
+
+    topics: input by topic name, None to pick what fits by name; smooth: give each estimate what
+    came after it, too, which takes memory in proportion to the recording.
+    """
 
     topics: Mapping[str, str] | None = None
     order: str = 'recorded'
     world_frame: str = 'enu'
     frame_id: str = ''
+    smooth: bool = False
 
 
 @define
@@ -76,6 +81,18 @@ class Revisions:
         return [self._held.pop(stamp) for stamp in stamps]
 
 
+def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
+    """The last word on each stamp out of everything a live tracker of `config` published."""
+    revisions = Revisions(window_ns(config))
+    return [*(final for estimate in estimates for final in revisions.add([estimate])),
+            *revisions.finish()]
+
+
+def window_ns(config: Config) -> int:
+    """How far back late input can change the estimates of a tracker."""
+    return round(getattr(config, 'history', 0.0) * SECOND)
+
+
 class OfflineRun:
     """One pass of a tracker over an open recording. The counters are complete after `estimates`.
 
@@ -90,11 +107,12 @@ class OfflineRun:
         self._system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
         self.topics = {name: entry.name for name, entry in chosen.items()}
-        self.tracker = system.build(config)
+        build = system.build_smoother if self.options.smooth else system.build
+        self.tracker = build(config)
         self.refused: dict[str, Refused] = {}
         self.messages = 0
         self.durations = array('d')
-        self._window_ns = round(getattr(config, 'history', 0.0) * SECOND)
+        self._window_ns = window_ns(config)
 
     @property
     def total(self) -> int:
@@ -104,12 +122,19 @@ class OfflineRun:
     def estimates(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Estimate]:
         """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
         revisions = Revisions(self._window_ns)
+        self.tracker.warm()
         for measurement in self._measurements(advance):
             begin = time.perf_counter()
             made = self.tracker.process(measurement)
             self.durations.append(time.perf_counter() - begin)
-            yield from revisions.add(made)
-        yield from revisions.finish()
+            final = revisions.add(made)
+            if not self.options.smooth:
+                yield from final
+        last = revisions.finish()
+        if not self.options.smooth:
+            yield from last
+        elif last:
+            yield from self.tracker.smoothed()
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
         guard = FrameGuard(self.options.frame_id)

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
 import functools
+from pathlib import Path
 import sys
 import threading
 import time
@@ -40,9 +41,9 @@ from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
 from ..measurements import Rejection
-from ..parameters import ConfigError, ParameterSpec
+from ..parameters import ConfigError
 from ..trackers import SYSTEMS
-from .config import NodeConfig
+from .config import NodeConfig, type_spec, type_specs
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
@@ -64,7 +65,7 @@ class TrackerNode(Node):
         self._topics = INPUTS[system]
         config_type = SYSTEMS[system].config_type()
         self._settings = NodeParameters(self, (config_type, NodeConfig),
-                                        [s for t in self._topics if (s := _type_spec(t))])
+                                        type_specs(system))
         self.tracker = SYSTEMS[system].build(self._settings[config_type])
         self._guard = FrameGuard(self._node_config.frame_id)
         self._warm()
@@ -126,7 +127,7 @@ class TrackerNode(Node):
 
     def _listen(self, topic: InputTopic) -> str:
         """Subscribe to one input and give the resolved name of its topic."""
-        spec = _type_spec(topic)
+        spec = type_spec(topic)
         type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
         reader = functools.partial(topic.readers[type_name],
                                    world_frame=self._node_config.world_frame_convention)
@@ -248,7 +249,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except ConfigError as error:
-        print(error, file=sys.stderr)
+        print(f'{Path(sys.argv[0]).stem}: {error}', file=sys.stderr)
         return 2
     except RuntimeError:  # RCLError, when the context vanished in the middle of a call
         if rclpy.ok():
@@ -266,18 +267,6 @@ def _init(args: list[str] | None) -> None:
         rclpy.init(args=args)
     except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
         raise ConfigError(' '.join(str(error).split())) from None
-
-
-def _type_spec(topic: InputTopic) -> ParameterSpec | None:
-    """Declare ``<input>_type``, needed where an input can be one of several message types.
-
-    In ROS one topic name has one type, so the user has to say which.
-    """
-    if len(topic.readers) == 1:
-        return None
-    return ParameterSpec(name=f'{topic.name}_type', kind='str', default=next(iter(topic.readers)),
-                         description=f"message type of the input '{topic.name}'",
-                         choices=tuple(topic.readers))
 
 
 @contextlib.contextmanager

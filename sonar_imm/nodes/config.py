@@ -1,10 +1,12 @@
-"""What every node can be told besides the parameters of its tracker; offline tools read it too."""
+"""What a node can be told besides the parameters of its tracker; offline tools read it too."""
 
 from __future__ import annotations
 
 from attrs import frozen
 
-from ..parameters import Config, parameter
+from msg_adapters.inputs import INPUTS, InputTopic
+
+from ..parameters import Config, parameter, ParameterSpec
 
 
 @frozen(kw_only=True)
@@ -26,3 +28,20 @@ class NodeConfig(Config):
     stale_after: float = parameter(
         10.0, 'silence after which diagnostics call the input stale', unit='s', low=0.01, high=1e6,
         read_only=False)
+
+
+def type_specs(system: str) -> tuple[ParameterSpec, ...]:
+    """The parameters ``<input>_type`` of the node of `system`."""
+    return tuple(spec for topic in INPUTS[system] if (spec := type_spec(topic)) is not None)
+
+
+def type_spec(topic: InputTopic) -> ParameterSpec | None:
+    """``<input>_type``, needed where an input can be one of several message types; else None.
+
+    In ROS one topic name has one type, so the user has to say which.
+    """
+    if len(topic.readers) == 1:
+        return None
+    return ParameterSpec(name=f'{topic.name}_type', kind='str', default=next(iter(topic.readers)),
+                         description=f"message type of the input '{topic.name}'; a recording "
+                                     'knows its own', choices=tuple(topic.readers))

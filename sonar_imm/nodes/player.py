@@ -16,10 +16,10 @@ from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from ..parameters import did_you_mean
+from ..parameters import ConfigError, did_you_mean
 from ..recordings.messages import typestore
-from ..recordings.reader import BagMessage, BagReader
-from .link import Link, LinkError, MATCH_LIMIT
+from ..recordings.reader import BagError, BagMessage, BagReader
+from .link import Link, MATCH_LIMIT
 from .lockstep import LockStep, only_node
 from .messages import make, message_class
 from .qos import lockstep_qos, output_qos
@@ -34,12 +34,17 @@ _NANO = 10**9
 
 def _positive(instance: PlayOptions, attribute: object, value: float | None) -> None:
     if value is not None and not 0.0 < value < float('inf'):
-        raise LinkError(f'the {attribute.name} must be positive, got {value:g}')
+        raise ConfigError(f'the {attribute.name} must be positive, got {value:g}')
+
+
+def _not_negative(instance: PlayOptions, attribute: object, value: float) -> None:
+    if not 0.0 <= value < float('inf'):
+        raise ConfigError(f'the {attribute.name} must not be negative, got {value:g}')
 
 
 @frozen(kw_only=True)
 class PlayOptions:
-    """How to play. Raises `LinkError` for a rate that is not positive.
+    """How to play. Raises `ConfigError` for a number that makes no sense.
 
     rate: speed, 2 is twice as fast; loop: start over at the end; start_offset: seconds of the
     recording to skip; delay: seconds to wait before the first message; start_paused: wait for the
@@ -51,8 +56,8 @@ class PlayOptions:
 
     rate: float = field(default=1.0, validator=_positive)
     loop: bool = False
-    start_offset: float = 0.0
-    delay: float = 0.0
+    start_offset: float = field(default=0.0, validator=_not_negative)
+    delay: float = field(default=0.0, validator=_not_negative)
     start_paused: bool = False
     clock: float | None = field(default=None, validator=_positive)
     topics: tuple[str, ...] = ()
@@ -74,7 +79,8 @@ def play(path: Path | str, options: PlayOptions, *, domain_id: int | None = None
     """Publish the bag at `path`; ends with it, or never with ``loop``.
 
     `progress` is called with the number of messages just published. Raises `BagError` for a bag
-    that cannot be read and `LinkError` when there is nothing to publish or nobody answers.
+    that cannot be read or has nothing to publish, `ConfigError` for topics it does not have, and
+    `LinkError` when the node to step with is missing, ends or does not answer.
     """
     with BagReader(path) as bag, Link(NAME, domain_id=domain_id) as link:
         player = Player(bag, link, options)
@@ -122,8 +128,8 @@ class Player:
         recorded = {topic.name: topic.type_name for topic in self._bag.topics}
         for name in (*self._options.topics, *self._options.remap):
             if name not in recorded:
-                raise LinkError(f"{self._bag.path} has no topic '{name}'"
-                                f'{did_you_mean(name, recorded)}')
+                raise ConfigError(f"{self._bag.path} has no topic '{name}'"
+                                  f'{did_you_mean(name, recorded)}')
         # Reliable, which every listener accepts; in lock-step nothing may be dropped at all.
         qos = lockstep_qos() if self._options.lockstep else output_qos(_DEPTH)
         publishers = {}
@@ -138,7 +144,7 @@ class Player:
             publishers[name] = self._link.node.create_publisher(
                 cls, self._options.remap.get(name, name), qos)
         if not publishers:
-            raise LinkError(f'{self._bag.path} has nothing to publish')
+            raise BagError(f'{self._bag.path} has nothing to publish')
         return publishers
 
     def _meet(self, limit: float) -> set[str]:

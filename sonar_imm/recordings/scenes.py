@@ -1,48 +1,33 @@
-"""Simulated scenes as bags."""
+"""Simulated scenes as bags.
+
+What a scene holds is told apart by its class: `MEASUREMENTS` says on which topic a measurement
+goes and who writes it, `TRUTHS` how the truth becomes messages.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from msg_adapters.arrivals import write_arrivals
 from msg_adapters.estimates import write_true_profile
 from msg_adapters.fixes import write_fix
 from msg_adapters.snapshots import write_snapshot
 from sonar_imm.measurements import Arrivals, Fix, Snapshot
-from sonar_imm.simulation.scene import Scene, TrueProfile
+from sonar_imm.simulation.scene import Scene, TrueProfile, TrueTrack
 
 from .conversion import ConversionReport, Record
 from .convert_truth import track_records, TRUTH_TOPIC
 from .messages import ros_message
 from .writer import BagWriter
 
-_WRITERS = {
-    Fix: ('/fix', write_fix),
-    Arrivals: ('/arrivals', write_arrivals),
-    Snapshot: ('/snapshot', write_snapshot),
-}
 
-
-def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) -> ConversionReport:
-    """Write measurements and truth, in the order of reception. Raises `BagError`."""
-    report = ConversionReport(Path(out))
-    records: list[Record] = []
-    for one in scene.measurements:
-        topic, write = _WRITERS[type(one.measurement)]
-        topic = _namespaced(one.namespace, topic)
-        records.append((one.received_ns, topic, write(one.measurement, ros_message)))
-    for true in scene.truth:
-        if isinstance(true, TrueProfile):
-            records.append(profile_record(true))
-        else:
-            records += track_records(
-                true.stamp_ns, true.position, true.velocity, true.track_id, scene.frame_id
-            )
-    with BagWriter(out, custom_data=provenance) as bag:
-        for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
-            bag.write(topic, message, log_ns)
-            report.messages[topic] = report.messages.get(topic, 0) + 1
-    return report
+def true_track_records(track: TrueTrack, frame_id: str) -> list[Record]:
+    """One truth message a stamp."""
+    return track_records(
+        track.stamp_ns, track.position, track.velocity, track.track_id, frame_id
+    )
 
 
 def profile_record(profile: TrueProfile) -> Record:
@@ -67,3 +52,34 @@ def profile_record(profile: TrueProfile) -> Record:
 
 def _namespaced(namespace: str, topic: str) -> str:
     return f'/{namespace}{topic}' if namespace else topic
+
+
+MEASUREMENTS: dict[type, tuple[str, Callable[..., Any]]] = {
+    Fix: ('/fix', write_fix),
+    Arrivals: ('/arrivals', write_arrivals),
+    Snapshot: ('/snapshot', write_snapshot),
+}
+"""Topic and writer ``(measurement, make) -> message`` by class of measurement."""
+
+TRUTHS: dict[type, Callable[[Any, str], Iterable[Record]]] = {
+    TrueTrack: true_track_records,
+    TrueProfile: lambda profile, frame_id: [profile_record(profile)],
+}
+"""Writer ``(truth, frame_id) -> records`` by class of truth."""
+
+
+def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) -> ConversionReport:
+    """Write measurements and truth, in the order of reception. Raises `BagError`."""
+    report = ConversionReport(Path(out))
+    records: list[Record] = []
+    for one in scene.measurements:
+        topic, write = MEASUREMENTS[type(one.measurement)]
+        topic = _namespaced(one.namespace, topic)
+        records.append((one.received_ns, topic, write(one.measurement, ros_message)))
+    for true in scene.truth:
+        records += TRUTHS[type(true)](true, scene.frame_id)
+    with BagWriter(out, custom_data=provenance) as bag:
+        for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
+            bag.write(topic, message, log_ns)
+            report.messages[topic] = report.messages.get(topic, 0) + 1
+    return report

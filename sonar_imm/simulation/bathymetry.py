@@ -116,8 +116,8 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'paper': ('flat floor with a rough patch, 30 to 10 dB: the scene of the paper', {}),
     'slope': ('paper on a floor that rises 0.1 m a metre', {'slope': 0.1}),
     'correlated': (
-        'paper with roughness correlated over 0.5 m, as real roughness is',
-        {'correlation_length': 0.5},
+        'paper with roughness correlated over a metre, as real roughness is',
+        {'correlation_length': 1.0},
     ),
     'undulating': (
         'paper on an undulating floor',

@@ -2,7 +2,7 @@
 
 How a diver moves is a `motion`, what the sensors see of it a `sensor`; a scenario is a choice of
 both with a name (`SCENARIOS`). The paper's Table 1 gives start, speed, sampling and accuracy but
-not the path; `table1` swims legs of 5 to 15 s whose headings lie within 90 degrees of a general
+not the path; `table1` swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
 one: zigzag with general consistent direction, as the paper puts it.
 """
 
@@ -41,11 +41,13 @@ class DiverScenario(Config):
         (-40.0, 40.0), 'first position of the first diver', unit='m'
     )
     heading_deg: float = parameter(0.0, 'general heading, counter-clockwise from +x', unit='deg')
-    random_heading: bool = parameter(False, 'draw the general heading anew for each scene')
-    turn_deg: float = parameter(
-        90.0, 'legs head within this of the general heading', unit='deg', low=0.0, high=180.0
+    random_rotation: bool = parameter(
+        False, 'turn the scene, start and heading, about the sonar by an angle drawn at random'
     )
-    leg_min: float = parameter(5.0, 'shortest leg', unit='s', low=0.1)
+    turn_deg: float = parameter(
+        85.0, 'legs head within this of the general heading', unit='deg', low=0.0, high=180.0
+    )
+    leg_min: float = parameter(7.0, 'shortest leg', unit='s', low=0.1)
     leg_max: float = parameter(15.0, 'longest leg', unit='s', low=0.1)
     duration: float = parameter(100.0, 'length of the scene', unit='s', low=1.0, high=1e6)
     step: float = parameter(1.0, 'time between scans', unit='s', low=1e-3, high=1e4)
@@ -87,11 +89,14 @@ class DiverScenario(Config):
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'table1': ('zigzag legs at 1 m/s, polar sonar: Table 1 of the paper', {}),
-    'random_heading': ('table1 with a general heading drawn at random', {'random_heading': True}),
+    'random_heading': (
+        'table1 turned about the sonar by a random angle: no heading is a model',
+        {'random_rotation': True},
+    ),
     'legs_slow': ('table1 at 0.5 m/s', {'speed': 0.5}),
     'straight': (
-        'a straight cruise, heading drawn at random',
-        {'motion': 'straight', 'random_heading': True},
+        'a straight cruise, turned at random',
+        {'motion': 'straight', 'random_rotation': True},
     ),
     'circle': ('a circle once every 80 s at 0.75 m/s', {'motion': 'circle', 'speed': 0.75}),
     'zigzag': (
@@ -102,12 +107,12 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'leg_min': 10.0,
             'leg_max': 10.0,
             'speed': 0.75,
-            'random_heading': True,
+            'random_rotation': True,
         },
     ),
     'stop_and_go': (
         'legs with rests between',
-        {'motion': 'stop_and_go', 'speed': 0.75, 'random_heading': True},
+        {'motion': 'stop_and_go', 'speed': 0.75, 'random_rotation': True},
     ),
     'still': ('a diver that does not move', {'motion': 'still'}),
     'irregular': (
@@ -121,12 +126,12 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'speed': 0.75,
             'detection_probability': 0.7,
             'outlier_probability': 0.02,
-            'random_heading': True,
+            'random_rotation': True,
         },
     ),
     'multistatic_fixes': (
         'fixes computed ping by ping from four receivers',
-        {'sensor': 'multistatic_fixes', 'speed': 0.75, 'random_heading': True},
+        {'sensor': 'multistatic_fixes', 'speed': 0.75, 'random_rotation': True},
     ),
     'several': (
         'four divers, missed detections and clutter',
@@ -134,7 +139,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'divers': 4,
             'detection_probability': 0.9,
             'clutter': 2.0,
-            'random_heading': True,
+            'random_rotation': True,
             'speed': 0.75,
         },
     ),
@@ -158,7 +163,8 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
     rng = np.random.default_rng(seed)
     times = _scan_times(config, rng)
     stamps = FIRST_STAMP_NS + np.round(times * 1e9).astype(np.int64)
-    paths = [_path(config, times, diver, rng) for diver in range(config.divers)]
+    turn = rng.uniform(0.0, 2.0 * np.pi) if config.random_rotation else 0.0
+    paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
     truth = tuple(
         TrueTrack(
             number, stamps, np.column_stack([state[:, :2], np.zeros(len(times))]), state[:, 2:]
@@ -183,16 +189,15 @@ def _scan_times(config: DiverScenario, rng: np.random.Generator) -> FloatArray:
 
 
 def _path(
-    config: DiverScenario, times: FloatArray, diver: int, rng: np.random.Generator
+    config: DiverScenario, times: FloatArray, diver: int, turn: float, rng: np.random.Generator
 ) -> FloatArray:
-    """State (n, 4), px py vx vy, of one diver at `times`; the velocity is that of the step
-    before."""
-    general = (
-        rng.uniform(0.0, 2.0 * np.pi) if config.random_heading else np.deg2rad(config.heading_deg)
-    )
+    """State (n, 4), px py vx vy, of one diver at `times` in a scene turned by `turn` rad; the
+    velocity is that of the step before."""
+    general = np.deg2rad(config.heading_deg) + turn
     velocity = _VELOCITY[config.motion](config, times, general, rng)
     state = np.empty((len(times), 4))
-    start = np.array(config.start) + config.spacing * _spiral(diver)
+    turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    start = turned @ (np.array(config.start) + config.spacing * _spiral(diver))
     moved = np.cumsum(velocity[1:] * np.diff(times)[:, None], axis=0)
     state[:, :2] = start + np.vstack([np.zeros(2), moved])
     state[:, 2:] = velocity

@@ -55,9 +55,12 @@ class TrueProfile:
 
 @frozen(eq=False)
 class Scene:
-    """measurements in the order in which they were received; truth, one track a target or one
-    profile a ping."""
+    """measurements in the order in which they were received; truth, e.g. one track a target
+    or one profile a ping.
+
+    How a measurement or a truth of some class is recorded: `recordings.scenes`.
+    """
 
     measurements: tuple[Received, ...]
-    truth: tuple[TrueTrack | TrueProfile, ...]
+    truth: tuple[Any, ...]
     frame_id: str = 'map'

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from attrs import frozen
 
 from ..estimates import Estimate
-from ..parameters import Config
+from ..parameters import Config, ConfigError
 
 
 class Tracker(Protocol):
@@ -48,6 +48,14 @@ class Tracker(Protocol):
         ...
 
 
+class SmoothingTracker(Tracker, Protocol):
+    """A tracker that remembers a whole recording."""
+
+    def smoothed(self) -> list[Estimate]:
+        """The estimates of all stamps, oldest first, each given all measurements."""
+        ...
+
+
 @frozen
 class System:
     """A tracker by name. Strings name the modules so that listing systems stays fast."""
@@ -57,12 +65,22 @@ class System:
     config_class: str
     tracker_class: str
     summary: str
+    smoother: str = ''
 
     def config_type(self) -> type[Config]:
         return getattr(import_module(self.module), self.config_class)
 
     def build(self, config: Config) -> Tracker:
         return getattr(import_module(self.module), self.tracker_class)(config)
+
+    def build_smoother(self, config: Config) -> SmoothingTracker:
+        """The tracker that can look back at the end of a recording.
+
+        Raises `ConfigError` when the system has none."""
+        if not self.smoother:
+            raise ConfigError(f'the {self.name} tracker has no smoother')
+        module, _, name = self.smoother.rpartition('.')
+        return getattr(import_module(module), name)(config)
 
 
 SYSTEMS = {
@@ -79,6 +97,7 @@ SYSTEMS = {
         'DiverConfig',
         'DiverTracker',
         'divers from multistatic fixes or raw arrival times, 16-direction IMM',
+        smoother='sonar_imm.trackers.diver_smoothing.SmoothingDiverTracker',
     ),
     'fathometer': System(
         'fathometer',

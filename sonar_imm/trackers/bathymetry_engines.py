@@ -9,6 +9,7 @@ from __future__ import annotations
 from attrs import evolve, frozen
 import numpy as np
 
+from ..estimation.rows import normals
 from ..measurements import FloatArray
 from .bathymetry_grid_kernels import filter_ping, smooth_ping
 from .bathymetry_kernels import filter_block
@@ -46,16 +47,20 @@ def run_particles(
     of always one demands.
     """
     seeds = np.random.SeedSequence(entropy).spawn(3)
-    start, uniforms, normals = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)
+    start, draws, noises = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)
     T, M = models.scale.shape
     n, k = models.F.shape[1], models.G.shape[2]
     x, w = models.draw(particles, start), np.full((M, particles), 1.0 / particles)
     mu = models.initial.copy()
     track = _empty(T, M, n)
     block = max(1, min(_BLOCK // (M * k * particles), T))
-    noise = np.empty((block, M, k, particles))
+    size = M * k * particles
+    uniform = np.empty(block * size + block * size % 2)
+    noise = np.empty_like(uniform)
     for first in range(0, T, block):
         count = min(block, T - first)
+        noises.random(out=uniform)
+        normals(uniform, noise)
         filter_block(
             first,
             x,
@@ -67,8 +72,8 @@ def run_particles(
             models.scale,
             models.coast,
             redraw,
-            uniforms.random((count, 2, M)),
-            normals.standard_normal(out=noise[:count]),
+            draws.random((count, 2, M)),
+            noise[: count * size].reshape(count, M, k, particles),
             law.ranges,
             law.heard,
             law.form,

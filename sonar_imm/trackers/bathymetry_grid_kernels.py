@@ -48,7 +48,7 @@ def filter_ping(
     densities themselves are given, one after the other, M rows each; else nothing (0,).
     """
     (M, G), T = p.shape, slant_range.shape[0]
-    mixed, scratch = np.empty((M, G)), np.empty((3, max(G, 128) + 16))
+    mixed, scratch = np.empty((M, G)), np.empty((7, max(G, 128) + 16))
     work, value, sines = np.empty((4, G)), np.empty(G), np.empty(G)
     kept, used = np.empty(4096 if keep else 0), 0
     low, high = grid.trim(p, 0, G)
@@ -128,7 +128,7 @@ def smooth_ping(
     the last are written anew."""
     M, G, T = transition.shape[0], cells.shape[0], slant_range.shape[0]
     beta, back, p = np.empty((M, G)), np.empty((M, G)), np.empty((M, G))
-    scratch, work = np.empty((3, max(G, 128) + 16)), np.empty((4, G))
+    scratch, work = np.empty((7, max(G, 128) + 16)), np.empty((4, G))
     value, sines = np.empty(G), np.empty(G)
     end = 0
     for t in range(T):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..acoustics import law_kernels as law
 from ..estimation import imm_particles_kernels as imm
 from ..estimation.jit import kernel
+from ..estimation.rows import phasors
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -42,7 +43,7 @@ def sines_of(
             work[0, s] = geometry[0] - state[s]
         law.direction_sines(work[0], slant_range, geometry[1], geometry[2], out)
     else:
-        law.phasors(state, _TURNS, work[0], out)
+        phasors(state, _TURNS, work[0], out)
         for s in range(n):
             if not abs(state[s]) <= _HALF_CIRCLE:
                 out[s] = math.nan

@@ -8,6 +8,7 @@ The engines know nothing of arrays. They are given, for each bin, whether it is 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from attrs import frozen
 import numpy as np
@@ -23,7 +24,6 @@ BoolArray = NDArray[np.bool_]
 WATER_COLUMN = 0.8
 """Bins nearer than this share of the sonar's height hold no echo of the floor."""
 FEWEST_QUIET_BINS = 16
-_CHUNK = 4096
 
 
 @frozen(eq=False)
@@ -56,61 +56,95 @@ def spacing_of(snapshot: Snapshot, config: BathymetryConfig) -> float:
 
 def ping_law(snapshot: Snapshot, config: BathymetryConfig) -> PingLaw:
     """The likelihood of every bin of a snapshot under `config`."""
-    ranges = snapshot.ranges(config.sound_speed)
+    ranges = np.array(snapshot.ranges(config.sound_speed))
     spacing, tilt = spacing_of(snapshot, config), math.radians(config.tilt_deg)
     noise = _noise(snapshot, ranges, config)
-    signal = _signal(snapshot, noise)
+    iq = np.where(snapshot.usable[:, None], snapshot.iq, 0.0)
+    height = math.nan if config.model_set == 'angle_two_rw' else config.sonar_height
+    make = _beside_surface if config.multipath else _in_white_noise
+    parts = make(snapshot, iq, ranges, spacing, noise, config)
+    P = snapshot.staves
     laplacian = config.likelihood == 'laplace'
     constant = laplace.log_constant if laplacian else laplace.gaussian_log_constant
-    P, T = snapshot.staves, len(snapshot)
-    if config.multipath:
-        step = 2.0 * math.pi * spacing
-        R = interference.noise_covariance(
-            array.multipath_sines(
-                np.full(T, config.sonar_height), ranges, tilt, config.sonar_depth
-            ),
-            signal[:, None] * 10.0 ** (0.1 * config.multipath_level_db),
-            noise,
-            P,
-            step,
-        )
-        parts = interference.interference_form(
-            np.where(snapshot.usable[:, None], snapshot.iq, 0.0), R
-        )
-        form, base, spread = -signal[:, None] * parts.beam, parts.base, parts.spread
-        log_determinant = parts.log_determinant
-    else:
-        form = laplace.form_coefficients(snapshot.iq, signal, noise)
-        base, spread = np.zeros(T), np.empty((T, 0), np.complex128)
-        log_determinant = P * np.log(noise) + np.log1p(P * signal / noise)
-    height = math.nan if config.model_set == 'angle_two_rw' else config.sonar_height
     return PingLaw(
-        ranges=np.array(ranges),
-        heard=_heard(snapshot, abs(spacing), config),
-        form=np.ascontiguousarray(form),
-        base=np.ascontiguousarray(base),
-        spread=np.ascontiguousarray(spread),
-        signal=signal,
+        ranges=ranges,
+        heard=_heard(snapshot.usable, parts.coherence, P, abs(spacing), config),
+        form=np.ascontiguousarray(parts.form),
+        base=np.ascontiguousarray(parts.base),
+        spread=np.ascontiguousarray(parts.spread),
+        signal=parts.signal,
         noise=noise,
-        constant=constant(P, log_determinant),
+        constant=constant(P, parts.log_determinant),
         table=law_kernels.law_table(P, config.likelihood),
         geometry=np.array([height, math.cos(tilt), math.sin(tilt), spacing]),
     )
 
 
-def _heard(snapshot: Snapshot, spacing: float, config: BathymetryConfig) -> BoolArray:
+class _Parts(NamedTuple):
+    form: ComplexArray
+    base: FloatArray
+    spread: ComplexArray
+    signal: FloatArray
+    log_determinant: FloatArray
+    coherence: FloatArray
+
+
+def _in_white_noise(
+    snapshot: Snapshot,
+    iq: ComplexArray,
+    ranges: FloatArray,
+    spacing: float,
+    noise: FloatArray,
+    config: BathymetryConfig,
+) -> _Parts:
+    T, P = iq.shape
+    signal = _signal(snapshot, noise, np.ones(T))
+    return _Parts(
+        form=laplace.form_coefficients(iq, signal, noise),
+        base=np.zeros(T),
+        spread=np.empty((T, 0), np.complex128),
+        signal=signal,
+        log_determinant=P * np.log(noise) + np.log1p(P * signal / noise),
+        coherence=coherence.coherence(iq, abs(spacing))[0] if config.shadow_gate else np.ones(T),
+    )
+
+
+def _beside_surface(
+    snapshot: Snapshot,
+    iq: ComplexArray,
+    ranges: FloatArray,
+    spacing: float,
+    noise: FloatArray,
+    config: BathymetryConfig,
+) -> _Parts:
+    """With echoes by way of the surface as noise from where a flat floor would send them."""
+    T, P = iq.shape
+    level = 10.0 ** (0.1 * config.multipath_level_db)
+    sines = array.multipath_sines(
+        np.full(T, config.sonar_height), ranges, math.radians(config.tilt_deg), config.sonar_depth
+    )
+    signal = _signal(snapshot, noise, 1.0 + level * np.isfinite(sines).sum(axis=1))
+    step = 2.0 * math.pi * spacing
+    R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
+    form = interference.interference_form(iq, R)
+    return _Parts(
+        form=-signal[:, None] * form.beam,
+        base=form.base,
+        spread=form.spread,
+        signal=signal,
+        log_determinant=form.log_determinant,
+        coherence=interference.coherence_beside(form, abs(spacing)),
+    )
+
+
+def _heard(
+    usable: BoolArray, gamma: FloatArray, staves: int, spacing: float, config: BathymetryConfig
+) -> BoolArray:
     if not config.shadow_gate:
-        return np.array(snapshot.usable)
-    gamma = np.concatenate(
-        [
-            coherence.coherence(snapshot.iq[k : k + _CHUNK], spacing)[0]
-            for k in range(0, len(snapshot), _CHUNK)
-        ]
-    )
-    silent = coherence.silent_bins(
-        gamma, snapshot.staves, spacing=spacing, false_alarm=config.gate_false_alarm
-    )
-    return snapshot.usable & ~silent
+        return np.array(usable)
+    false_alarm = config.gate_false_alarm
+    silent = coherence.silent_bins(gamma, staves, spacing=spacing, false_alarm=false_alarm)
+    return usable & ~silent
 
 
 def _noise(snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig) -> FloatArray:
@@ -133,12 +167,13 @@ def _noise(snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig) -> 
     return noise if known is None else np.where(np.isfinite(known), known, noise)
 
 
-def _signal(snapshot: Snapshot, noise: FloatArray) -> FloatArray:
-    """Signal variance (T,) at a stave: from the snapshot, else a moving mean of the power."""
+def _signal(snapshot: Snapshot, noise: FloatArray, echoes: FloatArray) -> FloatArray:
+    """Signal variance (T,) at a stave: from the snapshot, else a moving mean of the power, of
+    which the floor has one part in `echoes` (T,)."""
     known = snapshot.signal_variance
     if known is not None and np.isfinite(known).all():
         return np.array(known)
     power = np.where(snapshot.usable, variances.mean_power(snapshot.iq), 0.0)
-    signal = variances.signal_variance(power, noise, usable=snapshot.usable)
+    signal = variances.signal_variance(power, noise, usable=snapshot.usable) / echoes
     signal = np.fmax(signal, variances.LEAST_SNR * noise)
     return signal if known is None else np.where(np.isfinite(known), known, signal)

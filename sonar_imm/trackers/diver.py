@@ -69,11 +69,13 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
-        tracker = DiverTracker(evolve(self.config, max_gap=3600.0, history=10.0))
+        # A contested scan and a ping, in which nothing is left to be loaded at the first real one.
+        tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
         for second in (1, 2):
-            tracker.process(
-                Fix(stamp_ns=second * 10**9, position=np.zeros(3), covariance=np.eye(2))
-            )
+            for x in (0.0, 0.1):
+                position = np.array([x, 0.0, 0.0])
+                fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
+                tracker.process(fix)
 
     def health(self) -> dict[str, float]:
         now = self._history.state
@@ -132,6 +134,7 @@ class DiverTracker:
             learnt=self._chain.fresh(0),
             nis=np.empty(0),
             nis_dof=np.empty(0, np.uint16),
+            score=np.empty(0),
             scale=np.zeros((2, 2)),
         )
         return ReplayHistory(nobody, _ns(self.config.history))
@@ -142,7 +145,11 @@ class DiverTracker:
         """The state after all measurements of one stamp. Pure."""
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
         scan = Scan(self.config, self.models, self._chain, before, stamp_ns)
-        left = [(group, ~scan.take(group)) for group in groups_of(items, self.config, factor)]
+        left = [
+            (group, ~taken)
+            for groups in groups_of(items, self.config, factor)
+            for group, taken in zip(groups, scan.take(groups))
+        ]
         return self._census(scan.result(), self._births(items, left, float(factor[1])))
 
     def _births(
@@ -172,12 +179,13 @@ class DiverTracker:
             looked=np.full(len(sound), config.fixes_are_scans),
         )
         life, kept = life.only(sound[kept]), kept & sound
-        confirmed = life.status != TrackStatus.TENTATIVE
-        if confirmed.sum() >= config.max_tracks:
-            # No room for more: the tentative ones have lost.
-            room = confirmed & (np.cumsum(confirmed) <= config.max_tracks)
+        confirmed = np.flatnonzero(life.status != TrackStatus.TENTATIVE)
+        if len(confirmed) > config.max_tracks:
+            best = np.argsort(-now.score[kept][confirmed], kind='stable')[: config.max_tracks]
+            room = life.status == TrackStatus.TENTATIVE
+            room[confirmed[best]] = True
             kept[kept] = room
-            life, births = life.only(room), []
+            life = life.only(room)
         births = births[: max(0, 10 + 5 * config.max_tracks - len(life))]
         if not births and kept.all():
             return evolve(now, life=life)
@@ -192,6 +200,7 @@ class DiverTracker:
             learnt=np.concatenate([now.learnt[kept], self._chain.fresh(count)]),
             nis=np.append(now.nis[kept], np.full(count, np.nan)),
             nis_dof=np.append(now.nis_dof[kept], np.zeros(count, np.uint16)),
+            score=np.append(now.score[kept], np.zeros(count)),
             scale=now.scale,
             broken=now.broken + int((~sound).sum()),
         )

@@ -41,6 +41,13 @@ class DiverConfig(Config):
         low=1e-3,
         high=3600.0,
     )
+    longest_step: float = parameter(
+        2.0,
+        'longer gaps are crossed in steps of this, so that the diver may turn inside them',
+        unit='s',
+        low=1e-3,
+        high=3600.0,
+    )
     stay_probability: float = parameter(
         0.86, 'probability of keeping the heading over a reference step', low=0.0, high=1.0
     )
@@ -223,7 +230,7 @@ class DiverConfig(Config):
         read_only=False,
     )
     clutter_density: float = parameter(
-        1e-4,
+        1e-6,
         'false fixes expected in a scan, for each square metre',
         unit='1/m^2',
         low=1e-12,

@@ -3,6 +3,10 @@ after it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+import math
+from typing import NamedTuple
+
 from attrs import evolve, frozen
 import numpy as np
 
@@ -12,10 +16,19 @@ from ..estimation.association import assign, association_cost, gate_threshold, T
 from ..measurements import FloatArray
 from .diver_config import DiverConfig
 from .diver_models import ModelSet
-from .diver_sensing import Bearings, Group, Positions, RangeSums, reduced, TagPing
+from .diver_sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing
 
 SCALE_PRIOR = 20.0
 """Numbers measured that the stated covariances are worth when their scale is being learnt."""
+
+MOST_STEPS = 300
+"""A gap is crossed in no more steps than this, however long it is."""
+
+EXCLUDED = -1
+"""Rank of a track that takes no part in a message."""
+
+SCORE_MEMORY = 0.9
+"""Share of its score a track keeps from scan to scan."""
 
 SCALE_MEMORY = 400.0
 """Numbers measured over which the learnt scale forgets."""
@@ -26,9 +39,10 @@ class Divers:
     """All that is known after a scan: T tracks with M models of n states.
 
     x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
-    (T,): of this scan, NaN and 0 without a hit; scale (2, 2): for fixes and for arrivals the sum
-    of squared residuals in units of their stated variance, and their number; broken: tracks ended
-    so far because their numbers were not finite.
+    (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
+    track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
+    for arrivals the sum of squared residuals in units of their stated variance, and their number;
+    broken: tracks ended so far because their numbers were not finite.
     """
 
     stamp_ns: int
@@ -39,12 +53,47 @@ class Divers:
     learnt: FloatArray
     nis: FloatArray
     nis_dof: np.ndarray
+    score: FloatArray
     scale: FloatArray
     broken: int = 0
 
     def factor(self) -> FloatArray:
         """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
         return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
+
+
+class Step(NamedTuple):
+    """Tracks after a step of dt seconds without a measurement, and the transitions (T or 1, M, M)
+    of that step."""
+
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+    transition: FloatArray
+    dt: float
+
+    def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+        """The step as one track took it."""
+        shared = len(self.transition) == 1
+        transition = self.transition[0 if shared else track]
+        return self.x[track], self.P[track], self.mu[track], transition, self.dt
+
+
+def cross(
+    models: ModelSet, chain: AdaptiveChain, before: Divers, dt: float, longest: float
+) -> Iterator[Step]:
+    """Mix and predict over dt seconds, in equal steps of at most `longest`.
+
+    A model holds for a whole step, so one step over a long gap says that the diver swam straight
+    all the while: the prediction is a ring, and the diver, who turned, is inside it.
+    """
+    count = min(max(math.ceil(dt / longest), 1), MOST_STEPS)
+    transition, motion = chain.transition(before.learnt, dt / count), models.motion(dt / count)
+    x, P, mu = before.x, before.P, before.mu
+    for _ in range(count):
+        x, P, mu = imm_kernels.mix(x, P, mu, transition)
+        x, P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        yield Step(x, P, mu, transition, dt / count)
 
 
 class Scan:
@@ -62,28 +111,56 @@ class Scan:
         self.config, self.models, self.chain, self.before = config, models, chain, before
         self.stamp_ns = stamp_ns
         self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        self.transition = chain.transition(before.learnt, self.dt)
-        motion = models.motion(self.dt)
-        x, P, self.mu = imm_kernels.mix(before.x, before.P, before.mu, self.transition)
-        self.x, self.P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-        self.nis = np.zeros(len(x))
-        self.nis_dof = np.zeros(len(x), np.uint16)
+        steps = list(cross(models, chain, before, self.dt, config.longest_step))
+        self.x, self.P, self.mu, transition, _ = steps[-1]
+        self.transition = np.linalg.matrix_power(transition, len(steps))
+        self.nis = np.zeros(len(self.x))
+        self.nis_dof = np.zeros(len(self.x), np.uint16)
+        self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
+        self.rank = np.zeros(len(self.x), np.int64)
 
-    def take(self, group: Group) -> np.ndarray:
-        """Update the tracks with what the group holds for them; True (D,) for what was taken."""
-        taken = np.zeros(len(group.z), bool)
+    def take(self, groups: Sequence[Group]) -> list[np.ndarray]:
+        """Update the tracks with what one message holds for them, group after group. Gives for
+        each group True (D,) where a detection was taken.
+
+        Tracks that can explain more of the groups choose first, and among those the confirmed
+        ones: a ghost fits the arrivals it was made of, but only those. One that ends up with
+        fewer than half of the groups is not what the message shows; for it nothing happened.
+        """
+        before = self._copies()
+        tentative = self.before.life.status == TrackStatus.TENTATIVE
+        explained = np.sum([self._fit(group).max(axis=1) > -np.inf for group in groups], axis=0)
+        self.rank = 2 * (len(groups) - explained) + tentative
+        chosen = [self._take_group(group) for group in groups]
+        agreeing = np.sum([choice >= 0 for choice in chosen], axis=0)
+        doubtful = (agreeing > 0) & (2 * agreeing < len(groups))
+        if doubtful.any():
+            self.x, self.P, self.mu, self.nis, self.nis_dof, self.score, self.scale = before
+            self.rank = np.where(doubtful, EXCLUDED, self.rank)
+            chosen = [self._take_group(group) for group in groups]
+        return [np.isin(np.arange(len(group.z)), choice) for group, choice in zip(groups, chosen)]
+
+    def _copies(self) -> tuple[np.ndarray, ...]:
+        return tuple(
+            part.copy()
+            for part in (self.x, self.P, self.mu, self.nis, self.nis_dof, self.score, self.scale)
+        )
+
+    def _take_group(self, group: Group) -> np.ndarray:
+        """Associate and update; the detection (T,) each track took, -1 for none."""
         chosen = self._associate(group)
         if isinstance(group, TagPing) and not (chosen >= 0).any():
-            group = reduced(group, self.config)
-            chosen = self._associate(group)
+            # A late reflection among the arrivals, or a prediction too uncertain to linearise at.
+            fixed = as_fix(group, self.config)
+            if fixed is not None:
+                group, chosen = fixed, self._associate(fixed)
         tracks = np.flatnonzero(chosen >= 0)
         if len(tracks):
-            taken[chosen[tracks]] = True
             self._update(group, tracks, chosen[tracks])
             if isinstance(group, RangeSums):
                 self._take_bearings(group.bearings(), tracks, chosen[tracks])
-        return taken
+        return chosen
 
     def result(self) -> Divers:
         """What is known now; the transitions have learnt from the tracks that were hit."""
@@ -106,30 +183,45 @@ class Scan:
             learnt=learnt,
             nis=np.where(self.nis_dof > 0, self.nis, np.nan),
             nis_dof=self.nis_dof,
+            score=self.score,
             scale=self.scale,
         )
 
-    def _associate(self, group: Group) -> np.ndarray:
-        """The detection of each track (T,), -1 for none; confirmed tracks choose before tentative
-        ones."""
-        chosen = np.full(len(self.x), -1)
-        free = np.ones(len(group.z), bool)
-        tentative = self.before.life.status == TrackStatus.TENTATIVE
+    def _fit(self, group: Group) -> FloatArray:
+        """Log-likelihood (T, D) of each detection for each track, -inf outside the gate."""
         h, H = group.linearise(self.x, self.models.E)
         threshold = gate_threshold(self.config.gate_probability, group.z.shape[1])
-        fit = imm_kernels.gate(
+        return imm_kernels.gate(
             h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold
         )
+
+    def _associate(self, group: Group) -> np.ndarray:
+        """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
+        chosen = np.full(len(self.x), -1)
+        free = np.ones(len(group.z), bool)
+        fit = self._fit(group)
         target, detection = np.nonzero(np.isfinite(fit))
-        cost = association_cost(
-            fit[target, detection], self.config.detection_probability, group.clutter
-        )
-        for own in (~tentative, tentative):
-            pairs = own[target] & free[detection]
+        likelihood = fit[target, detection]
+        if group.clutter == 0.0:
+            cost = -1e6 - likelihood  # nothing to compare with but the other tracks
+        else:
+            p_detection = self.config.detection_probability
+            cost = association_cost(likelihood, p_detection, group.clutter)
+        for rank in np.unique(self.rank[self.rank != EXCLUDED]):
+            pairs = (self.rank == rank)[target] & free[detection]
             found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
             chosen = np.where(found >= 0, found, chosen)
             free[found[found >= 0]] = False
+        self._keep_score(fit, chosen, group)
         return chosen
+
+    def _keep_score(self, fit: FloatArray, chosen: np.ndarray, group: Group) -> None:
+        """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""
+        p_detection = self.config.detection_probability
+        hit = np.flatnonzero(chosen >= 0)
+        self.score += np.log1p(-p_detection)
+        self.score[hit] += fit[hit, chosen[hit]] + np.log(p_detection / (1.0 - p_detection))
+        self.score[hit] -= np.log(group.clutter or self.config.clutter_density)
 
     def _expected(self, group: Group, tracks: np.ndarray) -> tuple[FloatArray, FloatArray]:
         """Mean (t, m) and covariance (t, m, m), without R, of what the group would measure of

@@ -23,7 +23,8 @@ from .diver_config import DiverConfig
 
 @frozen(eq=False)
 class Group:
-    """D detections of m numbers each: z (D, m), R (D, m, m); `clutter` density of false ones.
+    """D detections of m numbers each: z (D, m), R (D, m, m); `clutter` density of false ones, 0
+    where each detection is known to be a target's.
 
     kind: index of the sensor, 0 fixes, 1 arrivals; factor: what the stated covariances were
     multiplied by to give R; ping, rows: where the detections come from, when from a ping.
@@ -122,33 +123,41 @@ class TagPing(Group):
 
 def groups_of(
     items: Sequence[Measurement], config: DiverConfig, factor: FloatArray
-) -> list[Group]:
-    """The groups of one stamp, in an order that depends on content only.
+) -> list[Sequence[Group]]:
+    """The groups of one stamp, message by message (all fixes are one), in an order that depends on
+    content only.
 
     factor (2,): learnt factor on the covariances of fixes and of arrivals.
     """
     scale = config.covariance_scale * factor
-    groups: list[Group] = []
+    said: list[Sequence[Group]] = []
     fixes = [item for item in items if isinstance(item, Fix)]
     if fixes:
-        groups.append(_positions(fixes, config, scale[0]))
+        said.append([_positions(fixes, config, scale[0])])
     for ping in (item for item in items if isinstance(item, Arrivals)):
         if ping.passive:
             usable = np.flatnonzero(np.isfinite(ping.toa))
-            groups += [_tag_ping(ping, usable, config, scale[1])] if len(usable) > 1 else []
+            said += [[_tag_ping(ping, usable, config, scale[1])]] if len(usable) > 1 else []
         else:
-            groups += _range_sums(ping, config, scale[1])
-    return groups
+            said.append(list(_range_sums(ping, config, scale[1])))
+    return said
 
 
-def reduced(group: TagPing, config: DiverConfig) -> TagPing:
-    """The same ping without the arrivals that do not fit the others, late reflections above
-    all."""
-    ping, rows = group.ping, group.rows
-    fix = locate(ping, rows, config, group.factor)
-    if fix is None or fix.used.sum() in (len(rows), 0, 1):
-        return group
-    return _tag_ping(ping, rows[fix.used], config, group.factor)
+def as_fix(group: TagPing, config: DiverConfig) -> Positions | None:
+    """The same ping as one fix, without the arrivals that do not fit the others; None where the
+    arrivals do not give one, or more than one."""
+    fix = locate(group.ping, group.rows, config, group.factor)
+    if fix is None or fix.ambiguous:
+        return None
+    return Positions(
+        z=fix.position[None],
+        R=fix.covariance[None],
+        clutter=0.0,
+        kind=group.kind,
+        factor=group.factor,
+        ping=group.ping,
+        rows=group.rows,
+    )
 
 
 def locate(
@@ -221,7 +230,7 @@ def _tag_ping(ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: flo
     return TagPing(
         z=difference.z[None],
         R=difference.R[None],
-        clutter=config.clutter_density,
+        clutter=0.0,  # a tag says who it is
         kind=1,
         factor=factor,
         ping=ping,

@@ -1,10 +1,10 @@
 """Small recordings with fixes and truth, written by the package itself."""
 
+from dive_scenes import legs, stamps
 import numpy as np
 
 from msg_adapters.estimates import write_truth
 from msg_adapters.fixes import write_fix
-from dive_scenes import legs, stamps
 from sonar_imm.measurements import Fix
 from sonar_imm.recordings.writer import BagWriter, ros_message
 

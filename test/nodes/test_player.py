@@ -20,8 +20,9 @@ from sonar_imm.nodes.link import Link, LinkError
 from sonar_imm.nodes.lockstep import LockStep, Recorder
 from sonar_imm.nodes.player import NAME, Pace, play, Player, PlayOptions
 from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.parameters import ConfigError
 from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.reader import BagError, BagReader
 from sonar_imm.recordings.writer import BagWriter
 
 START = 1_700_000_000 * 10**9
@@ -162,11 +163,20 @@ def test_a_paused_player_waits_for_resume(bag, link, domain):
     ({'remap': {'/fxi': '/x'}}, "has no topic '/fxi'"),
     ({'rate': 0.0}, 'the rate must be positive, got 0'),
     ({'rate': float('nan')}, 'the rate must be positive, got nan'),
+    ({'start_offset': float('nan')}, 'the start_offset must not be negative, got nan'),
+    ({'delay': -1.0}, 'the delay must not be negative, got -1'),
     ({'clock': -1.0}, 'the clock must be positive, got -1'),
 ])
 def test_what_cannot_be_played_is_said(bag, domain, options, sentence):
-    with pytest.raises(LinkError, match=sentence):
+    with pytest.raises(ConfigError, match=sentence):
         play(bag, PlayOptions(**options), domain_id=domain)
+
+
+def test_a_bag_without_messages_is_said(tmp_path, domain):
+    with BagWriter(tmp_path / 'empty'):
+        pass
+    with pytest.raises(BagError, match='nothing to publish'):
+        play(tmp_path / 'empty', PlayOptions(), domain_id=domain)
 
 
 class Live:

@@ -103,8 +103,8 @@ def test_the_parameter_file_reaches_the_live_node(bag, tmp_path):
 def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
     file = tmp_path / 'diver.yaml'
     file.write_text('/**:\n  ros__parameters:\n    sound_speed: 1500\n')
-    with pytest.raises(LinkError, match=r"exit code 2: parameter 'sound_speed' is a double: "
-                                        r'write 1500\.0 instead of 1500'):
+    with pytest.raises(LinkError, match=r"exit code 2: diver: parameter 'sound_speed' is a "
+                                        r'double: write 1500\.0 instead of 1500'):
         run_lockstep(bag, 'diver', params_file=file)
 
 

@@ -8,9 +8,6 @@ lag                  the shift of truth that makes the error smallest: late stam
 consistency          NEES and NIS against their chi-square bounds, coverage of the ellipses
 tracks, gospa        several targets: identity switches, losses, false tracks, and GOSPA
 models               how probable each motion model was, and how often the leading one changed
-
-The chi-square bounds take successive errors as independent. Errors of one track are correlated
-over a few stamps, so a mean slightly outside its bounds is no proof; one far outside is.
 """
 
 from __future__ import annotations
@@ -22,15 +19,16 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from ..estimation.consistency import average_bounds, gospa, nees
-from ..measurements import Fix
+from ...estimation.consistency import gospa
+from ...measurements import Fix
+from .. import SECOND
+from ..numbers import chi2_summary, error_summary, nis_summary, usable_nees
 from .matching import match, Matching, track_summary
-from .series import FloatArray, SECOND, Series
+from .series import Series
 from .truth import Truth
 
 COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0
-SINGULAR = 1e-9
 
 
 def score(series: Series, truth: Truth | None = None, *, fixes: Series | None = None,
@@ -40,12 +38,14 @@ def score(series: Series, truth: Truth | None = None, *, fixes: Series | None = 
     fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is off target.
     """
     confirmed = series.confirmed()
+    hits = confirmed.hits()
     span = (series.scan_ns[-1] - series.scan_ns[0]) / SECOND if len(series.scan_ns) else 0.0
     metrics: dict[str, Any] = {
         'stamps': len(series.scan_ns), 'span_s': float(span), 'rows_confirmed': len(confirmed),
         'rows_tentative': len(series) - len(confirmed),
         'tracks_confirmed': len(np.unique(confirmed.track_id)),
-        'consistency': {'nis': nis_summary(confirmed)}, 'models': model_summary(confirmed)}
+        'consistency': {'nis': nis_summary(hits.nis, hits.nis_dof)},
+        'models': model_summary(confirmed)}
     if truth is None or not len(truth):
         return metrics
     matching = match(confirmed, truth, cutoff=cutoff)
@@ -79,15 +79,6 @@ def fix_series(fixes: Iterable[Fix]) -> Series:
                   nis_dof=np.full(n, np.nan))
 
 
-def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
-    """RMSE, median and 95 % point of non-negative errors; NaN when there are none."""
-    if not len(error):
-        return {'n': 0, **{f'{name}_{unit}': float('nan') for name in ('rmse', 'median', 'p95')}}
-    return {'n': len(error), f'rmse_{unit}': float(np.sqrt(np.mean(error**2))),
-            f'median_{unit}': float(np.median(error)),
-            f'p95_{unit}': float(np.percentile(error, 95.0))}
-
-
 def truth_consistency(matching: Matching) -> dict[str, Any]:
     """NEES on position and on the whole state, and the coverage of the position ellipses."""
     error, covariance = matching.error, matching.series.covariance[matching.row]
@@ -102,45 +93,6 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
         result['nees_state'] = chi2_summary(state, 4)
         result['singular_state_covariances'] = known - len(state)
     return result
-
-
-def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """NEES of the rows that are finite and whose covariance is not singular.
-
-    A filter that is certain of one heading states a velocity along that heading only: its whole
-    covariance is singular then, and NEES says nothing.
-    """
-    good = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    values = np.linalg.eigvalsh(covariance[good])
-    good[good] = values[:, 0] > SINGULAR * values[:, -1]
-    return nees(error[good], covariance[good]) if good.any() else np.empty(0)
-
-
-def nis_summary(series: Series) -> dict[str, Any]:
-    """NIS of all hits against its bounds; divided by its degrees of freedom where these vary."""
-    nis, dof = hits_of(series)
-    if not len(nis) or (dof == dof[0]).all():
-        return chi2_summary(nis, int(dof[0]) if len(nis) else 2)
-    low, high = average_bounds(1, int(dof.sum()))
-    mean, low, high = (float(value / dof.sum()) for value in (nis.sum(), low, high))
-    return {'n': len(nis), 'dof': 1, 'mean': mean, 'low': low, 'high': high,
-            'believable': low <= mean <= high, 'divided_by_dof': True}
-
-
-def hits_of(series: Series) -> tuple[FloatArray, FloatArray]:
-    """NIS and degrees of freedom of the rows that had a hit."""
-    hits = np.isfinite(series.nis) & (series.nis_dof > 0)
-    return series.nis[hits], series.nis_dof[hits]
-
-
-def chi2_summary(values: FloatArray, dof: int) -> dict[str, Any]:
-    """Mean of chi-square values with its 95 % two-sided bounds (dof is expected)."""
-    if not len(values):
-        return {'n': 0, 'dof': dof, 'mean': float('nan'), 'believable': None}
-    low, high = average_bounds(len(values), dof)
-    mean = float(np.mean(values))
-    return {'n': len(values), 'dof': dof, 'mean': mean, 'low': low, 'high': high,
-            'believable': bool(low <= mean <= high)}
 
 
 def model_summary(series: Series) -> dict[str, Any]:

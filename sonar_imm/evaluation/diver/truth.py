@@ -11,7 +11,8 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .series import FloatArray, IntArray, SECOND, Series
+from .. import SECOND
+from .series import FloatArray, IntArray, Series
 
 
 @frozen(eq=False)

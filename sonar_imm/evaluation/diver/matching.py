@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ..estimation.consistency import identity_switches
+from ...estimation.consistency import identity_switches
 from .series import FloatArray, IntArray, Series
 from .truth import Truth
 

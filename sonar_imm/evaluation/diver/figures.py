@@ -1,7 +1,4 @@
-"""The figures of the report. Each function takes arrays and gives one plotly figure.
-
-Colours are those of Okabe and Ito, which people with any colour vision can tell apart.
-"""
+"""The figures of divers. Each function takes arrays and gives one plotly figure."""
 
 from __future__ import annotations
 
@@ -9,18 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
-from scipy.stats import chi2
 
+from ..plotting import (
+    add_band,
+    COLOURS,
+    GREY,
+    INK,
+    MOST_POINTS,
+    seconds,
+    styled,
+    thin,
+    transparent,
+)
 from .matching import Matching
-from .series import FloatArray, IntArray, SECOND, Series
+from .series import FloatArray, IntArray, Series
 from .truth import Truth
 
-INK, GRID, GREY, AMBER = '#1b2733', '#e4e9ee', '#8593a1', '#E69F00'
-TRACK_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
-MOST_POINTS = 20_000
-MOST_ELLIPSES = 120
+MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12
-FONT = 'Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif'
 
 
 def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.Figure:
@@ -35,23 +38,38 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
     for path in truth.paths if truth else ():
         shown = thin(len(path.stamp_ns), MOST_POINTS)
         figure.add_scatter(x=path.state[shown, 0], y=path.state[shown, 1], mode='lines',
-                           name='truth' if len(truth) == 1 else f'truth {path.track_id}',
+                           name='truth', legendgroup='truth',
+                           showlegend=path is truth.paths[0],
+                           hovertemplate=f'target {path.track_id}: x %{{x:.2f}}, y %{{y:.2f}}',
                            line={'color': INK, 'width': 1.5, 'dash': 'dot'})
     for order, track_id in enumerate(_tracks_by_length(series)):
         _add_track(figure, series.pick(series.track_id == track_id), order)
-    figure.update_xaxes(title='x [m]')
-    figure.update_yaxes(title='y [m]', scaleanchor='x', scaleratio=1)
-    return _styled(figure, height=640)
+    # Clutter can lie anywhere: the first view is of the tracks and the truth, the rest by zoom.
+    paths = truth.paths if truth else ()
+    x_range, y_range = view_of(np.concatenate(
+        [series.state[:, :2], *(path.state[:, :2] for path in paths)]))
+    figure.update_xaxes(title='x [m]', range=x_range)
+    figure.update_yaxes(title='y [m]', range=y_range, scaleanchor='x', scaleratio=1)
+    return styled(figure, height=640)
+
+
+def view_of(points: FloatArray) -> tuple[list[float] | None, list[float] | None]:
+    """Ranges of x and y with some room around `points` (n, 2); None, None without points."""
+    if not len(points):
+        return None, None
+    low, high = points.min(axis=0), points.max(axis=0)
+    room = 0.08 * max(float((high - low).max()), 1.0)
+    return tuple([float(a - room), float(b + room)] for a, b in zip(low, high))
 
 
 def _add_track(figure: go.Figure, track: Series, order: int) -> None:
-    colour = TRACK_COLOURS[order % len(TRACK_COLOURS)]
+    colour = COLOURS[order % len(COLOURS)]
     name = f'track {track.track_id[0]}'
     shown = thin(len(track), MOST_POINTS)
     outline = outlines(track.state[:, :2], track.covariance[:, :2, :2])
     figure.add_scatter(x=outline[:, 0], y=outline[:, 1], mode='lines', fill='toself',
-                       fillcolor=_transparent(colour, 0.10), hoverinfo='skip',
-                       line={'color': _transparent(colour, 0.35), 'width': 1},
+                       fillcolor=transparent(colour, 0.10), hoverinfo='skip',
+                       line={'color': transparent(colour, 0.35), 'width': 1},
                        legendgroup=name, showlegend=False)
     figure.add_scatter(x=track.state[shown, 0], y=track.state[shown, 1], mode='lines+markers',
                        name=name, legendgroup=name, showlegend=order < MOST_TRACKS_NAMED,
@@ -70,14 +88,15 @@ def error_figure(matching: Matching, track_id: int) -> go.Figure:
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     for axis, name in enumerate('xy'):
         sigma = np.sqrt(matching.series.covariance[row, axis, axis])
-        _add_band(figure, time, 1.96 * sigma, first=axis == 0, row=axis + 1)
+        add_band(figure, time, 1.96 * sigma, first=axis == 0, row=axis + 1)
         figure.add_scattergl(x=time, y=error[:, axis], mode='lines+markers',
                              name='error of the track', legendgroup='error',
                              showlegend=axis == 0, row=axis + 1, col=1,
-                             line={'color': TRACK_COLOURS[0], 'width': 1.2}, marker={'size': 3})
+                             line={'color': COLOURS[0], 'width': 1.2}, marker={'size': 3})
         figure.update_yaxes(title=f'{name} error [m]', row=axis + 1, col=1)
+    figure.update_xaxes(zeroline=False)
     figure.update_xaxes(title='time [s]', row=2, col=1)
-    return _styled(figure, height=460)
+    return styled(figure, height=460)
 
 
 def sigma_figure(series: Series, track_id: int) -> go.Figure:
@@ -87,19 +106,10 @@ def sigma_figure(series: Series, track_id: int) -> go.Figure:
     for axis, name in enumerate('xy'):
         figure.add_scattergl(x=seconds(track.stamp_ns, track.scan_ns), mode='lines', name=name,
                              y=np.sqrt(track.covariance[:, axis, axis]),
-                             line={'color': TRACK_COLOURS[axis], 'width': 1.5})
-    figure.update_xaxes(title='time [s]')
+                             line={'color': COLOURS[axis], 'width': 1.5})
+    figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='stated sigma [m]', rangemode='tozero')
-    return _styled(figure, height=320)
-
-
-def _add_band(figure: go.Figure, time: FloatArray, half: FloatArray, *, first: bool,
-              row: int) -> None:
-    figure.add_scatter(x=np.concatenate([time, time[::-1]]), y=np.concatenate([half, -half[::-1]]),
-                       fill='toself', fillcolor=_transparent(AMBER, 0.28), mode='lines',
-                       line={'color': _transparent(AMBER, 0.6), 'width': 0.5}, hoverinfo='skip',
-                       name='95 % band it predicted', legendgroup='band', showlegend=first,
-                       row=row, col=1)
+    return styled(figure, height=320)
 
 
 def models_figure(series: Series, track_id: int, truth_course: tuple[FloatArray, FloatArray] | None
@@ -124,52 +134,12 @@ def models_figure(series: Series, track_id: int, truth_course: tuple[FloatArray,
         time, degrees = truth_course
         figure.add_scattergl(x=time, y=others + np.mod(degrees, 360.0) * headings / 360.0,
                              mode='markers', name='true course', showlegend=True,
-                             marker={'color': TRACK_COLOURS[1], 'size': 4})
+                             marker={'color': COLOURS[1], 'size': 4})
     figure.update_yaxes(tickvals=np.arange(len(order)), showgrid=False, zeroline=False,
                         ticktext=[model_label(track.model_names[index]) for index in order],
                         range=[-0.5, len(order) - 0.5])
-    figure.update_xaxes(title='time [s]', showgrid=False)
-    return _styled(figure, height=180 + 18 * len(order))
-
-
-def nis_figure(series: Series) -> go.Figure:
-    """NIS of every hit, its running mean, and what chi-square allows.
-
-    Hits with different degrees of freedom (pings heard by more or fewer receivers) are divided by
-    them, and then share no chi-square bounds.
-    """
-    hits = series.pick(np.isfinite(series.nis) & (series.nis_dof > 0))
-    time = seconds(hits.stamp_ns, hits.scan_ns)
-    same = len(np.unique(hits.nis_dof)) == 1
-    nis, dof = (hits.nis, int(hits.nis_dof[0])) if same else (hits.nis / hits.nis_dof, 0)
-    figure = go.Figure()
-    shown = thin(len(hits), MOST_POINTS)
-    figure.add_scattergl(x=time[shown], y=nis[shown], mode='markers', name='NIS of a hit',
-                         marker={'size': 4, 'color': TRACK_COLOURS[0], 'opacity': 0.6})
-    width = max(5, min(50, len(hits) // 8))
-    if len(hits) > width:
-        mean = np.convolve(nis, np.full(width, 1.0 / width), mode='valid')
-        figure.add_scattergl(x=time[width - 1:], y=mean, mode='lines',
-                             name=f'mean of {width}', line={'color': INK, 'width': 2})
-        if dof:
-            low, high = chi2.ppf([0.025, 0.975], width * dof) / width
-            figure.add_hrect(y0=low, y1=high, fillcolor=AMBER, opacity=0.25, line_width=0)
-    if dof:
-        figure.add_hline(y=chi2.ppf(0.95, dof), line={'color': TRACK_COLOURS[1], 'dash': 'dash'},
-                         annotation_text='95 % of hits should lie below')
-    figure.update_xaxes(title='time [s]')
-    figure.update_yaxes(title='NIS' if same else 'NIS / degrees of freedom', rangemode='tozero')
-    return _styled(figure, height=340)
-
-
-def seconds(stamp_ns: IntArray, scan_ns: IntArray) -> FloatArray:
-    """Seconds since the first scan of the run."""
-    return (stamp_ns - scan_ns[0]) / SECOND if len(scan_ns) else np.empty(0)
-
-
-def thin(count: int, most: int) -> slice:
-    """An even choice of at most `most` out of `count`."""
-    return slice(None, None, max(1, -(-count // most)))
+    figure.update_xaxes(title='time [s]', showgrid=False, zeroline=False)
+    return styled(figure, height=180 + 18 * len(order))
 
 
 def outlines(mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95,
@@ -199,19 +169,3 @@ def model_label(name: str) -> str:
 def _tracks_by_length(series: Series) -> IntArray:
     ids, counts = np.unique(series.track_id, return_counts=True)
     return ids[np.argsort(-counts, kind='stable')]
-
-
-def _transparent(colour: str, opacity: float) -> str:
-    red, green, blue = (int(colour[place:place + 2], 16) for place in (1, 3, 5))
-    return f'rgba({red},{green},{blue},{opacity})'
-
-
-def _styled(figure: go.Figure, *, height: int) -> go.Figure:
-    figure.update_layout(
-        height=height, margin={'l': 64, 'r': 24, 't': 44, 'b': 52}, paper_bgcolor='white',
-        plot_bgcolor='white', font={'family': FONT, 'size': 13, 'color': INK}, hovermode='closest',
-        legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0})
-    axis = {'gridcolor': GRID, 'zerolinecolor': '#c3ccd5', 'linecolor': '#c3ccd5', 'ticks': ''}
-    figure.update_xaxes(**axis)
-    figure.update_yaxes(**axis)
-    return figure

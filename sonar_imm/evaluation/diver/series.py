@@ -13,13 +13,12 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from ..estimates import Estimate
+from ...estimates import Estimate
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 STATES = ('px', 'py', 'vx', 'vy')
-SECOND = 10**9
 
 
 @frozen(eq=False, kw_only=True)
@@ -54,6 +53,10 @@ class Series:
     def confirmed(self) -> Series:
         """Without the rows of tentative tracks."""
         return self.pick(self.track_state > 0)
+
+    def hits(self) -> Series:
+        """The rows that took a measurement in."""
+        return self.pick(np.isfinite(self.nis) & (self.nis_dof > 0))
 
     def longest_track(self) -> int | None:
         """Id of the track with most rows (the lowest such id), None without rows."""

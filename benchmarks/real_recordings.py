@@ -1,0 +1,280 @@
+"""The diver tracker on real recordings: a towed acoustic tag (yaps) and boats (Autoferry).
+
+    SONAR_IMM_DATA=../shared/data python -m benchmarks.real_recordings
+
+Prints the tables of docs/real_recordings.md. Truth of the tag is a hand-held GPS, itself good to
+a few metres and ahead of the tag, which is towed: errors are given against GPS as it is and
+against GPS 3.4 s later.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import tempfile
+
+import numpy as np
+
+from msg_adapters.estimates import read_estimate
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.consistency import gospa
+from sonar_imm.measurements import Arrivals, Fix, Rejection
+from sonar_imm.recordings.convert import convert_arrivals, convert_autoferry, convert_fixes
+from sonar_imm.recordings.measurements import measurements_of
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.trackers.diver import DiverConfig, DiverTracker
+from sonar_imm.trackers.diver_sensing import locate
+from sonar_imm.trackers.diver_smoothing import SmoothingDiverTracker
+
+DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
+LAG = 3.4
+
+TAG = {
+    'max_tracks': 1,
+    'confirm_hits': 1,
+    'max_coast': 600.0,
+    'delete_misses': 3,
+    'sound_speed': 1545.0,
+    'target_z': -1.0,
+    'speed_mean': 0.5,
+    'speed_std': 0.3,
+    'speed_noise': 0.03,
+    'lateral_noise': 0.3,
+    'stay_probability': 0.95,
+    'hover_enter': 0.005,
+    'hover_stay': 0.95,
+    'gate_probability': 0.9999,
+    'toa_std': 0.0009,
+    'clutter_density': 1e-8,
+}
+SETS = {
+    'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
+    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
+    'heading_speed': {},
+    'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
+}
+
+
+def load(bag: Path) -> tuple[list, np.ndarray]:
+    """Measurements of a bag, and truth as rows (stamp s, id, x, y)."""
+    with BagReader(bag) as reader:
+        heard = [one.measurement for one in measurements_of(reader, 'diver')]
+    truth = []
+    with BagReader(bag) as reader:
+        for one in reader.messages(['/truth/estimate']):
+            table = read_estimate(one.message)
+            truth += [
+                (table.stamp_ns * 1e-9, int(i), x, y)
+                for i, x, y in zip(
+                    table.extras['track_id'], table.extras['px'], table.extras['py']
+                )
+            ]
+    return [one for one in heard if not isinstance(one, Rejection)], np.array(truth)
+
+
+def follow(config: DiverConfig, items: list) -> tuple[list, list]:
+    """Estimates of the filter and of the smoother, the last word on each stamp."""
+    tracker = SmoothingDiverTracker(config)
+    final = {}
+    for item in items:
+        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(item))
+    return [final[stamp] for stamp in sorted(final)], tracker.smoothed()
+
+
+def against_gps(
+    stamps: np.ndarray, places: np.ndarray, truth: np.ndarray, lag: float
+) -> np.ndarray:
+    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps."""
+    t = stamps + lag
+    after = np.clip(np.searchsorted(truth[:, 0], t), 1, len(truth) - 1)
+    good = (
+        (t >= truth[0, 0]) & (t <= truth[-1, 0]) & (truth[after, 0] - truth[after - 1, 0] < 60.0)
+    )
+    there = np.column_stack([np.interp(t, truth[:, 0], truth[:, c]) for c in (2, 3)])
+    return (places - there)[good], good
+
+
+def tag_scores(estimates: list, truth: np.ndarray) -> list[float]:
+    """RMSE as it is and with the lag, median, NEES with the lag."""
+    rows = [
+        (e.stamp_ns * 1e-9, e.state[0, :2], e.covariance[0, :2, :2]) for e in estimates if len(e)
+    ]
+    stamps, places, covariances = (np.array(column) for column in zip(*rows))
+    plain, _ = against_gps(stamps, places, truth, 0.0)
+    lagged, good = against_gps(stamps, places, truth, LAG)
+    squared = np.einsum(
+        'ki,ki->k', lagged, np.linalg.solve(covariances[good], lagged[..., None])[..., 0]
+    )
+    distance = np.hypot(*lagged.T)
+    return [
+        np.sqrt(np.mean(np.sum(plain**2, 1))),
+        np.sqrt(np.mean(distance**2)),
+        np.median(distance),
+        squared.mean(),
+        len(distance),
+    ]
+
+
+def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[float]:
+    """The fixes themselves, or those that each ping gives by itself."""
+    rows = []
+    for item in items:
+        if isinstance(item, Fix):
+            rows.append((item.stamp_ns * 1e-9, item.position[:2], item.covariance))
+        elif isinstance(item, Arrivals):
+            fix = locate(item, np.arange(len(item)), config, config.covariance_scale)
+            rows += [(item.stamp_ns * 1e-9, fix.position, fix.covariance)] if fix else []
+
+    return tag_scores(
+        [
+            Estimate(
+                stamp_ns=round(stamp * 1e9),
+                frame_id='map',
+                xyz=np.zeros((1, 3), np.float32),
+                state_names=('px', 'py'),
+                state=place[None, :2],
+                covariance=covariance[None],
+            )
+            for stamp, place, covariance in rows
+        ],
+        truth,
+    )
+
+
+def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
+    """Fewer receivers a ping, and fewer pings."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for ping in items:
+        rows = np.sort(rng.permutation(len(ping))[:receivers])
+        if rng.uniform() < keep and len(rows) > 1:
+            out.append(
+                Arrivals(
+                    stamp_ns=ping.stamp_ns,
+                    frame_id=ping.frame_id,
+                    **{
+                        name: getattr(ping, name)[rows]
+                        for name in (
+                            'tx_id',
+                            'rx_id',
+                            'tx',
+                            'rx',
+                            'toa',
+                            'var_toa',
+                            'bearing',
+                            'var_bearing',
+                        )
+                    },
+                )
+            )
+    return out
+
+
+def tag_table(title: str, items: list, truth: np.ndarray, **extra) -> None:
+    print(f'\n### {title} ({len(items)} messages)\n')
+    header('RMSE m', 'RMSE, GPS 3.4 s later', 'median', 'NEES (2)', 'compared')
+    config = DiverConfig(**{**TAG, **extra})
+    row('each ping or fix by itself', raw_scores(items, truth, config))
+    for name, values in SETS.items():
+        filtered, smooth = follow(DiverConfig(**{**TAG, **extra, **values}), items)
+        row(name, tag_scores(filtered, truth))
+        row(f'{name}, smoothed', tag_scores(smooth, truth))
+
+
+def header(*columns: str) -> None:
+    print(f'| | {" | ".join(columns)} |\n{"|---" * (len(columns) + 1)}|')
+
+
+def row(name: str, values: list[float]) -> None:
+    print(f'| {name} | {" | ".join(f"{v:.2f}".removesuffix(".00") for v in values)} |')
+
+
+def boats(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        for sensor in ('radar', 'lidar'):
+            out = Path(scratch) / sensor
+            convert_autoferry(
+                folder / 'scenario13_detections.json',
+                out,
+                sensors=(sensor,),
+                truth=folder / 'scenario13_groundTruth.json',
+            )
+            items, truth = load(out)
+            print(f'\n### Autoferry scenario 13, {sensor}: {len(items)} fixes\n')
+            header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
+            for name, values in {
+                'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
+                'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
+                'heading_speed': {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1},
+            }.items():
+                config = DiverConfig(
+                    fix_std=4.0 if sensor == 'radar' else 2.0,
+                    clutter_density=1e-5,
+                    confirm_hits=4,
+                    confirm_window=6,
+                    **values,
+                )
+                tracker, final = DiverTracker(config), {}
+                for item in items:
+                    final.update((e.stamp_ns, e) for e in tracker.process(item))
+                row(name, boat_scores(final, truth))
+
+
+def boat_scores(final: dict, truth: np.ndarray) -> list[float]:
+    distance, missed, false, ids, squared = [], 0, 0, set(), []
+    for stamp in sorted(final):
+        estimate = final[stamp]
+        rows = estimate.extras['track_state'] > 0
+        present = []
+        for number in np.unique(truth[:, 1]):
+            path = truth[truth[:, 1] == number]
+            if path[0, 0] <= stamp * 1e-9 <= path[-1, 0]:
+                present.append([np.interp(stamp * 1e-9, path[:, 0], path[:, c]) for c in (2, 3)])
+        result = gospa(np.reshape(present, (-1, 2)), estimate.state[rows, :2], 20.0, 2)
+        distance.append(result.distance)
+        pairs = [(i, j) for i, j in enumerate(result.estimate_of) if j >= 0]
+        missed += len(present) - len(pairs)
+        false += int(rows.sum()) - len(pairs)
+        squared += [
+            np.sum((np.array(present[i]) - estimate.state[rows, :2][j]) ** 2) for i, j in pairs
+        ]
+        ids.update(estimate.extras['track_id'][rows].tolist())
+    n = len(final)
+    return [np.mean(distance), missed / n, false / n, len(ids), np.sqrt(np.mean(squared))]
+
+
+def main() -> None:
+    folder = DATA / 'yaps_ssu1'
+    if not folder.is_dir():
+        raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
+    with tempfile.TemporaryDirectory() as scratch:
+        fixes, arrivals = Path(scratch) / 'fixes', Path(scratch) / 'arrivals'
+        convert_fixes(folder / 'fixes.csv', fixes, truth=folder / 'gps_truth.csv')
+        convert_arrivals(
+            folder / 'arrivals.csv',
+            arrivals,
+            receivers=folder / 'receivers.csv',
+            truth=folder / 'gps_truth.csv',
+        )
+        items, truth = load(fixes)
+        tag_table('yaps, fixes as they are', items, truth)
+        tag_table('yaps, fixes, covariances times 6', items, truth, covariance_scale=6.0)
+        tag_table(
+            'yaps, fixes, covariance scale learnt', items, truth, estimate_covariance_scale=True
+        )
+        pings, truth = load(arrivals)
+        tag_table('yaps, raw arrivals, all receivers', pings, truth)
+        for receivers in (5, 4, 3):
+            tag_table(
+                f'yaps, raw arrivals, {receivers} receivers a ping',
+                thinned(pings, receivers, 1.0),
+                truth,
+            )
+        tag_table(
+            'yaps, raw arrivals, 4 receivers, 60 % of the pings', thinned(pings, 4, 0.6), truth
+        )
+    boats(DATA / 'autoferry')
+
+
+if __name__ == '__main__':
+    main()

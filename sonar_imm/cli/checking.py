@@ -1,0 +1,117 @@
+"""One recording through the real node and through the offline tracker, compared and scored.
+
+``check`` prints the outcome, ``demo`` makes a report of it.
+"""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from attrs import asdict, frozen
+
+from ..evaluation.judging import Check, Judgement
+from ..evaluation.run_folder import BAG, CSV, RunFolder
+from ..evaluation.tracking import final_estimates, InputOptions
+from ..nodes.harness import LockstepResult, run_lockstep
+from ..parameters import Config
+from ..resources import share_folder
+from ..trackers import SYSTEMS
+from .common import load_config, progress
+from .evaluate import evaluate_run
+from .track import track_recording
+
+
+@frozen
+class Outcome:
+    """All checks of one recording, and what is said of the offline run.
+
+    `folder` holds the runs ``offline`` and ``live``.
+    """
+
+    system: str
+    bag: Path
+    folder: Path
+    checks: tuple[Check, ...]
+    latency_ms: dict[str, float]
+    judgement: Judgement
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing fell short."""
+        return all(check.good for check in self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, fit for JSON."""
+        return {'system': self.system, 'bag': str(self.bag), 'good': self.good,
+                'checks': [asdict(check) for check in self.checks],
+                'latency_ms': self.latency_ms}
+
+
+def shipped_bags(system: str) -> list[Path]:
+    """The recordings of `system` that come with the package. Raises FileNotFoundError if none."""
+    found = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
+    if not found:
+        raise FileNotFoundError(f'no recordings for {system} in {share_folder() / "bags"}')
+    return found
+
+
+def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None = None,
+                    limit: float | None = None, quiet: bool = False) -> Outcome:
+    """Track `bag` offline and by the live node into `folder`, compare, score.
+
+    limit: error to stay within, in the unit of the system; None for that of the shipped
+    recordings.
+    Raises `BagError`, `ConfigError` and `LinkError`.
+    """
+    config, node = load_config(SYSTEMS[system], params, {})
+    options = InputOptions(frame_id=node.frame_id, world_frame=node.world_frame_convention)
+    run = track_recording(bag, folder / 'offline', SYSTEMS[system], config, options,
+                          overwrite=True, quiet=quiet)
+    with progress('playing to the node', run['messages'], quiet=quiet) as advance:
+        live = run_lockstep(bag, system, params_file=params, progress=advance)
+    _keep(live, config, system, folder / 'live')
+    judgement = evaluate_run(folder / 'offline')
+    checks = [_answered(live, run), _equal(folder), _ended(live)]
+    if (accuracy := judgement.accuracy(limit)) is not None:
+        checks.append(accuracy)
+    return Outcome(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
+
+
+def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
+    """Write what the node published the way the offline run is written."""
+    folder = RunFolder(path)
+    folder.prepare(overwrite=True)
+    folder.write_estimates(final_estimates(live.estimates, config), system)
+
+
+def _answered(live: LockstepResult, run: dict[str, Any]) -> Check:
+    taken, refused = live.counts.messages, live.counts.refused
+    offline_refused = sum(entry['count'] for entry in run['refused'].values())
+    return Check('messages taken / refused by the node', f'{taken} / {refused}',
+                 f'{run["messages"]} / {offline_refused}',
+                 (taken, refused) == (run['messages'], offline_refused))
+
+
+def _equal(folder: Path) -> Check:
+    """Bag and CSV of both runs, byte for byte; tells how many rows differ when they do."""
+    first, second = folder / 'offline', folder / 'live'
+    names = sorted(path.name for path in (first / BAG).iterdir())
+    files = [Path(CSV), *(Path(BAG) / name for name in names)]
+    same = all((second / file).is_file()
+               and (first / file).read_bytes() == (second / file).read_bytes() for file in files)
+    result = 'equal bytes' if same else f'{_rows_apart(first / CSV, second / CSV)} rows differ'
+    return Check('estimates of the node against offline', result, 'equal bytes', same)
+
+
+def _rows_apart(first: Path, second: Path) -> int:
+    with first.open(encoding='utf-8') as one, second.open(encoding='utf-8') as other:
+        return sum(a != b for a, b in zip_longest(one, other))
+
+
+def _ended(live: LockstepResult) -> Check:
+    clean = live.exit_code == 0 and 'Traceback' not in live.log
+    return Check('end of the node after Ctrl-C',
+                 f'exit code {live.exit_code}{"" if clean else ", see its log"}', 'exit code 0',
+                 clean)

@@ -1,0 +1,128 @@
+"""Estimate and truth of each ping, bin by bin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from ...estimates import Estimate
+from ...measurements import FloatArray
+
+BoolArray = NDArray[np.bool_]
+FAR = 0.55
+"""Share of a bin by which the range of a true floor may differ from that of an estimate. Half a
+bin, and what single precision adds."""
+
+
+@frozen(eq=False)
+class TrueFloor:
+    """The true floor at the bins of one ping (n,): height m and angle rad, NaN where unknown;
+    patch: rough there; echo: neither shadow nor water column."""
+
+    height: FloatArray
+    angle: FloatArray
+    patch: BoolArray
+    echo: BoolArray
+
+
+@frozen(eq=False)
+class Profile:
+    """What the tracker said of one ping (n,): height m, angle rad, their standard deviations, and
+    probabilities (n, M) of its models; heard: bins with an echo; truth: None where unknown."""
+
+    stamp_ns: int
+    range: FloatArray
+    height: FloatArray
+    height_std: FloatArray
+    angle: FloatArray
+    angle_std: FloatArray
+    heard: BoolArray
+    probabilities: FloatArray
+    truth: TrueFloor | None
+
+
+@frozen(eq=False)
+class Swath:
+    """All pings of a run in order; rough: which of `model_names` mean rough floor."""
+
+    profiles: tuple[Profile, ...]
+    model_names: tuple[str, ...]
+    rough: BoolArray
+
+    def roughness(self, profile: Profile) -> FloatArray:
+        """Probability (n,) that the floor is rough; NaN when the models do not tell."""
+        if not self.rough.any():
+            return np.full(len(profile.range), np.nan)
+        return profile.probabilities[:, self.rough].sum(axis=1)
+
+
+def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None) -> Swath:
+    """Lay out the estimates of a run, each beside the truth of the same stamp."""
+    known = {one.stamp_ns: one for one in truth or ()}
+    profiles, names = [], ()
+    for estimate in estimates:
+        names = estimate.model_names
+        profiles.append(profile_of(estimate, known.get(estimate.stamp_ns)))
+    return Swath(tuple(profiles), names, rough_models(names))
+
+
+def rough_models(names: tuple[str, ...]) -> BoolArray:
+    """Which models (M,) mean rough floor: the random walk beside a constant slope, else the upper
+    half of a bank, whose noise grows from model to model. None of a single model."""
+    if 'ncs' in names:
+        return np.array([name == 'rw' for name in names])
+    rough = np.arange(len(names)) >= len(names) // 2
+    return rough & (len(names) > 1)
+
+
+def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
+    """One ping; the state is a height or an angle, and the other one follows from it."""
+    ranges, height, angle = (_column(estimate, name) for name in ('range', 'height', 'angle'))
+    std = np.sqrt(estimate.covariance[:, 0, 0])
+    # A small angle moves the point along the circle around the sonar: dh = |y| d(angle).
+    arm = np.abs(estimate.xyz[:, 1].astype(np.float64))
+    arm = np.where(arm > 0.0, arm, np.nan)
+    in_angle = estimate.state_names[0] == 'angle'
+    return Profile(
+        stamp_ns=estimate.stamp_ns,
+        range=ranges,
+        height=height,
+        height_std=std * arm if in_angle else std,
+        angle=angle,
+        angle_std=std if in_angle else std / arm,
+        heard=estimate.extras['valid'].astype(bool),
+        probabilities=estimate.probabilities,
+        truth=None if truth is None else true_floor(truth, ranges),
+    )
+
+
+def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
+    """The true floor at `ranges` (n,); unknown in bins that the truth does not have."""
+    where = _column(truth, 'range')
+    if not len(where):
+        unknown, no = np.full(len(ranges), np.nan), np.zeros(len(ranges), bool)
+        return TrueFloor(unknown, unknown, no, no)
+    after = np.clip(np.searchsorted(where, ranges), 1, max(len(where) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(where) - 1)
+    nearest = np.where(ranges - where[before] <= where[after] - ranges, before, after)
+    width = float(np.median(np.diff(ranges))) if len(ranges) > 1 else np.inf
+    found = np.abs(where[nearest] - ranges) <= FAR * width
+    return TrueFloor(
+        height=np.where(found, _column(truth, 'height')[nearest], np.nan),
+        angle=np.where(found, _column(truth, 'angle')[nearest], np.nan),
+        patch=found & (_column(truth, 'patch')[nearest] > 0),
+        echo=found & (_column(truth, 'valid')[nearest] > 0),
+    )
+
+
+def _column(estimate: Estimate, name: str) -> FloatArray:
+    """A state or a further column as float64; NaN when the table has none."""
+    if name in estimate.state_names:
+        return estimate.state[:, estimate.state_names.index(name)]
+    if name not in estimate.extras:
+        return np.full(len(estimate), np.nan)
+    return np.asarray(estimate.extras[name], np.float64)

@@ -1,0 +1,75 @@
+"""The scores of a run of sea floors in words and lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+from ..numbers import error_line
+
+
+def summary_sentence(metrics: Mapping[str, Any]) -> str:
+    """The result in plain words."""
+    height = metrics.get('height', {}).get('all', {})
+    if not height.get('n'):
+        return (
+            f'{metrics["pings"]} pings with {metrics["bins"]} range bins, of which '
+            f'{percent(metrics["heard_share"])} have an echo. There is no truth to compare with, '
+            'so this page shows what the tracker says of itself.'
+        )
+    words = [f'On average the floor lies {height["rmse_m"]:.2f} m from the truth (RMS)']
+    patch, smooth = metrics['height']['patch'], metrics['height']['smooth']
+    if patch['n'] and smooth['n']:
+        words[0] += (
+            f': {smooth["rmse_m"]:.2f} m where it is smooth, {patch["rmse_m"]:.2f} m in rough '
+            'patches'
+        )
+    words[0] += '.'
+    words.append(
+        f'{percent(metrics["inside_band"]["all"])} of the bins lie inside the band of two '
+        'standard deviations; 95 % would be perfect.'
+    )
+    found = metrics.get('segmentation', {})
+    if found.get('patches'):
+        words.append(
+            f'What is labelled rough and what is rough overlap by {percent(found["iou"])}.'
+        )
+    return ' '.join(words)
+
+
+def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Title and value of the numbers a person wants to see first."""
+    result = [
+        ('pings, range bins', f'{metrics["pings"]}, {metrics["bins"]}'),
+        ('bins with an echo', percent(metrics['heard_share'])),
+    ]
+    for place in ('all', 'smooth', 'patch', 'shadow'):
+        result += error_line(f'height error, {place}', metrics.get('height', {}).get(place, {}))
+    result += error_line('angle error, all', metrics.get('angle', {}).get('all', {}), 'deg')
+    inside = metrics.get('inside_band', {})
+    if inside and not math.isnan(inside['all']):
+        result.append(
+            (
+                'inside two sd, smooth / patch',
+                f'{percent(inside["smooth"])} / {percent(inside["patch"])}',
+            )
+        )
+    found = metrics.get('segmentation', {})
+    if found.get('patches'):
+        result.append(('overlap of the rough patches', f'{found["iou"]:.2f}'))
+        result.append(
+            (
+                'bins late, into / out of a patch',
+                f'{found["bins_late_in"]:.0f} / {found["bins_late_out"]:.0f}',
+            )
+        )
+    gate = metrics.get('gate', {})
+    if gate.get('shadow_bins'):
+        result.append(('shadow passed over', percent(gate['shadow_passed_over'])))
+    return result
+
+
+def percent(share: float) -> str:
+    """A share as per cent, '-' when it is unknown."""
+    return '-' if math.isnan(share) else f'{100.0 * share:.0f} %'

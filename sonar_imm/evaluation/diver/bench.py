@@ -1,0 +1,174 @@
+"""How fast the diver filter is, against FilterPy doing the same sums in the same run.
+
+Times of one machine at one moment say little; ratios of two programs measured in turn say much.
+Each round times both, one after the other, and the median of the rounds' ratios is reported. That
+both did the same work is checked: their estimates have to agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import time
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+
+from ...estimation import imm_kernels
+from ...estimation.association import assign, association_cost, gate_threshold
+from ...measurements import FloatArray
+from ..benching import Bench
+
+MODELS, STATES, STEP = 16, 4, 1.0
+RATIO_WANTED = 100.0
+SCAN_WANTED_MS = 25.0
+
+
+@frozen(eq=False)
+class Problem:
+    """Sixteen coordinated turns, position fixes: F, Q (M, 4, 4), transition (M, M), z (K, 2)."""
+
+    F: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+    transition: FloatArray
+    z: FloatArray
+
+
+def problem(steps: int, seed: int = 0) -> Problem:
+    """A target that turns this way and that. The transition matrix is not symmetric."""
+    rng = np.random.default_rng(seed)
+    rates = np.radians(np.linspace(-40.0, 40.0, MODELS))
+    F = np.array([turn(rate) for rate in rates])
+    Q = np.array([np.diag([0.05, 0.05, 0.02, 0.02]) * (1.0 + 0.1 * j) for j in range(MODELS)])
+    transition = 0.8 * np.eye(MODELS) + 0.2 * rng.dirichlet(np.ones(MODELS), MODELS)
+    state, z = np.array([0.0, 0.0, 1.0, 0.0]), np.empty((steps, 2))
+    for k in range(steps):
+        state = turn(rates[(k // 10 * 7) % MODELS]) @ state
+        z[k] = state[:2] + rng.normal(0.0, 1.0, 2)
+    return Problem(F, Q, np.eye(2, STATES), np.eye(2), transition, z)
+
+
+def turn(rate: float) -> FloatArray:
+    """(4, 4) coordinated turn over `STEP`, state px, py, vx, vy."""
+    angle = rate * STEP
+    s, c = np.sin(angle), np.cos(angle)
+    a, b = (s / rate, (1.0 - c) / rate) if rate else (STEP, 0.0)
+    return np.array([[1, 0, a, -b], [0, 1, b, a], [0, 0, c, -s], [0, 0, s, c]], float)
+
+
+def run_kernel(p: Problem) -> FloatArray:
+    """(K, 4) estimates by our compiled cycle, one target."""
+    x, P = np.zeros((1, MODELS, STATES)), np.tile(10.0 * np.eye(STATES), (1, MODELS, 1, 1))
+    mu, B = np.full((1, MODELS), 1.0 / MODELS), np.zeros((MODELS, STATES))
+    E = np.tile(np.eye(STATES), (MODELS, 1, 1))
+    H, R, transition = np.tile(p.H, (MODELS, 1, 1)), p.R[None], p.transition[None]
+    means = np.empty((len(p.z), STATES))
+    for k in range(len(p.z)):
+        x, P, mu, mean, *_ = imm_kernels.linear_cycle(x, P, mu, transition, p.F, p.Q, B,
+                                                      p.z[k:k + 1], H, R, E)
+        means[k] = mean[0]
+    return means
+
+
+def run_filterpy(p: Problem) -> FloatArray:
+    """(K, 4) estimates by FilterPy. Raises ModuleNotFoundError when it is not installed."""
+    from filterpy.kalman import IMMEstimator, KalmanFilter
+    filters = []
+    for F, Q in zip(p.F, p.Q):
+        one = KalmanFilter(dim_x=STATES, dim_z=2)
+        one.x, one.P = np.zeros(STATES), 10.0 * np.eye(STATES)
+        one.F, one.Q, one.H, one.R = F, Q, p.H, p.R
+        filters.append(one)
+    imm = IMMEstimator(filters, np.full(MODELS, 1.0 / MODELS), p.transition)
+    means = np.empty((len(p.z), STATES))
+    for k, z in enumerate(p.z):
+        imm.predict()
+        imm.update(z)
+        means[k] = imm.x
+    return means
+
+
+def bench_step(rounds: int = 7, steps: int = 150) -> dict[str, Any]:
+    """Microseconds of one IMM step, ours and FilterPy's, and their ratio in paired rounds."""
+    p = problem(steps)
+    ours, theirs = run_kernel(p), run_filterpy(p)
+    agreement = float(np.abs(ours - theirs).max())
+    pairs = np.array([[_seconds(run_kernel, p), _seconds(run_filterpy, p)]
+                      for _ in range(rounds)]) / steps * 1e6
+    ratio = pairs[:, 1] / pairs[:, 0]
+    return {'models': MODELS, 'states': STATES, 'measurements': 2, 'steps': steps,
+            'rounds': rounds, 'ours_us': float(np.median(pairs[:, 0])),
+            'filterpy_us': float(np.median(pairs[:, 1])), 'ratio': float(np.median(ratio)),
+            'ratio_lowest': float(ratio.min()), 'ratio_wanted': RATIO_WANTED,
+            'largest_difference_m': agreement,
+            'good': bool(np.median(ratio) >= RATIO_WANTED and agreement < 1e-9)}
+
+
+def bench_scan(targets: int = 1000, scans: int = 20) -> dict[str, Any]:
+    """Milliseconds of a whole scan: mix, predict, gate, assign, update, combine."""
+    p = problem(1)
+    rng = np.random.default_rng(1)
+    side = 20.0 * np.sqrt(targets)
+    x = np.zeros((targets, MODELS, STATES))
+    x[:, :, :2] = rng.uniform(0.0, side, (targets, 1, 2))
+    P = np.tile(np.eye(STATES), (targets, MODELS, 1, 1))
+    mu = np.full((targets, MODELS), 1.0 / MODELS)
+    times, hits = [], []
+    for _ in range(scans + 1):
+        z = x[:, 0, :2] + rng.normal(0.0, 1.0, (targets, 2))
+        begin = time.perf_counter()
+        x, P, mu, hit = _scan(p, x, P, mu, z)
+        times.append(1e3 * (time.perf_counter() - begin))
+        hits.append(hit / targets)
+    median = float(np.median(times[1:]))
+    return {'targets': targets, 'scans': scans, 'median_ms': median,
+            'worst_ms': float(np.max(times[1:])), 'assigned': float(np.mean(hits)),
+            'wanted_ms': SCAN_WANTED_MS, 'good': median <= SCAN_WANTED_MS}
+
+
+def _scan(p: Problem, x: FloatArray, P: FloatArray, mu: FloatArray, z: FloatArray
+          ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """One scan of many targets, and how many of them were hit."""
+    targets = len(x)
+    H = np.tile(p.H, (1, MODELS, 1, 1))
+    x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
+    x, P = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
+    expected = np.ascontiguousarray(x[:, :, :2])
+    fit = imm_kernels.gate(expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)),
+                           gate_threshold(0.999, 2))
+    target, detection = np.nonzero(np.isfinite(fit))
+    cost = association_cost(fit[target, detection], 0.95, 1e-4)
+    chosen = assign(target, detection, cost, targets, len(z))
+    innovation = z[chosen][:, None] - expected
+    innovation[chosen < 0] = np.nan
+    x, P, mu, *_ = imm_kernels.update(x, P, c, innovation, H, p.R[None])
+    imm_kernels.combine(x, P, mu, np.tile(np.eye(STATES), (MODELS, 1, 1)))
+    return x, P, mu, int((chosen >= 0).sum())
+
+
+def _seconds(function: Callable[[Problem], Any], p: Problem) -> float:
+    begin = time.perf_counter()
+    function(p)
+    return time.perf_counter() - begin
+
+
+def _step_sentence(step: Mapping[str, Any]) -> str:
+    return (f'IMM step, {step["models"]} models, {step["states"]} states, {step["measurements"]} '
+            f'measurements: {step["ours_us"]:.1f} us, FilterPy {step["filterpy_us"]:.0f} us: '
+            f'{step["ratio"]:.0f} times as fast (wanted {step["ratio_wanted"]:.0f}; lowest of '
+            f'{step["rounds"]} paired rounds {step["ratio_lowest"]:.0f}); the estimates agree to '
+            f'{step["largest_difference_m"]:.0e} m')
+
+
+def _scan_sentence(scan: Mapping[str, Any]) -> str:
+    return (f'scan of {scan["targets"]} targets with gating and assignment: median '
+            f'{scan["median_ms"]:.1f} ms (wanted {scan["wanted_ms"]:.0f}), worst of '
+            f'{scan["scans"]} {scan["worst_ms"]:.1f} ms')
+
+
+BENCHES = (
+    Bench('step', bench_step, _step_sentence),
+    Bench('scan', lambda rounds: bench_scan(), _scan_sentence),
+)

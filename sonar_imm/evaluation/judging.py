@@ -1,0 +1,105 @@
+"""Judges: what is said of a finished run, each system in its own terms.
+
+How far a diver's track lies from the diver is one question, how well a sea floor was drawn is
+another. So each system has a module that judges its runs, named in `JUDGES`, which provides
+
+- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores, finds the words;
+- ``LIMIT``: the `Limit` that the error of a shipped recording has to stay within.
+
+Everything else is the same for all of them: the folder of a run, the page, the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol, TYPE_CHECKING
+
+from attrs import frozen
+
+if TYPE_CHECKING:
+    from .page import Part
+    from .run_folder import RunFolder
+
+TRUTH_GAP = 60.0
+
+JUDGES = {
+    'bathymetry': 'sonar_imm.evaluation.bathymetry',
+    'diver': 'sonar_imm.evaluation.diver',
+}
+"""Module by system. A new system adds its line here."""
+
+
+@frozen
+class Check:
+    """One thing that was checked: what came out, and what was wanted."""
+
+    name: str
+    result: str
+    wanted: str
+    good: bool
+
+
+@frozen
+class Limit:
+    """What an error may be at most: `meaning` names the error, e.g. 'position RMSE'."""
+
+    value: float
+    unit: str
+    meaning: str
+
+    def check(self, error: float, *, at_most: float | None = None, remark: str = '') -> Check:
+        """Compare `error` with the limit, or with `at_most` instead; `remark` follows it."""
+        limit = self.value if at_most is None else at_most
+        return Check(f'{self.meaning} against truth', f'{error:.2f} {self.unit}{remark}',
+                     f'at most {limit:g} {self.unit}', error <= limit)
+
+
+@frozen(kw_only=True)
+class JudgeOptions:
+    """What a run is compared with, and how.
+
+    truth_bag: where the truth is, None for the tracked recording itself. lag: seconds by which the
+    truth is later than the estimate it is compared with. gap: seconds without truth across which
+    it is not interpolated. cutoff: distance from which an estimate is on no target, None for what
+    is usual in the system.
+    """
+
+    truth_bag: Path | None = None
+    lag: float = 0.0
+    gap: float = TRUTH_GAP
+    cutoff: float | None = None
+
+
+@frozen(eq=False, kw_only=True)
+class Judgement:
+    """What is said of one run.
+
+    metrics: the content of ``metrics.json``. summary: the result in plain words. lines: title and
+    value of the numbers a person wants to see first. part: the run as a part of the report, made
+    only when asked for, with checks that were made besides. accuracy: the error against a limit
+    (None for `LIMIT` of the system); gives None where there is no truth.
+    """
+
+    metrics: dict[str, Any]
+    summary: str
+    lines: tuple[tuple[str, str], ...]
+    part: Callable[[Sequence[Check]], Part]
+    accuracy: Callable[[float | None], Check | None]
+
+
+class Judge(Protocol):
+    """What a module in `JUDGES` provides."""
+
+    LIMIT: Limit
+
+    def judge(self, folder: RunFolder, options: JudgeOptions) -> Judgement:
+        """Judge the run in `folder`. Raises `BagError` when it or the truth cannot be read."""
+        ...
+
+
+def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
+    """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
+    one: Judge = import_module(JUDGES[folder.read_run()['system']])
+    return one.judge(folder, options or JudgeOptions())

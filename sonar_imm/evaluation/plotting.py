@@ -1,0 +1,86 @@
+"""What the figures of all systems share: colours, style, time axes, and the NIS figure.
+
+Colours are those of Okabe and Ito, which people with any colour vision can tell apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+import plotly.graph_objects as go
+from scipy.stats import chi2
+
+from ..measurements import FloatArray
+from . import SECOND
+
+INK, GRID, GREY, AMBER = '#1b2733', '#e4e9ee', '#8593a1', '#E69F00'
+COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
+MOST_POINTS = 20_000
+FONT = 'Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif'
+
+
+def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
+    """NIS of every hit over `time` [s], its running mean, and what chi-square allows.
+
+    Hits with different degrees of freedom (pings heard by more or fewer receivers) are divided by
+    them, and then share no chi-square bounds.
+    """
+    same = len(np.unique(dof)) == 1
+    shared = int(dof[0]) if same else 0
+    nis = nis if same else nis / dof
+    figure = go.Figure()
+    shown = thin(len(nis), MOST_POINTS)
+    figure.add_scattergl(x=time[shown], y=nis[shown], mode='markers', name='NIS of a hit',
+                         marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6})
+    width = max(5, min(50, len(nis) // 8))
+    if len(nis) > width:
+        mean = np.convolve(nis, np.full(width, 1.0 / width), mode='valid')
+        figure.add_scattergl(x=time[width - 1:], y=mean, mode='lines',
+                             name=f'mean of {width}', line={'color': INK, 'width': 2})
+        if shared:
+            low, high = chi2.ppf([0.025, 0.975], width * shared) / width
+            figure.add_hrect(y0=low, y1=high, fillcolor=AMBER, opacity=0.25, line_width=0)
+    if shared:
+        figure.add_hline(y=chi2.ppf(0.95, shared), line={'color': COLOURS[1], 'dash': 'dash'},
+                         annotation_text='95 % of hits should lie below')
+    figure.update_xaxes(title='time [s]', zeroline=False)
+    figure.update_yaxes(title='NIS' if same else 'NIS / degrees of freedom', rangemode='tozero')
+    return styled(figure, height=340)
+
+
+def add_band(figure: go.Figure, time: FloatArray, half: FloatArray, *, first: bool,
+             row: int) -> None:
+    """Add the band from -half to half to subplot `row`; `first`: with an entry in the legend."""
+    figure.add_scatter(x=np.concatenate([time, time[::-1]]), y=np.concatenate([half, -half[::-1]]),
+                       fill='toself', fillcolor=transparent(AMBER, 0.28), mode='lines',
+                       line={'color': transparent(AMBER, 0.6), 'width': 0.5}, hoverinfo='skip',
+                       name='95 % band it predicted', legendgroup='band', showlegend=first,
+                       row=row, col=1)
+
+
+def seconds(stamp_ns: NDArray[np.int64], scan_ns: NDArray[np.int64]) -> FloatArray:
+    """Seconds since the first scan of the run."""
+    return (stamp_ns - scan_ns[0]) / SECOND if len(scan_ns) else np.empty(0)
+
+
+def thin(count: int, most: int) -> slice:
+    """An even choice of at most `most` out of `count`."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
+def transparent(colour: str, opacity: float) -> str:
+    """A colour ``#rrggbb`` that lets others through."""
+    red, green, blue = (int(colour[place:place + 2], 16) for place in (1, 3, 5))
+    return f'rgba({red},{green},{blue},{opacity})'
+
+
+def styled(figure: go.Figure, *, height: int) -> go.Figure:
+    """Give `figure` the style of the page; `height` in pixels."""
+    figure.update_layout(
+        height=height, margin={'l': 64, 'r': 24, 't': 44, 'b': 52}, paper_bgcolor='white',
+        plot_bgcolor='white', font={'family': FONT, 'size': 13, 'color': INK}, hovermode='closest',
+        legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0})
+    axis = {'gridcolor': GRID, 'zerolinecolor': '#c3ccd5', 'linecolor': '#c3ccd5', 'ticks': ''}
+    figure.update_xaxes(**axis)
+    figure.update_yaxes(**axis)
+    return figure

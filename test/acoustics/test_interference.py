@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import array, interference, laplace, law_kernels
+
+STAVES, SPACING = 8, 0.5
+STEP = array.phase_step(SPACING)
+SINES = np.array([[0.3, -0.2], [0.1, np.nan], [0.5, 0.55]])
+VARIANCES = np.array([[5.0, 2.0], [3.0, 3.0], [0.0, 4.0]])
+NOISE = np.array([1.0, 0.5, 2.0])
+
+
+@pytest.fixture
+def scene():
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(3, STAVES)) + 1j * rng.normal(size=(3, STAVES))
+    return y, interference.noise_covariance(SINES, VARIANCES, NOISE, STAVES, STEP)
+
+
+def test_the_covariance_is_the_sum_of_its_parts(scene):
+    _, covariance = scene
+    a, b = (array.steering(u, STAVES, SPACING) for u in (0.3, -0.2))
+    first = 5.0 * np.outer(a, a.conj()) + 2.0 * np.outer(b, b.conj()) + np.eye(STAVES)
+    assert np.allclose(covariance[0], first)
+    a, b = (array.steering(u, STAVES, SPACING) for u in (0.1, 0.55))
+    assert np.allclose(covariance[1], 3.0 * np.outer(a, a.conj()) + 0.5 * np.eye(STAVES))
+    assert np.allclose(covariance[2], 4.0 * np.outer(b, b.conj()) + 2.0 * np.eye(STAVES))
+
+
+@pytest.mark.parametrize('law', laplace.LAWS)
+def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, law):
+    y, covariance = scene
+    form = interference.interference_form(y, covariance)
+    u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
+    out = np.empty(len(u))
+    for n in range(3):
+        law_kernels.log_likelihoods(
+            u,
+            SPACING,
+            -signal * form.beam[n],
+            form.base[n],
+            form.spread[n],
+            signal,
+            law_kernels.law_table(STAVES, law),
+            np.empty((4, len(u))),
+            out,
+        )
+        expected = interference.interfered_log_likelihood(
+            u, y[n], signal, covariance[n], STEP, law
+        )
+        assert out[-1] == expected[-1] == -np.inf
+        assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
+
+
+def test_without_interferers_it_is_the_plain_law(scene):
+    y, _ = scene
+    covariance = interference.noise_covariance(np.full((3, 1), np.nan), 1.0, NOISE, STAVES, STEP)
+    form = interference.interference_form(y, covariance)
+    assert np.allclose(form.log_determinant, STAVES * np.log(NOISE))
+    u = np.linspace(-0.9, 0.9, 31)
+    plain = laplace.log_likelihood(u, y[0], 7.0, NOISE[0], STEP)
+    other = interference.interfered_log_likelihood(u, y[0], 7.0, covariance[0], STEP)
+    assert np.ptp(plain - other) < 1e-9
+
+
+def test_an_interferer_no_longer_draws_the_likelihood():
+    # An echo from 0.2 beside a surface echo from -0.6, three times as strong.
+    rng = np.random.default_rng(1)
+    grid, found, drawn = np.linspace(-0.95, 0.95, 191), [], []
+    covariance = interference.noise_covariance([[-0.6]], [[900.0]], np.ones(1), STAVES, STEP)[0]
+    for _ in range(50):
+        s = 10.0 * np.exp(2j * np.pi * rng.uniform(size=2)) * [1.0, 3.0]
+        y = s[0] * array.steering(0.2, 8, 0.5) + s[1] * array.steering(-0.6, 8, 0.5)
+        y += (rng.normal(size=8) + 1j * rng.normal(size=8)) / np.sqrt(2.0)
+        told = interference.interfered_log_likelihood(grid, y, 100.0, covariance, STEP)
+        found.append(grid[told.argmax()])
+        drawn.append(grid[laplace.log_likelihood(grid, y, 100.0, 1.0, STEP).argmax()])
+    assert np.abs(np.array(found) - 0.2).max() < 0.06
+    assert np.abs(np.median(drawn) + 0.6) < 0.06

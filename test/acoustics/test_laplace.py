@@ -1,0 +1,166 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import kve
+
+from sonar_imm.acoustics import array, laplace, law_kernels
+
+STEP = array.phase_step(0.5)
+
+
+def complex_normal(rng, *shape):
+    return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) / math.sqrt(2.0)
+
+
+@pytest.mark.parametrize(
+    'staves, q, value',
+    [
+        (8, 1.0, 5.7220742150),
+        (8, 8.0, -9.8732948088),
+        (8, 1e4, -234.5379989984),
+        (4, 1.0, -0.4348135035),
+    ],
+)
+def test_golden_values(staves, q, value):
+    assert laplace.log_density(q, staves) == pytest.approx(value, abs=1e-9)
+
+
+@pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
+@pytest.mark.parametrize('q', [0.3, 5.0, 200.0])
+def test_the_law_is_the_mixture_it_is_derived_from(staves, q):
+    # The same by integrating over the power z, without any Bessel function.
+    peak = 0.5 * (math.sqrt(staves**2 + 4.0 * q) - staves)
+    height = -peak - q / peak - staves * math.log(peak)
+
+    def mixture(z):
+        return math.exp(-z - q / z - staves * math.log(z) - height)
+
+    total = quad(mixture, 0.0, peak)[0] + quad(mixture, peak, np.inf, limit=200)[0]
+    assert laplace.log_density(q, staves) + math.log(2.0) == pytest.approx(
+        math.log(total) + height, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize('staves', range(2, 17))
+def test_both_laws_integrate_to_one(staves):
+    # Over C^P in whitened coordinates: shells of area pi^P / Gamma(P) q^(P-1) dq, q = v^2.
+    shell = staves * math.log(math.pi) - math.lgamma(staves) + math.log(2.0)
+    constant = laplace.log_constant(staves, 0.0)
+    gaussian = laplace.gaussian_log_constant(staves, 0.0)
+
+    def total(density, rest):
+        def shells(v):
+            log_area = shell + (2 * staves - 1) * math.log(v)
+            return math.exp(rest + float(density(v * v, staves)) + log_area)
+
+        return quad(shells, 0.0, 10.0, limit=200)[0] + quad(shells, 10.0, 80.0, limit=200)[0]
+
+    assert total(laplace.log_density, constant) == pytest.approx(1.0, abs=1e-8)
+    assert total(laplace.gaussian_log_density, gaussian) == pytest.approx(1.0, abs=1e-8)
+
+
+def test_extreme_values_stay_finite_and_ordered():
+    q = np.geomspace(1e-300, 1e15, 2000)
+    for staves in (2, 3, 8, 33, 64):
+        f = laplace.log_density(q, staves)
+        assert np.isfinite(f).all() and (np.diff(f) < 0.0).all()
+        slope = laplace.log_density_slope(q, staves)
+        assert np.isfinite(slope).all() and (slope <= 0.0).all()
+    assert laplace.log_density(0.0, 8) == np.inf
+
+
+def test_the_slope_is_the_derivative():
+    ln_q = np.linspace(-8.0, 15.0, 200)
+    for staves in (2, 5, 16, 64):
+        ends = [laplace.log_density(np.exp(ln_q + d), staves) for d in (1e-5, -1e-5)]
+        slope = laplace.log_density_slope(np.exp(ln_q), staves)
+        assert np.allclose((ends[0] - ends[1]) / 2e-5, slope, rtol=1e-5)
+
+
+def test_moments_of_q_are_those_of_samples():
+    rng = np.random.default_rng(1)
+    q = rng.exponential(size=400_000) * rng.gamma(8, size=400_000)
+    mean, variance = laplace.moments_of_q(8)
+    assert q.mean() == pytest.approx(mean, rel=0.01)
+    assert q.var() == pytest.approx(variance, rel=0.02)
+
+
+@pytest.mark.parametrize('staves', [2, 3, 8, 17])
+def test_the_form_is_that_of_the_covariance(staves):
+    rng = np.random.default_rng(staves)
+    y = complex_normal(rng, 4, staves)
+    signal, noise = rng.uniform(0.1, 100.0, 4), rng.uniform(0.1, 10.0, 4)
+    g = laplace.form_coefficients(y, signal, noise)
+    for u in (-0.8, 0.0, 0.37):
+        q = (g * np.exp(-1j * STEP * u * np.arange(staves))).sum(axis=1).real
+        for n in range(4):
+            a = array.steering(u, staves, 0.5)
+            gamma = signal[n] * np.outer(a, a.conj()) + noise[n] * np.eye(staves)
+            assert q[n] == pytest.approx((y[n].conj() @ np.linalg.solve(gamma, y[n])).real)
+            determinant = staves * np.log(noise[n]) + np.log1p(staves * signal[n] / noise[n])
+            assert determinant == pytest.approx(np.linalg.slogdet(gamma)[1])
+
+
+@pytest.mark.parametrize('law', laplace.LAWS)
+@pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
+def test_the_table_is_the_law(staves, law):
+    q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
+    out = np.empty(len(q))
+    law_kernels.log_densities(q.copy(), np.empty(len(q)), law_kernels.law_table(staves, law), out)
+    if law == 'gaussian':
+        assert np.allclose(out, -q, rtol=1e-12)
+        return
+    root = np.sqrt(q)
+    exact = np.log(kve(staves - 1, 2 * root)) - 2 * root + (1 - staves) * np.log(root)
+    error = np.abs(out - exact) / np.maximum(1.0, np.abs(exact))
+    finite = np.isfinite(exact)  # the Bessel function overflows in the first cells of many staves
+    assert finite.mean() > 0.9 and error[finite].max() < 3e-7
+
+
+def test_what_the_table_does_not_reach_is_held_at_its_end():
+    table, out = law_kernels.law_table(8), np.empty(5)
+    q = np.array([0.0, -1.0, 1e-30, np.nan, 1e300])
+    law_kernels.log_densities(q.copy(), np.empty(5), table, out)
+    assert (out[:4] == out[0]).all() and np.isfinite(out).all() and out[4] < -1e7
+    for staves, law in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
+        with pytest.raises(ValueError):
+            law_kernels.law_table(staves, law)
+    assert not table.flags.writeable
+
+
+@pytest.mark.parametrize('law', laplace.LAWS)
+@pytest.mark.parametrize('staves, spacing', [(2, 0.5), (5, 0.3), (8, 0.5), (8, -0.5), (64, 0.5)])
+def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, law):
+    rng = np.random.default_rng(2)
+    u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
+    y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
+    out = np.empty(len(u))
+    law_kernels.log_likelihoods(
+        u,
+        spacing,
+        laplace.form_coefficients(y, signal, noise),
+        0.0,
+        np.empty(0, complex),
+        0.0,
+        law_kernels.law_table(staves, law),
+        np.empty((4, len(u))),
+        out,
+    )
+    expected = laplace.log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, law)
+    assert out[300] == expected[300] == -np.inf
+    fine = np.arange(len(u)) != 300
+    assert np.allclose(out[fine], expected[fine], rtol=3e-7, atol=1e-6)
+
+
+def test_the_likelihood_peaks_at_the_direction_of_the_echo():
+    rng = np.random.default_rng(3)
+    grid = np.linspace(-0.95, 0.95, 381)
+    for law in laplace.LAWS:
+        for u in (-0.6, 0.1, 0.7):
+            y = 10.0 * array.steering(u, 8, 0.5) + complex_normal(rng, 8)
+            best = grid[laplace.log_likelihood(grid, y, 100.0, 1.0, STEP, law).argmax()]
+            assert best == pytest.approx(u, abs=0.03)
+            turned = laplace.log_likelihood(grid, y, 100.0, 1.0, -STEP, law)
+            assert grid[turned.argmax()] == pytest.approx(-u, abs=0.03)

@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import variances
+from sonar_imm.simulation.bathymetry import scenario, simulate, snr
+
+
+@pytest.fixture(scope='module')
+def pings():
+    scene = simulate(scenario('paper', {'pings': 12}), 7)
+    return [(one.measurement, true) for one, true in zip(scene.measurements, scene.truth)]
+
+
+def test_moving_mean_over_usable_rows_only():
+    values = np.array([1.0, 2.0, np.nan, 4.0, 100.0, 6.0])
+    usable = np.array([True, True, False, True, False, True])
+    assert variances.moving_mean(values, 1, usable).tolist() == [1.5, 1.5, 3.0, 4.0, 5.0, 6.0]
+    assert np.isnan(variances.moving_mean(values, 0, usable)).tolist() == (~usable).tolist()
+    square = np.arange(12.0).reshape(4, 3)
+    expected = [square[max(k - 2, 0) : k + 3].mean(axis=0) for k in range(4)]
+    assert np.allclose(variances.moving_mean(square, 2), expected)
+    assert variances.moving_mean(1j * values[:2], 5).tolist() == [1.5j, 1.5j]
+
+
+def test_which_bins_are_usable():
+    iq = np.ones((5, 4), np.complex64)
+    iq[0, 1], iq[1, 3], iq[2], iq[3] = np.nan, complex(0.0, np.inf), 0.0, 1e30
+    assert variances.usable_bins(iq).tolist() == [False, False, False, False, True]
+
+
+def test_the_signal_is_known_to_two_decibels(pings):
+    config = scenario('paper')
+    errors = [
+        variances.signal_variance(variances.mean_power(ping.iq), 1.0) / snr(config, ping.range)
+        for ping, _ in pings
+    ]
+    decibels = 10.0 * np.log10(np.concatenate(errors))
+    assert abs(decibels.mean()) < 0.5 and decibels.std() < 2.0
+
+
+def test_silence_leaves_a_floor_and_spoilt_bins_do_not_count(pings):
+    ping, _ = pings[0]
+    noise = np.full(len(ping), 1e9)
+    floor = variances.signal_variance(variances.mean_power(ping.iq), noise)
+    assert (floor == variances.LEAST_SNR * 1e9).all()
+    power = variances.mean_power(ping.iq)
+    clean = variances.signal_variance(power, 1.0)
+    usable = np.ones(len(ping), bool)
+    usable[500] = False
+    spoilt = power.copy()
+    spoilt[500] = np.nan
+    told = variances.signal_variance(spoilt, 1.0, usable=usable)
+    assert np.isfinite(told).all() and np.abs(10.0 * np.log10(told / clean)).max() < 6.0
+    assert (told[:490] == clean[:490]).all()
+
+
+def test_noise_from_the_water_column():
+    config = scenario('water_column', {'pings': 1, 'noise_variance': 3.0})
+    ping = simulate(config, 3).measurements[0].measurement
+    assert ping.noise_variance is None
+    assert variances.noise_variance(ping.iq, ping.range < 14.0) == pytest.approx(3.0, rel=0.2)
+    assert np.isnan(variances.noise_variance(ping.iq, ping.range < 0.0))
+
+
+def test_blind_noise_is_right_within_two_decibels(pings):
+    told = [variances.blind_noise_variance(ping.iq) for ping, _ in pings]
+    assert np.abs(10.0 * np.log10(told)).max() < 2.0
+    assert np.isnan(variances.blind_noise_variance(pings[0][0].iq[:5]))

@@ -1,0 +1,134 @@
+"""The command line as a user meets it: help, exit codes, one line and no traceback."""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+
+import pytest
+
+from sonar_imm import __version__
+from sonar_imm.cli import COMMANDS, main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(*arguments, **options):
+    """The command as a process of its own."""
+    environment = dict(os.environ, PYTHONPATH=str(ROOT))
+    return subprocess.run([sys.executable, '-m', 'sonar_imm.cli', *arguments], text=True,
+                          capture_output=True, env=environment, timeout=120, **options)
+
+
+@pytest.mark.parametrize('arguments', [[], ['--help'], ['-h']])
+def test_help_lists_every_command(arguments, capsys):
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert all(f'  {name} ' in printed for name in COMMANDS)
+
+
+@pytest.mark.parametrize('name', list(COMMANDS))
+def test_every_command_has_help(name, capsys):
+    assert main([name, '--help']) == 0
+    printed = capsys.readouterr().out
+    assert f'Usage: sonar-imm {name}' in printed
+    if name != 'convert':
+        assert f'Example:\n    sonar-imm {name}' in printed
+
+
+@pytest.mark.parametrize('kind', ['fixes', 'arrivals', 'truth', 'autoferry'])
+def test_every_kind_of_conversion_has_help(kind, capsys):
+    assert main(['convert', kind, '--help']) == 0
+    assert f'Example:\n    sonar-imm convert {kind}' in capsys.readouterr().out
+
+
+def test_version(capsys):
+    assert main(['--version']) == 0
+    assert __version__ in capsys.readouterr().out
+
+
+def test_help_loads_no_heavy_module():
+    code = ("import sys; from sonar_imm.cli import main; main(['--help']); "
+            "print([name for name in ('numpy', 'scipy', 'rosbags', 'numba', 'plotly', 'rclpy', "
+            "'rich') if name in sys.modules])")
+    done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True, cwd=ROOT)
+    assert done.stdout.splitlines()[-1] == '[]'
+
+
+@pytest.mark.parametrize('arguments, words', [
+    (['trakc'], "there is no command 'trakc' (did you mean 'track'?)"),
+    (['--bad'], '--bad'),
+    (['track'], "Missing argument 'BAG'"),
+    (['track', 'nowhere.bag', 'out'], 'nowhere.bag does not exist'),
+    (['info', 'nowhere.bag'], 'nowhere.bag does not exist'),
+    (['evaluate', 'nowhere'], 'holds no finished run'),
+    (['track', 'b', 'o', '--set', 'speed_mean'], "'speed_mean' is not of the form NAME=VALUE"),
+    (['track', 'b', 'o', '--topic', 'fix'], "'fix' is not of the form INPUT=TOPIC"),
+    (['track', 'b', 'o', '--system', 'divers'], "'divers'"),
+    (['simulate', 'diver'], "Missing argument 'OUT_BAG'"),
+    (['simulate', 'diver', 'b', '--scenario', 'tabel1'], "did you mean 'table1'?"),
+    (['simulate', 'diver', 'b', '--set', 'speed=fast'], "'speed' must be a number, got 'fast'"),
+    (['convert', 'fixes', 'nowhere.csv', 'b'], 'nowhere.csv'),
+    (['convert', 'fixes', 'a', 'b', '--origin', '5'], "'5' is not of the form LAT,LON"),
+    (['convert', 'fixes', 'a', 'b', '--time-offset', 'x'], 'not a number of seconds'),
+    (['check', 'dvier'], "'dvier'"),
+])
+def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_path,
+                                                  monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ''
+    assert len(printed.err.splitlines()) == 1 and printed.err.startswith('sonar-imm: ')
+    assert words in printed.err
+
+
+def test_a_bug_is_not_hidden(monkeypatch):
+    from sonar_imm.cli import info
+
+    def broken(*arguments, **options):
+        raise RuntimeError('a bug')
+    monkeypatch.setattr(info, 'progress', broken)
+    monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__',
+                        lambda self: (_ for _ in ()).throw(RuntimeError('a bug')))
+    with pytest.raises(RuntimeError, match='a bug'):
+        main(['info', 'x.bag'])
+
+
+def test_a_package_that_is_not_there_is_named(monkeypatch, capsys):
+    def absent(self):
+        raise ModuleNotFoundError("No module named 'rclpy'", name='rclpy')
+    monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__', absent)
+    assert main(['info', 'x.bag']) == 2
+    assert 'sonar_imm[ros]' in capsys.readouterr().err
+
+
+def test_ctrl_c_is_clean(monkeypatch, capsys):
+    def interrupted(self):
+        raise KeyboardInterrupt
+    monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__', interrupted)
+    assert main(['info', 'x.bag']) == 130
+    assert 'Traceback' not in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == 'win32', reason='pipes end otherwise there')
+def test_a_reader_that_goes_away_is_no_trouble():
+    process = subprocess.Popen([sys.executable, '-m', 'sonar_imm.cli', 'simulate', 'diver',
+                                '--list'], env=dict(os.environ, PYTHONPATH=str(ROOT)),
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.wait(60) == 141
+    assert b'Traceback' not in process.stderr.read()
+    process.stderr.close()
+
+
+def test_the_module_runs_as_the_command():
+    done = run('info', 'nowhere.bag')
+    assert done.returncode == 2 and done.stderr == 'sonar-imm: nowhere.bag does not exist\n'
+
+
+def test_help_is_fast():
+    begin = time.perf_counter()
+    assert run('--help').returncode == 0
+    assert time.perf_counter() - begin < 2.0

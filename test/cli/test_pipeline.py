@@ -1,0 +1,180 @@
+"""Simulate or convert, look, track, evaluate: the commands one after the other."""
+
+import csv
+import json
+
+from dive_bags import write_dive
+import pytest
+
+from sonar_imm.cli import main
+
+
+@pytest.fixture
+def call(capsys):
+    """Run a command that has to succeed and give its JSON."""
+    def call(*arguments):
+        capsys.readouterr()
+        assert main([*map(str, arguments), '--json']) == 0
+        return json.loads(capsys.readouterr().out)
+    return call
+
+
+@pytest.fixture
+def dive(tmp_path):
+    return write_dive(tmp_path / 'dive', spoilt=(30, 31), shuffle=True)
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob('*')
+            if path.is_file() and path.name != 'run.json'}
+
+
+def test_track_twice_writes_the_same_bytes(call, dive, tmp_path):
+    for name in ('first', 'second'):
+        call('track', dive, tmp_path / name)
+    first, second = contents(tmp_path / 'first'), contents(tmp_path / 'second')
+    assert first == second and len(first) == 3
+
+
+def test_run_json_accounts_for_every_message(call, dive, tmp_path):
+    run = call('track', dive, tmp_path / 'out')
+    assert run == json.loads((tmp_path / 'out' / 'run.json').read_text())
+    assert run['messages'] == 120 and run['estimates'] == 118
+    assert run['counts']['used'] == 118 and run['counts']['refused'] == 2
+    assert run['refused']['nan']['count'] == 2
+    assert run['topics'] == {'/fix': 'fix'} and run['bag'] == str(dive.resolve())
+    assert run['parameters']['model_set'] == 'heading_speed'
+    assert {'sonar_imm', 'numpy', 'rosbags'} <= run['versions'].keys()
+
+
+def test_the_csv_is_sorted_by_stamp(call, dive, tmp_path):
+    call('track', dive, tmp_path / 'out')
+    with (tmp_path / 'out' / 'estimate.csv').open(newline='') as file:
+        stamps = [int(row['stamp_ns']) for row in csv.DictReader(file)]
+    assert stamps == sorted(stamps) and len(stamps) == 118
+
+
+def test_evaluate_scores_and_reports(call, dive, tmp_path):
+    call('track', dive, tmp_path / 'out')
+    metrics = call('evaluate', tmp_path / 'out', '--report', tmp_path / 'page.html')
+    assert metrics == json.loads((tmp_path / 'out' / 'metrics.json').read_text())
+    assert metrics['position']['rmse_m'] < 0.75 * metrics['raw_fix']['rmse_m']
+    assert metrics['tracks']['tracks'] == 1
+    assert (tmp_path / 'page.html').stat().st_size > 1_000_000
+
+
+def test_evaluate_takes_truth_from_another_bag(call, tmp_path):
+    blind = write_dive(tmp_path / 'blind', truth=False)
+    known = write_dive(tmp_path / 'known')
+    call('track', blind, tmp_path / 'out')
+    assert 'position' not in call('evaluate', tmp_path / 'out', '--no-report')
+    metrics = call('evaluate', tmp_path / 'out', '--no-report', '--truth', known)
+    assert metrics['position']['n'] > 100
+    assert not (tmp_path / 'out' / 'report.html').exists()
+
+
+def test_evaluate_says_when_the_truth_bag_has_none(call, tmp_path, capsys):
+    blind = write_dive(tmp_path / 'blind', truth=False)
+    call('track', blind, tmp_path / 'out')
+    assert main(['evaluate', str(tmp_path / 'out'), '--truth', str(blind)]) == 2
+    assert 'has no topic /truth/estimate' in capsys.readouterr().err
+
+
+def test_a_run_is_not_overwritten_by_accident(call, dive, tmp_path, capsys):
+    call('track', dive, tmp_path / 'out')
+    assert main(['track', str(dive), str(tmp_path / 'out')]) == 2
+    assert '--overwrite' in capsys.readouterr().err
+    call('track', dive, tmp_path / 'out', '--overwrite')
+
+
+def test_parameters_come_from_file_and_command(call, dive, tmp_path):
+    params = tmp_path / 'diver.yaml'
+    params.write_text('/**:\n  ros__parameters:\n    model_set: cv_cv\n    confirm_hits: 2\n'
+                      '    use_sim_time: true\n')
+    run = call('track', dive, tmp_path / 'out', '--params', params, '--set', 'confirm_hits=1',
+               '--set', 'acceleration_noise=0.1, 1.5', '--set', 'hover=false')
+    parameters = run['parameters']
+    assert parameters['model_set'] == 'cv_cv' and parameters['confirm_hits'] == 1
+    assert parameters['acceleration_noise'] == [0.1, 1.5] and parameters['hover'] is False
+
+
+@pytest.mark.parametrize('text, words', [
+    ('/**:\n  ros__parameters:\n    model_sett: cv', "did you mean 'model_set'?"),
+    ('model_set: vc', 'must be one of'),
+    ('{', 'not a YAML file'),
+    ('- 1', 'must hold a mapping'),
+    (b'\xff\xfe', 'is not a text file'),
+])
+def test_bad_parameter_files_are_one_sentence(dive, tmp_path, capsys, text, words):
+    params = tmp_path / 'diver.yaml'
+    params.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert main(['track', str(dive), str(tmp_path / 'out'), '--params', str(params)]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_the_shipped_parameter_file_is_understood(call, dive, tmp_path):
+    from sonar_imm.resources import shared_file
+    run = call('track', dive, tmp_path / 'out', '--params', shared_file('config/diver.yaml'))
+    assert run['estimates'] == 118
+
+
+def test_topics_are_named_and_suggested(call, tmp_path, capsys):
+    odd = write_dive(tmp_path / 'odd', topic='/usbl/pose')
+    assert main(['info', str(odd)]) == 0
+    assert '--topic fix=/usbl/pose' in capsys.readouterr().out
+    run = call('track', odd, tmp_path / 'out', '--topic', 'fix=/usbl/pose')
+    assert run['topics'] == {'/usbl/pose': 'fix'}
+    assert call('evaluate', tmp_path / 'out', '--no-report')['raw_fix']['n'] == 120
+
+
+def test_smoothing_is_recorded_in_the_run(call, dive, tmp_path):
+    assert call('track', dive, tmp_path / 'out', '--smooth')['smoothed'] is True
+
+
+def test_simulate_gives_the_same_bag_for_the_same_seed(call, tmp_path):
+    for folder in ('a', 'b'):
+        (tmp_path / folder).mkdir()
+        result = call('simulate', 'diver', tmp_path / folder / 'bag', '--seed', '5', '--scenario',
+                      'several', '--set', 'divers=2', '--set', 'duration=20')
+    assert result['targets'] == 2 and result['messages']['/fix'] > 20
+    assert contents(tmp_path / 'a') == contents(tmp_path / 'b')
+
+
+def test_convert_tells_what_it_left_out(call, tmp_path, capsys):
+    table = tmp_path / 'usbl.csv'
+    table.write_text('when,easting,northing,std\n1700000000,1,2,0.5\n1700000001,x,2,0.5\n'
+                     '1700000002,1,3,0.5\n')
+    arguments = ['convert', 'fixes', str(table), '--column', 'stamp=when', '--time-offset', '0.5']
+    result = call(*arguments, tmp_path / 'bag')
+    assert result['messages'] == {'/fix': 2} and result['bad_rows'] == 1
+    assert main([*arguments, str(tmp_path / 'again')]) == 0
+    assert 'line 3' in capsys.readouterr().out
+    found = call('info', tmp_path / 'bag')
+    assert found['systems'] == {'diver': {'fix': ['/fix']}}
+
+
+def test_convert_does_not_replace_a_bag(call, tmp_path, capsys):
+    table = tmp_path / 'usbl.csv'
+    table.write_text('stamp,x,y\n1700000000,1,2\n')
+    call('convert', 'fixes', table, tmp_path / 'bag')
+    assert main(['convert', 'fixes', str(table), str(tmp_path / 'bag')]) == 2
+    assert 'exists already' in capsys.readouterr().err
+
+
+def test_info_on_what_no_tracker_knows_exits_with_1(tmp_path, capsys):
+    from sonar_imm.recordings.writer import BagWriter, ros_message
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/note', ros_message('std_msgs/msg/String', data='hello'), 10**9)
+    assert main(['info', str(tmp_path / 'bag')]) == 1
+    assert 'no tracker can use it' in capsys.readouterr().out
+
+
+def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_path, capsys):
+    params = tmp_path / 'diver.yaml'
+    params.write_text('fix_type: geometry_msgs/msg/PointStamped\nqueue_depth: 7\n')
+    run = call('track', dive, tmp_path / 'out', '--params', params)
+    assert 'fix_type' not in run['parameters'] and run['estimates'] == 118
+    params.write_text('fix_type: geometry_msgs/msg/PointStampd\n')
+    assert main(['track', str(dive), str(tmp_path / 'no'), '--params', str(params)]) == 2
+    assert "did you mean 'geometry_msgs/msg/PointStamped'?" in capsys.readouterr().err

@@ -1,0 +1,27 @@
+"""The measurements measure what they say."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.evaluation.diver import bench
+
+
+def test_turns_compose_and_keep_the_speed():
+    rate = np.radians(20.0)
+    half = bench.turn(rate)
+    assert np.hypot(*(half @ [0.0, 0.0, 3.0, 4.0])[2:]) == pytest.approx(5.0)
+    np.testing.assert_allclose((half @ half)[2:, 2:], bench.turn(2 * rate)[2:, 2:])
+    np.testing.assert_allclose(bench.turn(0.0) @ [1, 2, 3, 4], [4, 6, 3, 4])
+
+
+def test_both_programs_do_the_same_sums():
+    pytest.importorskip('filterpy')
+    result = bench.bench_step(rounds=1, steps=30)
+    assert result['largest_difference_m'] < 1e-9
+    assert result['ours_us'] > 0 and result['filterpy_us'] > 0
+
+
+def test_a_scan_hits_its_targets():
+    result = bench.bench_scan(targets=40, scans=3)
+    assert result['assigned'] > 0.9
+    assert 0.0 < result['median_ms'] <= result['worst_ms']

@@ -1,0 +1,43 @@
+"""The figures of divers: ellipses, order of models, first view."""
+
+from dive_scenes import single_run
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_imm.evaluation.diver import figures
+from sonar_imm.evaluation.diver.scoring import fix_series
+from sonar_imm.evaluation.diver.series import series_of
+from sonar_imm.evaluation.diver.truth import Truth
+from sonar_imm.measurements import Fix
+
+
+def test_ellipses_hold_the_probability_they_claim():
+    covariance = np.array([[[4.0, 1.2], [1.2, 1.0]]])
+    mean = np.array([[3.0, -2.0]])
+    outline = figures.outlines(mean, covariance, probability=0.9)
+    assert np.isnan(outline[-1]).all()
+    offset = outline[:-1] - mean
+    distance = np.einsum('ni,ij,nj->n', offset, np.linalg.inv(covariance[0]), offset)
+    np.testing.assert_allclose(distance, chi2.ppf(0.9, 2), rtol=1e-12)
+
+
+def test_models_are_ordered_by_heading_with_the_others_below():
+    names = ('heading_090', 'hover', 'heading_000')
+    assert [names[i] for i in figures.model_order(names)] == ['hover', 'heading_000',
+                                                              'heading_090']
+    assert figures.model_label('heading_022') == '22°'
+
+
+def test_the_first_view_holds_tracks_and_truth_but_not_the_clutter():
+    estimates, true_rows, _ = single_run(count=60)
+    truth, clutter = Truth.from_series(series_of(true_rows)), np.array([[500.0, 500.0]])
+    series = series_of(estimates)
+    fixes = fix_series([Fix(stamp_ns=1, position=[*clutter[0], 0.0])])
+    figure = figures.map_figure(series, truth, fixes)
+    low, high = figure.layout.xaxis.range
+    assert low < series.state[:, 0].min() and series.state[:, 0].max() < high < 500.0
+    assert figure.layout.yaxis.scaleanchor == 'x'
+
+
+def test_no_points_leave_the_view_open():
+    assert figures.view_of(np.empty((0, 2))) == (None, None)

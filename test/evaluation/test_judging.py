@@ -1,0 +1,85 @@
+"""Every system has what the commands need of it, and judges its own runs."""
+
+from dive_bags import write_dive
+import pytest
+
+from sonar_imm.evaluation.benching import BENCHES, benches_of
+from sonar_imm.evaluation.judging import judge, JudgeOptions, JUDGES, Limit
+from sonar_imm.evaluation.run_folder import read_measurements, read_truth, RunFolder
+from sonar_imm.measurements import Fix
+from sonar_imm.recordings.reader import BagError
+from sonar_imm.trackers import SYSTEMS
+
+
+def folder_of(tmp_path, estimates=(), **run):
+    folder = RunFolder(tmp_path / 'run')
+    folder.prepare()
+    folder.write_estimates(estimates, 'diver')
+    folder.write_json('run.json', {'system': 'diver', 'bag': str(tmp_path / 'dive'), 'counts': {},
+                                   'topics': {'/fix': 'fix'}, 'parameters': {}, **run})
+    return folder
+
+
+@pytest.mark.parametrize('table', [JUDGES, BENCHES])
+def test_every_system_is_registered(table):
+    assert list(table) == list(SYSTEMS)
+
+
+@pytest.mark.parametrize('system', BENCHES)
+def test_benches_have_names_of_their_own(system):
+    names = [bench.name for bench in benches_of(system)]
+    assert names and len(set(names)) == len(names) and 'node_ms' not in names
+
+
+def test_a_limit_is_met_or_missed():
+    limit = Limit(0.5, 'm', 'height RMSE')
+    check = limit.check(0.5, remark=' (flat floor 1.20 m)')
+    assert check.good and check.wanted == 'at most 0.5 m'
+    assert check.name == 'height RMSE against truth'
+    assert check.result == '0.50 m (flat floor 1.20 m)'
+    assert not limit.check(0.4, at_most=0.3).good
+
+
+def test_without_truth_there_is_no_accuracy_but_a_page(tmp_path):
+    from dive_scenes import single_run
+    judgement = judge(folder_of(tmp_path, single_run(count=30)[0]))
+    assert judgement.accuracy(None) is None
+    assert 'no truth' in judgement.summary and judgement.metrics['truth_lag_s'] == 0.0
+    assert judgement.part([]).title == 'dive'
+
+
+def test_truth_of_another_bag_is_scored(tmp_path):
+    from dive_scenes import single_run
+    truth = write_dive(tmp_path / 'truth')
+    options = JudgeOptions(truth_bag=truth, lag=0.5, gap=5.0, cutoff=3.0)
+    judgement = judge(folder_of(tmp_path, single_run(count=100)[0]), options)
+    assert judgement.metrics['cutoff_m'] == 3.0 and judgement.metrics['truth_lag_s'] == 0.5
+    check = judgement.accuracy(None)
+    assert check.wanted == 'at most 1.25 m' and check.name == 'position RMSE against truth'
+    assert not judgement.accuracy(1e-3).good
+    assert judgement.lines[0][0] == 'position error, RMSE / median / 95 %'
+
+
+def test_estimates_of_something_else_are_one_sentence(tmp_path):
+    import attrs
+    from dive_scenes import single_run
+    whales = [attrs.evolve(one, state_names=('a', 'b', 'c', 'd')) for one in
+              single_run(count=3)[0]]
+    with pytest.raises(BagError, match="no column 'px'"):
+        judge(folder_of(tmp_path, whales))
+
+
+def test_what_went_into_a_run_is_read_again(tmp_path):
+    run = {'system': 'diver', 'topics': {'/fix': 'fix'}, 'bag': str(tmp_path / 'dive')}
+    assert read_truth(run) is None and list(read_measurements(run)) == []
+    write_dive(tmp_path / 'dive', count=10, spoilt=(3,))
+    assert len(read_truth(run)) == 20
+    measured = list(read_measurements(run))
+    assert len(measured) == 9 and all(isinstance(one, Fix) for one in measured)
+
+
+def test_a_truth_bag_without_truth_is_told(tmp_path):
+    blind = write_dive(tmp_path / 'blind', truth=False, count=5)
+    assert read_truth({'bag': str(blind)}) is None
+    with pytest.raises(BagError, match='has no topic /truth/estimate'):
+        read_truth({'bag': str(blind)}, blind)

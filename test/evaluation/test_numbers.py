@@ -1,0 +1,43 @@
+"""Numbers that every system is judged by."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.evaluation.numbers import (
+    belief_sentence,
+    bounds_remark,
+    chi2_line,
+    chi2_summary,
+    error_line,
+    error_summary,
+    nis_summary,
+    usable_nees,
+)
+
+
+@pytest.mark.parametrize('coverage, words', [(0.6, 'more sure'), (0.95, 'can be believed'),
+                                             (1.0, 'more careful')])
+def test_belief_is_put_in_words(coverage, words):
+    assert words in belief_sentence(coverage)
+
+
+def test_lines_name_the_unit_and_are_left_out_without_errors():
+    summary = error_summary(np.radians([3.0, 4.0]), unit='rad')
+    (title, value), = error_line('angle error', summary, 'rad')
+    assert title == 'angle error, RMSE / median / 95 %'
+    assert value == '0.062 / 0.061 / 0.069 rad'
+    assert error_line('angle error', error_summary(np.empty(0)), 'm') == []
+    assert chi2_line('NEES', chi2_summary(np.empty(0), 2)) == []
+
+
+def test_nees_leaves_out_what_says_nothing():
+    error = np.array([[3.0, 4.0], [1.0, 1.0], [np.nan, 0.0]])
+    covariance = np.array([np.diag([1.0, 4.0]), np.diag([1.0, 0.0]), np.eye(2)])
+    assert usable_nees(error, covariance).tolist() == [13.0]
+
+
+def test_mixed_degrees_of_freedom_share_bounds_around_one():
+    summary = nis_summary(np.array([2.0, 4.0]), np.array([2.0, 3.0]))
+    assert summary['mean'] == pytest.approx(6.0 / 5.0) and summary['low'] < 1.0 < summary['high']
+    assert bounds_remark(summary).startswith('per degree of freedom: 1 expected')
+    assert bounds_remark(nis_summary(np.array([2.0]), np.array([2.0]))).startswith('2 expected')

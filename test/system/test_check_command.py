@@ -1,0 +1,45 @@
+"""``check`` and ``play`` with a real node."""
+
+import json
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from sonar_imm.cli import main  # noqa: E402
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp('bags') / 'dive'
+    assert main(['simulate', 'diver', str(path), '--seed', '3', '--scenario', 'irregular',
+                 '--set', 'duration=40']) == 0
+    return path
+
+
+def test_live_lockstep_equals_offline(bag, tmp_path, capsys):
+    assert main(['check', 'diver', '--bag', str(bag), '--limit', '3', '--out', str(tmp_path),
+                 '--json']) == 0
+    outcome, = json.loads(capsys.readouterr().out)
+    assert outcome['good'] and len(outcome['checks']) == 4
+    assert outcome['latency_ms']['p50'] > 0.0
+    offline, live = tmp_path / 'dive' / 'offline', tmp_path / 'dive' / 'live'
+    assert (offline / 'estimate.csv').read_bytes() == (live / 'estimate.csv').read_bytes()
+    assert (offline / 'estimate.csv').stat().st_size > 10_000
+
+
+def test_a_limit_that_is_not_reached_exits_with_1(bag, capsys):
+    assert main(['check', 'diver', '--bag', str(bag), '--limit', '0.01']) == 1
+    printed = capsys.readouterr().out
+    assert 'FAIL  position RMSE against truth' in printed
+    assert 'ok    estimates of the node against offline: equal bytes' in printed
+
+
+def test_lockstep_with_nobody_is_one_line_and_exit_code_1(bag, capsys, monkeypatch):
+    from sonar_imm.nodes import player
+    monkeypatch.setattr(player, 'MATCH_LIMIT', 0.5)
+    assert main(['play', str(bag), '--lockstep', '/nobody']) == 1
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and "no answer from a node '/nobody'" in error

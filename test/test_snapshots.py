@@ -1,0 +1,98 @@
+"""The Snapshot measurement: what it refuses and what it keeps."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import MAX_BINS, Rejection, Snapshot
+
+
+def snapshot(bins=20, staves=4, **changes):
+    rng = np.random.default_rng(0)
+    values = {
+        'stamp_ns': 10**18,
+        'range': 17.0 + 0.05 * np.arange(bins),
+        'iq': rng.normal(size=(bins, staves)) + 1j * rng.normal(size=(bins, staves)),
+        'frame_id': 'sonar',
+    }
+    return Snapshot(**{**values, **changes})
+
+
+def test_what_is_fine_is_kept_as_it_came_and_read_only():
+    one = snapshot()
+    assert len(one) == 20 and one.staves == 4 and one.usable.all()
+    assert one.iq.dtype == np.complex128 and one.bin_width == pytest.approx(0.05)
+    single = one.iq.astype(np.complex64)
+    assert snapshot(iq=single).iq.dtype == np.complex64
+    for array in (one.range, one.iq, one.usable):
+        assert not array.flags.writeable
+    single[0] = 0.0  # the caller's array stays the caller's
+    assert single.flags.writeable
+
+
+@pytest.mark.parametrize(
+    'reason, changes',
+    [
+        ('bad_stamp', {'stamp_ns': 0}),
+        ('no_staves', {'staves': 0}),
+        ('bad_staves', {'staves': 1}),
+        ('bad_staves', {'staves': 65}),
+        ('too_short', {'bins': 1}),
+        ('too_short', {'bins': 0}),
+        ('bad_shape', {'range': np.arange(1.0, 20.0)}),
+        ('bad_shape', {'iq': np.ones(20)}),
+        ('bad_shape', {'noise_variance': np.ones(19)}),
+        ('bad_shape', {'two_way_time': np.ones(3)}),
+        ('bad_range', {'range': np.full(20, 5.0)}),
+        ('bad_range', {'range': -np.arange(20.0)}),
+        ('out_of_range', {'range': np.arange(20.0) - 3.0}),
+        ('out_of_range', {'range': 1e5 + np.arange(20.0)}),
+        ('nan', {'range': np.append(np.arange(19.0), np.nan)}),
+        ('nan', {'iq': np.full((20, 4), np.nan)}),
+        ('silent', {'iq': np.zeros((20, 4))}),
+        ('out_of_range', {'sound_speed': 15.0}),
+        ('out_of_range', {'frequency': 455.0}),
+        ('out_of_range', {'element_spacing': -0.1}),
+        ('out_of_range', {'sample_rate': np.nan}),
+        ('out_of_range', {'element_spacing': 1.0, 'frequency': 1e6, 'sound_speed': 1500.0}),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_reason(reason, changes):
+    with pytest.raises(Rejection) as caught:
+        snapshot(**changes)
+    assert caught.value.reason == reason and caught.value.sentence
+
+
+def test_a_storm_of_bins_is_refused():
+    with pytest.raises(Rejection) as caught:
+        snapshot(bins=MAX_BINS + 1, staves=2)
+    assert caught.value.reason == 'too_large'
+    assert len(snapshot(bins=MAX_BINS, staves=2)) == MAX_BINS
+
+
+def test_spoilt_bins_are_kept_and_marked():
+    iq = np.array(snapshot().iq)
+    iq[3, 1], iq[7], iq[9, 0] = np.nan, 0.0, np.inf
+    one = snapshot(iq=iq)
+    assert np.flatnonzero(~one.usable).tolist() == [3, 7, 9]
+
+
+def test_variances_that_are_none_become_unknown():
+    variances = np.full(20, 2.0)
+    variances[:3] = [0.0, -1.0, np.inf]
+    one = snapshot(noise_variance=variances, signal_variance=np.zeros(20))
+    assert np.isnan(one.noise_variance[:3]).all() and (one.noise_variance[3:] == 2.0).all()
+    assert one.signal_variance is None
+
+
+def test_spacing_in_wavelengths_when_all_is_known():
+    one = snapshot(element_spacing=0.00165, frequency=455e3, sound_speed=1500.0)
+    assert one.spacing_wavelengths == pytest.approx(0.5005)
+    assert snapshot(element_spacing=0.00165, frequency=455e3).spacing_wavelengths is None
+
+
+def test_ranges_of_times_follow_the_sound_speed_unless_the_sonar_knows_it():
+    time = (17.0 + 0.05 * np.arange(20)) / 750.0
+    assert np.allclose(snapshot(two_way_time=time).ranges(1480.0), 740.0 * time)
+    known = snapshot(two_way_time=time, sound_speed=1500.0)
+    assert (known.ranges(1480.0) == known.range).all()
+    assert (snapshot().ranges(1480.0) == snapshot().range).all()

@@ -1,0 +1,52 @@
+"""Helpers of the diver tests: fixes, runs, comparison to the last bit."""
+
+import numpy as np
+
+from sonar_imm.measurements import Fix
+
+SECOND = 10**9
+
+
+def fix(second, x, y, covariance=None, frame_id='map'):
+    return Fix(
+        stamp_ns=round(second * SECOND),
+        position=[x, y, 0.0],
+        covariance=np.eye(2) if covariance is None else covariance,
+        frame_id=frame_id,
+    )
+
+
+def run(tracker, measurements):
+    """The last word on every stamp."""
+    final = {}
+    for measurement in measurements:
+        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(measurement))
+    return [final[stamp] for stamp in sorted(final)]
+
+
+def same(one, other):
+    """Equal to the last bit."""
+    ours, theirs = one.columns(), other.columns()
+    return (
+        one.stamp_ns == other.stamp_ns
+        and list(ours) == list(theirs)
+        and all(
+            ours[name].dtype == theirs[name].dtype
+            and ours[name].tobytes() == theirs[name].tobytes()
+            for name in ours
+        )
+    )
+
+
+def errors(estimates, track):
+    """Position error (k, 2) and covariance (k, 2, 2) of the confirmed row of each stamp."""
+    at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
+    found = []
+    for estimate in estimates:
+        rows = np.flatnonzero(estimate.extras['track_state'] > 0)
+        if len(rows):
+            truth = track.position[at[estimate.stamp_ns], :2]
+            found.append(
+                (estimate.state[rows[0], :2] - truth, estimate.covariance[rows[0], :2, :2])
+            )
+    return [np.array(column) for column in zip(*found)]
