@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sonar_imm.measurements import Rejection
+from sonar_imm.measurements import ArrayDepth, Rejection
 
 
 class FrameGuard:
@@ -17,8 +17,10 @@ class FrameGuard:
     def check(self, measurement: Any) -> None:
         """Raise `Rejection` when `measurement` is in another frame.
 
-        One without a frame passes only until a frame is known.
+        One without a frame passes only until a frame is known. A depth is a depth in any frame.
         """
+        if isinstance(measurement, ArrayDepth):
+            return
         if not self._frame_id:
             self._frame_id = measurement.frame_id
         elif measurement.frame_id != self._frame_id:

@@ -11,6 +11,8 @@ from typing import Any
 
 from attrs import frozen
 
+from .array_depth import read_array_depth
+from .array_records import read_csdm, read_pressure, read_trace
 from .arrivals import read_arrivals
 from .fixes import doubt_fix, read_fix
 from .snapshots import read_snapshot
@@ -34,6 +36,11 @@ class InputTopic:
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
+    'bathymetry': (
+        InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
+            'sensor_msgs/msg/PointCloud2': read_snapshot,
+        }),
+    ),
     'diver': (
         InputTopic('fix', 'position fixes in a local metric frame', {
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
@@ -43,9 +50,19 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
         }),
     ),
-    'bathymetry': (
-        InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
-            'sensor_msgs/msg/PointCloud2': read_snapshot,
+    'fathometer': (
+        InputTopic('csdm', 'cross-spectra of a vertical array, one row a frequency', {
+            'sensor_msgs/msg/PointCloud2': read_csdm,
+        }),
+        InputTopic('pressure', 'pressure at the phones of a vertical array, one row a sample', {
+            'sensor_msgs/msg/PointCloud2': read_pressure,
+        }),
+        InputTopic('trace', 'ready-made traces, one row a depth', {
+            'sensor_msgs/msg/PointCloud2': read_trace,
+        }),
+        InputTopic('array_depth', 'depth of the deepest phone, from a companion instrument', {
+            'geometry_msgs/msg/PointStamped': read_array_depth,
+            'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
         }),
     ),
 }
