@@ -109,19 +109,30 @@ def read_trace(message: Any, *, world_frame: str = 'enu') -> Trace:
     )
 
 
-def write_trace(trace: Trace, make: Make, *, draw: bool = False) -> Any:
-    """Write the table of a trace, in single precision; `draw` puts ``x y z`` before it, z being
-    up, so that displays can show it."""
-    rows = len(trace)
-    columns: dict[str, NDArray] = {}
-    if draw:
-        zero = np.zeros(rows, np.float32)
-        columns = {'x': zero, 'y': zero, 'z': (-trace.depth).astype(np.float32)}
-    columns['depth'] = trace.depth.astype(np.float32)
-    columns['amplitude'] = trace.amplitude.astype(np.float32)
-    if trace.sigma is not None:
-        columns['sigma'] = trace.sigma.astype(np.float32)
-    return _encode(trace, columns, rows, make)
+def write_trace(trace: Trace, make: Make) -> Any:
+    """Write the table of a trace, in single precision."""
+    columns = _trace_columns(trace.depth, trace.amplitude, trace.sigma)
+    return _encode(trace, columns, len(trace), make)
+
+
+def write_response(response: Any, make: Make) -> Any:
+    """Write a depth response (stamp_ns, frame_id, depth, amplitude and sigma (n,)) as the table of
+    a trace with ``x y z`` before it, z up, so that displays can draw it."""
+    zero = np.zeros(len(response.depth), np.float32)
+    columns = {'x': zero, 'y': zero, 'z': (-response.depth).astype(np.float32)}
+    columns |= _trace_columns(response.depth, response.amplitude, response.sigma)
+    return encode_table(
+        columns, stamp_ns=response.stamp_ns, frame_id=response.frame_id, make=make
+    )
+
+
+def _trace_columns(
+    depth: NDArray, amplitude: NDArray, sigma: NDArray | None
+) -> dict[str, NDArray]:
+    columns = {'depth': depth, 'amplitude': amplitude}
+    if sigma is not None:
+        columns['sigma'] = sigma
+    return {name: column.astype(np.float32) for name, column in columns.items()}
 
 
 def _encode(record: Any, columns: dict[str, NDArray], rows: int, make: Make) -> Any:

@@ -44,7 +44,7 @@ ComplexArray = NDArray[np.complexfloating]
 PROCESSORS = ('conventional', 'mvdr', 'white_noise')
 
 _MAD_OF_UNIT_NORMAL = 0.6744897501960817
-_LOADINGS = np.geomspace(1e-8, 1e3, 2)
+_LOADINGS = (1e-6, 1e2)
 
 
 def steering(frequency: ArrayLike, heights: ArrayLike, sound_speed: float) -> ComplexArray:
@@ -67,7 +67,8 @@ def mvdr(
     one a frequency. Raises numpy.linalg.LinAlgError when a loaded matrix is singular."""
     M = csdm.shape[-1]
     power = np.einsum('fmm->f', csdm).real / M
-    loaded = csdm + (loading * power)[:, None, None] * np.eye(M, dtype=csdm.dtype)
+    ridge = np.asarray(loading * power)[:, None, None].astype(csdm.dtype)
+    loaded = csdm + ridge * np.eye(M, dtype=csdm.dtype)
     w = w.astype(csdm.dtype)
     solved = np.linalg.solve(loaded, np.stack([w, w.conj()], axis=-1))
     cross = np.einsum('fm,fm->f', w, solved[..., 0])  # w_-^H is the plain transpose of w
@@ -81,21 +82,21 @@ def white_noise_loading(csdm: ComplexArray, w: ComplexArray, gain_db: float) -> 
     """The least loading (F,), in units of the mean phone power, with which the white-noise gain
     1 / |weights|^2 of both beams is within `gain_db` (negative) of its greatest value M.
 
-    The gain grows with the loading; the loading is bisected on a logarithmic scale.
+    The gain grows with the loading, which is bisected on a logarithmic scale from 1e-6 to 1e2, to
+    one per cent.
     """
     M = csdm.shape[-1]
     power = np.einsum('fmm->f', csdm).real / M
-    values, vectors = np.linalg.eigh(csdm)
-    shares = [np.abs(np.einsum('fmk,fm->fk', vectors.conj(), v)) ** 2 for v in (w, w.conj())]
-    values = np.maximum(values, 0.0) / power[:, None]
-    low, high = (np.full(len(csdm), x) for x in np.log(_LOADINGS))
-    for _ in range(30):
+    eye = np.eye(M, dtype=csdm.dtype)
+    beams = np.stack([w, w.conj()], axis=-1).astype(csdm.dtype)
+    low, high = (np.full(len(csdm), bound) for bound in np.log(_LOADINGS))
+    for _ in range(11):
         middle = 0.5 * (low + high)
-        enough = np.ones(len(csdm), np.bool_)
-        for share in shares:
-            inverse = 1.0 / (values + np.exp(middle)[:, None])
-            gain = np.sum(share * inverse, axis=1) ** 2 / np.sum(share * inverse**2, axis=1)
-            enough &= gain >= M * 10.0 ** (0.1 * gain_db)
+        loaded = csdm + (np.exp(middle) * power)[:, None, None].astype(csdm.dtype) * eye
+        solved = np.linalg.solve(loaded, beams)
+        passed = np.abs(np.sum(beams.conj() * solved, axis=1)) ** 2
+        gain = passed / np.sum(np.abs(solved) ** 2, axis=1)
+        enough = (gain >= M * 10.0 ** (0.1 * gain_db)).all(axis=1)
         high, low = np.where(enough, middle, high), np.where(enough, low, middle)
     return np.exp(high)
 

@@ -107,15 +107,17 @@ class Average(NamedTuple):
 
 
 class BlockAverage:
-    """The mean of `count` snapshots after the other."""
+    """The mean of each `count` snapshots, of which `skip` are passed over after each mean: those
+    that overlap with it, so that no sample is in two means."""
 
-    def __init__(self, count: int):
-        self.count = count
+    def __init__(self, count: int, skip: int = 0):
+        self.count, self.skip = count, skip
         self.clear()
 
     def clear(self) -> None:
         self._sum: ComplexArray | None = None
         self._in = 0
+        self._to_skip = 0
 
     @property
     def waiting(self) -> int:
@@ -125,13 +127,18 @@ class BlockAverage:
         """The averages that `spectra` (k, F, M) complete."""
         done = []
         while len(spectra):
-            now, spectra = np.split(spectra, [self.count - self._in])
+            passed = min(self._to_skip, len(spectra))
+            self._to_skip -= passed
+            now, spectra = np.split(spectra[passed:], [self.count - self._in])
+            if not len(now):
+                break
             product = outer_sum(now)
             self._sum = product if self._sum is None else self._sum + product
             self._in += len(now)
             if self._in == self.count:
                 done.append(Average(self._sum / np.float32(self.count), self.count))
                 self.clear()
+                self._to_skip = self.skip
         return done
 
 

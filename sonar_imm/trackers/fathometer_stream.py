@@ -75,10 +75,11 @@ class PressureStream:
                 f'{rate:g} samples a second in snapshots of {config.snapshot_seconds:g} s leave '
                 'less than 2 frequencies in the band',
             )
-        count = max(1, round(config.record_seconds * rate / hop))
+        straddling = math.ceil(length / hop) - 1
+        count = max(1, round(config.record_seconds * rate / hop) - straddling)
         self._frequency = self._spacing * np.arange(first, last + 1)
         self._snapshots = SnapshotStream(length, hop, slice(first, last + 1), config.window)
-        self._blocks = BlockAverage(count)
+        self._blocks = BlockAverage(count, straddling)
         step = round(config.preview_seconds * rate / hop)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
         self._alive: NDArray[np.bool_] = np.ones(block.phones, np.bool_)
