@@ -121,9 +121,7 @@ def write_response(response: Any, make: Make) -> Any:
     zero = np.zeros(len(response.depth), np.float32)
     columns = {'x': zero, 'y': zero, 'z': (-response.depth).astype(np.float32)}
     columns |= _trace_columns(response.depth, response.amplitude, response.sigma)
-    return encode_table(
-        columns, stamp_ns=response.stamp_ns, frame_id=response.frame_id, make=make
-    )
+    return encode_table(columns, stamp_ns=response.stamp_ns, frame_id=response.frame_id, make=make)
 
 
 def _trace_columns(

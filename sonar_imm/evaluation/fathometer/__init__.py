@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from ..page import Part
 
 LIMIT = Limit(0.10, 'm', 'OSPA')
-"""What a shipped recording must stay within. The best configuration has 0.05 m on average over long
-drifts, a cell of the depths is 0.06 m, and one recording is not an average."""
+"""What a shipped recording must stay within. The best configuration has 0.05 m on average over
+long drifts, and one recording is not an average."""
 
 
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
-    """Score the reflectors of `folder`. Raises `BagError` when they or the truth cannot be read."""
+    """Score the reflectors of `folder`. Raises `BagError` when it or the truth cannot be read."""
     run = folder.read_run()
     records = records_of(
         folder.read_estimates(),

@@ -64,19 +64,18 @@ def score(records: Sequence[Record], cutoff: float = CUTOFF) -> dict[str, Any]:
     return metrics
 
 
-def _against_truth(
-    scored: Sequence[tuple[Record, Reflections]], cutoff: float
-) -> dict[str, Any]:
+def _against_truth(scored: Sequence[tuple[Record, Reflections]], cutoff: float) -> dict[str, Any]:
     pairs = [pair(record.found.depth, true.depth, cutoff) for record, true in scored]
     error = np.concatenate(
         [r.found.depth[p.found] - t.depth[p.true] for (r, t), p in zip(scored, pairs)]
     )
     std = np.concatenate([r.depth_std[p.found] for (r, _), p in zip(scored, pairs)])
-    metrics = {
+    extra = [len(r.found) - len(p.found) for (r, _), p in zip(scored, pairs)]
+    return {
         'scored_records': len(scored),
         'order_right': _mean([record.order == len(true) for record, true in scored]),
         'ospa_m': _mean([p.ospa for p in pairs]),
-        'false_per_record': _mean([len(r.found) - len(p.found) for (r, _), p in zip(scored, pairs)]),
+        'false_per_record': _mean(extra),
         'missed_per_record': _mean([len(t) - len(p.true) for (_, t), p in zip(scored, pairs)]),
         'depth': {
             **error_summary(np.abs(error)),
@@ -87,7 +86,6 @@ def _against_truth(
         'existence': _existence(scored, pairs),
         'identity_switches': _switches(scored, pairs),
     }
-    return metrics
 
 
 def _amplitudes(
@@ -128,9 +126,7 @@ def _existence(
     }
 
 
-def _switches(
-    scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
-) -> int:
+def _switches(scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]) -> int:
     """How often a true reflector is found under another id than the last time."""
     last: dict[int, int] = {}
     switches = 0
