@@ -10,7 +10,7 @@ import textwrap
 
 import yaml
 
-from sonar_imm.nodes.config import NodeConfig, type_specs
+from sonar_imm.nodes.config import node_config_type, type_specs
 from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 
@@ -66,7 +66,7 @@ def parameter_file(system: System) -> str:
 
 def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     """Give what the live node of `system` can be told besides the parameters of its tracker."""
-    return (*type_specs(system.name), *NodeConfig.specs())
+    return (*type_specs(system.name), *node_config_type(system.name).specs())
 
 
 def _entry(spec: ParameterSpec) -> str:

@@ -26,6 +26,7 @@ class InputTopic:
     ``(message, *, world_frame='enu')`` and raises `Rejection` for a message it cannot use.
     doubt: gives a reason code to count when a message can be used but deserves a warning.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
+    one_topic: several topics are several instruments, each for a tracker of its own.
     """
 
     name: str
@@ -33,13 +34,14 @@ class InputTopic:
     readers: Mapping[str, Callable[..., Any]]
     doubt: Callable[[Any], str | None] = lambda message: None
     scans: bool = False
+    one_topic: bool = False
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
     'bathymetry': (
         InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
             'sensor_msgs/msg/PointCloud2': read_snapshot,
-        }),
+        }, one_topic=True),
     ),
     'diver': (
         InputTopic('fix', 'position fixes in a local metric frame', {

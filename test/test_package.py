@@ -65,7 +65,8 @@ SIDE_BY_SIDE = {('msg_adapters', 'sonar_imm.trackers'), ('sonar_imm.trackers', '
 ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
 
 # Other libraries that `sonar-imm bench` measures when they are there; they come with [test].
-PEERS = {'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'}}
+PEERS = {'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
+         'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'}}
 
 # Path below the root: why it may exceed 400 lines.
 LONG_FILES: dict[str, str] = {

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from ..nodes.config import NodeConfig, type_specs
+from ..nodes.config import node_config_type, NodeConfig, type_specs
 from ..parameters import (
     Config,
     ConfigError,
@@ -104,7 +104,7 @@ def load_config(system: System, params: Path | None,
 
     Raises `ConfigError` with one sentence for each mistake.
     """
-    types = (system.config_type(), NodeConfig)
+    types = (system.config_type(), node_config_type(system.name))
     choices = {spec.name: spec for spec in type_specs(system.name)}
     values = _parameters_of(params, system.name) if params else {}
     specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices

@@ -14,7 +14,7 @@ have no estimate.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import functools
 from pathlib import Path
@@ -43,7 +43,7 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
-from .config import NodeConfig, type_spec, type_specs
+from .config import node_config_type, NodeConfig, type_spec, type_specs
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
@@ -64,7 +64,8 @@ class TrackerNode(Node):
         super().__init__(system, **options)
         self._topics = INPUTS[system]
         config_type = SYSTEMS[system].config_type()
-        self._settings = NodeParameters(self, (config_type, NodeConfig),
+        self._node_config_type = node_config_type(system)
+        self._settings = NodeParameters(self, (config_type, self._node_config_type),
                                         type_specs(system))
         self.tracker = SYSTEMS[system].build(self._settings[config_type])
         self._guard = FrameGuard(self._node_config.frame_id)
@@ -104,7 +105,7 @@ class TrackerNode(Node):
 
     @property
     def _node_config(self) -> NodeConfig:
-        return self._settings[NodeConfig]
+        return self._settings[self._node_config_type]
 
     def _warm(self) -> None:
         """Compile or load the kernels, with a word to the user when that takes long."""
@@ -137,10 +138,14 @@ class TrackerNode(Node):
             input_qos(self._node_config.queue_depth))
         return subscription.topic_name
 
-    def _receive(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
+    def _receive(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any,
+                 info: Mapping[str, Any]) -> None:
         """Take one message all the way; whatever it holds, the node goes on."""
         start = time.monotonic()
         self._meter.arrived(topic.name, start)
+        if self._waited_too_long(topic, info):
+            self._acknowledge(message.header.stamp)
+            return
         try:
             if self._enabled:
                 self._process(topic, reader, message)
@@ -154,6 +159,19 @@ class TrackerNode(Node):
             self._recover(topic)
         self._acknowledge(message.header.stamp)
         self._meter.spent(time.monotonic() - start)
+
+    def _waited_too_long(self, topic: InputTopic, info: Mapping[str, Any]) -> bool:
+        """Whether a message lay in the queue for more than `max_wait`; counts it."""
+        limit, arrived_ns = self._node_config.max_wait, info['received_timestamp']
+        # 0: a middleware that does not know. Both times are those of the system's clock.
+        if not limit or not arrived_ns or time.time_ns() - arrived_ns <= limit * 1e9:
+            return False
+        if not self._meter.dropped:
+            self.get_logger().warning(
+                f"messages on '{topic.name}' come faster than they can be processed: those that "
+                f'waited more than {limit:g} s are dropped (said once, counted in /diagnostics)')
+        self._meter.dropped[topic.name] += 1
+        return True
 
     def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         measurement = reader(message)

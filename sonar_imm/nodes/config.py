@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from attrs import frozen
 
 from msg_adapters.inputs import INPUTS, InputTopic
 
 from ..parameters import Config, parameter, ParameterSpec
+
+
+def _max_wait(default: float) -> Any:
+    return parameter(
+        default, 'a message that waited longer than this while the tracker was busy is dropped, '
+        'and counted, so that the output does not lag; 0: never', unit='s', low=0.0, high=1e6,
+        read_only=False)
 
 
 @frozen(kw_only=True)
@@ -15,6 +24,7 @@ class NodeConfig(Config):
 
     queue_depth: int = parameter(
         50, 'messages an input holds while the tracker is busy', low=1, high=100000)
+    max_wait: float = _max_wait(0.0)
     frame_id: str = parameter(
         '', 'frame the input must be in; empty: that of the first message accepted')
     world_frame_convention: str = parameter(
@@ -28,6 +38,21 @@ class NodeConfig(Config):
     stale_after: float = parameter(
         10.0, 'silence after which diagnostics call the input stale', unit='s', low=0.01, high=1e6,
         read_only=False)
+
+
+@frozen(kw_only=True)
+class BathymetryNodeConfig(NodeConfig):
+    """A swath is looked at while it is surveyed, and no ping needs the one before."""
+
+    max_wait: float = _max_wait(0.5)
+
+
+_SPECIAL = {'bathymetry': BathymetryNodeConfig}
+
+
+def node_config_type(system: str) -> type[NodeConfig]:
+    """What the node of `system` can be told besides the parameters of its tracker."""
+    return _SPECIAL.get(system, NodeConfig)
 
 
 def type_specs(system: str) -> tuple[ParameterSpec, ...]:

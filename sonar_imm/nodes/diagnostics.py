@@ -27,6 +27,7 @@ class Meter:
         self.received: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.doubted: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
         self.last: dict[str, float] = {}
         self._durations: deque[float] = deque(maxlen=_WINDOW)
 
@@ -55,25 +56,27 @@ class Reporter:
         self._name = name
         self._topics = dict(topics)
         self._meter = meter
-        self._before = (None, Counter(), Counter())
+        self._before = (None, Counter(), Counter(), 0)
 
     def report(self, stamp: Any, now: float, *, enabled: bool, stale_after: float,
                counts: Mapping[str, int], health: Mapping[str, float], lost: Mapping[str, int],
                incompatible: Mapping[str, str]) -> DiagnosticArray:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds."""
-        then, received_before, refused_before = self._before
+        then, received_before, refused_before, dropped_before = self._before
         meter = self._meter
         elapsed = np.nan if then is None else max(now - then, 1e-9)
         fresh = meter.received - received_before
         refused = meter.refused - refused_before
-        self._before = (now, meter.received.copy(), meter.refused.copy())
+        dropped = meter.dropped.total()
+        self._before = (now, meter.received.copy(), meter.refused.copy(), dropped)
 
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
             self._input_status(now, elapsed, fresh, refused, enabled, stale_after, lost,
                                incompatible),
-            self._tracker_status(fresh.total() / elapsed, enabled, counts, health),
+            self._tracker_status(fresh.total() / elapsed, dropped - dropped_before, enabled,
+                                 counts, health),
         ]
         return message
 
@@ -87,6 +90,8 @@ class Reporter:
             values[f'{name} topic'] = topic
             values[f'{name} received'] = meter.received[name]
             values[f'{name} rate [Hz]'] = fresh[name] / elapsed
+            if meter.dropped[name]:
+                values[f'{name} dropped, waited too long'] = meter.dropped[name]
             values[f'{name} silent for [s]'] = now - meter.last.get(name, np.nan)
         values |= {f'refused: {reason}': n for reason, n in sorted(meter.refused.items())}
         values |= {f'doubtful: {reason}': n for reason, n in sorted(meter.doubted.items())}
@@ -111,14 +116,18 @@ class Reporter:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
 
-    def _tracker_status(self, rate: float, enabled: bool, counts: Mapping[str, int],
+    def _tracker_status(self, rate: float, dropped: int, enabled: bool,
+                        counts: Mapping[str, int],
                         health: Mapping[str, float]) -> DiagnosticStatus:
         p50, p99 = self._meter.compute_ms()
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
         level, text = DiagnosticStatus.OK, 'tracking' if enabled else 'disabled'
-        if rate * p50 > 1000.0:
+        if dropped:
+            level, text = DiagnosticStatus.WARN, (
+                f'input comes faster than it can be processed: {dropped} messages dropped')
+        elif rate * p50 > 1000.0:
             level, text = DiagnosticStatus.WARN, 'input comes faster than it can be processed'
         if counts.get('internal_error'):
             level, text = DiagnosticStatus.ERROR, 'an internal error was caught, see the log'

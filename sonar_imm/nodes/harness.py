@@ -176,7 +176,8 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
 def _arguments(bag: BagReader, system: str, inputs: Mapping[str, InputTopic],
                params_file: Path | str | None) -> list[str]:
     """Write the ROS arguments of a node that loses nothing and expects the types of the bag."""
-    parameters = {f'qos_overrides./{system}/estimate.publisher.history': 'keep_all'}
+    parameters = {f'qos_overrides./{system}/estimate.publisher.history': 'keep_all',
+                  'max_wait': '0.0'}
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():
         parameters[f'qos_overrides./{entry.name}.subscription.history'] = 'keep_all'

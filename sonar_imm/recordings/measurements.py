@@ -30,7 +30,8 @@ def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None
 
     A topic fits when its type can be read and its last name component is the input's name; topics
     below ``/truth`` never do. `topics` maps topic names to input names instead, e.g.
-    ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is there, when nothing fits.
+    ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is there, when nothing fits, and
+    when several topics fit an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
@@ -39,6 +40,11 @@ def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None
                and 'truth' not in topic.name.split('/')[:-1]}
     if not fitting:
         raise BagError(_nothing_fits(bag, system))
+    for entry in INPUTS[system]:
+        names = [name for name, its in fitting.items() if its is entry]
+        if entry.one_topic and len(names) > 1:
+            raise BagError(f'several topics fit {entry.name}: {", ".join(names)}; say which one '
+                           f'is meant, e.g. --topic {entry.name}={names[0]}')
     return fitting
 
 

@@ -103,6 +103,18 @@ def test_compute_time_and_a_tracker_that_cannot_keep_up(desk):
     assert desk.tracker.level == DiagnosticStatus.WARN
 
 
+def test_dropped_messages_warn_while_they_are_dropped(desk):
+    desk.report(0.0)
+    desk.meter.arrived('fix', 0.5)
+    desk.meter.dropped['fix'] += 3
+    desk.report(1.0)
+    assert desk.tracker.level == DiagnosticStatus.WARN
+    assert '3 messages dropped' in desk.tracker.message
+    desk.report(2.0)
+    assert desk.tracker.level == DiagnosticStatus.OK
+    assert desk.values['fix dropped, waited too long'] == '3'
+
+
 def test_internal_errors_and_disabling_show(desk):
     desk.meter.arrived('fix', 0.0)
     desk.report(1.0, enabled=False)

@@ -45,7 +45,9 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         ('bins with an echo', percent(metrics['heard_share'])),
     ]
     for place in ('all', 'smooth', 'patch', 'shadow'):
-        result += error_line(f'height error, {place}', metrics.get('height', {}).get(place, {}))
+        result += error_line(
+            f'height error, {place}', metrics.get('height', {}).get(place, {}), 'm'
+        )
     result += error_line('angle error, all', metrics.get('angle', {}).get('all', {}), 'deg')
     inside = metrics.get('inside_band', {})
     if inside and not math.isnan(inside['all']):

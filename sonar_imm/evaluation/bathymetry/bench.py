@@ -1,0 +1,117 @@
+"""How fast the bathymetry tracker is, against other filters on the same pings in the same run.
+
+All see the complex64 snapshots of the paper's scene and are timed in turn, round after round; the
+best round counts, as the one least disturbed. What is timed of the tracker is `process`, the whole
+of it: variances, filter and estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from ...measurements import Snapshot
+from ...simulation.bathymetry import scenario, simulate
+from ...trackers.bathymetry import BathymetryTracker
+from ..benching import Bench
+from .peers import config, cut, numpy_filter, stone_soup_filter
+
+PEER_BINS = 400
+GOAL, GOAL_RATIO = 80_000, 30
+
+Timed = tuple[Callable[[], Any], int]
+
+
+def a_ping(**values: Any) -> Snapshot:
+    """One ping of the paper's scene, longer: 2000 bins."""
+    scene = simulate(scenario('paper', {'pings': 1, 'last_range': 117.0, **values}), 1)
+    ping: Snapshot = scene.measurements[0].measurement
+    return ping
+
+
+def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
+    """Bins a second of each method, the best of `rounds` rounds in turn; `methods` maps a name to
+    what to call and how many bins that does."""
+    best = dict.fromkeys(methods, math.inf)
+    for run, _ in methods.values():
+        run()
+    for _ in range(rounds):
+        for name, (run, _) in methods.items():
+            begin = time.perf_counter()
+            run()
+            best[name] = min(best[name], time.perf_counter() - begin)
+    return {name: bins / best[name] for name, (_, bins) in methods.items()}
+
+
+def engines(ping: Snapshot) -> dict[str, Timed]:
+    """The tracker as the peers have it, with its coherence gate, and with the exact grid."""
+    variants: dict[str, dict[str, Any]] = {
+        'particles': {'shadow_gate': False},
+        'gated': {},
+        'grid': {'engine': 'grid', 'shadow_gate': False},
+    }
+    trackers = {name: BathymetryTracker(config(**values)) for name, values in variants.items()}
+    return {
+        name: (lambda tracker=tracker: tracker.process(ping), len(ping))  # type: ignore[misc]
+        for name, tracker in trackers.items()
+    }
+
+
+def bench_numpy(rounds: int = 7) -> dict[str, Any]:
+    """Bins a second of the tracker and of the same filter in plain numpy; and how far their
+    estimates are apart, which has to be as little as Monte Carlo noise."""
+    ping = a_ping()
+    short = cut(ping, PEER_BINS)
+    peer: Timed = (lambda: numpy_filter(short), PEER_BINS)
+    speed = rates({**engines(ping), 'numpy': peer}, rounds)
+    ratio = speed['particles'] / speed['numpy']
+    apart = float(np.sqrt(np.mean(np.square(_heights(short) - numpy_filter(short)))))
+    return {
+        'bins_per_second': speed,
+        'ratio': ratio,
+        'ratio_wanted': GOAL_RATIO,
+        'wanted': GOAL,
+        'rms_difference_m': apart,
+        'good': ratio >= GOAL_RATIO and speed['particles'] >= GOAL,
+    }
+
+
+def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
+    """Bins a second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
+    short = cut(a_ping(), PEER_BINS)
+    peer: Timed = (lambda: stone_soup_filter(short), PEER_BINS)
+    speed = rates({'particles': engines(short)['particles'], 'stone_soup': peer}, min(rounds, 3))
+    return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
+
+
+def _heights(ping: Snapshot) -> np.ndarray:
+    tracker = BathymetryTracker(config(shadow_gate=False))
+    return tracker.process(ping)[0].state[:, 0]
+
+
+def _numpy_sentence(result: Mapping[str, Any]) -> str:
+    speed = result['bins_per_second']
+    return (
+        f'two models, 100 particles each, 8 staves: {speed["particles"]:,.0f} bins/s (wanted '
+        f'{result["wanted"]:,}), with the coherence gate {speed["gated"]:,.0f}, exact grid '
+        f'{speed["grid"]:,.0f}; numpy {speed["numpy"]:,.0f}: {result["ratio"]:.0f} times as fast '
+        f'(wanted {result["ratio_wanted"]}), {result["rms_difference_m"]:.3f} m apart (RMS)'
+    )
+
+
+def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
+    speed = result['bins_per_second']
+    return (
+        f'Stone Soup, multi-model particle filter with as many particles: '
+        f'{speed["stone_soup"]:,.0f} bins/s: {result["ratio"]:.0f} times as fast'
+    )
+
+
+BENCHES = (
+    Bench('numpy', bench_numpy, _numpy_sentence),
+    Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
+)

@@ -1,0 +1,144 @@
+"""Other filters for the same floor, to compare speed and result with.
+
+`numpy_filter` is the IMM particle filter written as one would: all particles of a model at once,
+one bin after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup: not
+the same algorithm (one set of particles that carry their model), with the same law and as many
+particles in all. Both suppose the scene of the paper, two random walks and noise of unit variance.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+import math
+from typing import Any
+
+import numpy as np
+from scipy.special import kve
+
+from ...acoustics.laplace import autocorrelation
+from ...measurements import FloatArray, Snapshot
+from ...trackers.bathymetry import BathymetryConfig
+
+CHAIN = np.array([[0.98, 0.02], [0.02, 0.98]])
+SIGMAS = (0.01, 1.0)
+HEIGHT, TILT, SPACING = 15.0, math.radians(30.0), 0.5
+
+
+def config(**values: Any) -> BathymetryConfig:
+    """Parameters under which the tracker does what the peers do."""
+    defaults = {'sigmas': SIGMAS, 'initial_std': 1.0, 'transition_matrix': tuple(CHAIN.ravel())}
+    return BathymetryConfig(**{**defaults, **values})
+
+
+class NumpyLaw:
+    """The Laplace law of all bins of a ping over heights."""
+
+    def __init__(self, ping: Snapshot):
+        self.range, self.P = ping.range, ping.staves
+        power = (np.abs(ping.iq) ** 2).mean(axis=1)
+        window = np.ones(21)
+        level = np.convolve(power, window, 'same') / np.convolve(power**0, window, 'same')
+        rho = np.maximum(level - 1.0, 0.01)
+        self.c = autocorrelation(ping.iq)
+        self.kappa = rho / (1.0 + self.P * rho)
+
+    def log_density(self, t: int, height: FloatArray) -> FloatArray:
+        ratio = (HEIGHT - height) / self.range[t]
+        with np.errstate(invalid='ignore'):
+            u = ratio * math.cos(TILT) - np.sqrt(1.0 - ratio**2) * math.sin(TILT)
+        waves = np.exp(-2j * math.pi * SPACING * u[..., None] * np.arange(1, self.P))
+        beam = self.c[t, 0].real + 2.0 * (waves @ self.c[t, 1:]).real
+        v = np.sqrt(np.maximum(self.c[t, 0].real - self.kappa[t] * beam, 1e-12))
+        log_q = np.log(kve(self.P - 1, 2.0 * v)) - 2.0 * v - (self.P - 1) * np.log(v)
+        return np.where(np.isnan(u), -np.inf, log_q)
+
+
+def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatArray:
+    """Mean height (T,) by the IMM particle filter, one bin after the other."""
+    law, rng, N = NumpyLaw(ping), np.random.default_rng(seed), particles
+    x, w = rng.normal(size=(2, N)), np.full((2, N), 1.0 / N)
+    mu, sigma = np.array([0.5, 0.5]), np.array(SIGMAS)[:, None]
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        joint = CHAIN * mu[:, None]
+        c = joint.sum(axis=0)
+        points = (np.arange(N) + rng.random((2, 1))) / N
+        drawn = np.empty_like(x)
+        for j in range(2):
+            cumulative = np.cumsum(joint[:, j, None] * w)
+            index = np.searchsorted(cumulative, points[j] * cumulative[-1])
+            drawn[j] = x.ravel()[np.minimum(index, 2 * N - 1)]
+        x = drawn + sigma * rng.standard_normal((2, N))
+        log_q = law.log_density(t, x)
+        q = np.exp(log_q - log_q.max())
+        total = q.sum(axis=1)
+        w = q / np.maximum(total, 1e-300)[:, None]
+        mu = c * total
+        mu /= mu.sum()
+        mean[t] = mu @ (w * x).sum(axis=1)
+    return mean
+
+
+def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
+    """Mean height (T,) by Stone Soup's multi-model particle filter."""
+    from stonesoup.base import Property
+    from stonesoup.models.measurement.base import MeasurementModel
+    from stonesoup.models.transition.linear import RandomWalk
+    from stonesoup.predictor.particle import MultiModelPredictor
+    from stonesoup.resampler.particle import SystematicResampler
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import MultiModelParticleState
+    from stonesoup.updater.particle import MultiModelParticleUpdater
+
+    class Law(MeasurementModel):
+        """A detection is the number of its bin; the law knows the samples."""
+
+        law: NumpyLaw = Property()
+        ndim_meas = 1
+
+        def function(self, state, noise=False, **kwargs):
+            raise NotImplementedError
+
+        def rvs(self, num_samples=1, **kwargs):
+            raise NotImplementedError
+
+        def pdf(self, state1, state2, **kwargs):
+            return np.exp(self.logpdf(state1, state2))
+
+        def logpdf(self, state1, state2, **kwargs):
+            heights = np.asarray(state2.state_vector[0, :], np.float64)
+            return self.law.log_density(int(state1.state_vector[0, 0]), heights)
+
+    # Stone Soup scales the variance with the time step, which is one second here.
+    predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
+    law = Law(ndim_state=1, mapping=(0,), law=NumpyLaw(ping))
+    updater = MultiModelParticleUpdater(law, predictor, SystematicResampler())
+    np.random.seed(0)
+    start = datetime(2026, 1, 1)
+    state = MultiModelParticleState(
+        StateVectors(np.random.normal(size=(1, particles))),
+        weight=np.full(particles, 1.0 / particles),
+        dynamic_model=np.random.randint(0, 2, particles),
+        timestamp=start,
+    )
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        stamp = start + timedelta(seconds=t + 1)
+        prediction = predictor.predict(state, timestamp=stamp)
+        detection = Detection([t], timestamp=stamp)
+        state = updater.update(SingleHypothesis(prediction, detection))
+        mean[t] = float(np.mean(state.state_vector[0, :]))
+        state.hypothesis = None
+        state.parent = None
+    return mean
+
+
+def cut(ping: Snapshot, bins: int) -> Snapshot:
+    return Snapshot(
+        stamp_ns=ping.stamp_ns,
+        range=ping.range[:bins],
+        iq=ping.iq[:bins],
+        noise_variance=np.ones(min(bins, len(ping))),
+    )

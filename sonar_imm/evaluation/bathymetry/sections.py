@@ -1,0 +1,124 @@
+"""A run of sea floors on the page: key numbers, and sections with a figure each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ...measurements import Snapshot
+from ...trackers.bathymetry_config import BathymetryConfig
+from ...trackers.bathymetry_law import spacing_of
+from ..judging import Check
+from ..page import Card, Part, Section
+from ..report import run_part
+from ..run_folder import read_measurements
+from . import figures
+from .profiles import Profile, Swath
+from .words import percent, summary_sentence
+
+
+def bathymetry_part(
+    run: Mapping[str, Any], metrics: Mapping[str, Any], swath: Swath, checks: Sequence[Check]
+) -> Part:
+    """The whole part of one run, `checks` first."""
+    return run_part(
+        run,
+        metrics,
+        checks,
+        summary=summary_sentence(metrics),
+        cards=_cards(metrics),
+        sections=_sections(run, swath),
+    )
+
+
+def _cards(metrics: Mapping[str, Any]) -> list[Card]:
+    height = metrics.get('height', {})
+    if not height.get('all', {}).get('n'):
+        return [
+            Card(str(metrics['pings']), 'Pings', f'{metrics["bins"]} range bins'),
+            Card(percent(metrics['heard_share']), 'Bins with an echo'),
+            Card(f'{metrics["height_std_median_m"]:.2f} m', 'Stated uncertainty, median'),
+            Card(percent(metrics['rough_share']), 'Bins labelled rough'),
+        ]
+    every = height['all']
+    cards = [
+        Card(
+            f'{every["rmse_m"]:.2f} m',
+            'Height error, RMS',
+            f'median {every["median_m"]:.2f} m, 95 % {every["p95_m"]:.2f} m',
+        )
+    ]
+    if height['patch']['n'] and height['smooth']['n']:
+        cards.append(Card(f'{height["smooth"]["rmse_m"]:.2f} m', 'On smooth floor, RMS'))
+        cards.append(Card(f'{height["patch"]["rmse_m"]:.2f} m', 'In rough patches, RMS'))
+    angle = metrics['angle']['all']
+    if angle['n']:
+        cards.append(Card(f'{angle["rmse_deg"]:.2f}°', 'Angle error, RMS'))
+    cards.append(
+        Card(
+            percent(metrics['inside_band']['all']),
+            'Truth inside two standard deviations',
+            '95 % would be perfect',
+        )
+    )
+    found = metrics.get('segmentation', {})
+    if found.get('patches'):
+        cards.append(
+            Card(
+                f'{found["iou"]:.2f}',
+                'Overlap of the rough patches',
+                f'noticed {found["bins_late_in"]:.0f} bins late, left '
+                f'{found["bins_late_out"]:.0f} bins late',
+            )
+        )
+    return cards
+
+
+def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
+    if not swath.profiles:
+        return []
+    number = len(swath.profiles) // 2
+    profile = swath.profiles[number]
+    which = f' Ping {number + 1} of {len(swath.profiles)}.'
+    sections = [
+        Section(
+            'Profile of the floor',
+            'Height along one ping. Dotted: truth. Shaded: where the floor should be 95 times in '
+            f'a hundred; blue ground: the true rough patch.{which}',
+            figures.profile_figure(profile),
+        )
+    ]
+    if (snapshot := _snapshot(run, profile)) is not None:
+        spacing = spacing_of(snapshot, BathymetryConfig.from_mapping(run['parameters']))
+        sections.append(
+            Section(
+                'What the array hears, and what the tracker makes of it',
+                'Light: sound from there (Capon spectrum of the samples, 11 bins at a time, no '
+                f'terrain model). Over it the estimated angle.{which}',
+                figures.spectrum_figure(profile, snapshot, spacing),
+            )
+        )
+    sections.append(
+        Section(
+            'Which terrain model held',
+            f'Dark: the model is probable. Lines: ends of the true patch.{which}',
+            figures.models_figure(profile, swath.model_names),
+        )
+    )
+    if swath.rough.any():
+        sections.append(
+            Section(
+                'Rough floor over the whole run',
+                'One row a ping. Dark: rough with great probability.',
+                figures.segmentation_figure(swath),
+            )
+        )
+    return sections
+
+
+def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
+    """The samples of one ping, None when the recording is gone."""
+    for one in read_measurements(run):
+        if one.stamp_ns == profile.stamp_ns and len(one) == len(profile.range):
+            return one
+    return None

@@ -1,0 +1,109 @@
+"""Runs of the bathymetry tracker from a recording to the page, as the command makes them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.evaluation.bathymetry import truth_topic
+from sonar_imm.evaluation.bathymetry.figures import spectrum_figure
+from sonar_imm.evaluation.bathymetry.profiles import profile_of
+from sonar_imm.evaluation.judging import judge
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.simulation.bathymetry import scenario, simulate
+from sonar_imm.trackers.bathymetry import BathymetryConfig, BathymetryTracker
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp('bags') / 'floor'
+    assert run('simulate', 'bathymetry', path, '--seed', 4, '--set', 'pings=2',
+               '--set', 'last_range=55') == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def tracked(bag):
+    out = bag.parent / 'out'
+    assert run('track', bag, out) == 0
+    return out
+
+
+def test_a_run_is_scored_and_has_a_page(tracked, capsys):
+    assert run('evaluate', tracked) == 0
+    assert 'On average the floor lies 0.' in capsys.readouterr().out
+    metrics = json.loads((tracked / 'metrics.json').read_text())
+    assert metrics['scored_pings'] == 2
+    assert metrics['height']['smooth']['rmse_m'] < 0.1 < metrics['height']['patch']['rmse_m'] < 0.6
+    assert metrics['segmentation']['iou'] > 0.6
+    assert metrics['inside_band']['all'] > 0.85
+    page = (tracked / 'report.html').read_text()
+    for title in ('Profile of the floor', 'What the array hears', 'Which terrain model held',
+                  'Rough floor over the whole run'):
+        assert title in page
+
+
+def test_the_limit_of_the_shipped_recordings_holds(tracked):
+    judgement = judge(RunFolder(tracked))
+    check = judgement.accuracy(None)
+    assert check.good and check.name == 'height RMSE against truth'
+    assert not judgement.accuracy(0.001).good
+
+
+def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
+    folder = RunFolder(tmp_path / 'run')
+    folder.prepare()
+    folder.write_estimates(RunFolder(tracked).read_estimates(), 'bathymetry')
+    folder.write_json('run.json', {**RunFolder(tracked).read_run(), 'bag': str(tmp_path / 'gone')})
+    judgement = judge(folder)
+    assert judgement.accuracy(None) is None
+    part = judgement.part([])
+    assert 'What the array hears, and what the tracker makes of it' not in [
+        section.title for section in part.sections]
+
+
+@pytest.mark.parametrize('values', [
+    {'model_set': 'angle_two_rw'}, {'model_set': 'height_bank', 'sigmas': '0.01'},
+    {'model_set': 'height_rw_ncs'}, {'engine': 'grid', 'smoothing': 'states'}])
+def test_every_model_set_is_judged(bag, tmp_path, values):
+    settings = [word for name, value in values.items() for word in ('--set', f'{name}={value}')]
+    assert run('track', bag, tmp_path / 'out', *settings) == 0
+    judgement = judge(RunFolder(tmp_path / 'out'))
+    assert 0.0 < judgement.metrics['height']['all']['rmse_m'] < 0.5
+    assert judgement.metrics['inside_band']['all'] > 0.5
+    assert len(judgement.part([]).sections) >= 5
+
+
+def test_two_sides_need_a_choice(tmp_path, capsys):
+    assert run('simulate', 'bathymetry', tmp_path / 'both', '--scenario', 'two_sides', '--set',
+               'pings=1', '--set', 'last_range=30') == 0
+    assert run('track', tmp_path / 'both', tmp_path / 'out') == 2
+    error = capsys.readouterr().err
+    assert 'several topics fit snapshot: /port/snapshot, /starboard/snapshot' in error
+    assert run('track', tmp_path / 'both', tmp_path / 'out', '--topic', 'snapshot=/port/snapshot',
+               '--set', 'side=port') == 0
+    judgement = judge(RunFolder(tmp_path / 'out'))
+    assert judgement.metrics['scored_pings'] == 1
+    assert judgement.metrics['height']['all']['rmse_m'] < 0.2
+
+
+def test_truth_lies_beside_the_topic_that_was_tracked():
+    assert truth_topic({'topics': {'/snapshot': 'snapshot'}}) == '/truth/estimate'
+    assert truth_topic({'topics': {'/port/snapshot': 'snapshot'}}) == '/truth/port/estimate'
+
+
+@pytest.mark.parametrize('conjugate', [False, True])
+def test_the_bright_line_of_the_spectrum_is_the_floor(conjugate):
+    scene = simulate(scenario('paper', {'pings': 1, 'last_range': 35.0, 'conjugate': conjugate}), 2)
+    snapshot, truth = scene.measurements[0].measurement, scene.truth[0]
+    tracker = BathymetryTracker(BathymetryConfig(conjugate=conjugate))
+    profile = profile_of(tracker.process(snapshot)[0], None)
+    figure = spectrum_figure(profile, snapshot, -0.5 if conjugate else 0.5)
+    image = figure.data[0]
+    brightest = np.asarray(image.y)[np.asarray(image.z).argmax(axis=0)]
+    assert np.median(np.abs(brightest - np.degrees(truth.angle))) < 2.0

@@ -1,0 +1,87 @@
+"""Scores of floors, from profiles whose errors are known by hand."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
+from sonar_imm.evaluation.bathymetry.scoring import runs, score
+from sonar_imm.evaluation.bathymetry.words import lines, summary_sentence
+
+N = 20
+PATCH = slice(8, 14)
+
+
+def profile(*, height=0.1, rough=slice(9, 15), known=True, shadow=slice(0, 0), heard=None,
+            stamp_ns=0):
+    """Twenty bins of a floor at 0 with a patch in 8..13; estimates are off by `height`."""
+    probabilities = np.tile([0.9, 0.1], (N, 1))
+    probabilities[rough] = [0.2, 0.8]
+    patch = np.zeros(N, bool)
+    patch[PATCH] = True
+    echo = np.ones(N, bool)
+    echo[shadow] = False
+    truth = TrueFloor(np.zeros(N), np.full(N, 0.1), patch, echo)
+    return Profile(stamp_ns=stamp_ns, range=20.0 + np.arange(N), height=np.full(N, height),
+                   height_std=np.full(N, 0.06), angle=np.full(N, 0.1 + np.radians(2.0)),
+                   angle_std=np.full(N, 0.01), heard=np.ones(N, bool) if heard is None else heard,
+                   probabilities=probabilities, truth=truth if known else None)
+
+
+def swath(*profiles, names=('rw_smooth', 'rw_rough')):
+    return Swath(profiles, names, np.array([False, True]))
+
+
+def test_errors_by_place_and_the_share_inside_the_band():
+    one = profile()
+    one.height[PATCH] = 0.3
+    metrics = score(swath(one))
+    assert metrics['height']['smooth']['rmse_m'] == pytest.approx(0.1)
+    assert metrics['height']['patch']['rmse_m'] == pytest.approx(0.3)
+    assert metrics['height']['all']['n'] == N
+    assert metrics['height']['all']['rmse_m'] == pytest.approx(
+        np.sqrt((14 * 0.01 + 6 * 0.09) / N))
+    assert metrics['angle']['all']['rmse_deg'] == pytest.approx(2.0)
+    assert metrics['inside_band'] == pytest.approx(
+        {'smooth': 1.0, 'patch': 0.0, 'all': 0.7, 'shadow': np.nan}, nan_ok=True)
+
+
+def test_overlap_and_delay_of_the_segmentation():
+    # Labels 9..14 against the patch 8..13: five of seven bins, one late in, one late out.
+    found = score(swath(profile()))['segmentation']
+    assert found['iou'] == pytest.approx(5 / 7)
+    assert found['recall'] == found['precision'] == pytest.approx(5 / 6)
+    assert (found['bins_late_in'], found['bins_late_out']) == (1.0, 1.0)
+    missed = score(swath(profile(rough=slice(0, 2))))['segmentation']
+    assert (missed['patches'], missed['patches_missed'], missed['iou']) == (1, 1, 0.0)
+    to_the_end = score(swath(profile(rough=slice(8, N))))['segmentation']
+    assert (to_the_end['bins_late_in'], to_the_end['bins_late_out']) == (0.0, 6.0)
+
+
+def test_shadow_is_scored_apart():
+    heard = np.ones(N, bool)
+    heard[:3] = False
+    metrics = score(swath(profile(shadow=slice(0, 4), heard=heard)))
+    assert metrics['height']['all']['n'] == N - 4
+    assert metrics['height']['shadow']['n'] == 4
+    assert metrics['gate'] == {'shadow_bins': 4, 'shadow_passed_over': 0.75, 'echo_heard': 1.0}
+    assert any('shadow passed over' in name for name, _ in lines(metrics))
+
+
+def test_without_truth_the_tracker_speaks_for_itself():
+    metrics = score(swath(profile(known=False), profile(known=False, stamp_ns=10**9)))
+    assert metrics['pings'] == 2 and metrics['bins'] == 2 * N and metrics['span_s'] == 1.0
+    assert metrics['rough_share'] == pytest.approx(0.3)
+    assert 'height' not in metrics
+    assert 'no truth' in summary_sentence(metrics)
+    assert dict(lines(metrics))['bins with an echo'] == '100 %'
+
+
+def test_a_run_without_a_ping_has_words_too():
+    metrics = score(Swath((), (), np.zeros(0, bool)))
+    assert summary_sentence(metrics).startswith('0 pings with 0 range bins')
+    assert lines(metrics)
+
+
+def test_runs():
+    assert runs(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 2), (3, 4), (6, 7)]
+    assert runs(np.zeros(4, bool)) == runs(np.zeros(0, bool)) == []

@@ -1,0 +1,146 @@
+"""The bathymetry node: an estimate a ping, hostile snapshots named and counted, pings dropped."""
+
+import time
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import PointCloud2
+
+from msg_adapters.estimates import read_estimate
+from msg_adapters.snapshots import write_snapshot
+from msg_adapters.table import encode_table
+from sonar_imm.nodes.bathymetry import BathymetryNode
+from sonar_imm.nodes.messages import make
+from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.simulation.bathymetry import scenario, simulate
+
+SHORT = {'pings': 3, 'last_range': 24.0}
+
+
+def pings(**values):
+    scene = simulate(scenario('paper', {**SHORT, **values}), 3)
+    return [item.measurement for item in scene.measurements], scene.truth
+
+
+class Rig:
+    def __init__(self, bench):
+        self.bench = bench
+        self.node = bench.add(BathymetryNode(context=bench.context))
+        self.tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
+        self.publisher = bench.peer.create_publisher(PointCloud2, '/snapshot', lockstep_qos())
+        bench.spin_until(lambda: self.publisher.get_subscription_count()
+                         and self.node.count_subscribers('/bathymetry/estimate'))
+
+    def send(self, *messages):
+        for message in messages:
+            received = self.node._meter.received
+            before = received.total()
+            self.publisher.publish(message)
+            self.bench.spin_until(lambda want=before: received.total() > want)
+        self.bench.spin_until(lambda: len(self.tables) == self.node._published)
+
+
+@pytest.fixture
+def rig(make_bench):
+    return Rig(make_bench('-p', 'max_wait:=0.0'))
+
+
+def table(rows, *, stamp_ns=5 * 10**9, **columns):
+    """A message that no adapter of ours would write."""
+    columns.setdefault('range', np.linspace(17.0, 24.0, rows, dtype=np.float32))
+    columns.setdefault('iq', np.ones((rows, 8), np.float32))
+    return encode_table(columns, stamp_ns=stamp_ns, frame_id='sonar', make=make)
+
+
+def test_a_ping_becomes_the_floor_under_it(rig):
+    snapshots, truth = pings()
+    rig.send(*[write_snapshot(one, make) for one in snapshots])
+    assert len(rig.tables) == 3
+    for message, snapshot, true in zip(rig.tables, snapshots, truth):
+        estimate = read_estimate(message)
+        assert estimate.stamp_ns == snapshot.stamp_ns and estimate.frame_id == 'sonar'
+        assert len(estimate) == len(snapshot)
+        assert np.sqrt(np.mean(np.square(estimate.state[20:, 0] - true.height[20:]))) < 0.1
+        # What RViz2 and Foxglove draw: starboard is to the right, the floor 15 m below.
+        assert np.median(np.abs(estimate.xyz[20:, 2] + 15.0)) < 0.1
+        assert (estimate.xyz[20:, 1] < 0.0).all()
+        assert set(estimate.extras['label']) <= {0, 1}
+    assert not rig.node._errors
+
+
+def test_hostile_snapshots_are_named_and_counted_and_the_node_lives(rig):
+    good, = pings(pings=1)[0]
+    one_bin = table(1)
+    huge = table(1_000_000, iq=np.ones((1_000_000, 4), np.float32))
+    backward = table(40, range=np.linspace(24.0, 17.0, 40, dtype=np.float32))
+    odd = table(40, iq=np.ones((40, 7), np.float32))
+    no_staves = table(40, iq=np.ones((40, 2), np.float32))
+    nan = table(40, iq=np.full((40, 8), np.nan, np.float32))
+    silent = table(40, iq=np.zeros((40, 8), np.float32))
+    empty = table(0)
+    no_column = encode_table({'range': np.ones(4, np.float32)}, stamp_ns=10**9, frame_id='sonar',
+                             make=make)
+    changing = table(40, sound_speed=np.linspace(1400, 1500, 40, dtype=np.float32))
+    cut = write_snapshot(good, make)
+    cut.data = bytes(cut.data)[:-100]
+    rig.send(one_bin, huge, backward, odd, no_staves, nan, silent, empty, no_column, changing, cut)
+    refused = rig.node._meter.refused
+    assert refused.total() == 11 and not rig.tables and not rig.node._errors
+    assert {'too_short', 'too_large', 'bad_range', 'bad_field', 'nan', 'silent',
+            'missing_column', 'not_constant'} <= set(refused)
+    rig.send(write_snapshot(good, make))
+    assert len(read_estimate(rig.tables[0])) == len(good)
+
+
+def test_pings_of_changing_sizes_and_some_bad_bins_are_used(rig):
+    sizes = []
+    for number, values in enumerate(({'staves': 8}, {'staves': 2}, {'staves': 16},
+                                     {'last_range': 18.0}, {'first_range': 10.0})):
+        one = pings(pings=1, **values)[0][0]
+        message = write_snapshot(one, make)
+        message.header.stamp.sec = 100 + number
+        raw = np.frombuffer(bytes(message.data), np.uint8).copy().reshape(len(one), -1)
+        iq = next(field.offset for field in message.fields if field.name == 'iq')
+        raw[5, iq:iq + 4] = np.array([np.nan], np.float32).view(np.uint8)
+        message.data = raw.tobytes()
+        rig.send(message)
+        sizes.append(len(one))
+    assert [message.width for message in rig.tables] == sizes
+    for message in rig.tables:
+        assert np.isfinite(read_estimate(message).state).all()
+    assert rig.node.tracker.counts['bins_unusable'] == 5
+
+
+def test_a_spacing_other_than_configured_is_counted(make_bench):
+    rig = Rig(make_bench('-p', 'max_wait:=0.0', '-p', 'element_spacing_wavelengths:=0.7'))
+    rig.send(*[write_snapshot(one, make) for one in pings()[0]])
+    assert not rig.tables
+    assert rig.node.tracker.counts['other_spacing'] == 3
+
+
+def test_pings_that_waited_too_long_are_dropped_whole_and_counted(make_bench):
+    limit = 0.2
+    rig = Rig(make_bench('-p', f'max_wait:={limit}'))
+    first, second, last = [write_snapshot(one, make) for one in pings()[0]]
+    begin = time.monotonic()
+    rig.publisher.publish(first)
+    rig.publisher.publish(second)
+    while time.monotonic() < begin + 3 * limit:  # the node is busy
+        time.sleep(0.05)
+    rig.bench.spin_until(lambda: rig.node._meter.received['snapshot'] == 2)
+    assert rig.node._meter.dropped['snapshot'] == 2
+    rig.send(last)
+    assert len(rig.tables) == 1 and rig.tables[0].header.stamp == last.header.stamp
+    assert rig.node._meter.dropped['snapshot'] == 2
+
+
+def test_two_sides_are_two_nodes(make_bench):
+    bench = make_bench('-p', 'side:=port')
+    node = bench.add(BathymetryNode(context=bench.context, namespace='port'))
+    tables = bench.listen(PointCloud2, '/port/bathymetry/estimate', lockstep_qos())
+    publisher = bench.peer.create_publisher(PointCloud2, '/port/snapshot', lockstep_qos())
+    bench.spin_until(lambda: publisher.get_subscription_count()
+                     and node.count_subscribers('/port/bathymetry/estimate'))
+    publisher.publish(write_snapshot(pings(pings=1)[0][0], make))
+    bench.spin_until(lambda: tables)
+    assert (read_estimate(tables[0]).xyz[20:, 1] > 0.0).all()
