@@ -55,13 +55,13 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
     'fathometer': (
         InputTopic('csdm', 'cross-spectra of a vertical array, one row a frequency', {
             'sensor_msgs/msg/PointCloud2': read_csdm,
-        }),
+        }, one_topic=True),
         InputTopic('pressure', 'pressure at the phones of a vertical array, one row a sample', {
             'sensor_msgs/msg/PointCloud2': read_pressure,
-        }),
+        }, one_topic=True),
         InputTopic('trace', 'ready-made traces, one row a depth', {
             'sensor_msgs/msg/PointCloud2': read_trace,
-        }),
+        }, one_topic=True),
         InputTopic('array_depth', 'depth of the deepest phone, from a companion instrument', {
             'geometry_msgs/msg/PointStamped': read_array_depth,
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,

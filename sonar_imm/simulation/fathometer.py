@@ -156,10 +156,6 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         {
             **_SHORT,
             'level': 'pressure',
-            'phones': 16,
-            'frequency_max': 2000.0,
-            'sample_rate': 6000.0,
-            'snapshot_seconds': 0.7,
             'record_seconds': 9.8,
             'layers': 2,
             'layer_spacing': 8.0,
