@@ -196,7 +196,8 @@ class CrossSpectra:
             raise Rejection('bad_frequency', 'the frequencies of the cross-spectra do not increase')
 
     def _check_matrices(self, csdm: NDArray[np.complexfloating], power: FloatArray) -> None:
-        scale = np.sqrt(power[:, :, None] * power[:, None, :])
+        root = np.sqrt(power)  # the product of the powers may overflow in single precision
+        scale = root[:, :, None] * root[:, None, :]
         if (np.abs(csdm - csdm.conj().swapaxes(1, 2)) > _HERMITIAN * scale).any():
             raise Rejection('not_hermitian', 'the cross-spectral matrices are not Hermitian')
         if (np.abs(csdm) > (1.0 + _HERMITIAN) * scale).any():
