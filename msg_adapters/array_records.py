@@ -153,7 +153,7 @@ def _matrices(values: NDArray) -> NDArray[np.complexfloating]:
         raise Rejection('bad_field', f'column csdm holds {values.dtype}, not floats')
     double = values.dtype == np.float64
     paired = np.ascontiguousarray(values).view(np.complex128 if double else np.complex64)
-    return paired.reshape(-1, phones, phones)
+    return paired.reshape(len(values), phones, phones)
 
 
 def _snapshots(columns: Columns) -> int:
