@@ -246,9 +246,7 @@ def test_the_depth_of_the_array_is_down_whatever_the_frame():
     assert reason(read_array_depth, message) == 'nan'
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400), st.sampled_from([read_csdm, read_pressure, read_trace]))
 def test_bytes_of_any_kind_are_read_or_refused(data, read):
     good = {
