@@ -6,6 +6,8 @@ was, is put onto it: its `Response` is what the particles see.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
@@ -59,12 +61,13 @@ def pulse_of(config: FathometerConfig) -> Pulse:
     if config.pulse == 'gaussian':
         return gaussian_pulse(config.pulse_width)
     try:
-        table = np.genfromtxt(config.pulse_file, delimiter=',', comments='#', ndmin=2)
-        table = table[np.isfinite(table).all(axis=1)]
-        return measured_pulse(table[:, 0], table[:, 1])
+        rows = Path(config.pulse_file).read_text(encoding='utf-8-sig').split('\n')
+        # The first line may name the columns.
+        named = any(character.isalpha() for character in rows[0].replace('e', ''))
+        table = [[float(cell) for cell in row.split(',')] for row in rows[named:] if row.strip()]
+        return measured_pulse([row[0] for row in table], [row[1] for row in table])
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise ConfigError(f'pulse_file {config.pulse_file}: {reason}') from None
+        raise ConfigError(f'pulse_file {config.pulse_file}: {error.strerror}') from None
     except (ValueError, IndexError) as error:
         raise ConfigError(f'pulse_file {config.pulse_file}: {error}') from None
 

@@ -147,10 +147,10 @@ def test_the_printed_output_has_its_echo_at_negative_times(band):
 
 
 def test_noise_is_as_large_as_predicted():
-    frequency = 100.0 + np.arange(2000)
-    R = np.tile(np.eye(8), (len(frequency), 1, 1)).astype(complex)
+    frequency = 400.0 + 2.0 * np.arange(1000)
+    R = np.tile(np.eye(M), (len(frequency), 1, 1)).astype(complex)
     rng = np.random.default_rng(0)
-    w = steering(frequency, D * np.arange(8), C)
+    w = steering(frequency, HEIGHTS, C)
     seen = [
         noise_sigma(response(coherence(sample_csdm(R, 64, rng), w, 'conventional'), frequency)[1])
         for _ in range(4)
