@@ -28,7 +28,8 @@ from .local_frame import LocalFrame
 from .messages import ros_message
 
 __all__ = ['convert_arrivals', 'convert_autoferry', 'convert_fixes', 'convert_segy',
-           'convert_snapshots', 'convert_traces', 'convert_truth', 'ConversionReport', 'CsvOptions', 'KINDS']
+           'convert_snapshots', 'convert_traces', 'convert_truth', 'ConversionReport',
+           'CsvOptions', 'KINDS']
 
 
 def convert_fixes(path: str | Path, out: str | Path, *, options: CsvOptions | None = None,

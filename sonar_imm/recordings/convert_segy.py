@@ -67,6 +67,7 @@ def convert_segy(
         raise BagError(f'{path} states no sample interval: tell the sample spacing')
     depth = depth_offset + 0.5 * sound_speed * delay + spacing * np.arange(amplitude.shape[1])
     part = slice(first_sample, None if samples is None else first_sample + samples)
+    depth, amplitude = depth[part], amplitude[:, part]
     report.notes['sample_spacing'] = f'{spacing:g} m'
     records = _records(
         report, Path(path), stamps, depth[part], amplitude[:, part], stack, frame_id
