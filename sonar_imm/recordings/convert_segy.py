@@ -69,9 +69,7 @@ def convert_segy(
     part = slice(first_sample, None if samples is None else first_sample + samples)
     depth, amplitude = depth[part], amplitude[:, part]
     report.notes['sample_spacing'] = f'{spacing:g} m'
-    records = _records(
-        report, Path(path), stamps, depth[part], amplitude[:, part], stack, frame_id
-    )
+    records = _records(report, Path(path), stamps, depth, amplitude, stack, frame_id)
     return write_bag(out, records, report, source=Path(path).name, storage=storage)
 
 
