@@ -13,6 +13,7 @@ from sonar_imm.recordings.reader import BagReader
 from sonar_imm.recordings.sources import BagError
 
 DEPTH = 120.0 + 0.25 * np.arange(40)
+ONES = np.ones((3, 40))
 SECOND = 10**9
 
 
@@ -69,8 +70,8 @@ def test_bad_traces_are_left_out_by_name(archive):
     'arrays, words',
     [
         ({'depth': DEPTH}, "no array 'amplitude'"),
-        ({'depth': DEPTH[:5], 'amplitude': np.ones((3, 40))}, r'\(traces, n\) are needed'),
-        ({'depth': DEPTH, 'amplitude': np.ones((3, 40)), 'stamp': [1.0]}, '3 traces need as many'),
+        ({'depth': DEPTH[:5], 'amplitude': ONES}, r'\(traces, n\) are needed'),
+        ({'depth': DEPTH, 'amplitude': ONES, 'stamp': [1.0]}, '3 traces need as many'),
         (
             {'depth': DEPTH, 'amplitude': np.ones((3, 40)), 'sigma': np.ones(7)},
             'sigma has the shape',

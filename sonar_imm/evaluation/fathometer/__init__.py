@@ -19,7 +19,7 @@ from .words import lines, summary_sentence
 if TYPE_CHECKING:
     from ..page import Part
 
-LIMIT = Limit(0.10, 'm', 'OSPA')
+LIMIT = Limit(0.08, 'm', 'OSPA')
 """What a shipped recording must stay within. The best configuration has 0.05 m on average over
 long drifts, and one recording is not an average."""
 

@@ -1,10 +1,9 @@
 """How far sets of reflectors lie from the true sets.
 
-Of each record, found and true reflectors are paired so that the sum of squared distances is least,
-none further apart than the cutoff c. OSPA of second order (Schuhmacher, Vo and Vo 2008) counts
-every reflector that has no partner as one that is c away:
-
-    OSPA = sqrt((sum of squared distances + c^2 (n - pairs)) / n),  n = max(found, true)
+OSPA of first order (Schuhmacher, Vo and Vo 2008) says it in one number, in metres: the mean error
+of a reflector, where one too many or too few counts as one that is the cutoff away. For everything
+else found and true reflectors are paired so that the sum of distances is least, none further apart
+than `NEAR` of the cutoff: who has no partner is false, or missed.
 
 Previews are not scored: they are revised by their record.
 """
@@ -17,12 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...estimation.consistency import ospa
 from ...measurements import FloatArray
 from ..numbers import error_summary
 from .records import Record, Reflections
 
 CUTOFF = 2.0
-"""Metres from which a found reflector is not a true one."""
+"""Metres: what a reflector too many or too few counts."""
+NEAR = 0.2
+"""Share of the cutoff within which a found reflector is a true one."""
 
 
 class Pairing(NamedTuple):
@@ -37,14 +39,11 @@ def pair(found: FloatArray, true: FloatArray, cutoff: float) -> Pairing:
     """Pair depths (K,) with depths (J,)."""
     from scipy.optimize import linear_sum_assignment
 
-    most = max(len(found), len(true))
-    if not most:
-        return Pairing(np.empty(0, np.intp), np.empty(0, np.intp), 0.0)
-    cost = np.minimum(np.abs(found[:, None] - true), cutoff) ** 2
-    rows, columns = linear_sum_assignment(cost)
-    total = cost[rows, columns].sum() + cutoff**2 * (most - len(rows))
-    near = cost[rows, columns] < cutoff**2
-    return Pairing(rows[near], columns[near], float(np.sqrt(total / most)))
+    distance = np.abs(found[:, None] - true)
+    rows, columns = linear_sum_assignment(np.minimum(distance, NEAR * cutoff))
+    near = distance[rows, columns] < NEAR * cutoff
+    apart = ospa(true[:, None], found[:, None], cutoff, order=1.0)
+    return Pairing(rows[near], columns[near], apart)
 
 
 def score(records: Sequence[Record], cutoff: float = CUTOFF) -> dict[str, Any]:
