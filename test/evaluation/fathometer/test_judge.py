@@ -60,7 +60,7 @@ def test_ospa_in_closed_form():
 
 
 def test_partners_are_near_and_as_many_as_can_be():
-    one = pair(np.array([10.0, 10.3]), np.array([9.7, 10.1]), 2.0)
+    one = pair(np.array([10.0, 10.3]), np.array([9.7, 10.2]), 2.0)
     assert list(one.found) == [0, 1] and list(one.true) == [0, 1]
     assert not len(pair(np.array([10.0]), np.array([10.41]), 2.0).found)
 
