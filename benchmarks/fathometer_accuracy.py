@@ -22,7 +22,8 @@ import numpy as np
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra, Trace
-from sonar_imm.simulation.fathometer import FathometerScenario, simulate
+from sonar_imm.simulation.fathometer import cross_spectra, FathometerScenario
+from sonar_imm.simulation.fathometer_scenario import drift_of
 from sonar_imm.trackers.fathometer import FathometerConfig, FathometerTracker
 
 DEPTHS = (122.0, 1 / 32, 1600)
@@ -75,16 +76,12 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
         gamma = coherence(spectra.csdm[band], w[band], processor)
         comb = float(spectra.frequency[band][0]), spacing
 
-        def at(first: float, count: int, envelope: bool) -> np.ndarray:
-            lattice = first, DEPTHS[1], count
-            return depth_response(gamma, *comb, lattice, reference, 1500.0, envelope=envelope)
-
-        sigma = noise_sigma(at(180.0, 3840, False))
+        noise = depth_response(gamma, *comb, (180.0, DEPTHS[1], 3840), reference, 1500.0)
         made[name] = Trace(
             stamp_ns=spectra.stamp_ns,
             depth=depth,
-            amplitude=at(DEPTHS[0], DEPTHS[2], envelope),
-            sigma=np.full(DEPTHS[2], sigma),
+            amplitude=depth_response(gamma, *comb, DEPTHS, reference, 1500.0, envelope=envelope),
+            sigma=np.full(DEPTHS[2], noise_sigma(noise)),
             reference_depth=reference,
         )
     return made
@@ -95,19 +92,22 @@ def drift(seed: int, records: int, cache: Path | None) -> tuple[dict[str, list[T
     file = cache / f'drift_{seed}_{records}.npz' if cache else None
     if file is None or not file.exists():
         scale = records / 300
-        scene = simulate(
-            FathometerScenario(
-                records=records,
-                appearing=(int(140 * scale), int(262 * scale)),
-                fading=(int(75 * scale),),
-            ),
-            seed,
+        config = FathometerScenario(
+            records=records,
+            appearing=(int(140 * scale), int(262 * scale)),
+            fading=(int(75 * scale),),
         )
         traces: dict[str, list[Trace]] = {}
-        for one in scene.measurements:
-            for name, trace in responses(one.measurement).items():
+        truth = []
+        # Cross-spectra of a whole drift would not fit into memory, nor does `check` let them.
+        rng = np.random.default_rng(seed)
+        floor = drift_of(config, rng)
+        for record in range(records):
+            spectra = cross_spectra(config, floor, record, floor.array_depth_told[record], rng)
+            for name, trace in responses(spectra).items():
                 traces.setdefault(name, []).append(trace)
-        truth = [(one.track_id, one.depth) for one in scene.truth]
+            here = floor.present[record]
+            truth.append((np.flatnonzero(here), floor.depth[record, here]))
         if file:
             file.parent.mkdir(parents=True, exist_ok=True)
             _save(file, traces, truth)
@@ -215,7 +215,9 @@ def main() -> None:
     if options.out:
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(
-            json.dumps({'runs': options.runs, 'records': options.records, 'table': table}, indent=1)
+            json.dumps(
+                {'runs': options.runs, 'records': options.records, 'table': table}, indent=1
+            )
             + '\n'
         )
 

@@ -1,5 +1,5 @@
-"""What the fathometer takes in: pressure at the phones of a vertical array, their cross-spectra, or
-ready-made traces; and the depth of the array, which a companion instrument may tell.
+"""What the fathometer takes in: pressure at the phones of a vertical array, their cross-spectra,
+or ready-made traces; and the depth of the array, which a companion instrument may tell.
 
 Phones fail at sea. A phone that is silent, constant or not finite is *dead*: it is left out by
 whoever uses the measurement (`alive`), and only when too few are left is the measurement refused.
@@ -33,8 +33,8 @@ def _depth(value: Any) -> float | None:
         return None
     if not -100.0 <= depth <= DEEPEST:
         raise Rejection(
-            'out_of_range', f'the array is said to be {depth:g} m deep; -100 to {DEEPEST:g} m '
-            'are possible'
+            'out_of_range',
+            f'the array is said to be {depth:g} m deep; -100 to {DEEPEST:g} m are possible',
         )
     return depth
 
@@ -105,7 +105,9 @@ class Trace:
         if n < 2:
             raise Rejection('too_short', f'the trace has {n} depth samples; 2 are needed')
         if n > MAX_SAMPLES:
-            raise Rejection('too_large', f'the trace has {n} samples; at most {MAX_SAMPLES} are read')
+            raise Rejection(
+                'too_large', f'the trace has {n} samples; at most {MAX_SAMPLES} are read'
+            )
         if not np.isfinite(self.depth).all():
             raise Rejection('nan', 'the trace has a depth that is not finite')
         if (np.diff(self.depth) <= 0.0).any():
@@ -182,9 +184,7 @@ class CrossSpectra:
         if F < 2:
             raise Rejection('too_short', f'the cross-spectra have {F} frequencies; 2 are needed')
         if F > MAX_FREQUENCIES:
-            raise Rejection(
-                'too_large', f'{F} frequencies; at most {MAX_FREQUENCIES} are read'
-            )
+            raise Rejection('too_large', f'{F} frequencies; at most {MAX_FREQUENCIES} are read')
         _check_phones(M)
 
     def _check_frequencies(self) -> None:
@@ -193,17 +193,23 @@ class CrossSpectra:
         if self.frequency[0] < 0.0 or self.frequency[-1] > 1e6:
             raise Rejection('out_of_range', 'frequencies must lie between 0 and 1 MHz')
         if (np.diff(self.frequency) <= 0.0).any():
-            raise Rejection('bad_frequency', 'the frequencies of the cross-spectra do not increase')
+            raise Rejection(
+                'bad_frequency', 'the frequencies of the cross-spectra do not increase'
+            )
 
     def _check_matrices(self, csdm: NDArray[np.complexfloating], power: FloatArray) -> None:
-        root = np.sqrt(power)  # the product of the powers may overflow in single precision
-        scale = root[:, :, None] * root[:, None, :]
-        if (np.abs(csdm - csdm.conj().swapaxes(1, 2)) > _HERMITIAN * scale).any():
-            raise Rejection('not_hermitian', 'the cross-spectral matrices are not Hermitian')
-        if (np.abs(csdm) > (1.0 + _HERMITIAN) * scale).any():
-            raise Rejection(
-                'not_positive', 'the cross-spectra claim a coherence between phones above one'
-            )
+        root = np.sqrt(power).astype(csdm.real.dtype)
+        # Some frequencies at a time: the intermediate results of all would leave the cache.
+        for first in range(0, len(csdm), 64):
+            R, r = csdm[first : first + 64], root[first : first + 64]
+            normalised = R / r[:, :, None] / r[:, None, :]
+            if np.abs(normalised - normalised.conj().swapaxes(1, 2)).max() > _HERMITIAN:
+                raise Rejection('not_hermitian', 'the cross-spectral matrices are not Hermitian')
+            if np.abs(normalised).max() > 1.0 + _HERMITIAN:
+                raise Rejection(
+                    'not_positive',
+                    'the cross-spectra claim a coherence between phones above one',
+                )
 
 
 @frozen(eq=False, kw_only=True)

@@ -27,9 +27,7 @@ class Members(NamedTuple):
     existence: FloatArray
 
 
-def find_members(
-    sums: FloatArray, separation: int, most: int, least_existence: float
-) -> Members:
+def find_members(sums: FloatArray, separation: int, most: int, least_existence: float) -> Members:
     """At most `most` members whose existence is at least `least_existence`.
 
     sums (3, n): intensity, and first and second moment of the amplitude on each cell (see

@@ -100,8 +100,8 @@ class SetModel:
     cells: n, of the lattice; separation: smallest distance of two members, cells; order_min: the
     smallest set; transition (orders, orders); move (2 r + 1,); gram (n,) by lag in cells, one at
     0; amplitude_prior: one of PRIORS, with amplitude_std: s, and independent_samples: N;
-    move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a + noise, with
-    stationary standard deviation s, 0 for amplitudes drawn anew at each record.
+    move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
+    noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record.
     """
 
     cells: int
@@ -226,9 +226,7 @@ def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArr
     return np.append(0.0, np.cumsum(weight)), -np.log(model.cells * weight)
 
 
-def start(
-    model: SetModel, proposals: Proposals, uniform: FloatArray
-) -> tuple[Sets, FloatArray]:
+def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
     """Sets before the first record, drawn where it will want them, and the log ratio (N,).
 
     uniform (N, 1 + J): the order, and one for each member.

@@ -189,7 +189,7 @@ class FathometerTracker:
             self.counts['dead_phones_masked'] += 1
         self._health['dead_phones'] = float((~item.alive).sum())
 
-    # -- where the array is ------------------------------------------------------------------------
+    # -- where the array is -----------------------------------------------------------------------
 
     def _hear_depth(self, depth: ArrayDepth) -> None:
         insort(self._array_depths, (depth.stamp_ns, depth.depth))
@@ -214,7 +214,7 @@ class FathometerTracker:
         self.counts['array_depth_unknown'] += not self.config.array_depth
         return self.config.array_depth or None
 
-    # -- one record --------------------------------------------------------------------------------
+    # -- one record -------------------------------------------------------------------------------
 
     def _hear(self, record: CrossSpectra, span_ns: int) -> Response:
         if rank_deficient(record):

@@ -22,7 +22,7 @@ PROPOSALS = ('data', 'prior')
 class FathometerConfig(Config):
     """Everything the fathometer tracker can be told."""
 
-    # -- array and sound ---------------------------------------------------------------------------
+    # -- array and sound --------------------------------------------------------------------------
     phones: int = parameter(
         32, 'phones of the array; 0: as many as the first record has', low=0, high=256
     )
@@ -32,8 +32,8 @@ class FathometerConfig(Config):
     sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
     array_depth: float = parameter(
         0.0,
-        'depth of the deepest phone, where neither the record nor a companion instrument tells; 0: '
-        'depths are counted from it',
+        'depth of the deepest phone, where neither the record nor a companion instrument tells; '
+        '0: depths are counted from it',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -42,7 +42,7 @@ class FathometerConfig(Config):
         30.0, 'a depth from the companion is used so long', unit='s', low=0.0, high=86400.0
     )
 
-    # -- from pressure to cross-spectra ------------------------------------------------------------
+    # -- from pressure to cross-spectra -----------------------------------------------------------
     snapshot_seconds: float = parameter(
         1.4, 'length of a snapshot', unit='s', low=1e-3, high=1000.0
     )
@@ -59,17 +59,19 @@ class FathometerConfig(Config):
         high=86400.0,
     )
 
-    # -- from cross-spectra to a depth response ----------------------------------------------------
+    # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
     loading: float = live(
         1e-2, 'mvdr: diagonal loading, in units of the mean phone power', low=0.0, high=1e6
     )
     white_noise_gain_db: float = live(
-        -3.0, 'white_noise: least gain, against the most there is', unit='dB', low=-60.0, high=-0.01
+        -3.0,
+        'white_noise: least gain, against the most there is',
+        unit='dB',
+        low=-60.0,
+        high=-0.01,
     )
-    frequency_min: float = parameter(
-        50.0, 'lower edge of the band', unit='Hz', low=0.0, high=1e6
-    )
+    frequency_min: float = parameter(50.0, 'lower edge of the band', unit='Hz', low=0.0, high=1e6)
     frequency_max: float = parameter(
         4000.0, 'upper edge of the band', unit='Hz', low=1.0, high=1e6
     )
@@ -110,7 +112,7 @@ class FathometerConfig(Config):
         False, 'take the median of the noise off the trace first: for envelopes'
     )
 
-    # -- pulse -------------------------------------------------------------------------------------
+    # -- pulse ------------------------------------------------------------------------------------
     pulse: str = parameter(
         'band',
         'what one reflector leaves on the response: that of a flat band, a Gaussian, or from a '
@@ -124,7 +126,7 @@ class FathometerConfig(Config):
         '', 'file: a CSV of two columns, distance in m from 0 on, and value'
     )
 
-    # -- the set of reflectors ---------------------------------------------------------------------
+    # -- the set of reflectors --------------------------------------------------------------------
     order_min: int = parameter(1, 'least number of reflectors', low=0, high=64)
     order_max: int = parameter(12, 'greatest number of reflectors', low=1, high=64)
     order_switch_probability: float = parameter(
@@ -162,7 +164,7 @@ class FathometerConfig(Config):
         high=0.9999,
     )
 
-    # -- computation -------------------------------------------------------------------------------
+    # -- computation ------------------------------------------------------------------------------
     particles: int = parameter(20_000, 'sets of reflectors tried', low=2, high=10_000_000)
     proposal: str = parameter(
         'data',
@@ -173,11 +175,9 @@ class FathometerConfig(Config):
         1, 'processor cores used; the result does not depend on it', low=1, high=256
     )
     seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
-    smoothing_lag: int = parameter(
-        0, 'revise the estimate so many records later', low=0, high=100
-    )
+    smoothing_lag: int = parameter(0, 'revise the estimate so many records later', low=0, high=100)
 
-    # -- output ------------------------------------------------------------------------------------
+    # -- output -----------------------------------------------------------------------------------
     existence_min: float = live(
         0.5, 'least probability with which a reflector is reported', low=0.0, high=1.0
     )
@@ -213,8 +213,8 @@ class FathometerConfig(Config):
         orders = self.orders
         if len(self.order_transition_matrix) != orders * orders:
             return [
-                f'order_transition_matrix needs {orders} x {orders} = {orders * orders} values for '
-                f'order_min {self.order_min} to order_max {self.order_max}, got '
+                f'order_transition_matrix needs {orders} x {orders} = {orders * orders} values '
+                f'for order_min {self.order_min} to order_max {self.order_max}, got '
                 f'{len(self.order_transition_matrix)}'
             ]
         sums = np.reshape(self.order_transition_matrix, (orders, orders)).sum(axis=1)

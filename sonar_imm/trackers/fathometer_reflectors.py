@@ -58,9 +58,7 @@ class Identities:
         return evolve(self, known=())
 
 
-def nearest_ids(
-    depth: FloatArray, known: Sequence[Known], config: FathometerConfig
-) -> IdArray:
+def nearest_ids(depth: FloatArray, known: Sequence[Known], config: FathometerConfig) -> IdArray:
     """Ids (K,) of the known reflectors that are near enough, the nearest pairs first; 0: none."""
     ids = np.zeros(len(depth), np.uint32)
     taken = np.zeros(len(known), np.bool_)

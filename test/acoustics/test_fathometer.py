@@ -221,7 +221,9 @@ def test_sampled_cross_spectra_scatter_as_wishart():
     for snapshots in (8, 64):
         drawn = sample_csdm(np.repeat(R, 4000, axis=0), snapshots, rng)
         assert np.allclose(drawn.mean(axis=0), R[0], atol=0.02)
-        assert np.var(drawn[:, 3, 3].real) == pytest.approx(R[0, 3, 3].real ** 2 / snapshots, rel=0.1)
+        assert np.var(drawn[:, 3, 3].real) == pytest.approx(
+            R[0, 3, 3].real ** 2 / snapshots, rel=0.1
+        )
         assert np.mean(np.abs(drawn[:, 0, 9] - R[0, 0, 9]) ** 2) == pytest.approx(
             R[0, 0, 0].real * R[0, 9, 9].real / snapshots, rel=0.1
         )

@@ -18,9 +18,7 @@ GOLDEN = Path(__file__).parents[1] / 'vectors' / 'fathometer' / 'golden.json'
 
 
 def test_band_pulse_is_the_golden_one():
-    wanted = json.loads(GOLDEN.read_text())[
-        'pulse lattice lag 4,20,100 (50-4000) vs closed form'
-    ]
+    wanted = json.loads(GOLDEN.read_text())['pulse lattice lag 4,20,100 (50-4000) vs closed form']
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     assert pulse(np.array([4, 20, 100]) / 64.0) == pytest.approx(wanted[1], abs=1e-12)
     assert pulse(0.0) == 1.0
@@ -43,7 +41,9 @@ def test_a_band_has_two_b_t_independent_samples():
 
 def test_a_measured_pulse_is_even_and_scaled():
     pulse = measured_pulse([-0.2, -0.1, 0.0, 0.1, 0.2], [0.0, 2.2, 4.0, 1.8, 0.0])
-    assert pulse(np.array([0.0, 0.1, -0.1, 0.15, 3.0])) == pytest.approx([1.0, 0.5, 0.5, 0.25, 0.0])
+    assert pulse(np.array([0.0, 0.1, -0.1, 0.15, 3.0])) == pytest.approx(
+        [1.0, 0.5, 0.5, 0.25, 0.0]
+    )
 
 
 @pytest.mark.parametrize(

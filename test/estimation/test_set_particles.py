@@ -153,7 +153,9 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     b = exact['B'][3]
     known = tracker._start(b, (1, 2))
     uniform = np.random.Generator(
-        np.random.Philox(key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64))
+        np.random.Philox(
+            key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64)
+        )
     ).random((N, 1 + changed.order_max))
     sets, ratio = start(changed, propose(changed, b), uniform)
     assert np.allclose(known.log_weight, ratio)
