@@ -81,7 +81,7 @@ def draw_conventions() -> None:
     _draw_geometry(left)
     scene = simulate(
         scenario(
-            'drift',
+            'drift_spectra',
             {
                 'records': 1,
                 'layers': 1,

@@ -25,8 +25,3 @@ def kernel(function: F) -> F:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # numba: 'cannot cache function ...: no locator available'
         return numba.njit(**options)(function)
-
-
-def cached_kernels(functions: list[Any]) -> bool:
-    """True when every kernel in `functions` has been compiled or loaded in this process."""
-    return all(getattr(function, 'signatures', [None]) for function in functions)

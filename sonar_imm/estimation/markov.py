@@ -11,6 +11,7 @@ generator once, ``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so
 from __future__ import annotations
 
 from collections import OrderedDict
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,8 +83,19 @@ class RateChain:
     def _compute(self, dt: float) -> FloatArray:
         if dt == self.step and self.residual < 1e-9:
             return self.matrix.copy()
-        P = np.clip(_expm(self.generator * dt), 0.0, None)
-        return np.asarray(P / P.sum(axis=1, keepdims=True))
+        # The exponential of a short step is safe for any rates; squaring it gets there, and rows
+        # that are kept at one cannot drift.
+        rate = float(np.abs(self.generator).max()) * dt
+        halvings = max(0, math.ceil(math.log2(rate))) if rate > 1.0 else 0
+        P = _stochastic(_expm(self.generator * (dt / 2.0**halvings)))
+        for _ in range(halvings):
+            P = _stochastic(P @ P)
+        return P
+
+
+def _stochastic(P: FloatArray) -> FloatArray:
+    P = np.clip(P, 0.0, None)
+    return np.asarray(P / P.sum(axis=1, keepdims=True))
 
 
 def _expm(matrix: FloatArray) -> FloatArray:

@@ -32,6 +32,8 @@ def test_foreign_adapters_are_refused_and_both_places_named(tmp_path, content):
         (foreign / '__init__.py').write_text(content)
         path = [str(tmp_path), ROOT]
     else:  # a folder without __init__.py is a module too when nothing better is found
+        if 'site-packages' in ROOT:
+            pytest.skip('ours is installed here, and a bare folder never comes before it')
         house = tmp_path / 'house'
         house.mkdir()
         (house / 'sonar_imm').symlink_to(Path(ROOT) / 'sonar_imm')

@@ -32,8 +32,8 @@ class Rig:
                          and self.node.count_subscribers('/bathymetry/estimate'))
 
     def send(self, *messages):
+        received = self.node._meter.received
         for message in messages:
-            received = self.node._meter.received
             before = received.total()
             self.publisher.publish(message)
             self.bench.spin_until(lambda want=before: received.total() > want)

@@ -99,7 +99,8 @@ def test_truth_lies_beside_the_topic_that_was_tracked():
 
 @pytest.mark.parametrize('conjugate', [False, True])
 def test_the_bright_line_of_the_spectrum_is_the_floor(conjugate):
-    scene = simulate(scenario('paper', {'pings': 1, 'last_range': 35.0, 'conjugate': conjugate}), 2)
+    values = {'pings': 1, 'last_range': 35.0, 'conjugate': conjugate}
+    scene = simulate(scenario('paper', values), 2)
     snapshot, truth = scene.measurements[0].measurement, scene.truth[0]
     tracker = BathymetryTracker(BathymetryConfig(conjugate=conjugate))
     profile = profile_of(tracker.process(snapshot)[0], None)

@@ -1,0 +1,92 @@
+"""What goes wrong on difficult floors, and what helps: the same pings without and with the remedy.
+
+    python -m benchmarks.bathymetry_scenes --out docs/results/bathymetry_scenes.json
+
+Prints RMSE of the height over smooth floor, patch and all bins with an echo (m), the overlap of
+the rough patch with the bins labelled rough, and the share of heights within two standard
+deviations. The first two rows are the errata of the paper at work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
+from msg_adapters.estimates import read_estimate
+from sonar_imm.evaluation.bathymetry.profiles import profiles_of
+from sonar_imm.evaluation.bathymetry.scoring import score
+from sonar_imm.recordings.scenes import profile_record
+from sonar_imm.simulation.bathymetry import scenario, simulate
+from sonar_imm.trackers.bathymetry import BathymetryConfig, BathymetryTracker
+
+OPEN = {'shadow_gate': False}
+SLOPE = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
+FLAT = {'patch_std': 0.0, 'slope': 0.1}
+
+# Name: scenario, what it changes, parameters.
+CASES = {
+    'slope .1, constant slope only, paper': ('slope', FLAT, {**SLOPE, 'variant': 'paper'}),
+    'slope .1, constant slope only, corrected': ('slope', FLAT, SLOPE),
+    'slope .1 and patch, height_rw_ncs, paper': (
+        'slope',
+        {},
+        {**OPEN, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN, 'variant': 'paper'},
+    ),
+    'slope .1 and patch, height_rw_ncs, corrected': (
+        'slope',
+        {},
+        {**OPEN, **SLOPE_SET, 'transition_matrix': PAPER_CHAIN},
+    ),
+    'shadows, no gate': ('shadow', {}, OPEN),
+    'shadows, gate': ('shadow', {}, {}),
+    'spikes, no gate': ('spikes', {}, OPEN),
+    'spikes, gate': ('spikes', {}, {}),
+    'multipath, not expected': ('multipath', {}, {}),
+    'multipath, expected': ('multipath', {}, {'multipath': True}),
+    'noise not stated': ('water_column', {}, {}),
+    'Gaussian echoes, Laplace law': ('gaussian', {}, {}),
+    'Gaussian echoes, Gaussian law': ('gaussian', {}, {'likelihood': 'gaussian'}),
+    'Laplace echoes, Gaussian law': ('paper', {}, {'likelihood': 'gaussian'}),
+    'undulating, two walks': ('undulating', {}, {}),
+    'undulating, bank': ('undulating', {}, {'model_set': 'height_bank'}),
+    'roughness correlated, .01 and 1 m': ('correlated', {}, {'sigmas': (0.01, 1.0)}),
+    'roughness correlated, defaults': ('correlated', {}, {}),
+    'roughness correlated, .01 and .15 m': ('correlated', {}, {'sigmas': (0.01, 0.15)}),
+    'bins four times as fine': ('paper', {'bin_width': 0.0125}, {'sigma_reference_bin': 0.05}),
+}
+
+
+def run(name: str, pings: int, seed: int) -> dict:
+    """Scores of one case."""
+    scene_name, changes, values = CASES[name]
+    scene = simulate(scenario(scene_name, {'pings': pings, **changes}), seed)
+    tracker = BathymetryTracker(BathymetryConfig(**values))
+    estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
+    truth = [read_estimate(profile_record(profile)[2]) for profile in scene.truth]
+    return score(profiles_of(estimates, truth))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--pings', type=int, default=60)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
+    options = parser.parse_args()
+    print(f'{options.pings} pings, seed {options.seed}')
+    print(f'{"":46}{"smooth":>8}{"patch":>8}{"all":>8}{"iou":>8}  within 2 sd')
+    results = {}
+    for name in CASES:
+        results[name] = metrics = run(name, options.pings, options.seed)
+        errors = [metrics['height'][place]['rmse_m'] for place in ('smooth', 'patch', 'all')]
+        iou = metrics.get('segmentation', {}).get('iou', float('nan'))
+        cells = ''.join(f'{value:8.3f}' for value in (*errors, iou))
+        print(f'{name:46}{cells}  {metrics["inside_band"]["all"]:.3f}', flush=True)
+    if options.out:
+        run_of = {'pings': options.pings, 'seed': options.seed, 'cases': results}
+        options.out.write_text(json.dumps(run_of, indent=2) + '\n')
+
+
+if __name__ == '__main__':
+    main()

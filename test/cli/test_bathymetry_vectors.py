@@ -1,0 +1,62 @@
+"""The independent vectors through ``track`` on a bag, as a user would run them."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msg_adapters.snapshots import write_snapshot
+from sonar_imm.cli import main
+from sonar_imm.measurements import Snapshot
+from sonar_imm.recordings.writer import BagWriter, ros_message
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
+
+
+def tracked(name, tmp_path, **more):
+    """The case and the columns of its estimate.csv."""
+    with np.load(VECTORS / f'{name}.npz') as archive:
+        case = dict(archive)
+    noise = np.full(len(case['r']), float(case['sn2']))
+    snapshot = Snapshot(stamp_ns=10**9, range=case['r'], iq=case['Y'], noise_variance=noise,
+                        signal_variance=case['rho'] * noise)
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/snapshot', write_snapshot(snapshot, ros_message), 10**9)
+    values = {
+        'sonar_height': float(case['H']), 'tilt_deg': float(np.degrees(case['tilt'])),
+        'element_spacing_wavelengths': float(case['dlam']),
+        'transition_matrix': case['Pi'].ravel().tolist(),
+        'initial_probabilities': case['mu0'].tolist(), 'initial_std': float(case['sd0']),
+        'particles_per_model': 3000, 'shadow_gate': False, **more}
+    if name.startswith('set_iii'):
+        values |= {'model_set': 'angle_two_rw', 'initial_mean': float(case['th0']),
+                   'sigmas_deg': [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()]}
+    else:
+        values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}
+    (tmp_path / 'params.yaml').write_text(json.dumps({'/**': {'ros__parameters': values}}))
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'out'), '--params',
+                 str(tmp_path / 'params.yaml')]) == 0
+    with open(tmp_path / 'out' / 'estimate.csv', newline='') as file:
+        rows = list(csv.DictReader(file))
+    return case, {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}
+
+
+@pytest.mark.parametrize('name', ['set_ii_0', 'set_ii_1', 'set_iii_0', 'set_iii_1'])
+def test_particles_meet_the_exact_filter(name, tmp_path):
+    case, table = tracked(name, tmp_path)
+    state = 'angle' if name.startswith('set_iii') else 'height'
+    error = np.abs(table[state] - case['m'].ravel()) / np.sqrt(case['v'].ravel())
+    assert error.mean() <= 0.035
+    rough = case['mu'].reshape(len(error), 2)[:, 1]
+    assert np.abs(table['prob_rw_rough'] - rough).mean() <= 0.006
+
+
+@pytest.mark.parametrize('name', ['set_ii_0', 'set_iii_0'])
+def test_the_grid_is_the_exact_filter(name, tmp_path):
+    case, table = tracked(name, tmp_path, engine='grid')
+    state = 'angle' if name.startswith('set_iii') else 'height'
+    error = np.abs(table[state] - case['m'].ravel()) / np.sqrt(case['v'].ravel())
+    # What is left is the single precision of the recording, and of the exact filter's own grid.
+    assert error.mean() <= 1e-3

@@ -1,0 +1,39 @@
+"""``check`` with a real bathymetry node."""
+
+import json
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from sonar_imm.cli import main  # noqa: E402
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp('bags') / 'floor'
+    assert main(['simulate', 'bathymetry', str(path), '--seed', '3', '--scenario', 'shadow',
+                 '--set', 'pings=3', '--set', 'last_range=45', '--set', 'shadows=30,33']) == 0
+    return path
+
+
+@pytest.mark.parametrize('parameters', [{}, {'engine': 'grid', 'smoothing': 'states'}])
+def test_live_lockstep_equals_offline(bag, tmp_path, capsys, parameters):
+    params = tmp_path / 'my.yaml'
+    params.write_text(json.dumps({'/**': {'ros__parameters': {'seed': 7, **parameters}}}))
+    assert main(['check', 'bathymetry', '--bag', str(bag), '--params', str(params), '--out',
+                 str(tmp_path), '--json']) == 0
+    outcome, = json.loads(capsys.readouterr().out)
+    assert outcome['good'] and len(outcome['checks']) == 4
+    offline, live = tmp_path / 'floor' / 'offline', tmp_path / 'floor' / 'live'
+    assert (offline / 'estimate.csv').read_bytes() == (live / 'estimate.csv').read_bytes()
+    assert (offline / 'estimate.csv').stat().st_size > 10_000
+
+
+def test_a_limit_that_is_not_reached_exits_with_1(bag, capsys):
+    assert main(['check', 'bathymetry', '--bag', str(bag), '--limit', '0.001']) == 1
+    printed = capsys.readouterr().out
+    assert 'FAIL  height RMSE against truth' in printed
+    assert 'ok    estimates of the node against offline: equal bytes' in printed
