@@ -27,6 +27,7 @@ class InputTopic:
     doubt: gives a reason code to count when a message can be used but deserves a warning.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     one_topic: several topics are several instruments, each for a tracker of its own.
+    companion: says something about another input, known by its name and never enough alone.
     """
 
     name: str
@@ -35,6 +36,7 @@ class InputTopic:
     doubt: Callable[[Any], str | None] = lambda message: None
     scans: bool = False
     one_topic: bool = False
+    companion: bool = False
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
@@ -65,6 +67,6 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         InputTopic('array_depth', 'depth of the deepest phone, from a companion instrument', {
             'geometry_msgs/msg/PointStamped': read_array_depth,
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
-        }),
+        }, companion=True),
     ),
 }
