@@ -30,8 +30,8 @@ def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None
 
     A topic fits when its type can be read and its last name component is the input's name; topics
     below ``/truth`` never do, and companions alone are nothing. `topics` maps topic names to input
-    names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is there, when nothing fits, and
-    when several topics fit an input that is one instrument.
+    names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is
+    there, when nothing fits, and when several topics fit an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
