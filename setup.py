@@ -10,7 +10,7 @@ PACKAGE = 'sonar_imm'
 ROOT = Path(__file__).resolve().parent
 
 # As in sonar_imm/trackers/__init__.py, which cannot be imported before its dependencies are here.
-SYSTEMS = ['bathymetry', 'diver', 'obstacle']
+SYSTEMS = ['bathymetry', 'diver', 'fathometer', 'obstacle']
 
 REQUIRES = [
     'attrs>=23.1',
@@ -31,6 +31,7 @@ EXTRAS = {
     'test': ['filterpy', 'hypothesis', 'pytest>=7.4', 'pytest-benchmark', 'pytest-xdist',
              'stonesoup'],
     'lint': ['mypy', 'ruff'],
+    'segy': ['segyio>=1.9'],
 }
 
 

@@ -68,6 +68,20 @@ def write_true_profile(xyz: ArrayLike, columns: Mapping[str, ArrayLike], *, stam
     return encode_table(table, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
 
 
+def write_true_reflectors(depth: ArrayLike, amplitude: ArrayLike, track_id: ArrayLike, *,
+                          stamp_ns: int, frame_id: str, make: Make) -> Any:
+    """Write the true reflectors of one record as the table ``x y z depth amplitude track_id``.
+
+    depth: (K,) metres, down positive; amplitude, track_id: (K,); zero rows are fine.
+    """
+    z = -np.asarray(depth, np.float64)
+    zero = np.zeros(len(z), np.float32)
+    columns = {'x': zero, 'y': zero, 'z': z.astype(np.float32), 'depth': -z,
+               'amplitude': np.asarray(amplitude, np.float64),
+               'track_id': np.asarray(track_id, np.uint32)}
+    return encode_table(columns, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
+
+
 def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
     """Write one diver as nav_msgs/Odometry.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sonar_imm.measurements import Altitude, Detections, Rejection
+from sonar_imm.measurements import Altitude, ArrayDepth, Detections, Rejection
 
 ON_BOARD = (Altitude, Detections)
 
@@ -24,8 +24,10 @@ class FrameGuard:
     def check(self, measurement: Any) -> None:
         """Raise `Rejection` when `measurement` is in another frame.
 
-        One without a frame passes only until a frame is known.
+        One without a frame passes only until a frame is known. A depth is a depth in any frame.
         """
+        if isinstance(measurement, ArrayDepth):
+            return
         if isinstance(measurement, ON_BOARD):
             guard = self._on_board.setdefault(type(measurement), FrameGuard())
             guard._check(measurement, 'earlier ones')

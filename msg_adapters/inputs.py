@@ -12,6 +12,8 @@ from typing import Any
 
 from attrs import frozen
 
+from .array_depth import read_array_depth
+from .array_records import read_csdm, read_pressure, read_trace
 from .arrivals import read_arrivals
 from .detections import (
     read_detections,
@@ -36,6 +38,7 @@ class InputTopic:
     one_topic: several topics are several instruments, each for a tracker of its own.
     settings: parameters of the tracker that its readers take as keywords, too: how messages are to
     be understood that do not say it themselves.
+    companion: says something about another input, known by its name and never enough alone.
     """
 
     name: str
@@ -51,6 +54,7 @@ class InputTopic:
         """Give the reader of a message type, told everything; `settings` may hold more."""
         told = {name: settings[name] for name in self.settings if name in settings}
         return partial(self.readers[type_name], world_frame=world_frame, **told)
+    companion: bool = False
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
@@ -67,6 +71,21 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
             'sensor_msgs/msg/PointCloud2': read_arrivals,
         }),
+    ),
+    'fathometer': (
+        InputTopic('csdm', 'cross-spectra of a vertical array, one row a frequency', {
+            'sensor_msgs/msg/PointCloud2': read_csdm,
+        }, one_topic=True),
+        InputTopic('pressure', 'pressure at the phones of a vertical array, one row a sample', {
+            'sensor_msgs/msg/PointCloud2': read_pressure,
+        }, one_topic=True),
+        InputTopic('trace', 'ready-made traces, one row a depth', {
+            'sensor_msgs/msg/PointCloud2': read_trace,
+        }, one_topic=True),
+        InputTopic('array_depth', 'depth of the deepest phone, from a companion instrument', {
+            'geometry_msgs/msg/PointStamped': read_array_depth,
+            'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
+        }, companion=True),
     ),
     'obstacle': (
         InputTopic('detections', 'echoes of one ping of a forward-looking sonar, also none', {

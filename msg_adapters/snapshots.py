@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sonar_imm.measurements import Rejection, Snapshot
 
 from .headers import Make, stamp_ns
-from .table import decode_table, encode_table, scalar_column
+from .table import constant_column, decode_table, encode_table, scalar_column
 
 CONSTANTS = ('sound_speed', 'frequency', 'element_spacing', 'sample_rate')
 VARIANCES = ('noise_variance', 'signal_variance')
@@ -40,7 +40,7 @@ def read_snapshot(message: Any, *, world_frame: str = 'enu') -> Snapshot:
     if 'iq' not in columns:
         raise Rejection('missing_column', 'a table of snapshots needs the column iq')
     iq = _complex(columns['iq'])
-    constants = {name: _constant(columns, name) for name in CONSTANTS}
+    constants = {name: constant_column(columns, name) for name in CONSTANTS}
     ranges, time = _ranges(columns, constants['sound_speed'])
     return Snapshot(
         stamp_ns=stamp_ns(message),
@@ -95,20 +95,6 @@ def _organised(columns: dict[str, NDArray], bins: int, staves: int) -> dict[str,
         if name not in ('re', 'im') and column.ndim == 1
     }
     return {**single, 'iq': np.stack(parts, axis=-1).reshape(bins, 2 * staves)}
-
-
-def _constant(columns: dict[str, NDArray], name: str) -> float | None:
-    """Give the one value of a column that holds for the whole ping; None when it is not known."""
-    if name not in columns:
-        return None
-    values = scalar_column(columns, name)
-    known = values[~np.isnan(values)]
-    if not len(known):
-        return None
-    if (known != known[0]).any():
-        raise Rejection('not_constant', f'column {name} changes within the ping')
-    # Drivers leave 0 in what they do not know.
-    return float(known[0]) or None
 
 
 def _ranges(

@@ -108,6 +108,24 @@ def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float
     return column.astype(np.float64)
 
 
+def constant_column(columns: Mapping[str, NDArray], name: str, *, zero_is_known: bool = False
+                    ) -> float | None:
+    """Give the one value of a column that holds for the whole message; None when it is not known.
+
+    NaN is unknown; so is 0, which drivers leave in what they do not know, unless `zero_is_known`.
+    Raises `Rejection` when the value changes from row to row.
+    """
+    if name not in columns:
+        return None
+    values = scalar_column(columns, name)
+    known = values[~np.isnan(values)]
+    if not len(known):
+        return None
+    if (known != known[0]).any():
+        raise Rejection('not_constant', f'column {name} changes within the message')
+    return float(known[0]) if zero_is_known else float(known[0]) or None
+
+
 def require_columns(columns: Mapping[str, NDArray], names: tuple[str, ...], what: str) -> None:
     """Raise `Rejection` naming the columns that are missing from a table of `what`."""
     if missing := [name for name in names if name not in columns]:

@@ -14,21 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .acoustics.variances import usable_bins
+from .fathometer_measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from .measurement_checks import check_stamp, FloatArray, floats, Rejection
 from .obstacle_measurements import Altitude, Detections, Navigation
 
 __all__ = [
     'Altitude',
+    'ArrayDepth',
     'Arrivals',
     'check_covariance',
     'check_stamp',
+    'CrossSpectra',
     'Detections',
     'Fix',
     'FloatArray',
     'Measurement',
     'Navigation',
+    'Pressure',
     'Rejection',
     'Snapshot',
+    'Trace',
 ]
 
 
@@ -74,6 +79,8 @@ class Fix:
         if self.covariance is not None:
             covariance = floats(2, 2)(self.covariance)
             check_covariance(covariance, 'a fix')
+            covariance = 0.5 * covariance + 0.5 * covariance.T
+            covariance.flags.writeable = False
             object.__setattr__(self, 'covariance', covariance)
 
 
@@ -265,4 +272,15 @@ _SNAPSHOT_LIMITS = (
     ('spacing_wavelengths', 0.01, 100.0, 'wavelengths'),
 )
 
-Measurement = Fix | Arrivals | Snapshot | Detections | Navigation | Altitude
+Measurement = (
+    Fix
+    | Arrivals
+    | Snapshot
+    | Trace
+    | CrossSpectra
+    | Pressure
+    | ArrayDepth
+    | Detections
+    | Navigation
+    | Altitude
+)

@@ -4,6 +4,12 @@ import importlib.util
 import os
 import tempfile
 
+import hypothesis
+
+# The same examples in every run: what fails here fails everywhere, and nowhere by chance.
+hypothesis.settings.register_profile('same', derandomize=True, deadline=None)
+hypothesis.settings.load_profile('same')
+
 # Messages check what is put into them only when asked to, and only at their import.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='sonar_imm_ros_log_')

@@ -51,8 +51,9 @@ FLOORS = {
     'sonar_imm.estimation': 0,
     'sonar_imm.acoustics': 1,
     'sonar_imm.parameters': 2,
-    'sonar_imm.measurements': 2,
     'sonar_imm.measurement_checks': 2,
+    'sonar_imm.fathometer_measurements': 2,
+    'sonar_imm.measurements': 2,
     'sonar_imm.obstacle_measurements': 2,
     'sonar_imm.estimates': 2,
     'msg_adapters': 3,
@@ -66,9 +67,11 @@ FLOORS = {
 SIDE_BY_SIDE = {('msg_adapters', 'sonar_imm.trackers'), ('sonar_imm.trackers', 'msg_adapters')}
 ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
 
-# Other libraries that `sonar-imm bench` measures when they are there; they come with [test].
+# Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
+# those that some commands need, each with an extra of its own.
 PEERS = {'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
-         'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'}}
+         'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'},
+         'sonar_imm.recordings.convert_segy': {'segyio'}}
 
 # Path below the root: why it may exceed 400 lines.
 LONG_FILES: dict[str, str] = {

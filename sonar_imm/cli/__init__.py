@@ -92,6 +92,7 @@ def missing_package(name: str) -> str | None:
     """How to come by a package that only some commands need; None for one that all need."""
     remedies = {
         'rclpy': "ROS 2 is not here: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
+        'segyio': "segyio, which reads SEG-Y, is not here: pip install 'sonar_imm[segy]'",
         'filterpy': "FilterPy is not here: pip install 'sonar_imm[test]'",
     }
     return remedies.get(name)

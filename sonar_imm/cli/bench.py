@@ -62,5 +62,6 @@ def _measure(system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
 
 def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
     from ..nodes.harness import run_lockstep
-    from .checking import shipped_bags
-    return run_lockstep(bag or shipped_bags(system)[0], system).latency_ms()
+    from .checking import own_parameters, shipped_bags
+    bag = bag or shipped_bags(system)[0]
+    return run_lockstep(bag, system, params_file=own_parameters(bag)).latency_ms()

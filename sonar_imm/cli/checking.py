@@ -22,6 +22,9 @@ from .common import load_config, progress
 from .evaluate import evaluate_run
 from .track import track_recording
 
+OWN_PARAMETERS = 'parameters.yaml'
+"""Beside the files of a bag: what a tracker has to be told to make sense of it."""
+
 
 @frozen
 class Outcome:
@@ -57,14 +60,22 @@ def shipped_bags(system: str) -> list[Path]:
     return found
 
 
+def own_parameters(bag: Path) -> Path | None:
+    """The parameter file that a recording brings along, as one of an unusual array may have to;
+    None without."""
+    path = bag / OWN_PARAMETERS
+    return path if path.is_file() else None
+
+
 def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None = None,
                     limit: float | None = None, quiet: bool = False) -> Outcome:
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
-    limit: error to stay within, in the unit of the system; None for that of the shipped
-    recordings.
+    params: None for those that the recording brings along, if any. limit: error to stay within, in
+    the unit of the system; None for that of the shipped recordings.
     Raises `BagError`, `ConfigError` and `LinkError`.
     """
+    params = params or own_parameters(bag)
     config, node = load_config(SYSTEMS[system], params, {})
     options = InputOptions(frame_id=node.frame_id, world_frame=node.world_frame_convention)
     run = track_recording(bag, folder / 'offline', SYSTEMS[system], config, options,

@@ -256,3 +256,51 @@ def images(source: Path, out_bag: Path, overrides: dict[str, str], as_json: bool
     from msg_adapters.sonar_images import DetectorConfig
     _convert('images', source, out_bag, as_json,
              parameters=typed_overrides(DetectorConfig, overrides), **values)
+
+
+@command.command('segy', epilog=example(
+    'sonar-imm convert segy line.seg line.bag',
+    'sonar-imm convert segy line.seg line.bag --sample-spacing 0.376 --first-sample 12'))
+@click.argument('source', metavar='IN', type=FILE)
+@click.argument('out_bag', type=BAG_OUT)
+@click.option('--sample-spacing', type=click.FloatRange(min=0.0, min_open=True), metavar='METRES',
+              help='Depth from sample to sample; by default from the sample interval.')
+@click.option('--sound-speed', type=click.FloatRange(min=1300.0, max=1700.0), default=1500.0,
+              show_default=True, help='For the sample interval and the recording delay.')
+@click.option('--first-sample', type=click.IntRange(min=0), default=0, show_default=True,
+              help='Leave out what comes before, such as the transmit pulse.')
+@click.option('--samples', type=click.IntRange(min=2), help='How many to take; all by default.')
+@click.option('--stack', type=click.IntRange(min=1), default=1, show_default=True,
+              help='Traces averaged to one.')
+@click.option('--depth', 'depth_offset', type=float, default=0.0, show_default=True,
+              metavar='METRES', help='Depth of the transducer.')
+@click.option('--frame-id', default='profiler', show_default=True, help='Frame of the traces.')
+@storage_option
+@json_option
+def segy(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
+    """Traces of a sub-bottom profiler in SEG-Y to /trace. Needs segyio.
+
+    Stamps come from the trace headers; traces within one second are spread over it.
+    """
+    _convert('segy', source, out_bag, as_json, **values)
+
+
+@command.command('traces', epilog=example(
+    'sonar-imm convert traces responses.npz drift.bag --rate 0.0112',
+    'sonar-imm convert traces traces.csv line.bag --column depth=z'))
+@click.argument('source', metavar='IN', type=FILE)
+@click.argument('out_bag', type=BAG_OUT)
+@csv_options()
+@click.option('--rate', type=click.FloatRange(min=1e-6, max=1e6), default=1.0, show_default=True,
+              help='Traces a second, where an archive has no stamps.')
+@click.option('--frame-id', default='array', show_default=True, help='Frame of the traces.')
+@storage_option
+@json_option
+def traces(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
+    """Traces in a numpy archive (npz) or CSV to /trace.
+
+    Archive: depth (n,), amplitude (n,) or (traces, n); optional stamp, sigma, reference_depth, and
+    as truth reflector_depth and reflector_amplitude (traces, K). CSV: stamp, depth, amplitude and
+    optional std, one row a sample.
+    """
+    _convert('traces', source, out_bag, as_json, options=_options(values), **values)

@@ -34,6 +34,7 @@ def command(system: str, out_bag: Path | None, scenario: str | None, seed: int,
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
     from ..recordings.scenes import write_scene
+    from ..simulation.scene import TrueTrack
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
@@ -41,13 +42,15 @@ def command(system: str, out_bag: Path | None, scenario: str | None, seed: int,
         'source': f'simulated: {system} {name}', 'seed': str(seed),
         'sonar_imm': __version__,
         **{f'set {key}': value for key, value in sorted(overrides.items())}})
+    targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
     result = {'bag': str(out_bag), 'scenario': name, 'seed': seed, 'messages': report.messages,
-              'targets': len(scene.truth)}
+              'targets': targets}
     if as_json:
         print_json(result)
         return
     what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
-    say(f'{out_bag}: {what} ({name}, seed {seed}, {len(scene.truth)} targets)')
+    say(f'{out_bag}: {what} ({name}, seed {seed}'
+        + (f', {targets} targets)' if targets else ')'))
 
 
 def _list(scenes: Any, as_json: bool) -> None:

@@ -15,6 +15,7 @@ from attrs import frozen
 BENCHES = {
     'bathymetry': 'sonar_imm.evaluation.bathymetry.bench',
     'diver': 'sonar_imm.evaluation.diver.bench',
+    'fathometer': 'sonar_imm.evaluation.fathometer.bench',
     'obstacle': 'sonar_imm.evaluation.obstacle.bench',
 }
 """Module by system. A new system adds its line here."""

@@ -87,7 +87,8 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     if _is_truth(item.topic):
         return []
     return [(system, entry) for system, entries in INPUTS.items() for entry in entries
-            if item.type_name in entry.readers]
+            if item.type_name in entry.readers
+            and (not entry.companion or item.topic.split('/')[-1] == entry.name)]
 
 
 def _is_truth(topic: str) -> bool:
@@ -159,4 +160,7 @@ def _systems(topics: list[dict[str, Any]]) -> dict[str, dict[str, list[str]]]:
         for suited in topic['suits']:
             system, name = suited.split(' ')
             systems.setdefault(system, {}).setdefault(name, []).append(topic['name'])
-    return systems
+    companions = {(system, entry.name) for system, entries in INPUTS.items() for entry in entries
+                  if entry.companion}
+    return {system: found for system, found in systems.items()
+            if any((system, name) not in companions for name in found)}

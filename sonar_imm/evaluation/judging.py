@@ -27,6 +27,7 @@ TRUTH_GAP = 60.0
 JUDGES = {
     'bathymetry': 'sonar_imm.evaluation.bathymetry',
     'diver': 'sonar_imm.evaluation.diver',
+    'fathometer': 'sonar_imm.evaluation.fathometer',
     'obstacle': 'sonar_imm.evaluation.obstacle',
 }
 """Module by system. A new system adds its line here."""

@@ -25,6 +25,8 @@ from ..recordings.reader import BagReader
 from ..trackers import System
 from . import SECOND
 
+TO_THE_END = 2**62
+
 
 @frozen(kw_only=True)
 class InputOptions:
@@ -89,7 +91,9 @@ def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estim
 
 
 def window_ns(config: Config) -> int:
-    """How far back late input can change the estimates of a tracker."""
+    """How far back later input can change the estimates of a tracker."""
+    if getattr(config, 'smoothing_lag', 0):
+        return TO_THE_END  # so many records, and records come at any rate
     return round(getattr(config, 'history', 0.0) * SECOND)
 
 

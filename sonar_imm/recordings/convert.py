@@ -20,14 +20,17 @@ from .conversion import ConversionReport, Record, write_bag
 from .convert_arrivals import convert_arrivals
 from .convert_autoferry import convert_autoferry
 from .convert_images import convert_images
+from .convert_segy import convert_segy
 from .convert_snapshots import convert_snapshots
+from .convert_traces import convert_traces
 from .convert_truth import convert_truth, truth_records
 from .csv_table import CsvOptions, CsvTable, Row
 from .local_frame import LocalFrame
 from .messages import ros_message
 
 __all__ = ['convert_arrivals', 'convert_autoferry', 'convert_fixes', 'convert_images',
-           'convert_snapshots', 'convert_truth', 'ConversionReport', 'CsvOptions', 'KINDS']
+           'convert_segy', 'convert_snapshots', 'convert_traces', 'convert_truth',
+           'ConversionReport', 'CsvOptions', 'KINDS']
 
 
 def convert_fixes(path: str | Path, out: str | Path, *, options: CsvOptions | None = None,
@@ -86,5 +89,7 @@ KINDS: dict[str, Callable[..., ConversionReport]] = {
     'autoferry': convert_autoferry,
     'snapshots': convert_snapshots,
     'images': convert_images,
+    'segy': convert_segy,
+    'traces': convert_traces,
 }
 """The converters by the name that the command gives them."""

@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
-import zipfile
-import zlib
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +22,7 @@ from sonar_imm.simulation.scene import TrueProfile
 
 from .conversion import ConversionReport, Record, write_bag
 from .messages import ros_message
+from .npz import read_npz
 from .scenes import profile_record
 from .sources import BagError
 
@@ -95,7 +94,7 @@ class _Archive:
         self.path = Path(path)
         if unknown := [name for name in names if name not in NAMES]:
             raise BagError(f"nothing is called '{unknown[0]}'; there are {', '.join(NAMES)}")
-        there = _arrays(self.path)
+        there = read_npz(self.path)
         wanted = {what: (names[what],) if what in names else NAMES[what] for what in NAMES}
         self._arrays: dict[str, NDArray] = {}
         for what, candidates in wanted.items():
@@ -137,20 +136,6 @@ class _Archive:
         if row.shape != (bins,):
             raise Rejection('bad_shape', f'{what} has the shape {value.shape} for {bins} bins')
         return row
-
-
-def _arrays(path: Path) -> dict[str, NDArray]:
-    """Every array of an archive by name."""
-    try:
-        with path.open('rb') as file:
-            if not zipfile.is_zipfile(file):
-                raise BagError(f'{path} is no numpy archive (npz)')
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except OSError as error:
-        raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
-    except (ValueError, EOFError, zlib.error, zipfile.BadZipFile):
-        raise BagError(f'{path} is damaged, or holds more than plain arrays') from None
 
 
 def _samples(content: _Archive, staves: Sequence[Sequence[int]] | None) -> NDArray:

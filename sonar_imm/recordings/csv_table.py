@@ -52,6 +52,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'var_toa': ('var_toa', 'toa_variance', 'var_arrival'),
     'std_toa': ('std_toa', 'sigma_toa', 'std_arrival', 'sigma_arrival'),
     'bearing': ('bearing', 'azimuth', 'doa'),
+    'amplitude': ('amplitude', 'amp', 'response', 'value'),
     'var_bearing': ('var_bearing',),
     'std_bearing': ('std_bearing', 'sigma_bearing'),
 }

@@ -30,16 +30,16 @@ def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None
     """Say which topics of `bag` feed the tracker `system`: input by topic name.
 
     A topic fits when its type can be read and its last name component is the input's name; topics
-    below ``/truth`` never do. `topics` maps topic names to input names instead, e.g.
-    ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is there, when nothing fits, and
-    when several topics fit an input that is one instrument.
+    below ``/truth`` never do, and companions alone are nothing. `topics` maps topic names to input
+    names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is
+    there, when nothing fits, and when several topics fit an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
     fitting = {topic.name: entry for topic in bag.topics for entry in INPUTS[system]
                if _can_read(topic, entry) and topic.name.split('/')[-1] == entry.name
                and 'truth' not in topic.name.split('/')[:-1]}
-    if not fitting:
+    if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
     for entry in INPUTS[system]:
         names = [name for name, its in fitting.items() if its is entry]
@@ -107,7 +107,8 @@ def _nothing_fits(bag: BagReader, system: str) -> str:
         return f'{bag.path} is empty: it has no topics'
     there = ', '.join(f'{topic.name} ({topic.type_name})' for topic in bag.topics)
     maybe = [f'{topic.name} as {entry.name}' for topic in bag.topics for entry in INPUTS[system]
-             if _can_read(topic, entry) and 'truth' not in topic.name.split('/')]
+             if _can_read(topic, entry) and not entry.companion
+             and 'truth' not in topic.name.split('/')]
     hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''
     return (f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
             f'there are {there}{hint}')

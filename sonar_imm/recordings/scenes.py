@@ -12,23 +12,29 @@ from typing import Any
 
 import numpy as np
 
+from msg_adapters.array_depth import write_array_depth
+from msg_adapters.array_records import write_csdm, write_pressure, write_trace
 from msg_adapters.arrivals import write_arrivals
 from msg_adapters.detections import write_detections
-from msg_adapters.estimates import write_true_profile
+from msg_adapters.estimates import write_true_profile, write_true_reflectors
 from msg_adapters.fixes import write_fix
 from msg_adapters.navigation import write_navigation, write_range
 from msg_adapters.snapshots import write_snapshot
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import (
     Altitude,
+    ArrayDepth,
     Arrivals,
+    CrossSpectra,
     Detections,
     Fix,
     Navigation,
+    Pressure,
     Snapshot,
+    Trace,
 )
 from sonar_imm.simulation.obstacle import TrueObstacle
-from sonar_imm.simulation.scene import Scene, TrueProfile, TrueTrack
+from sonar_imm.simulation.scene import Scene, TrueProfile, TrueReflectors, TrueTrack
 
 from .conversion import ConversionReport, Record
 from .convert_truth import track_records, TRUTH_TOPIC
@@ -63,6 +69,19 @@ def profile_record(profile: TrueProfile) -> Record:
     return profile.stamp_ns, prefix + _namespaced(profile.namespace, f'/{name}'), message
 
 
+def reflectors_record(true: TrueReflectors) -> Record:
+    """The message of the true reflectors of one record."""
+    message = write_true_reflectors(
+        true.depth,
+        true.amplitude,
+        true.track_id,
+        stamp_ns=true.stamp_ns,
+        frame_id=true.frame_id,
+        make=ros_message,
+    )
+    return true.stamp_ns, TRUTH_TOPIC, message
+
+
 def _namespaced(namespace: str, topic: str) -> str:
     return f'/{namespace}{topic}' if namespace else topic
 
@@ -88,6 +107,10 @@ MEASUREMENTS: dict[type, tuple[str, Callable[..., Any]]] = {
     Detections: ('/detections', write_detections),
     Navigation: ('/nav', write_navigation),
     Altitude: ('/altitude', write_range),
+    CrossSpectra: ('/csdm', write_csdm),
+    Pressure: ('/pressure', write_pressure),
+    Trace: ('/trace', write_trace),
+    ArrayDepth: ('/array_depth', write_array_depth),
 }
 """Topic and writer ``(measurement, make) -> message`` by class of measurement."""
 
@@ -95,6 +118,7 @@ TRUTHS: dict[type, Callable[[Any, str], Iterable[Record]]] = {
     TrueTrack: true_track_records,
     TrueProfile: lambda profile, frame_id: [profile_record(profile)],
     TrueObstacle: true_obstacle_records,
+    TrueReflectors: lambda true, frame_id: [reflectors_record(true)],
 }
 """Writer ``(truth, frame_id) -> records`` by class of truth."""
 

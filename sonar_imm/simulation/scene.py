@@ -54,6 +54,18 @@ class TrueProfile:
 
 
 @frozen(eq=False)
+class TrueReflectors:
+    """The reflectors that one record really had: track_id (n,), depth (n,) m, amplitude (n,) of
+    reflection."""
+
+    stamp_ns: int
+    frame_id: str
+    track_id: NDArray[np.uint32]
+    depth: FloatArray
+    amplitude: FloatArray
+
+
+@frozen(eq=False)
 class Scene:
     """measurements in the order in which they were received; truth, e.g. one track a target
     or one profile a ping.

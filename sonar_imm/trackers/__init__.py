@@ -99,6 +99,13 @@ SYSTEMS = {
         'divers from multistatic fixes or raw arrival times, 16-direction IMM',
         smoother='sonar_imm.trackers.diver_smoothing.SmoothingDiverTracker',
     ),
+    'fathometer': System(
+        'fathometer',
+        'sonar_imm.trackers.fathometer',
+        'FathometerConfig',
+        'FathometerTracker',
+        'sub-bottom reflectors from array noise or traces, multiple-model particle filter',
+    ),
     'obstacle': System(
         'obstacle',
         'sonar_imm.trackers.obstacle',

@@ -100,3 +100,9 @@ def test_an_empty_recording_is_no_trouble(tmp_path):
         pass
     result, _ = found(tmp_path / 'bag')
     assert result['messages'] == 0 and result['duration_s'] == 0.0
+
+
+def test_a_companion_counts_by_its_name_and_not_alone(tmp_path):
+    alone, topics = found(write_dive(tmp_path / 'alone', topic='/array_depth', truth=False))
+    assert 'fathometer array_depth' in topics['/array_depth']['suits']
+    assert 'fathometer' not in alone['systems']

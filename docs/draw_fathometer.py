@@ -1,0 +1,283 @@
+"""Draw the figures of docs/fathometer.md from runs: python docs/draw_fathometer.py
+
+Needs matplotlib, which nothing else here does, and for the real lines segyio and the recordings
+(SONAR_IMM_DATA). Run it from the project root.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import sys
+import tempfile
+
+import matplotlib
+import numpy as np
+
+matplotlib.use('Agg')
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from matplotlib import pyplot as plt  # noqa: E402
+
+from sonar_imm.acoustics import fathometer  # noqa: E402
+from sonar_imm.evaluation.fathometer.records import records_of  # noqa: E402
+from sonar_imm.recordings.convert import convert_segy  # noqa: E402
+from sonar_imm.recordings.measurements import measurements_of  # noqa: E402
+from sonar_imm.recordings.reader import BagReader  # noqa: E402
+from sonar_imm.simulation.fathometer import scenario, simulate  # noqa: E402
+from sonar_imm.trackers.fathometer import FathometerConfig, FathometerTracker  # noqa: E402
+
+IMAGES = ROOT / 'docs' / 'images'
+DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'
+LINES = ('MET_NS-SN_SBP_L9_SN_20180313161627.seg', 'MET_EW-WE_SBP_L2_EW_20180313171011.seg')
+PROFILER = FathometerConfig(
+    pulse='gaussian',
+    pulse_width=0.8,
+    noise_sigma=2500.0,
+    depth_min=4.5,
+    depth_max=32.0,
+    order_max=4,
+    depth_std=0.2,
+    min_separation=2.4,
+    amplitude_std_sigmas=8.0,
+    particles=5000,
+)
+BLUE, RED, GREEN, AMBER, INK = '#0072B2', '#D55E00', '#009E73', '#E69F00', '#1b2733'
+COLOURS = (BLUE, RED, GREEN, '#CC79A7', AMBER, '#56B4E9')
+
+
+def main() -> None:
+    plt.rcParams.update({'font.size': 9, 'axes.spines.top': False, 'axes.spines.right': False})
+    draw_conventions()
+    scene = simulate(scenario('drift_traces'), 3)
+    traces = [one.measurement for one in scene.measurements]
+    draw_tracks(traces, scene.truth)
+    draw_fixed_orders(traces, scene.truth)
+    if DATA.exists():
+        draw_lines()
+
+
+def save(figure, name: str) -> None:
+    figure.tight_layout()
+    figure.savefig(IMAGES / name, dpi=80, pil_kwargs={'optimize': True})
+    print(IMAGES / name)
+
+
+def track(traces, config):
+    """Records and responses (depths, records) in units of the noise."""
+    tracker, records, columns = FathometerTracker(config), [], []
+    for trace in traces:
+        records += tracker.process(trace)
+        columns.append(tracker.response.amplitude / tracker.response.sigma)
+    return records_of(records), np.array(columns).T, tracker.response.depth
+
+
+def draw_conventions() -> None:
+    """The geometry; where the echo lands as implemented and as printed; loading."""
+    figure, (left, middle, right) = plt.subplots(
+        1, 3, figsize=(12, 3.6), width_ratios=(0.8, 1.3, 1.3)
+    )
+    _draw_geometry(left)
+    scene = simulate(
+        scenario(
+            'drift_spectra',
+            {
+                'records': 1,
+                'layers': 1,
+                'appearing': (),
+                'fading': (),
+                'snapshot_seconds': 0.35,
+                'snapshots': 256,
+                'heave': 0.0,
+                'array_depth_std': 0.0,
+                'phone_noise': 1e-4,
+                'ship_noise': 0.0,
+            },
+        ),
+        1,
+    )
+    one, H = scene.measurements[0].measurement, float(scene.truth[0].depth[0] - 73.5)
+    w = fathometer.steering(one.frequency, 0.18 * np.arange(one.phones), 1500.0)
+    csdm = one.csdm.astype(np.complex128)
+    comb = float(one.frequency[0]), float(one.frequency[1] - one.frequency[0])
+    z = np.linspace(-80.0, 80.0, 6401)
+
+    def response(gamma):
+        return fathometer.depth_response(gamma, *comb, (z[0], z[1] - z[0], len(z)), 0.0, 1500.0)
+
+    gamma = fathometer.coherence(csdm, w, 'mvdr')
+    time = 2e3 * z / 1500.0
+    middle.plot(time, response(gamma), color=BLUE, lw=0.8, label='as implemented')
+    middle.plot(
+        time, response(gamma.conj()) - 0.1, color=RED, lw=0.8, label='conjugate, as printed'
+    )
+    middle.axvline(2e3 * H / 1500.0, color=INK, ls=':', lw=1)
+    middle.set(xlabel='time [ms]; dotted: +2 H / c', ylabel='response', title='Where the echo is')
+    middle.legend(frameon=False, loc='center left')
+    loadings = np.geomspace(1e-3, 10.0, 13)
+    here = int(np.argmin(np.abs(z - H)))
+    right.semilogx(
+        loadings,
+        [response(fathometer.coherence(csdm, w, 'mvdr', loading=eps))[here] for eps in loadings],
+        'o-',
+        color=BLUE,
+        ms=3,
+        label='loaded throughout',
+    )
+    right.semilogx(
+        loadings,
+        [response(_unloaded_middle(csdm, w, eps))[here] for eps in loadings],
+        'o-',
+        color=RED,
+        ms=3,
+        label='plain R between loaded weights',
+    )
+    right.axhline(0.0, color=INK, lw=0.6)
+    right.set(xlabel='loading', ylabel='response at the layer', title='MVDR: the sign of the echo')
+    right.legend(frameon=False)
+    save(figure, 'fathometer_conventions.png')
+
+
+def _unloaded_middle(csdm, w, eps):
+    """The same MVDR with the plain matrix between the loaded weights, its sign turned alike."""
+    power = np.einsum('fmm->f', csdm).real / csdm.shape[-1]
+    loaded = csdm + (eps * power)[:, None, None] * np.eye(csdm.shape[-1])
+    solved = np.linalg.solve(loaded, np.stack([w, w.conj()], axis=-1))
+    up, down = (
+        solved[..., k] / np.einsum('fm,fm->f', v.conj(), solved[..., k])[:, None]
+        for k, v in enumerate((w, w.conj()))
+    )
+
+    def form(a, b):
+        return np.einsum('fm,fmn,fn->f', a.conj(), csdm, b)
+
+    return 1j * form(down, up) / np.sqrt(form(up, up).real * form(down, down).real)
+
+
+def _draw_geometry(axes) -> None:
+    heights = np.linspace(0.0, 3.0, 7)
+    axes.plot(np.zeros(7), heights, 'o', color=INK, ms=5)
+    axes.axhline(7.0, color=BLUE, lw=2)
+    axes.axhline(-5.0, color=AMBER, lw=3)
+    axes.annotate('', (0.5, 3.2), (0.5, 6.8), arrowprops={'arrowstyle': '->', 'color': BLUE})
+    axes.text(0.6, 5.0, 'noise going down\np = w = exp(+i k h$_m$)', color=BLUE, fontsize=8)
+    axes.annotate('', (0.5, -0.3), (0.5, -4.8), arrowprops={'arrowstyle': '->', 'color': RED})
+    axes.text(0.6, -3.2, 'echo: a exp(-i k (h$_m$ + 2 H))', color=RED, fontsize=8)
+    axes.annotate('', (-0.5, -5.0), (-0.5, 0.0), arrowprops={'arrowstyle': '<->'})
+    axes.text(-0.8, -2.6, 'H')
+    axes.text(-1.9, -0.3, 'phone 0,\nz$_{ref}$', fontsize=8)
+    axes.text(-1.9, 2.6, 'phone M-1', fontsize=8)
+    axes.text(-1.9, 7.2, 'surface', color=BLUE, fontsize=8)
+    axes.text(-1.9, -5.9, 'layer: z = z$_{ref}$ + c t / 2', color=AMBER, fontsize=8)
+    axes.set(xlim=(-2.0, 3.4), ylim=(-6.3, 8.0), title='Depth is positive downwards')
+    axes.axis('off')
+
+
+def _draw_image(axes, value, extent, vmax=12.0) -> None:
+    axes.imshow(value, aspect='auto', cmap='gray_r', vmin=0.0, vmax=vmax, extent=extent)
+
+
+def _draw_found(axes, records, size=2.0) -> None:
+    for k, record in enumerate(records):
+        axes.scatter(
+            np.full(len(record.found), k),
+            record.found.depth,
+            s=size,
+            linewidths=0,
+            c=[COLOURS[int(i) % len(COLOURS)] for i in record.found.track_id],
+        )
+
+
+def draw_tracks(traces, truth) -> None:
+    """As the paper's Figures 1 and 2: response and tracks, amplitudes, number of reflectors."""
+    records, value, depth = track(traces, FathometerConfig())
+    figure, axes = plt.subplots(3, 1, figsize=(10, 10), height_ratios=(2.2, 1.2, 1.0), sharex=True)
+    extent = (-0.5, len(records) - 0.5, depth[-1], depth[0])
+    _draw_image(axes[0], value, extent)
+    _draw_found(axes[0], records)
+    axes[0].set(ylabel='depth [m]', title='Depth response, and reflectors by identity')
+    for track_id in sorted({int(i) for r in records for i in r.found.track_id}):
+        place = [
+            (k, float(r.found.strength[r.found.track_id == track_id][0]))
+            for k, r in enumerate(records)
+            if track_id in r.found.track_id
+        ]
+        axes[1].plot(*zip(*place), lw=1, color=COLOURS[track_id % len(COLOURS)])
+    axes[1].set(ylabel='relative amplitude')
+    pmf = np.array([record.pmf for record in records]).T
+    axes[2].imshow(
+        pmf,
+        aspect='auto',
+        cmap='Blues',
+        origin='lower',
+        vmin=0.0,
+        vmax=1.0,
+        extent=(-0.5, len(records) - 0.5, 0.5, len(pmf) + 0.5),
+    )
+    axes[2].step(
+        range(len(truth)), [len(one.depth) for one in truth], color=RED, lw=1, where='mid'
+    )
+    axes[2].set(xlabel='record', ylabel='number of reflectors', title='Probability; red: truth')
+    save(figure, 'fathometer_tracks.png')
+
+
+def draw_fixed_orders(traces, truth) -> None:
+    """As the paper's Figure 3: what a bootstrap filter of a fixed order makes of the same."""
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), sharey=True)
+    for order, one in zip((7, 8, 9), axes):
+        config = FathometerConfig(order_min=order, order_max=order, proposal='prior')
+        records, value, depth = track(traces, config)
+        _draw_image(one, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]))
+        _draw_found(one, records, 1.5)
+        one.set(xlabel='record', title=f'fixed order {order}, bootstrap')
+    axes[0].set_ylabel('depth [m]')
+    save(figure, 'fathometer_fixed_order.png')
+
+
+def draw_lines() -> None:
+    """The tracks over the two real lines, and how much of the bottom they follow."""
+    figure, axes = plt.subplots(2, 1, figsize=(10, 7))
+    for name, one in zip(LINES, axes):
+        with tempfile.TemporaryDirectory() as folder:
+            convert_segy(
+                DATA / name,
+                Path(folder) / 'bag',
+                sample_spacing=0.376,
+                first_sample=12,
+                samples=108,
+                stack=4,
+            )
+            with BagReader(Path(folder) / 'bag') as bag:
+                traces = [heard.measurement for heard in measurements_of(bag, 'fathometer')]
+        records, value, depth = track(traces, PROFILER)
+        _draw_image(one, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]), 10.0)
+        _draw_found(one, records, 4.0)
+        one.set(
+            ylabel='depth [m]', title=f'{name.split("_")[3]}: {_followed(records, value, depth)}'
+        )
+    axes[1].set_xlabel('trace, four averaged to one')
+    save(figure, 'fathometer_chiapas.png')
+
+
+def _followed(records, value, depth) -> str:
+    """How many records have a reflector at the first arrival, which is picked without a tracker:
+    the first local maximum above half of the greatest response of the record."""
+    hits, ids, below = 0, set(), 0
+    for column, record in zip(value.T, records):
+        strong = column > 0.5 * column.max()
+        first = int(np.argmax(strong))
+        peak = first + int(np.argmax(column[first : first + round(1.5 / (depth[1] - depth[0]))]))
+        away = np.abs(record.found.depth - depth[peak])
+        if len(away) and away.min() < 1.0:
+            hits += 1
+            ids.add(int(record.found.track_id[np.argmin(away)]))
+            below += bool((record.found.depth > depth[peak] + 1.5).any())
+    return (
+        f'bottom followed in {100 * hits / len(records):.0f} % of the records under '
+        f'{len(ids)} ids, one or more below it in {100 * below / len(records):.0f} %'
+    )
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,176 @@
+"""What the fathometer hears of a vertical array, and ready-made traces, as tables.
+
+``csdm``, one row a frequency: ``frequency`` f4 [Hz]; ``csdm`` f4 x 2N^2, the matrix of N phones
+row by row, real and imaginary parts in turn, phone 0 the deepest; optional ``snapshots`` u4, the
+same in every row.
+
+``pressure``, one row a sample: ``p`` f4 x N, or i2 x N with ``scale`` f4; ``sample_rate`` f4 [Hz].
+The stamp is that of the first sample.
+
+``trace``, one row a depth: ``depth`` f4 [m, down positive]; ``amplitude`` f4; optional ``sigma``
+f4, the standard deviation of its noise.
+
+Each may say how deep phone 0 was, the same in every row: ``array_depth`` f4 [m, down positive];
+``csdm`` and ``pressure`` also ``element_depth`` f4 x N. Where none does, the companion topic tells
+(`array_depth`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.measurements import CrossSpectra, Pressure, Rejection, Trace
+
+from .headers import Make, stamp_ns
+from .table import constant_column, decode_table, encode_table, require_columns, scalar_column
+
+Columns = Mapping[str, NDArray]
+
+
+def read_csdm(message: Any, *, world_frame: str = 'enu') -> CrossSpectra:
+    """Read a PointCloud2 of cross-spectral density matrices.
+
+    `world_frame` has no meaning here or in the other readers of this module: depths are positive
+    downwards in any frame. Raises `Rejection`.
+    """
+    columns = decode_table(message)
+    require_columns(columns, ('frequency', 'csdm'), 'cross-spectra')
+    csdm = _matrices(columns['csdm'])
+    return CrossSpectra(
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        frequency=scalar_column(columns, 'frequency'),
+        csdm=csdm,
+        snapshots=_snapshots(columns),
+        reference_depth=_array_depth(columns, csdm.shape[-1]),
+    )
+
+
+def write_csdm(record: CrossSpectra, make: Make) -> Any:
+    """Write the table of cross-spectra, in single precision."""
+    rows = len(record)
+    flat = np.ascontiguousarray(record.csdm, np.complex64).reshape(rows, -1)
+    columns = {
+        'frequency': record.frequency.astype(np.float32),
+        'csdm': flat.view(np.float32),
+        'snapshots': np.full(rows, record.snapshots, np.uint32),
+    }
+    return _encode(record, columns, rows, make)
+
+
+def read_pressure(message: Any, *, world_frame: str = 'enu') -> Pressure:
+    """Read a PointCloud2 of pressure samples. Raises `Rejection`."""
+    columns = decode_table(message)
+    require_columns(columns, ('p', 'sample_rate'), 'pressure')
+    samples = columns['p'].reshape(len(columns['p']), -1)
+    if samples.dtype.kind in 'iu':
+        require_columns(columns, ('scale',), 'pressure in whole numbers')
+        scale = constant_column(columns, 'scale')
+        if scale is None:
+            raise Rejection('bad_scale', 'the scale of the pressure is zero or not a number')
+        samples = samples * np.float32(scale)
+    rate = constant_column(columns, 'sample_rate')
+    return Pressure(
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        pressure=samples,
+        sample_rate=0.0 if rate is None else rate,
+        reference_depth=_array_depth(columns, samples.shape[1]),
+    )
+
+
+def write_pressure(block: Pressure, make: Make, *, scale: float | None = None) -> Any:
+    """Write the table of a block; with `scale` as whole numbers of 16 bits, clipped at their
+    limits."""
+    rows = len(block)
+    columns: dict[str, NDArray] = {'p': block.pressure}
+    if scale is not None:
+        whole = np.clip(np.round(block.pressure / scale), -(2**15), 2**15 - 1)
+        columns = {'p': whole.astype(np.int16), 'scale': np.full(rows, scale, np.float32)}
+    columns['sample_rate'] = np.full(rows, block.sample_rate, np.float32)
+    return _encode(block, columns, rows, make)
+
+
+def read_trace(message: Any, *, world_frame: str = 'enu') -> Trace:
+    """Read a PointCloud2 of one trace. Raises `Rejection`."""
+    columns = decode_table(message)
+    require_columns(columns, ('depth', 'amplitude'), 'traces')
+    return Trace(
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        depth=scalar_column(columns, 'depth'),
+        amplitude=scalar_column(columns, 'amplitude'),
+        sigma=scalar_column(columns, 'sigma') if 'sigma' in columns else None,
+        reference_depth=constant_column(columns, 'array_depth', zero_is_known=True),
+    )
+
+
+def write_trace(trace: Trace, make: Make) -> Any:
+    """Write the table of a trace, in single precision."""
+    columns = _trace_columns(trace.depth, trace.amplitude, trace.sigma)
+    return _encode(trace, columns, len(trace), make)
+
+
+def write_response(response: Any, make: Make) -> Any:
+    """Write a depth response (stamp_ns, frame_id, depth, amplitude and sigma (n,)) as the table of
+    a trace with ``x y z`` before it, z up, so that displays can draw it."""
+    zero = np.zeros(len(response.depth), np.float32)
+    columns = {'x': zero, 'y': zero, 'z': (-response.depth).astype(np.float32)}
+    columns |= _trace_columns(response.depth, response.amplitude, response.sigma)
+    return encode_table(columns, stamp_ns=response.stamp_ns, frame_id=response.frame_id, make=make)
+
+
+def _trace_columns(
+    depth: NDArray, amplitude: NDArray, sigma: NDArray | None
+) -> dict[str, NDArray]:
+    columns = {'depth': depth, 'amplitude': amplitude}
+    if sigma is not None:
+        columns['sigma'] = sigma
+    return {name: column.astype(np.float32) for name, column in columns.items()}
+
+
+def _encode(record: Any, columns: dict[str, NDArray], rows: int, make: Make) -> Any:
+    if record.reference_depth is not None:
+        columns['array_depth'] = np.full(rows, record.reference_depth, np.float32)
+    return encode_table(columns, stamp_ns=record.stamp_ns, frame_id=record.frame_id, make=make)
+
+
+def _matrices(values: NDArray) -> NDArray[np.complexfloating]:
+    """Pair the real and imaginary parts (F, 2 N^2) into (F, N, N)."""
+    count = 1 if values.ndim == 1 else values.shape[1]
+    phones = round((count / 2) ** 0.5)
+    if 2 * phones * phones != count:
+        raise Rejection(
+            'bad_field',
+            f'column csdm holds {count} values a row; N phones need 2 N^2: real and imaginary '
+            'parts of a whole matrix',
+        )
+    if values.dtype.kind != 'f':
+        raise Rejection('bad_field', f'column csdm holds {values.dtype}, not floats')
+    double = values.dtype == np.float64
+    paired = np.ascontiguousarray(values).view(np.complex128 if double else np.complex64)
+    return paired.reshape(len(values), phones, phones)
+
+
+def _snapshots(columns: Columns) -> int:
+    """How many snapshots were averaged; 0: not known."""
+    count = constant_column(columns, 'snapshots')
+    return 0 if count is None else int(min(max(count, 0.0), 2.0**53))
+
+
+def _array_depth(columns: Columns, phones: int) -> float | None:
+    """Depth of phone 0, as ``array_depth`` or ``element_depth`` say; None when neither does."""
+    depth = constant_column(columns, 'array_depth', zero_is_known=True)
+    if depth is not None or 'element_depth' not in columns:
+        return depth
+    depths = columns['element_depth'].reshape(len(columns['element_depth']), -1)
+    if depths.shape[1] != phones:
+        raise Rejection(
+            'bad_field', f'element_depth has {depths.shape[1]} values for {phones} phones'
+        )
+    first = depths[:, 0].astype(np.float64)
+    return float(first[0]) if len(first) and np.isfinite(first[0]) else None

@@ -1,0 +1,93 @@
+"""Noise of the sea surface at a vertical line array above a layered floor, exactly.
+
+Sources at the surface radiate as dipoles: what comes down at the angle whose sine is u has the
+power 2 u du, and goes past the array as exp(+i u k h). Layer l returns it with the amplitude a_l,
+flat in frequency and angle, as a_l exp(-i u k (h + 2 H_l)), H_l below phone 0. Every element of
+the cross-spectral density is then a sum of one integral,
+
+    I(x) = 2 int_0^1 u exp(i u x) du
+    R_ij = I(k (h_i - h_j)) + sum_lm a_l a_m I(-k (h_i - h_j + 2 (H_l - H_m)))
+           + 2 sum_l a_l Re I(k (h_i + h_j + 2 H_l)),
+
+the last of which is what a fathometer hears.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+def noise_integral(x: ArrayLike) -> ComplexArray:
+    """I(x), of the shape of x."""
+    x = np.asarray(x, np.float64)
+    small = np.abs(x) < 1e-3
+    z = 1j * np.where(small, 1.0, x)
+    turn = np.exp(z)
+    exact = 2.0 * (turn / z - (turn - 1.0) / np.square(z))
+    series = 1.0 + 2j * x / 3.0 - np.square(x) / 4.0 - 1j * x**3 / 15.0
+    return np.where(small, series, exact)
+
+
+def surface_noise_csdm(
+    frequency: ArrayLike,
+    phones: int,
+    spacing: float,
+    heights: ArrayLike,
+    amplitudes: ArrayLike,
+    sound_speed: float,
+) -> ComplexArray:
+    """R (F, M, M) at `frequency` (F,) Hz, phones `spacing` m apart, phone 0 `heights` (K,) m above
+    layers of `amplitudes` (K,)."""
+    k = 2.0 * np.pi * np.asarray(frequency, np.float64)[:, None] / sound_speed
+    H, a = np.asarray(heights, np.float64), np.asarray(amplitudes, np.float64)
+    x = k * spacing * np.arange(phones)
+    down = noise_integral(x) + np.sum(a * a) * noise_integral(-x)
+    for m in range(len(a)):
+        for n in range(m):
+            apart = 2.0 * k * (H[m] - H[n])
+            pair = noise_integral(-(x + apart)) + noise_integral(-(x - apart))
+            down += a[m] * a[n] * pair
+    both = np.zeros((len(k), 2 * phones - 1))
+    for one, strength in zip(H, a):
+        y = k * (spacing * np.arange(2 * phones - 1) + 2.0 * one)
+        both += 2.0 * strength * noise_integral(y).real
+    i = np.arange(phones)
+    lag = i[:, None] - i[None, :]
+    table = np.concatenate([down[:, :0:-1].conj(), down], axis=1)
+    return np.asarray(table[:, lag + phones - 1] + both[:, i[:, None] + i[None, :]], np.complex128)
+
+
+def horizontal_noise_csdm(
+    frequency: ArrayLike, phones: int, spacing: float, spread: float, sound_speed: float
+) -> FloatArray:
+    """R (F, M, M) of unit power from near the horizontal: the sine of its angle is Gaussian with
+    standard deviation `spread`."""
+    k = 2.0 * np.pi * np.asarray(frequency, np.float64) / sound_speed
+    apart = spacing * (np.arange(phones)[:, None] - np.arange(phones)[None, :])
+    return np.exp(-0.5 * np.square(spread * k[:, None, None] * apart))
+
+
+def sample_csdm(
+    csdm: ComplexArray, snapshots: int, rng: np.random.Generator
+) -> NDArray[np.complex64]:
+    """The average of `snapshots` random snapshots whose expectation is `csdm` (F, M, M).
+
+    Wishart, by Bartlett's decomposition: R = C C^H, the average is (C A)(C A)^H / L with A lower
+    triangular, its diagonal the roots of gamma variables, the rest normal. For fewer snapshots
+    than phones the snapshots themselves are drawn.
+    """
+    F, M, _ = csdm.shape
+    C = np.linalg.cholesky(csdm).astype(np.complex64)
+    columns = min(M, snapshots)
+    A = rng.standard_normal((F, M, 2 * columns), np.float32).view(np.complex64)
+    A *= np.float32(np.sqrt(0.5))
+    if snapshots >= M:
+        A = np.tril(A, -1)
+        shape = snapshots - np.arange(M, dtype=np.float32)
+        A[:, np.arange(M), np.arange(M)] = np.sqrt(rng.standard_gamma(shape, (F, M)))
+    X = C @ A
+    return np.asarray(X @ X.conj().swapaxes(1, 2) / np.float32(snapshots))

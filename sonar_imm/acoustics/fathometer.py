@@ -1,0 +1,188 @@
+"""The passive fathometer: a depth response from the noise at a vertical line array.
+
+Noise made at the sea surface travels down past the array, is reflected by the layers of the floor
+and comes up again. Looking up and looking down with the array and correlating the two gives an
+echo at the two-way time of each layer.
+
+Conventions
+    Fourier transform exp(-i w t). Phone 0 is the deepest, phone m stands h_m above it; steering
+    vector w_m = exp(+i k h_m), k = w / c: noise going down is p = w, the echo of a layer H below
+    phone 0 is a exp(-i k (h_m + 2 H)), a phase that is exp(-i 2 k H) times conj(w). The echo then
+    lies at the time +2 H / c, so that depth is z = z_ref + c t / 2 with z_ref the depth of phone
+    0, and nothing else. Down is positive.
+
+Processors, R (F, M, M) the cross-spectral density, w_+ = w, w_- = conj(w)
+    conventional  C = w^T R w                   P_+- = w_+-^H R w_+-
+    MVDR          C = (w_-^H R_l^-1 w_+) / [(w_-^H R_l^-1 w_-) (w_+^H R_l^-1 w_+)]
+                                                P_+- = 1 / (w_+-^H R_l^-1 w_+-)
+                  with R_l = R + loading tr(R)/M I in *every* place: with a plain R between loaded
+                  weights the echo changes its sign as the loading grows.
+    white noise   the MVDR whose loading is, frequency by frequency, the least that keeps the gain
+                  against white noise of both beams above a limit.
+
+Coherence (`coherence`), |gamma| <= 1
+    gamma = -i C / sqrt(P_+ P_-), with the sign turned for MVDR, whose echo is inverted (Harrison
+    2009). Dividing by the beam powers makes red noise white; the quarter turn is there because
+    correlated noise gives the time integral of the impulse response.
+
+Depth response
+    b(z) = Re mean_n gamma_n exp(i w_n 2 (z - z_ref) / c), noise of standard deviation
+    1 / sqrt(2 L F) for L snapshots and F frequencies (conventional).
+
+Printed equations that do not hold: the MVDR output w^H R w with the weights as printed is the
+conjugate of the conventional one (echoes at negative times).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
+
+PROCESSORS = ('conventional', 'mvdr', 'white_noise')
+
+_MAD_OF_UNIT_NORMAL = 0.6744897501960817
+_LOADINGS = (1e-6, 1e2)
+
+
+def steering(frequency: ArrayLike, heights: ArrayLike, sound_speed: float) -> ComplexArray:
+    """w (F, M) at `frequency` (F,) Hz for phones `heights` (M,) m above the deepest."""
+    k = 2.0 * np.pi * np.asarray(frequency, np.float64) / sound_speed
+    return np.exp(1j * k[:, None] * np.asarray(heights, np.float64))
+
+
+def conventional(csdm: ComplexArray, w: ComplexArray) -> tuple[ComplexArray, FloatArray]:
+    """C = w^T R w (F,) and sqrt(P_+ P_-) (F,)."""
+    up, down = _form(w, csdm, w), _form(w.conj(), csdm, w.conj())
+    with np.errstate(invalid='ignore'):
+        return _form(w.conj(), csdm, w), np.sqrt(up.real * down.real)
+
+
+def mvdr(
+    csdm: ComplexArray, w: ComplexArray, loading: float | FloatArray
+) -> tuple[ComplexArray, FloatArray]:
+    """C (F,) and sqrt(P_+ P_-) (F,) with `loading` in units of the mean phone power, a number or
+    one a frequency. Raises numpy.linalg.LinAlgError when a loaded matrix is singular."""
+    M = csdm.shape[-1]
+    power = np.einsum('fmm->f', csdm).real / M
+    ridge = np.asarray(loading * power)[:, None, None].astype(csdm.dtype)
+    loaded = csdm + ridge * np.eye(M, dtype=csdm.dtype)
+    w = w.astype(csdm.dtype)
+    solved = np.linalg.solve(loaded, np.stack([w, w.conj()], axis=-1))
+    cross = np.einsum('fm,fm->f', w, solved[..., 0])  # w_-^H is the plain transpose of w
+    up = np.einsum('fm,fm->f', w.conj(), solved[..., 0]).real
+    down = np.einsum('fm,fm->f', w, solved[..., 1]).real
+    with np.errstate(invalid='ignore', divide='ignore'):
+        return cross / (up * down), 1.0 / np.sqrt(up * down)
+
+
+def white_noise_loading(csdm: ComplexArray, w: ComplexArray, gain_db: float) -> FloatArray:
+    """The least loading (F,), in units of the mean phone power, with which the white-noise gain
+    1 / |weights|^2 of both beams is within `gain_db` (negative) of its greatest value M.
+
+    The gain grows with the loading, which is bisected on a logarithmic scale from 1e-6 to 1e2, to
+    one per cent.
+    """
+    M = csdm.shape[-1]
+    power = np.einsum('fmm->f', csdm).real / M
+    eye = np.eye(M, dtype=csdm.dtype)
+    beams = np.stack([w, w.conj()], axis=-1).astype(csdm.dtype)
+    low, high = (np.full(len(csdm), bound) for bound in np.log(_LOADINGS))
+    for _ in range(11):
+        middle = 0.5 * (low + high)
+        loaded = csdm + (np.exp(middle) * power)[:, None, None].astype(csdm.dtype) * eye
+        solved = np.linalg.solve(loaded, beams)
+        passed = np.abs(np.sum(beams.conj() * solved, axis=1)) ** 2
+        gain = passed / np.sum(np.abs(solved) ** 2, axis=1)
+        enough = (gain >= M * 10.0 ** (0.1 * gain_db)).all(axis=1)
+        high, low = np.where(enough, middle, high), np.where(enough, low, middle)
+    return np.exp(high)
+
+
+def coherence(
+    csdm: ComplexArray,
+    w: ComplexArray,
+    processor: str,
+    *,
+    loading: float = 1e-2,
+    gain_db: float = -3.0,
+) -> ComplexArray:
+    """gamma (F,): normalised, quarter turned, echoes positive; NaN where a beam has no power.
+
+    Raises numpy.linalg.LinAlgError for MVDR when a loaded matrix is singular."""
+    if processor == 'conventional':
+        C, power = conventional(csdm, w)
+        turn = -1j
+    elif processor in ('mvdr', 'white_noise'):
+        white = processor == 'white_noise'
+        C, power = mvdr(csdm, w, white_noise_loading(csdm, w, gain_db) if white else loading)
+        turn = 1j
+    else:
+        raise ValueError(f'a processor is one of {PROCESSORS}, not {processor!r}')
+    with np.errstate(invalid='ignore', divide='ignore'):
+        gamma = turn * C / power
+    return np.where(np.isfinite(gamma), gamma, np.nan)
+
+
+def depth_response(
+    gamma: ComplexArray,
+    first: float,
+    spacing: float,
+    depths: tuple[float, float, int],
+    reference_depth: float,
+    sound_speed: float,
+    *,
+    envelope: bool = False,
+) -> FloatArray:
+    """b (n,) at n depths from `depths` = (first depth, step, n).
+
+    gamma (F,) at the frequencies ``first + spacing * row``; NaN rows are left out of the mean.
+    envelope: the modulus instead of the real part, which is what a Hilbert transform would show.
+    Raises ValueError when no row is left.
+    """
+    use = np.isfinite(gamma)
+    if not use.any():
+        raise ValueError('the coherence has no finite value')
+    z0, step, n = depths
+    t0, dt = 2.0 * (z0 - reference_depth) / sound_speed, 2.0 * step / sound_speed
+    rows = np.arange(len(gamma))
+    turned = np.where(use, gamma, 0.0) * np.exp(2j * np.pi * (first + spacing * rows) * t0)
+    total = chirp_z(turned, spacing * dt, n) * np.exp(2j * np.pi * first * dt * np.arange(n))
+    mean = total / np.count_nonzero(use)
+    return np.abs(mean) if envelope else np.ascontiguousarray(mean.real)
+
+
+def chirp_z(values: ComplexArray, turns: float, count: int) -> ComplexArray:
+    """sum_n values_n exp(2 pi i turns n k) for k = 0 .. count - 1 (Bluestein): n k is written as
+    (n^2 + k^2 - (k - n)^2) / 2, which makes it a convolution."""
+    N = len(values)
+    size = 1 << (N + count - 2).bit_length()
+    i = np.arange(max(N, count))
+    chirp = np.exp(1j * np.pi * np.mod(turns * i * i, 2.0))
+    filter_ = np.zeros(size, np.complex128)
+    filter_[:count] = chirp[:count].conj()
+    filter_[size - N + 1 :] = chirp[1:N][::-1].conj()
+    spectrum = np.fft.fft(values * chirp[:N], size) * np.fft.fft(filter_)
+    return np.asarray(np.fft.ifft(spectrum)[:count] * chirp[:count])
+
+
+def noise_sigma(b: FloatArray) -> float:
+    """Standard deviation of the noise of b, by the median absolute deviation: a few reflectors do
+    not spoil it. NaN without samples."""
+    finite = b[np.isfinite(b)]
+    if not len(finite):
+        return float('nan')
+    return float(np.median(np.abs(finite - np.median(finite)))) / _MAD_OF_UNIT_NORMAL
+
+
+def expected_noise_sigma(snapshots: float, frequencies: int) -> float:
+    """1 / sqrt(2 L F): what `noise_sigma` of the conventional processor should be."""
+    return 1.0 / float(np.sqrt(2.0 * snapshots * frequencies))
+
+
+def _form(left: ComplexArray, R: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """left^H R right (F,)."""
+    product = np.matmul(R, right[..., None].astype(R.dtype))[..., 0]
+    return np.einsum('fm,fm->f', left.conj().astype(R.dtype), product)

@@ -1,0 +1,168 @@
+"""Cross-spectral density matrices from the pressure at many phones, as it streams in.
+
+Pressure arrives in blocks of any length. It is cut into snapshots of `length` samples that overlap
+by half (or as told), each is weighted by a window and Fourier transformed with exp(-i w t), and
+the outer products of the snapshots at each frequency are averaged::
+
+    snapshots = SnapshotStream(...)      # pressure -> spectra (k, F, M)
+    average = BlockAverage(count)        # spectra -> R (F, M, M) once `count` are in, then anew
+    average = SlidingAverage(count, step)  # the same over the last `count`, every `step`
+
+R_ij = <p_i conj(p_j)>. The average of one batch is one matrix product a frequency, which costs a
+tenth of as many outer products.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complexfloating]
+
+WINDOWS = ('hann', 'rectangular')
+
+
+def window_of(name: str, length: int) -> FloatArray:
+    """Window (length,) of unit mean square: 'hann' (periodic) or 'rectangular'."""
+    if name == 'rectangular':
+        return np.ones(length)
+    if name != 'hann':
+        raise ValueError(f'a window is one of {WINDOWS}, not {name!r}')
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
+    return window / np.sqrt(np.mean(np.square(window)))
+
+
+def window_overlap(name: str, share: FloatArray | float) -> FloatArray:
+    """What is left of the correlation of two signals that lie `share` of a window apart, 0 .. 1:
+    the autocorrelation of the window, one at 0. ``1 - share`` for the rectangular one."""
+    x = np.clip(np.abs(np.asarray(share, np.float64)), 0.0, 1.0)
+    if name == 'rectangular':
+        return 1.0 - x
+    return (1.0 - x) * (2.0 + np.cos(2.0 * np.pi * x)) / 3.0 + np.sin(2.0 * np.pi * x) / (
+        2.0 * np.pi
+    )
+
+
+class SnapshotStream:
+    """Cuts pressure into windowed snapshots and transforms them.
+
+    length: samples of a snapshot; hop: samples from one to the next; rows: which bins of the
+    transform are kept, a slice.
+    """
+
+    def __init__(self, length: int, hop: int, rows: slice, window: str = 'hann'):
+        if not 0 < hop <= length:
+            raise ValueError('snapshots need 0 < hop <= length')
+        self.length, self.hop, self.rows = length, hop, rows
+        self._window = window_of(window, length).astype(np.float32)[:, None]
+        self._left: NDArray[np.float32] | None = None
+
+    def push(self, pressure: NDArray) -> ComplexArray:
+        """Spectra (k, F, M) complex64 of the snapshots that `pressure` (n, M) completes; k may be
+        0. ValueError when the number of phones changes; call `restart` then, and after a gap."""
+        block = np.asarray(pressure, np.float32)
+        if self._left is not None:
+            if self._left.shape[1] != block.shape[1]:
+                raise ValueError('the number of phones changed')
+            block = np.concatenate([self._left, block])
+        count = max(0, (len(block) - self.length) // self.hop + 1)
+        self._left = block[count * self.hop :].copy()
+        spectra = [self._transform(block[k * self.hop :][: self.length]) for k in range(count)]
+        bins = len(range(*self.rows.indices(self.length // 2 + 1)))
+        empty = np.empty((0, bins, block.shape[1]), np.complex64)
+        return np.stack(spectra) if spectra else empty
+
+    def restart(self) -> None:
+        """Forget the samples that wait for the rest of their snapshot."""
+        self._left = None
+
+    @property
+    def waiting(self) -> int:
+        """Samples that wait for the rest of their snapshot."""
+        return 0 if self._left is None else len(self._left)
+
+    def _transform(self, snapshot: NDArray[np.float32]) -> ComplexArray:
+        import scipy.fft  # unlike numpy's, it stays in single precision
+
+        # One phone after the other: transforms of contiguous rows are twice as fast.
+        rows = np.ascontiguousarray((snapshot * self._window).T)
+        return np.asarray(scipy.fft.rfft(rows, axis=1).T[self.rows])
+
+
+def outer_sum(spectra: ComplexArray) -> ComplexArray:
+    """sum_k p p^H (F, M, M) of spectra (k, F, M): one matrix product a frequency."""
+    columns = np.ascontiguousarray(spectra.transpose(1, 2, 0))
+    return np.matmul(columns, columns.conj().swapaxes(1, 2))
+
+
+class Average(NamedTuple):
+    """R (F, M, M), the mean of `snapshots`."""
+
+    csdm: ComplexArray
+    snapshots: int
+
+
+class BlockAverage:
+    """The mean of each `count` snapshots, of which `skip` are passed over after each mean: those
+    that overlap with it, so that no sample is in two means."""
+
+    def __init__(self, count: int, skip: int = 0):
+        self.count, self.skip = count, skip
+        self.clear()
+
+    def clear(self) -> None:
+        self._sum: ComplexArray | None = None
+        self._in = 0
+        self._to_skip = 0
+
+    @property
+    def waiting(self) -> int:
+        return self._in
+
+    def push(self, spectra: ComplexArray) -> list[Average]:
+        """The averages that `spectra` (k, F, M) complete."""
+        done = []
+        while len(spectra):
+            passed = min(self._to_skip, len(spectra))
+            self._to_skip -= passed
+            now, spectra = np.split(spectra[passed:], [self.count - self._in])
+            if not len(now):
+                break
+            product = outer_sum(now)
+            self._sum = product if self._sum is None else self._sum + product
+            self._in += len(now)
+            if self._in == self.count:
+                done.append(Average(self._sum / np.float32(self.count), self.count))
+                self.clear()
+                self._to_skip = self.skip
+        return done
+
+
+class SlidingAverage:
+    """The mean of the last `count` snapshots, after every `step` of them."""
+
+    def __init__(self, count: int, step: int):
+        if not 0 < step <= count:
+            raise ValueError('a sliding average needs 0 < step <= count')
+        self.count, self.step = count, step
+        self.clear()
+
+    def clear(self) -> None:
+        self._spectra: deque[ComplexArray] = deque(maxlen=self.count)
+        self._since = 0
+
+    def push(self, spectra: ComplexArray) -> list[Average]:
+        """The averages due after `spectra` (k, F, M)."""
+        done = []
+        for one in spectra:
+            self._spectra.append(one)
+            self._since += 1
+            if len(self._spectra) == self.count and self._since >= self.step:
+                total = outer_sum(np.stack(self._spectra))
+                done.append(Average(total / np.float32(self.count), self.count))
+                self._since = 0
+        return done

@@ -1,0 +1,257 @@
+"""The filter of `set_particles`, run: one record after the other, on any number of threads.
+
+`SetFilter.step` is pure: it takes what was known before a record and gives what is known after,
+so that a record can be tried without being committed to (a preview), and what is known at one
+record can be looked at again when later ones are in (`LagSmoother`).
+
+Random numbers are counter based: those of a record come from a Philox generator whose key is the
+seed and the record's own name (its stamp), and each particle has its row of them. The result is
+therefore the same whatever was processed before, and on one thread or several.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+import math
+from typing import NamedTuple
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from . import set_particles_kernels as kernels
+from .particles import effective_sample_size, normalise
+from .resampling import systematic
+from .set_particles import gain, propose_births, SetModel, Sets
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+_STEP, _START, _RESAMPLE = range(3)
+
+
+class Weighted(NamedTuple):
+    """Sets with log weights (N,) that need not be normalised: what is known between records."""
+
+    sets: Sets
+    log_weight: FloatArray
+
+
+@frozen(eq=False)
+class Step:
+    """One record taken in.
+
+    sets: weighted by w (N,), summing to one; amplitude (N, J) given each set, in units of the
+    noise. after: the same, resampled when needed; source (N,) the index into `sets` of each of
+    them. log_evidence: log of the record's probability given those before, against that of an
+    empty record; effective: sample size; ok False when no set could explain the record.
+    """
+
+    sets: Sets
+    w: FloatArray
+    amplitude: FloatArray
+    after: Weighted
+    source: IndexArray
+    log_evidence: float
+    effective: float
+    ok: bool
+
+
+class SetFilter:
+    """Runs a `SetModel` on `particles` sets with `threads` threads."""
+
+    def __init__(self, model: SetModel, particles: int, threads: int = 1):
+        self.model = model
+        self.particles = particles
+        self.threads = threads
+        n, width = model.cells, len(model.move)
+        self._cumulative = np.empty((n, width))
+        self._ratio = np.empty((n, width))
+        self._transition = np.cumsum(model.transition, axis=1)
+        self._charge = np.array(
+            [
+                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(n)
+                for m in range(model.order_min, model.order_max + 1)
+            ]
+        )
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+
+    def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> Step:
+        """Take in the record b (n,), in units of its noise. before: None before the first record.
+        key: seed and name of the record, each in 0 .. 2^64 - 1."""
+        if before is None:
+            before = self._start(b, key)
+        sets, log_ratio = self._propagate(before.sets, b, _uniform(key, _STEP))
+        log_weight = before.log_weight + log_ratio
+        amplitude = self._weigh(sets, b, log_weight)
+        w, log_sum = normalise(log_weight)
+        _, log_before = normalise(before.log_weight)
+        ok = bool(np.isfinite(log_sum))
+        effective = float(effective_sample_size(w)) if ok else 0.0
+        source = np.arange(self.particles)
+        if ok and effective < 0.5 * self.particles:
+            source = systematic(w, self.particles, _uniform(key, _RESAMPLE))
+            log_weight = np.zeros(self.particles)
+        after = self._remembered(sets.take(source), amplitude[source])
+        evidence = float(log_sum - log_before)
+        return Step(
+            sets, w, amplitude, Weighted(after, log_weight), source, evidence, effective, ok
+        )
+
+    def warm(self) -> None:
+        """Compile or load the kernels."""
+        b = np.maximum(0.0, 10.0 * self.model.gram[np.abs(np.arange(self.model.cells) - 1)])
+        step = SetFilter(self.model, 8).step(None, b, (0, 0))
+        self.summary(step, step.w, step.sets)
+
+    def summary(self, step: Step, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
+        """PMF (orders,) of the order and sums (3, n), see `set_particles_kernels.moments`, of
+        `sets` with weights w (N,)."""
+        pmf, sums = np.zeros(len(self.model.transition)), np.zeros((3, self.model.cells))
+        kernels.moments(w, sets.order, sets.cell, step.amplitude, self.model.order_min, pmf, sums)
+        return pmf, sums
+
+    def _start(self, b: FloatArray, key: tuple[int, int]) -> Weighted:
+        model, sets = self.model, Sets.empty(self.model, self.particles)
+        uniform = _uniform(key, _START).random((self.particles, 1 + model.order_max))
+        log_ratio = np.zeros(self.particles)
+        births = propose_births(model, b)
+        self._split(
+            lambda first, last: kernels.start(
+                first,
+                last,
+                model.order_min,
+                len(model.transition),
+                model.separation,
+                self._charge,
+                *births,
+                uniform,
+                sets.order,
+                sets.cell,
+                log_ratio,
+            )
+        )
+        # An impossible set has members that mean nothing; it must not be moved.
+        sets.cell[~np.isfinite(log_ratio)] = 0
+        # The sets are draws from the prior in disguise: as many particles as if they were.
+        return Weighted(sets, log_ratio)
+
+    def _propagate(
+        self, old: Sets, b: FloatArray, rng: np.random.Generator
+    ) -> tuple[Sets, FloatArray]:
+        model, new = self.model, Sets.empty(self.model, self.particles)
+        log_ratio = np.empty(self.particles)
+        uniform = rng.random((self.particles, model.uniforms))
+        filled = np.zeros(model.cells, np.bool_)
+        tables = self._cumulative, self._ratio
+        kernels.fill_moves(
+            old.order, old.cell, gain(b), model.move, model.move_share, filled, *tables
+        )
+        births = propose_births(model, b)
+        self._split(
+            lambda first, last: kernels.propagate(
+                first,
+                last,
+                model.order_min,
+                model.separation,
+                model.most_changes,
+                model.amplitude_memory > 0.0,
+                model.amplitude_std**2,
+                self._transition,
+                *tables,
+                *births,
+                uniform,
+                old.order,
+                old.cell,
+                old.prior_mean,
+                old.prior_variance,
+                new.order,
+                new.cell,
+                new.prior_mean,
+                new.prior_variance,
+                log_ratio,
+            )
+        )
+        return new, log_ratio
+
+    def _weigh(self, sets: Sets, b: FloatArray, log_weight: FloatArray) -> FloatArray:
+        model, amplitude = self.model, np.zeros(sets.cell.shape)
+        self._split(
+            lambda first, last: kernels.weigh(
+                first,
+                last,
+                b,
+                model.gram,
+                model.ridge,
+                model.fine,
+                model.amplitude_prior == 'marginal',
+                model.amplitude_memory > 0.0,
+                *sets,
+                log_weight,
+                amplitude,
+            )
+        )
+        return amplitude
+
+    def _remembered(self, sets: Sets, amplitude: FloatArray) -> Sets:
+        model = self.model
+        if model.amplitude_memory > 0.0:
+            self._split(
+                lambda first, last: kernels.remember(
+                    first,
+                    last,
+                    model.gram,
+                    model.amplitude_memory,
+                    model.amplitude_std**2,
+                    sets.order,
+                    sets.cell,
+                    amplitude,
+                    sets.prior_mean,
+                    sets.prior_variance,
+                )
+            )
+        return sets
+
+    def _split(self, work: Callable[[int, int], None]) -> None:
+        """Run work(first, last) over all particles, a share for each thread."""
+        if self._pool is None:
+            work(0, self.particles)
+            return
+        edges = np.linspace(0, self.particles, self.threads + 1).astype(int).tolist()
+        list(self._pool.map(work, edges[:-1], edges[1:]))
+
+
+class LagSmoother:
+    """What was known `lag` records ago, seen with all that came since: each particle of today is
+    traced to its ancestor of then (fixed-lag smoothing by surviving lines)."""
+
+    def __init__(self, lag: int):
+        self.lag = lag
+        self._steps: deque[Step] = deque(maxlen=lag + 1)
+
+    def push(self, step: Step) -> tuple[Step, FloatArray] | None:
+        """The step `lag` records before this one and the weights (N,) its sets now have; None
+        while there is none, and after a record that nothing explained."""
+        if not step.ok:
+            self._steps.clear()
+            return None
+        self._steps.append(step)
+        if len(self._steps) <= self.lag or not self.lag:
+            return None
+        steps = list(self._steps)
+        line = np.arange(len(step.w))
+        for earlier in reversed(steps[:-1]):
+            line = earlier.source[line]
+        weights = np.bincount(line, weights=step.w, minlength=len(step.w))
+        return steps[0], weights.astype(np.float64)
+
+    def clear(self) -> None:
+        self._steps.clear()
+
+
+def _uniform(key: tuple[int, int], purpose: int) -> np.random.Generator:
+    """The random numbers of one record for one purpose."""
+    counter = np.array([0, 0, 0, purpose], np.uint64)
+    return np.random.Generator(np.random.Philox(key=np.array(key, np.uint64), counter=counter))

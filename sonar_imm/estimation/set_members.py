@@ -1,0 +1,73 @@
+"""From many weighted sets to one list of members, each with what is known of it.
+
+The **intensity** of the particles, how many members are expected on each cell, has a hill for each
+member. No set has two members closer than the separation, so the intensity summed over a window
+narrower than that is a probability: that there is a member in it. Members are taken one after the
+other, the window that holds most first; what lies within the separation of one is its own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Members(NamedTuple):
+    """K members by place: place (K,) in cells, mean over the hill; amplitude (K,) mean in units of
+    the noise; covariance (K, 2, 2) of both, the spread of the particles; existence (K,), the
+    probability that it is there, at most 1."""
+
+    place: FloatArray
+    amplitude: FloatArray
+    covariance: FloatArray
+    existence: FloatArray
+
+
+def find_members(sums: FloatArray, separation: int, most: int, least_existence: float) -> Members:
+    """At most `most` members whose existence is at least `least_existence`.
+
+    sums (3, n): intensity, and first and second moment of the amplitude on each cell (see
+    `SetFilter.summary`).
+    """
+    n, half = sums.shape[1], max(0, (separation - 1) // 2)
+    left = sums.copy()
+    found = []
+    for _ in range(most):
+        mass = _windowed(left[0], half)
+        peak = int(np.argmax(mass))
+        low, high = max(0, peak - separation + 1), min(n, peak + separation)
+        weight = left[0, low:high]
+        existence = float(weight.sum())
+        if not existence > 0.0 or existence < least_existence:
+            break
+        found.append((*_moments(left[:, low:high], low), min(1.0, existence)))
+        left[:, low:high] = 0.0
+    found.sort(key=lambda member: member[0])
+    if not found:
+        return Members(np.empty(0), np.empty(0), np.empty((0, 2, 2)), np.empty(0))
+    return Members(*(np.array(column) for column in zip(*found)))
+
+
+def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray]:
+    cells = first + np.arange(sums.shape[1])
+    total = sums[0].sum()
+    place, amplitude = float(sums[0] @ cells) / total, float(sums[1].sum()) / total
+    spread = cells - place
+    cross = float(sums[1] @ spread) / total
+    covariance = np.array(
+        [
+            [float(sums[0] @ np.square(spread)) / total, cross],
+            [cross, max(0.0, float(sums[2].sum()) / total - amplitude**2)],
+        ]
+    )
+    return place, amplitude, covariance
+
+
+def _windowed(intensity: FloatArray, half: int) -> FloatArray:
+    """Sums (n,) over cells no further than `half`."""
+    running = np.append(0.0, np.cumsum(np.pad(intensity, half)))
+    return np.asarray(running[2 * half + 1 :] - running[: -2 * half - 1])

@@ -1,0 +1,320 @@
+"""`set_particles` compiled: the same draws for the same random numbers, into arrays of the caller.
+
+Every kernel works on the particles ``first .. last - 1`` and touches no other, so that several
+threads may share the work. `moments` alone adds up over particles; it is run by one thread.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .jit import kernel
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+@kernel
+def fill_moves(
+    order: IndexArray,
+    cell: IndexArray,
+    g: FloatArray,
+    move: FloatArray,
+    share: float,
+    filled: NDArray[np.bool_],
+    cumulative: FloatArray,
+    ratio: FloatArray,
+) -> None:
+    """The rows of `set_particles.propose` from which some particle moves, into cumulative and
+    ratio (n, 2 r + 1); filled (n,) is False throughout before, and says which rows after."""
+    n, width = cumulative.shape
+    radius = width // 2
+    for i in range(order.shape[0]):
+        for k in range(order[i]):
+            z = cell[i, k]
+            if filled[z]:
+                continue
+            filled[z] = True
+            low, high = max(0, radius - z), min(width, n + radius - z)
+            best, inside = -math.inf, 0.0
+            for step in range(low, high):
+                best = max(best, g[z + step - radius])
+                inside += move[step]
+            looking = 0.0
+            for step in range(low, high):
+                looking += move[step] * math.exp(g[z + step - radius] - best)
+            total = 0.0
+            for step in range(width):
+                q = 0.0
+                if low <= step < high:
+                    q = share * move[step] * math.exp(g[z + step - radius] - best) / looking
+                    q += (1.0 - share) * move[step] / inside
+                total += q
+                cumulative[z, step] = total
+                ratio[z, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
+
+
+@kernel
+def _search(cumulative: FloatArray, low: int, high: int, point: float) -> int:
+    """The first place in low .. high - 1 whose entry exceeds `point`, high if none does."""
+    while low < high:
+        middle = (low + high) // 2
+        if cumulative[middle] > point:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@kernel
+def _birth(
+    cells: IndexArray,
+    m: int,
+    separation: int,
+    birth: FloatArray,
+    birth_ratio: FloatArray,
+    uniform: float,
+) -> tuple[int, int, float]:
+    """(position in cells, cell, log ratio) of one more member of cells[:m]; position -1 when
+    there is no room."""
+    n = birth.shape[0] - 1
+    total, last = 0.0, -1
+    for k in range(m + 1):
+        low = 0 if k == 0 else cells[k - 1] + separation
+        high = n if k == m else cells[k] - separation + 1
+        if high > low:
+            total += birth[high] - birth[low]
+            last = k
+    if last < 0:
+        return -1, 0, -math.inf
+    left = uniform * total
+    for k in range(last + 1):
+        low = 0 if k == 0 else cells[k - 1] + separation
+        high = n if k == m else cells[k] - separation + 1
+        if high > low:
+            weight = birth[high] - birth[low]
+            if left < weight or k == last:
+                place = _search(birth, low, high, birth[low] + left) - 1
+                place = max(low, min(place, high - 1))
+                return k, place, birth_ratio[place] + math.log(total)
+            left -= weight
+    return -1, 0, -math.inf
+
+
+@kernel
+def start(
+    first: int,
+    last: int,
+    order_min: int,
+    orders: int,
+    separation: int,
+    charge: FloatArray,
+    birth: FloatArray,
+    birth_ratio: FloatArray,
+    uniform: FloatArray,
+    order: IndexArray,
+    cell: IndexArray,
+    log_ratio: FloatArray,
+) -> None:
+    """See `set_particles.start`; charge (orders,): what sets of each size cost in log ratio."""
+    for i in range(first, last):
+        chosen = min(int(uniform[i, 0] * orders), orders - 1)
+        m = order_min + chosen
+        ratio, here = 0.0, cell[i]
+        for k in range(m):
+            at, place, paid = _birth(here, k, separation, birth, birth_ratio, uniform[i, 1 + k])
+            ratio += paid
+            if at < 0:
+                break
+            for j in range(k, at, -1):
+                here[j] = here[j - 1]
+            here[at] = place
+        order[i] = m
+        log_ratio[i] = ratio - charge[chosen]
+
+
+@kernel
+def propagate(
+    first: int,
+    last: int,
+    order_min: int,
+    separation: int,
+    changes: int,
+    memory: bool,
+    new_variance: float,
+    transition: FloatArray,
+    move: FloatArray,
+    move_ratio: FloatArray,
+    birth: FloatArray,
+    birth_ratio: FloatArray,
+    uniform: FloatArray,
+    old_order: IndexArray,
+    old_cell: IndexArray,
+    old_mean: FloatArray,
+    old_variance: FloatArray,
+    order: IndexArray,
+    cell: IndexArray,
+    mean: FloatArray,
+    variance: FloatArray,
+    log_ratio: FloatArray,
+) -> None:
+    """See `set_particles.propagate`; transition (orders, orders) is cumulative along rows."""
+    orders, width = transition.shape[0], move.shape[1]
+    parent = np.empty(cell.shape[1], np.int64)
+    for i in range(first, last):
+        before, u, here = old_order[i], uniform[i], cell[i]
+        m = order_min + min(_search(transition[before - order_min], 0, orders, u[0]), orders - 1)
+        left, ratio = before, 0.0
+        for k in range(before):
+            parent[k] = k
+        for k in range(before - m):
+            gone = min(int(u[1 + k] * left), left - 1)
+            left -= 1
+            for j in range(gone, left):
+                parent[j] = parent[j + 1]
+        for k in range(left):
+            source = parent[k]
+            z = old_cell[i, source]
+            table = move[z]
+            step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
+            ratio += move_ratio[z, step]
+            z += step - width // 2
+            j = k
+            while j > 0 and here[j - 1] > z:
+                here[j], parent[j] = here[j - 1], parent[j - 1]
+                j -= 1
+            here[j], parent[j] = z, source
+        for k in range(1, left):
+            if here[k] - here[k - 1] < separation:
+                ratio = -math.inf
+        for k in range(m - left):
+            if ratio > -math.inf:
+                count = left + k
+                at, place, paid = _birth(here, count, separation, birth, birth_ratio, u[1 + k])
+                ratio += paid
+                if at >= 0:
+                    for j in range(count, at, -1):
+                        here[j], parent[j] = here[j - 1], parent[j - 1]
+                    here[at], parent[at] = place, -1
+        order[i], log_ratio[i] = m, ratio
+        if memory and ratio > -math.inf:
+            for k in range(m):
+                born = parent[k] < 0
+                mean[i, k] = 0.0 if born else old_mean[i, parent[k]]
+                variance[i, k] = new_variance if born else old_variance[i, parent[k]]
+
+
+@kernel
+def weigh(
+    first: int,
+    last: int,
+    b: FloatArray,
+    gram: FloatArray,
+    ridge: float,
+    fine: float,
+    marginal: bool,
+    memory: bool,
+    order: IndexArray,
+    cell: IndexArray,
+    mean: FloatArray,
+    variance: FloatArray,
+    log_weight: FloatArray,
+    amplitude: FloatArray,
+) -> None:
+    """See `set_particles.weigh`: adds the log likelihood to log_weight (N,), whose -inf are left
+    alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
+    J = cell.shape[1]
+    L, y = np.empty((J, J)), np.empty(J)
+    for i in range(first, last):
+        m = order[i]
+        if not log_weight[i] > -math.inf:
+            continue
+        value = 0.0
+        for r in range(m):
+            z, h, precision = cell[i, r], b[cell[i, r]], ridge
+            if memory:
+                precision = 1.0 / variance[i, r]
+                h += precision * mean[i, r]
+                value += 0.5 * (math.log(precision) - precision * mean[i, r] * mean[i, r])
+            row = L[r]
+            for c in range(r):
+                other = L[c]
+                value_rc = gram[z - cell[i, c]]
+                for k in range(c):
+                    value_rc -= row[k] * other[k]
+                value_rc *= other[c]
+                row[c] = value_rc
+                h -= value_rc * y[c]
+            pivot = gram[0] + precision
+            for k in range(r):
+                pivot -= row[k] * row[k]
+            if not pivot > 1e-12:
+                value = -math.inf
+                break
+            # The diagonal of L is kept as its reciprocal.
+            row[r] = 1.0 / math.sqrt(pivot)
+            y[r] = h * row[r]
+            value += 0.5 * y[r] * y[r]
+            if marginal:
+                value -= 0.5 * math.log(pivot)
+            if not memory:
+                value -= fine
+        if value > -math.inf:
+            a = amplitude[i]
+            for r in range(m - 1, -1, -1):
+                rest = y[r]
+                for k in range(r + 1, m):
+                    rest -= L[k, r] * a[k]
+                a[r] = rest * L[r, r]
+                if not a[r] > 0.0:
+                    value = -math.inf
+                    break
+        log_weight[i] += value
+
+
+@kernel
+def remember(
+    first: int,
+    last: int,
+    gram: FloatArray,
+    phi: float,
+    stationary: float,
+    order: IndexArray,
+    cell: IndexArray,
+    amplitude: FloatArray,
+    mean: FloatArray,
+    variance: FloatArray,
+) -> None:
+    """Amplitudes after a record become those expected before the next, a' = phi a + noise: mean
+    and variance (N, J) in place. Each is kept for itself, given the others: what overlapping
+    pulses do to each other is small at the separations that sets have."""
+    for i in range(first, last):
+        for k in range(order[i]):
+            after = 1.0 / (gram[0] + 1.0 / variance[i, k])
+            mean[i, k] = phi * amplitude[i, k]
+            variance[i, k] = phi * phi * after + (1.0 - phi * phi) * stationary
+
+
+@kernel
+def moments(
+    w: FloatArray,
+    order: IndexArray,
+    cell: IndexArray,
+    amplitude: FloatArray,
+    order_min: int,
+    pmf: FloatArray,
+    sums: FloatArray,
+) -> None:
+    """Add to pmf (orders,) and to sums (3, n), the intensity and the first two moments of the
+    amplitude that lie on each cell. Both are zero before."""
+    for i in range(w.shape[0]):
+        if w[i] > 0.0:
+            pmf[order[i] - order_min] += w[i]
+            for k in range(order[i]):
+                z, a = cell[i, k], amplitude[i, k]
+                sums[0, z] += w[i]
+                sums[1, z] += w[i] * a
+                sums[2, z] += w[i] * a * a

@@ -1,0 +1,156 @@
+"""How fast the reflector filter is, against the likelihood by least squares over the whole trace.
+
+What makes a particle cheap is that its likelihood needs the responses at its reflectors alone,
+O(m^2). The textbook way fits the pulses to all N samples of the trace, O(N m^2) in numpy. Both
+are timed in turn, and their values have to agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import time
+from typing import Any
+
+import numpy as np
+
+from ...acoustics.pulse import band_pulse
+from ...measurements import FloatArray, Trace
+from ...trackers.fathometer import FathometerConfig, FathometerTracker
+from ..benching import Bench
+
+REFLECTORS, PARTICLES = 8, 20_000
+RECORD_WANTED_MS = 40.0
+SAMPLES, STEP = 1600, 0.03125
+FIRST_STAMP_NS, RECORD_NS = 1_700_000_000_000_000_000, 90 * 10**9
+
+
+def trace(record: int, rng: np.random.Generator) -> Trace:
+    """Eight reflectors four metres apart that wander a little, in noise of the same band."""
+    depth = 122.0 + STEP * np.arange(SAMPLES)
+    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    places = 130.0 + 4.0 * np.arange(REFLECTORS) + 0.02 * rng.standard_normal(REFLECTORS)
+    noise = np.convolve(rng.standard_normal(2 * SAMPLES), pulse(STEP * np.arange(-32, 33)), 'same')
+    noise = noise[:SAMPLES] / noise.std()
+    amplitude = pulse(depth[:, None] - places) @ np.linspace(25.0, 8.0, REFLECTORS) + noise
+    return Trace(
+        stamp_ns=FIRST_STAMP_NS + record * RECORD_NS,
+        depth=depth,
+        amplitude=amplitude,
+        sigma=np.ones(SAMPLES),
+    )
+
+
+def bench_record(records: int = 12) -> dict[str, Any]:
+    """Milliseconds of one record of the tracker at its defaults, on one core."""
+    rng = np.random.default_rng(0)
+    tracker = FathometerTracker(FathometerConfig(particles=PARTICLES))
+    times, orders = [], []
+    for record in range(records + 3):
+        one = trace(record, rng)
+        begin = time.perf_counter()
+        estimates = tracker.process(one)
+        times.append(1e3 * (time.perf_counter() - begin))
+        orders.append(int(np.argmax(estimates[-1].probabilities[0])) + tracker.config.order_min)
+    median = float(np.median(times[3:]))
+    return {
+        'particles': PARTICLES,
+        'reflectors': orders[-1],
+        'records': records,
+        'median_ms': median,
+        'worst_ms': float(np.max(times[3:])),
+        'us_a_particle': 1e3 * median / PARTICLES,
+        'wanted_ms': RECORD_WANTED_MS,
+        'good': median <= RECORD_WANTED_MS and orders[-1] == REFLECTORS,
+    }
+
+
+def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
+    """Microseconds of the log likelihood ratio of one set of eight: from G and b at its places,
+    in plain numpy, and by least squares over the trace; and of a whole particle of the tracker."""
+    rng = np.random.default_rng(1)
+    lattice = STEP * np.arange(SAMPLES)
+    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    shapes = whitened_pulses(pulse, lattice)
+    x = rng.standard_normal(len(shapes))
+    b = shapes.T @ x
+    gram = shapes.T @ shapes
+    places = np.sort(rng.permuted(np.tile(np.arange(20, 1580, 24), (sets, 1)), axis=1)[:, :8])
+    short, full = _by_gram(b, gram, places), _by_least_squares(x, shapes, places)
+    pairs = np.array(
+        [
+            [_seconds(_by_gram, b, gram, places), _seconds(_by_least_squares, x, shapes, places)]
+            for _ in range(rounds)
+        ]
+    )
+    us = pairs / sets * 1e6
+    particle = bench_record(4)['us_a_particle']
+    return {
+        'sets': sets,
+        'samples': len(x),
+        'rounds': rounds,
+        'gram_numpy_us': float(np.median(us[:, 0])),
+        'least_squares_numpy_us': float(np.median(us[:, 1])),
+        'particle_us': particle,
+        'ratio': float(np.median(us[:, 1])) / particle,
+        'largest_relative_difference': float(np.abs(short / full - 1.0).max()),
+        'good': bool(np.allclose(short, full, rtol=1e-6)),
+    }
+
+
+def whitened_pulses(pulse: Any, lattice: FloatArray) -> FloatArray:
+    """What each depth leaves on the data before they are correlated with the pulse, one column a
+    depth: an orthonormal basis of the band, so that the Gram matrix is that of the pulse."""
+    length, step = len(lattice), float(lattice[1] - lattice[0])
+    size = length + 200  # a circle with some room between its ends
+    lags = step * np.minimum(np.arange(size), size - np.arange(size))
+    spectrum = np.fft.rfft(pulse(lags)).real.clip(min=0.0)
+    half = np.fft.irfft(np.sqrt(spectrum), size)
+    index = (np.arange(size)[:, None] - np.arange(length)[None, :]) % size
+    return np.ascontiguousarray(half[index])
+
+
+def _by_gram(b: FloatArray, gram: FloatArray, places: np.ndarray) -> FloatArray:
+    """b^T G^-1 b / 2 of each set."""
+    values = np.empty(len(places))
+    for k, z in enumerate(places):
+        values[k] = 0.5 * b[z] @ np.linalg.solve(gram[np.ix_(z, z)], b[z])
+    return values
+
+
+def _by_least_squares(x: FloatArray, shapes: FloatArray, places: np.ndarray) -> FloatArray:
+    """Half of what the residual sum of squares loses by fitting each set to all samples."""
+    values = np.empty(len(places))
+    for k, z in enumerate(places):
+        A = shapes[:, z]
+        fit = A @ np.linalg.lstsq(A, x, rcond=None)[0]
+        values[k] = 0.5 * (x @ x - np.sum(np.square(x - fit)))
+    return values
+
+
+def _seconds(function: Any, *arguments: Any) -> float:
+    begin = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - begin
+
+
+def _record_sentence(result: Mapping[str, Any]) -> str:
+    return (
+        f'a record, {result["particles"]} particles, {result["reflectors"]} reflectors: '
+        f'{result["median_ms"]:.1f} ms, worst {result["worst_ms"]:.1f} ms '
+        f'(wanted: at most {result["wanted_ms"]:g} ms)'
+    )
+
+
+def _likelihood_sentence(result: Mapping[str, Any]) -> str:
+    return (
+        f'likelihood of 8 reflectors: numpy over {result["samples"]} samples '
+        f'{result["least_squares_numpy_us"]:.0f} us, numpy at the reflectors '
+        f'{result["gram_numpy_us"]:.1f} us, a whole particle of the tracker '
+        f'{result["particle_us"]:.2f} us: {result["ratio"]:.0f} times less than the first'
+    )
+
+
+BENCHES = (
+    Bench('record', lambda rounds: bench_record(), _record_sentence),
+    Bench('likelihood', bench_likelihood, _likelihood_sentence),
+)

@@ -1,0 +1,136 @@
+"""A run of reflectors on the page: key numbers, and sections with a figure each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from attrs import evolve
+import numpy as np
+
+from ...trackers.fathometer import FathometerConfig, FathometerTracker
+from ..judging import Check
+from ..page import Card, Part, Section
+from ..report import run_part
+from ..run_folder import read_measurements
+from . import figures
+from .records import Record
+from .scoring import pair
+from .words import summary_sentence
+
+
+def fathometer_part(
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    records: Sequence[Record],
+    checks: Sequence[Check] = (),
+) -> Part:
+    """The whole part of one run, `checks` first."""
+    return run_part(
+        run,
+        metrics,
+        checks,
+        summary=summary_sentence(metrics),
+        cards=_cards(metrics),
+        sections=_sections(run, metrics, records) if records else [],
+    )
+
+
+def response_image(run: Mapping[str, Any]) -> figures.Image | None:
+    """The depth responses of a run as its tracker saw them; None when its recording is gone.
+
+    They are made anew by a tracker with two particles, whose estimates nobody asks for.
+    """
+    config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
+    columns, depths, last = [], None, None
+    for measurement in read_measurements(run):
+        tracker.process(measurement)
+        response = tracker.response
+        if response is None or response is last:
+            continue
+        last = response
+        if depths is None:
+            depths = response.depth
+        if len(response.depth) == len(depths):
+            columns.append((response.stamp_ns, response.amplitude / response.sigma))
+    if depths is None:
+        return None
+    columns.sort(key=lambda column: column[0])
+    return figures.Image(
+        np.array([value for _, value in columns]).T,
+        depths,
+        np.array([stamp for stamp, _ in columns], np.int64),
+    )
+
+
+def _cards(metrics: Mapping[str, Any]) -> list[Card]:
+    if 'scored_records' not in metrics:
+        return [
+            Card(f'{metrics["reflectors_mean"]:.1f}', 'Reflectors a record'),
+            Card(str(metrics['ids']), 'Reflectors in all', f'{metrics["records"]} records'),
+        ]
+    cards = [
+        Card(f'{100 * metrics["order_right"]:.0f} %', 'Number of reflectors right'),
+        Card(f'{metrics["ospa_m"]:.3f} m', 'OSPA', f'cutoff {metrics["cutoff_m"]:g} m'),
+        Card(
+            f'{metrics["false_per_record"]:.2f} / {metrics["missed_per_record"]:.2f}',
+            'False / missed a record',
+        ),
+    ]
+    if metrics['depth']['n']:
+        depth = metrics['depth']
+        cards.append(
+            Card(
+                f'{depth["rmse_m"]:.3f} m',
+                'Depth error, RMS',
+                f'{100 * depth["inside_2_sigma"]:.0f} % within two stated sigma',
+            )
+        )
+    if metrics['amplitude']['n']:
+        error = metrics['amplitude']['median_relative_error']
+        cards.append(Card(f'{100 * error:.0f} %', 'Amplitude error, median'))
+    return cards
+
+
+def _sections(
+    run: Mapping[str, Any], metrics: Mapping[str, Any], records: Sequence[Record]
+) -> list[Section]:
+    committed = [record for record in records if not record.preview]
+    start = records[0].stamp_ns
+    sections = [
+        Section(
+            'Depth response and reflectors',
+            'Grey: what the records show. Lines: the reflectors that were found, a colour an '
+            'identity. Yellow: where they truly are, when that is known.',
+            figures.response_figure(response_image(run), committed, start),
+        )
+    ]
+    if committed:
+        sections += [
+            Section(
+                'How many there are',
+                'Dark: this number of reflectors is probable. Line: the true number, when known.',
+                figures.order_figure(committed, start),
+            ),
+            Section(
+                'Amplitudes',
+                'Freed of spherical spreading where the depth of the array is known. A passive '
+                'array knows ratios only: the truth is brought to the same scale.',
+                figures.amplitude_figure(
+                    committed, start, metrics.get('amplitude', {}).get('factor')
+                ),
+            ),
+        ]
+    true = [record for record in committed if record.true is not None]
+    if true:
+        ospa = [pair(r.found.depth, r.true.depth, metrics['cutoff_m']).ospa for r in true]
+        sections.append(
+            Section(
+                'Distance from the truth',
+                'OSPA: depth errors, and reflectors too many or too few as if they were the '
+                'cutoff away.',
+                figures.distance_figure(true, np.array(ospa), start),
+            )
+        )
+    return sections

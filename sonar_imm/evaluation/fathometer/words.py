@@ -1,0 +1,61 @@
+"""The scores of a run of reflectors in words and lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..numbers import error_line
+
+
+def summary_sentence(metrics: Mapping[str, Any]) -> str:
+    """The result in plain words."""
+    if not metrics['records']:
+        return 'There is no record in this run.'
+    if 'scored_records' not in metrics:
+        return (
+            f'{metrics["reflectors_mean"]:.1f} reflectors a record in {metrics["records"]} '
+            'records. There is no truth to compare with, so this page shows what the tracker says '
+            'of itself.'
+        )
+    words = [
+        f'The number of reflectors is right in {100 * metrics["order_right"]:.0f} % of the '
+        f'records; a record lies {metrics["ospa_m"]:.3f} m from the true set (OSPA).'
+    ]
+    if metrics['depth']['n']:
+        words.append(
+            f'Depths are off by {metrics["depth"]["rmse_m"]:.3f} m (RMS); '
+            f'{metrics["false_per_record"]:.2f} reflectors a record are false and '
+            f'{metrics["missed_per_record"]:.2f} are missed.'
+        )
+    return ' '.join(words)
+
+
+def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Title and value of the numbers a person wants to see first."""
+    result = [
+        ('records', f'{metrics["records"]}'),
+        ('reflectors a record', f'{metrics["reflectors_mean"]:.2f}'),
+    ]
+    if 'scored_records' not in metrics:
+        return result
+    result += [
+        ('number of reflectors right', f'{100 * metrics["order_right"]:.1f} %'),
+        ('OSPA', f'{metrics["ospa_m"]:.3f} m'),
+        (
+            'false / missed a record',
+            f'{metrics["false_per_record"]:.3f} / {metrics["missed_per_record"]:.3f}',
+        ),
+        *error_line('depth error', metrics['depth'], 'm'),
+    ]
+    if metrics['amplitude']['n']:
+        error = metrics['amplitude']
+        result.append(
+            (
+                'amplitude error, median / 95 %',
+                f'{100 * error["median_relative_error"]:.1f} / '
+                f'{100 * error["p95_relative_error"]:.1f} %',
+            )
+        )
+    result.append(('identity switches', f'{metrics["identity_switches"]}'))
+    return result

@@ -1,0 +1,48 @@
+"""The fathometer node: ``ros2 run sonar_imm fathometer_node``, or
+``python -m sonar_imm.nodes.fathometer``.
+
+Hears ``csdm``, ``pressure`` or ``trace``, and ``array_depth`` beside them. One ``~/estimate`` a
+record; with `preview_seconds` also one at each sliding update between records, marked `preview`.
+Besides, for the newest record or preview:
+
+- ``~/response``: its depth response, as a table like that of ``trace`` with ``x y z`` before it;
+- ``~/model_probabilities``: how probable each number of reflectors is, by name.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from msg_adapters.array_records import write_response
+from msg_adapters.estimates import write_model_probabilities
+
+from ..estimates import Estimate
+from .base import run, TABLE, TrackerNode
+from .messages import make
+
+
+class FathometerNode(TrackerNode):
+    """Tracks reflectors below the sea floor from array noise or traces."""
+
+    def __init__(self, **options: Any):
+        super().__init__('fathometer', **options)
+
+    def advertise_displays(self) -> None:
+        self._response = self.advertise(TABLE, '~/response')
+        self._probabilities = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
+
+    def show(self, newest: Estimate) -> None:
+        if self._response.get_subscription_count() and self.tracker.response is not None:
+            self._response.publish(write_response(self.tracker.response, make))
+        if self._probabilities.get_subscription_count():
+            self._probabilities.publish(write_model_probabilities(newest, 0, make))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until it is told to stop; gives the exit code."""
+    return run(FathometerNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,26 @@
+"""Numpy archives (npz), the format in which research data usually travel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import zipfile
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .sources import BagError
+
+
+def read_npz(path: Path) -> dict[str, NDArray]:
+    """Give every array of an archive by name. Raises `BagError`."""
+    try:
+        with path.open('rb') as file:
+            if not zipfile.is_zipfile(file):
+                raise BagError(f'{path} is no numpy archive (npz)')
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
+    except (ValueError, EOFError, zlib.error, zipfile.BadZipFile):
+        raise BagError(f'{path} is damaged, or holds more than plain arrays') from None

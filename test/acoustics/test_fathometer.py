@@ -1,0 +1,229 @@
+"""The fathometer's processors against golden values, closed forms and the mistakes of print."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import fathometer
+from sonar_imm.acoustics.ambient import (
+    horizontal_noise_csdm,
+    noise_integral,
+    sample_csdm,
+    surface_noise_csdm,
+)
+from sonar_imm.acoustics.fathometer import (
+    chirp_z,
+    coherence,
+    conventional,
+    depth_response,
+    mvdr,
+    noise_sigma,
+    steering,
+    white_noise_loading,
+)
+from sonar_imm.acoustics.pulse import band_pulse
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
+C, M, D = 1500.0, 32, 0.18
+HEIGHTS = D * np.arange(M)
+
+
+@pytest.fixture(scope='module')
+def golden():
+    return json.loads((VECTORS / 'golden.json').read_text())
+
+
+def complex_of(pair):
+    return complex(*pair)
+
+
+@pytest.fixture(scope='module')
+def band():
+    """A coarse band over two layers, and what it is at every frequency."""
+    frequency = np.arange(200.0, 4000.0, 4.0)
+    R = surface_noise_csdm(frequency, M, D, [40.0, 52.0], [0.35, 0.1], C)
+    R += 0.01 * np.eye(M) + 0.5 * horizontal_noise_csdm(frequency, M, D, 0.03, C)
+    return frequency, R * (frequency[:, None, None] / 1000.0) ** -1.6
+
+
+def test_noise_integrals(golden):
+    for x, value in golden['I(x)=2*int_0^1 u e^{ixu}du'].items():
+        assert noise_integral(float(x)) == pytest.approx(complex_of(value), abs=1e-14)
+    u = (np.arange(100_000) + 0.5) / 100_000
+    for x in (0.0, 5e-4, 2e-3, -7.0):
+        expected = np.mean(2.0 * u * np.exp(1j * x * u))
+        assert noise_integral(x) == pytest.approx(expected, abs=1e-9)
+
+
+def one_layer():
+    R = surface_noise_csdm([1000.0], M, D, [56.5], [0.35], C) + 0.01 * np.eye(M)
+    return R, steering([1000.0], HEIGHTS, C)
+
+
+def test_cross_spectra_of_one_layer(golden):
+    R, _ = one_layer()
+    wanted = golden['R(1000Hz) one layer H=56.5 a=.35 no broadside, sens .01']
+    assert R[0, 0, 0] == pytest.approx(wanted['R00'])
+    assert R[0, 1, 0] == pytest.approx(complex_of(wanted['R10']))
+    assert R[0, 31, 0] == pytest.approx(complex_of(wanted['R31_0']))
+    assert np.allclose(R, R.conj().swapaxes(1, 2))
+    assert np.linalg.eigvalsh(R[0])[0] > 0.0
+
+
+@pytest.mark.parametrize('loading', [0.001, 0.01, 1.0])
+def test_mvdr_is_the_golden_one(golden, loading):
+    wanted = golden[f'MVDR eps={loading}']
+    R, w = one_layer()
+    C_, power = mvdr(R, w, loading)
+    assert C_[0] == pytest.approx(complex_of(wanted['closed']), rel=1e-10)
+    assert abs(C_[0] / power[0]) == pytest.approx(wanted['coherence closed'], rel=1e-10)
+    # The weights, each made of the loaded matrix, around the loaded matrix: the same.
+    L = R[0] + loading * np.trace(R[0]).real / M * np.eye(M)
+    up, down = (np.linalg.solve(L, v) for v in (w[0], w[0].conj()))
+    up, down = up / (w[0].conj() @ up), down / (w[0] @ down)
+    assert down.conj() @ L @ up == pytest.approx(C_[0], rel=1e-10)
+    unloaded = down.conj() @ R[0] @ up
+    assert unloaded == pytest.approx(complex_of(wanted['explicit_unloaded_R']), rel=1e-9)
+
+
+def test_conventional_is_the_golden_one(golden):
+    R, w = one_layer()
+    wanted = complex_of(golden['conv w^T R w/M^2'])
+    assert conventional(R, w)[0][0] / M**2 == pytest.approx(wanted, rel=1e-10)
+
+
+def response(gamma, frequency, low=20.0, high=80.0, step=1 / 32):
+    depth = np.arange(low, high, step)
+    spacing = frequency[1] - frequency[0]
+    b = depth_response(gamma, frequency[0], spacing, (low, step, len(depth)), 0.0, C)
+    return depth, b
+
+
+@pytest.mark.parametrize('processor', fathometer.PROCESSORS)
+def test_the_pulse_peaks_upright_at_the_layer(band, processor):
+    frequency, R = band
+    depth, b = response(coherence(R, steering(frequency, HEIGHTS, C), processor), frequency)
+    assert depth[np.argmax(b)] == pytest.approx(40.0, abs=0.04)
+    assert b.max() > 2.5 * -b.min()
+    near = np.abs(depth - 40.0) < 1.0
+    pulse = band_pulse(frequency[0], frequency[-1], C)(depth[near] - 40.0)
+    assert np.corrcoef(b[near], pulse)[0, 1] > 0.97
+
+
+def test_the_echo_keeps_its_sign_as_the_loading_grows(band):
+    """Loaded throughout it is upright to a loading of 3; an unloaded matrix in the middle turns it
+    over."""
+    frequency, R = band
+    w = steering(frequency, HEIGHTS, C)
+    for loading in (1e-3, 1e-2, 0.1, 1.0, 3.0):
+        depth, b = response(coherence(R, w, 'mvdr', loading=loading), frequency)
+        assert b[np.argmin(np.abs(depth - 40.0))] > 0.005
+
+    def in_the_middle(loading):
+        power = np.einsum('fmm->f', R).real / M
+        L = R + (loading * power)[:, None, None] * np.eye(M)
+        up, down = (np.linalg.solve(L, v[..., None])[..., 0] for v in (w, w.conj()))
+        cross = np.einsum('fm,fmn,fn->f', down.conj(), R, up)
+        norm = np.sqrt(np.einsum('fm,fm->f', w.conj(), up) * np.einsum('fm,fm->f', w, down))
+        depth, b = response(1j * cross / norm.real, frequency)
+        return b[np.argmin(np.abs(depth - 40.0))]
+
+    assert in_the_middle(1e-3) > 0.0 > in_the_middle(3.0)
+
+
+def test_the_printed_output_has_its_echo_at_negative_times(band):
+    """w^H R w* with plain weights is the conjugate of the conventional w^T R w."""
+    frequency, R = band
+    w = steering(frequency, HEIGHTS, C)
+    printed = np.einsum('fm,fmn,fn->f', w.conj(), R, w.conj())
+    C_, power = conventional(R, w)
+    assert np.allclose(printed, C_.conj())
+    _, above = response(-1j * printed / power, frequency)
+    depth, b = response(-1j * printed.conj() / power, frequency)
+    assert depth[np.argmax(b)] == pytest.approx(40.0, abs=0.04)
+    assert np.abs(above).max() < 0.5 * b.max()
+
+
+def test_noise_is_as_large_as_predicted():
+    frequency = 400.0 + 2.0 * np.arange(1000)
+    R = np.tile(np.eye(M), (len(frequency), 1, 1)).astype(complex)
+    rng = np.random.default_rng(0)
+    w = steering(frequency, HEIGHTS, C)
+    seen = [
+        noise_sigma(response(coherence(sample_csdm(R, 64, rng), w, 'conventional'), frequency)[1])
+        for _ in range(4)
+    ]
+    expected = fathometer.expected_noise_sigma(64, len(frequency))
+    assert np.mean(seen) == pytest.approx(expected, rel=0.06)
+
+
+def test_frequencies_may_be_missing(band):
+    frequency, R = band
+    gamma = coherence(R, steering(frequency, HEIGHTS, C), 'mvdr')
+    gamma[100:110] = np.nan
+    depth, b = response(gamma, frequency)
+    assert depth[np.argmax(b)] == pytest.approx(40.0, abs=0.04)
+    with pytest.raises(ValueError):
+        response(np.full(len(frequency), np.nan), frequency)
+
+
+def test_depth_response_is_the_sum_it_says(band):
+    frequency, _ = band
+    rng = np.random.default_rng(2)
+    gamma = rng.standard_normal(len(frequency)) + 1j * rng.standard_normal(len(frequency))
+    z = 30.0 + 0.013 * np.arange(50)
+    direct = np.exp(2j * np.pi * np.outer(2.0 * (z - 7.0) / C, frequency)) @ gamma
+    direct /= len(frequency)
+    arguments = gamma, frequency[0], 4.0, (30.0, 0.013, 50), 7.0, C
+    assert np.allclose(depth_response(*arguments), direct.real, atol=1e-10)
+    assert np.allclose(depth_response(*arguments, envelope=True), np.abs(direct), atol=1e-10)
+
+
+@pytest.mark.parametrize('N, count', [(1, 1), (1, 9), (13, 4), (64, 200)])
+def test_chirp_z(N, count):
+    rng = np.random.default_rng(N)
+    values = rng.standard_normal(N) + 1j * rng.standard_normal(N)
+    table = np.exp(2j * np.pi * 0.0137 * np.outer(np.arange(count), np.arange(N)))
+    assert np.allclose(chirp_z(values, 0.0137, count), table @ values, atol=1e-10)
+
+
+def test_white_noise_gain_is_kept(band):
+    frequency, R = band
+    w = steering(frequency, HEIGHTS, C)
+    loading = white_noise_loading(R, w, -3.0)
+    power = np.einsum('fmm->f', R).real / M
+    L = R + (loading * power)[:, None, None] * np.eye(M)
+    gains = []
+    for v in (w, w.conj()):
+        x = np.linalg.solve(L, v[..., None])[..., 0]
+        weights = x / np.einsum('fm,fm->f', v.conj(), x)[:, None]
+        gains.append(1.0 / np.sum(np.abs(weights) ** 2, axis=1))
+    least = np.minimum(*gains)
+    assert (least >= M * 10**-0.3 * 0.999).all()
+    loaded = loading > 2e-6
+    assert loaded.mean() > 0.2
+    assert (least[loaded] <= M * 10**-0.3 * 1.02).all()
+
+
+def test_singular_matrices_are_said_so():
+    w = steering([1000.0], HEIGHTS, C)
+    with pytest.raises(np.linalg.LinAlgError):
+        mvdr(np.zeros((1, M, M), complex), w, 1e-2)
+    with pytest.raises(ValueError, match='processor'):
+        coherence(np.eye(M)[None] + 0j, w, 'capon')
+
+
+def test_sampled_cross_spectra_scatter_as_wishart():
+    R, _ = one_layer()
+    rng = np.random.default_rng(0)
+    for snapshots in (8, 64):
+        drawn = sample_csdm(np.repeat(R, 4000, axis=0), snapshots, rng)
+        assert np.allclose(drawn.mean(axis=0), R[0], atol=0.02)
+        assert np.var(drawn[:, 3, 3].real) == pytest.approx(
+            R[0, 3, 3].real ** 2 / snapshots, rel=0.1
+        )
+        assert np.mean(np.abs(drawn[:, 0, 9] - R[0, 0, 9]) ** 2) == pytest.approx(
+            R[0, 0, 0].real * R[0, 9, 9].real / snapshots, rel=0.1
+        )

@@ -1,0 +1,94 @@
+"""Streaming cross-spectra against scipy's, whatever the blocks."""
+
+import numpy as np
+import pytest
+from scipy.signal import csd
+
+from sonar_imm.acoustics.spectra import (
+    BlockAverage,
+    outer_sum,
+    SlidingAverage,
+    SnapshotStream,
+    window_of,
+    window_overlap,
+)
+
+LENGTH, PHONES = 64, 4
+
+
+def pressure(samples=1000, seed=0):
+    rng = np.random.default_rng(seed)
+    shared = rng.standard_normal((samples, 1))
+    return (shared + rng.standard_normal((samples, PHONES))).astype(np.float32)
+
+
+def spectra_of(p, cuts=()):
+    stream = SnapshotStream(LENGTH, LENGTH // 2, slice(3, 20))
+    return np.concatenate([stream.push(block) for block in np.split(p, cuts)])
+
+
+def test_the_average_is_the_cross_spectrum_scipy_finds():
+    p = pressure()
+    spectra = spectra_of(p)
+    R = outer_sum(spectra) / len(spectra)
+    for i, j in ((0, 0), (0, 2), (3, 1)):
+        # scipy conjugates the first of the two, and scales to a density.
+        _, expected = csd(
+            p[:, j], p[:, i], nperseg=LENGTH, noverlap=LENGTH // 2, detrend=False, fs=1.0
+        )
+        assert R[:, i, j] * 2.0 / LENGTH == pytest.approx(expected[3:20], rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize('cuts', [(1,), (63, 64, 65), (500,), tuple(range(7, 1000, 7))])
+def test_blocks_may_be_cut_anywhere(cuts):
+    p = pressure()
+    assert spectra_of(p, cuts).tobytes() == spectra_of(p).tobytes()
+
+
+def test_a_restart_forgets_half_a_snapshot():
+    stream = SnapshotStream(LENGTH, LENGTH, slice(0, 5), 'rectangular')
+    stream.push(pressure(LENGTH - 1))
+    assert stream.waiting == LENGTH - 1
+    stream.restart()
+    assert len(stream.push(pressure(LENGTH - 1))) == 0
+    with pytest.raises(ValueError):
+        stream.push(np.zeros((5, PHONES + 1)))
+
+
+def test_block_averages_share_no_sample():
+    spectra = spectra_of(pressure())
+    average = BlockAverage(5, 1)
+    done = [one for part in np.split(spectra, [1, 8, 9]) for one in average.push(part)]
+    assert len(done) == (len(spectra) + 1) // 6
+    for k, one in enumerate(done):
+        assert one.csdm == pytest.approx(outer_sum(spectra[6 * k : 6 * k + 5]) / 5, rel=1e-5)
+        assert one.snapshots == 5
+
+
+def test_sliding_averages_are_of_the_last_snapshots():
+    spectra = spectra_of(pressure())
+    average = SlidingAverage(10, 4)
+    done = [one for part in np.split(spectra, [3, 11]) for one in average.push(part)]
+    assert len(done) == (len(spectra) - 10) // 4 + 1
+    for k, one in enumerate(done):
+        assert one.csdm == pytest.approx(outer_sum(spectra[4 * k : 4 * k + 10]) / 10, rel=1e-5)
+
+
+def test_windows_have_unit_power_and_the_autocorrelation_they_claim():
+    for name in ('hann', 'rectangular'):
+        window = window_of(name, 4096)
+        assert np.mean(window**2) == pytest.approx(1.0)
+        for share in (0.0, 0.1, 0.5, 0.9):
+            lag = round(share * 4096)
+            seen = np.sum(window[lag:] * window[: 4096 - lag]) / 4096
+            assert window_overlap(name, lag / 4096) == pytest.approx(seen, abs=1e-3)
+    with pytest.raises(ValueError):
+        window_of('kaiser', 8)
+
+
+def test_spectra_of_nothing():
+    assert BlockAverage(3).push(np.empty((0, 5, 4), np.complex64)) == []
+    with pytest.raises(ValueError):
+        SnapshotStream(8, 9, slice(0, 2))
+    with pytest.raises(ValueError):
+        SlidingAverage(3, 4)

@@ -1,0 +1,85 @@
+"""From files to scores by the commands: the simulated drift of the vectors, and real lines."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.recordings.measurements import measurements_of
+from sonar_imm.recordings.reader import BagReader
+
+ROOT = Path(__file__).resolve().parents[2]
+VECTORS = ROOT / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'
+DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'
+LINES = ('MET_NS-SN_SBP_L9_SN_20180313161627.seg', 'MET_EW-WE_SBP_L2_EW_20180313171011.seg')
+PROFILER = {
+    'pulse': 'gaussian',
+    'pulse_width': 0.8,
+    'noise_sigma': 2500.0,
+    'depth_min': 4.5,
+    'depth_max': 32.0,
+    'order_max': 4,
+    'depth_std': 0.2,
+    'min_separation': 2.4,
+    'amplitude_std_sigmas': 8.0,
+    'particles': 3000,
+}
+
+
+@pytest.fixture
+def call(capsys):
+    def call(*arguments):
+        capsys.readouterr()
+        assert main([*map(str, arguments), '--json']) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def test_the_drift_of_the_vectors_is_tracked_as_well_as_can_be(call, tmp_path):
+    call('convert', 'traces', VECTORS, tmp_path / 'bag', '--rate', '0.0111')
+    run = call('track', tmp_path / 'bag', tmp_path / 'out')
+    assert run['system'] == 'fathometer' and run['counts']['used'] == 300
+    metrics = call('evaluate', tmp_path / 'out', '--no-report')
+    assert metrics['order_right'] >= 0.94
+    assert metrics['ospa_m'] <= 0.07
+    assert metrics['depth']['rmse_m'] <= 0.04
+    assert metrics['identity_switches'] == 0
+
+
+@pytest.mark.parametrize('line', LINES)
+def test_the_water_bottom_of_a_real_line_is_followed(call, tmp_path, line):
+    pytest.importorskip('segyio')
+    if not (DATA / line).exists():
+        pytest.skip('no real recordings here; SONAR_IMM_DATA names their folder')
+    call(
+        'convert',
+        'segy',
+        DATA / line,
+        tmp_path / 'bag',
+        '--sample-spacing',
+        0.376,
+        '--first-sample',
+        12,
+        '--samples',
+        108,
+        '--stack',
+        4,
+    )
+    settings = [word for name, value in PROFILER.items() for word in ('--set', f'{name}={value}')]
+    call('track', tmp_path / 'bag', tmp_path / 'out', '--system', 'fathometer', *settings)
+    estimates = {one.stamp_ns: one for one in RunFolder(tmp_path / 'out').read_estimates()}
+    with BagReader(tmp_path / 'bag') as bag:
+        traces = [heard.measurement for heard in measurements_of(bag, 'fathometer')]
+    hits, below = [], []
+    for trace in traces:
+        first = int(np.argmax(trace.amplitude > 0.5 * trace.amplitude[:74].max()))
+        bottom = trace.depth[first + int(np.argmax(trace.amplitude[first : first + 4]))]
+        depth = estimates[trace.stamp_ns].state[:, 0]
+        hits.append(bool((np.abs(depth - bottom) < 1.0).any()))
+        below.append(bool((depth > bottom + 1.5).any()))
+    assert np.mean(hits) > 0.9 and np.mean(below) > 0.85

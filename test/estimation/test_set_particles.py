@@ -1,0 +1,283 @@
+"""The filter for sets against an exact one, its two forms against each other, and what each
+ingredient is good for."""
+
+import math
+from pathlib import Path
+
+from attrs import evolve
+import numpy as np
+import pytest
+
+from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
+from sonar_imm.estimation.set_particles import (
+    banded_transition,
+    gaussian_move,
+    propagate,
+    propose,
+    SetModel,
+    Sets,
+    start,
+    weigh,
+)
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
+EXACT_LOG_EVIDENCE = 298.6663117
+"""By enumeration of all sets of up to three members on the 60 cells, in a program of its own."""
+
+
+@pytest.fixture(scope='module')
+def exact():
+    with np.load(VECTORS / 'exact_hmm.npz') as file:
+        return {name: file[name] for name in file}
+
+
+@pytest.fixture(scope='module')
+def model():
+    lag = np.arange(60)
+    return SetModel(
+        cells=60,
+        separation=3,
+        order_min=1,
+        transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
+        move=gaussian_move(0.8),
+        gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
+        amplitude_std=3.0,
+    )
+
+
+def run(model, records, particles, seed, threads=1):
+    """PMFs (T, orders), intensities (T, n), log evidence."""
+    tracker, known = SetFilter(model, particles, threads), None
+    pmfs, intensities, evidence = [], [], 0.0
+    for name, b in enumerate(records):
+        step = tracker.step(known, b, (seed, name))
+        known = step.after
+        pmf, sums = tracker.summary(step, step.w, step.sets)
+        pmfs.append(pmf)
+        intensities.append(sums[0])
+        evidence += step.log_evidence
+    return np.array(pmfs), np.array(intensities), evidence
+
+
+def variation(pmf, exact):
+    return 0.5 * np.abs(pmf - exact['exP']).sum(axis=1).mean()
+
+
+def test_the_pmf_and_the_evidence_are_the_exact_ones(model, exact):
+    pmf, intensity, evidence = run(model, exact['B'], 20_000, seed=1)
+    assert variation(pmf, exact) <= 0.008
+    assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.5
+    assert np.abs(intensity - exact['exI']).sum(axis=1).mean() < 0.06
+
+
+def test_the_error_falls_with_the_root_of_the_number_of_particles(model, exact):
+    few, many = (
+        np.mean([variation(run(model, exact['B'], N, seed)[0], exact) for seed in range(6)])
+        for N in (500, 8000)
+    )
+    assert 2.5 < few / many < 6.5  # sqrt(16) = 4
+
+
+def test_proposals_change_how_many_particles_count_and_nothing_else(model, exact):
+    for shares in ({'birth_share': 0.0}, {'move_share': 0.5, 'birth_share': 0.5}):
+        pmf, _, evidence = run(evolve(model, **shares), exact['B'], 20_000, seed=2)
+        assert variation(pmf, exact) <= 0.012
+        assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.7
+
+
+@pytest.mark.parametrize('table', ['move_ratio', 'birth_ratio'])
+def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch):
+    from sonar_imm.estimation import set_filter
+
+    if table == 'move_ratio':
+        fill = set_filter.kernels.fill_moves
+
+        def unpaid(*arguments):
+            fill(*arguments)
+            ratio = arguments[-1]
+            ratio[np.isfinite(ratio)] = 0.0
+
+        monkeypatch.setattr(set_filter.kernels, 'fill_moves', unpaid)
+    else:
+        births = set_filter.propose_births
+        monkeypatch.setattr(
+            set_filter, 'propose_births', lambda *a: (births(*a)[0], np.zeros(model.cells))
+        )
+    assert variation(run(model, exact['B'], 5000, seed=1)[0], exact) > 0.03
+
+
+def test_amplitudes_that_are_not_drawn_anew_at_random_are_paid_for(model, exact):
+    """Best amplitudes without a fine make too many members; with the paper's fine, too few."""
+    orders = np.arange(1, 4)
+    mean = {
+        name: (run(changed, exact['B'], 3000, seed=1)[0] @ orders).mean()
+        for name, changed in {
+            'exact': model,
+            'free': evolve(model, amplitude_prior='bic_half', independent_samples=1.0),
+            'paper': evolve(model, amplitude_prior='paper', independent_samples=500.0),
+        }.items()
+    }
+    assert mean['free'] > mean['exact'] + 0.3
+    assert mean['paper'] < mean['exact'] - 0.1
+
+
+def test_threads_do_not_change_a_byte(model, exact):
+    one, four = (run(model, exact['B'][:10], 3001, seed=5, threads=n) for n in (1, 4))
+    assert one[0].tobytes() == four[0].tobytes()
+    assert one[1].tobytes() == four[1].tobytes()
+
+
+def test_a_record_has_random_numbers_of_its_own(model, exact):
+    tracker = SetFilter(model, 500)
+    known = tracker.step(None, exact['B'][0], (3, 7)).after
+    again = [tracker.step(known, exact['B'][1], (3, 8)) for _ in range(2)]
+    other = tracker.step(known, exact['B'][1], (3, 9))
+    assert again[0].w.tobytes() == again[1].w.tobytes() != other.w.tobytes()
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {},
+        {'move_share': 0.0, 'birth_share': 0.0},
+        {'amplitude_prior': 'bic_half'},
+        {'amplitude_prior': 'paper'},
+        {'amplitude_memory': 0.9},
+        {'transition': banded_transition(3, 0.3), 'order_min': 0},
+    ],
+)
+def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change):
+    changed = evolve(model, **change)
+    tracker, N = SetFilter(changed, 400), 400
+    rng = np.random.default_rng(1)
+    b = exact['B'][3]
+    known = tracker._start(b, (1, 2))
+    uniform = np.random.Generator(
+        np.random.Philox(
+            key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64)
+        )
+    ).random((N, 1 + changed.order_max))
+    sets, ratio = start(changed, propose(changed, b), uniform)
+    assert np.allclose(known.log_weight, ratio)
+    possible = np.isfinite(ratio)
+    assert np.array_equal(known.sets.cell[possible], sets.cell[possible])
+
+    sets = Sets(
+        *known.sets[:2],
+        rng.uniform(-1.0, 3.0, known.sets.cell.shape),
+        rng.uniform(0.5, 4.0, known.sets.cell.shape),
+    )
+    moved, ratio = tracker._propagate(sets, b, np.random.default_rng(8))
+    expected, wanted = propagate(
+        changed,
+        propose(changed, b),
+        sets,
+        np.random.default_rng(8).random((N, changed.uniforms)),
+    )
+    assert np.array_equal(moved.order, expected.order)
+    assert np.allclose(ratio, wanted)
+    assert len(set(moved.order)) == 3
+    possible = np.isfinite(ratio)
+    for i in np.flatnonzero(possible):
+        m = moved.order[i]
+        assert np.array_equal(moved.cell[i, :m], expected.cell[i, :m])
+        if changed.amplitude_memory:
+            assert np.array_equal(moved.prior_mean[i, :m], expected.prior_mean[i, :m])
+
+    weight = np.where(possible, 0.0, -np.inf)
+    amplitude = tracker._weigh(moved, b, weight)
+    log_likelihood, mean = weigh(changed, b, moved.take(np.flatnonzero(possible)))
+    assert np.allclose(weight[possible], log_likelihood)
+    alive = np.isfinite(log_likelihood)
+    assert 50 < np.count_nonzero(alive) < N
+    assert np.allclose(amplitude[possible][alive], mean[alive])
+
+
+def test_the_likelihood_is_that_of_the_whole_record():
+    """Least squares on every sample, noise as correlated as the pulse, is b' G^-1 b / 2."""
+    n, places, sigma = 40, np.array([8, 15, 22]), 0.3
+    lag = np.arange(n)
+    gram = np.exp(-0.5 * (lag / 1.2) ** 2)
+    G = gram[np.abs(lag[:, None] - lag[None, :])] + 1e-9 * np.eye(n)
+    y = G[:, places] @ [2.0, 1.0, 1.5] + np.linalg.cholesky(G) @ (
+        sigma * np.random.default_rng(0).standard_normal(n)
+    )
+    A = G[:, places]
+    a = np.linalg.solve(A.T @ np.linalg.solve(G, A), A.T @ np.linalg.solve(G, y))
+    residual = y - A @ a
+    full = 0.5 * (y @ np.linalg.solve(G, y) - residual @ np.linalg.solve(G, residual)) / sigma**2
+    model = SetModel(
+        cells=n,
+        separation=2,
+        order_min=3,
+        transition=[[1.0]],
+        move=gaussian_move(1.0),
+        gram=gram,
+        amplitude_prior='bic_half',
+        independent_samples=1.0,
+    )
+    sets = Sets.empty(model, 1)
+    sets.order[:], sets.cell[0] = 3, places
+    log_likelihood, amplitude = weigh(model, y / sigma, sets)
+    assert log_likelihood[0] == pytest.approx(full, rel=1e-6)
+    assert sigma * amplitude[0] == pytest.approx(a, rel=1e-6)
+
+
+def test_marginal_amplitudes_are_integrated_out():
+    model = SetModel(
+        cells=5,
+        separation=1,
+        order_min=1,
+        transition=[[1.0]],
+        move=gaussian_move(0.5),
+        gram=np.eye(1, 5)[0],
+        amplitude_std=2.0,
+    )
+    b = np.array([0.0, 0.0, 1.7, 0.0, 0.0])
+    sets = Sets.empty(model, 1)
+    sets.order[:], sets.cell[0] = 1, 2
+    a = np.linspace(-30.0, 30.0, 200_001)
+    prior = np.exp(-0.5 * (a / 2.0) ** 2) / (2.0 * math.sqrt(2.0 * math.pi))
+    integral = np.sum(prior * np.exp(a * 1.7 - 0.5 * a * a)) * (a[1] - a[0])
+    assert weigh(model, b, sets)[0][0] == pytest.approx(math.log(integral))
+
+
+def test_what_came_later_corrects_what_was_known(model, exact):
+    tracker, smoother, known = SetFilter(model, 5000), LagSmoother(3), None
+    right_then, right_later = [], []
+    pmfs = []
+    for name, b in enumerate(exact['B']):
+        step = tracker.step(known, b, (4, name))
+        known = step.after
+        pmfs.append(tracker.summary(step, step.w, step.sets)[0])
+        found = smoother.push(step)
+        if found:
+            earlier, w = found
+            assert w.sum() == pytest.approx(1.0)
+            true = exact['true_m'][name - 3] - 1
+            right_later.append(tracker.summary(earlier, w, earlier.sets)[0][true])
+            right_then.append(pmfs[name - 3][true])
+    assert np.mean(right_later) > np.mean(right_then) + 0.01
+
+
+def test_a_record_nothing_explains_is_said_so(model):
+    step = SetFilter(model, 100).step(None, np.full(60, -5.0), (0, 1))
+    assert not step.ok
+    assert step.log_evidence == -math.inf
+    assert step.w.sum() == pytest.approx(1.0)
+
+
+def test_models_that_cannot_be_are_refused(model):
+    for change in (
+        {'amplitude_prior': 'flat'},
+        {'separation': 40},
+        {'amplitude_prior': 'paper', 'amplitude_memory': 0.5},
+        {'transition': np.ones((3, 3))},
+    ):
+        with pytest.raises(ValueError):
+            evolve(model, **change)
+
+
+def test_room_counts_the_possible_sets(model):
+    pairs = sum(1 for i in range(60) for j in range(i) if i - j >= 3)
+    assert [model.room(m) for m in (0, 1, 2)] == [1, 60, pairs]

@@ -1,0 +1,187 @@
+"""Sets of reflectors are scored as they should be, and a whole run is told."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.evaluation.fathometer import LIMIT
+from sonar_imm.evaluation.fathometer.bench import bench_likelihood, bench_record
+from sonar_imm.evaluation.fathometer.records import Record, records_of, Reflections
+from sonar_imm.evaluation.fathometer.scoring import pair, score
+from sonar_imm.evaluation.fathometer.sections import response_image
+from sonar_imm.evaluation.judging import judge
+from sonar_imm.evaluation.run_folder import read_measurements, RunFolder
+from sonar_imm.measurements import Trace
+from sonar_imm.recordings.sources import BagError
+
+SECOND = 10**9
+
+
+def reflections(depth, strength=None, track_id=None):
+    depth = np.array(depth, float)
+    return Reflections(
+        depth,
+        np.ones(len(depth)) if strength is None else np.array(strength, float),
+        np.arange(len(depth)) if track_id is None else np.array(track_id),
+    )
+
+
+def record(found, true, stamp=1, order=None, **extra):
+    pmf = np.zeros(6)
+    pmf[(len(found) if order is None else order) - 1] = 1.0
+    return Record(
+        stamp_ns=stamp * SECOND,
+        preview=extra.get('preview', False),
+        found=found,
+        depth_std=np.full(len(found), 0.05),
+        existence=np.ones(len(found)),
+        pmf=pmf,
+        order_min=1,
+        sigma=1.0,
+        true=true,
+    )
+
+
+def test_a_set_lies_no_distance_from_itself():
+    z = np.array([130.0, 134.0, 138.0])
+    assert pair(z, z[::-1], 2.0).ospa == 0.0
+    assert pair(z[:0], z[:0], 2.0).ospa == 0.0
+
+
+def test_ospa_in_closed_form():
+    assert pair(np.array([10.0]), np.array([10.3]), 2.0).ospa == pytest.approx(0.3)
+    assert pair(np.array([10.0]), np.array([15.0]), 2.0).ospa == pytest.approx(2.0)
+    assert pair(np.array([]), np.array([15.0, 16.0]), 2.0).ospa == pytest.approx(2.0)
+    one = pair(np.array([10.0, 20.0, 30.0]), np.array([10.3, 20.0]), 2.0)
+    assert one.ospa == pytest.approx((0.3 + 2.0) / 3.0)
+    assert list(one.found) == [0, 1] and list(one.true) == [0, 1]
+
+
+def test_partners_are_near_and_as_many_as_can_be():
+    one = pair(np.array([10.0, 10.3]), np.array([9.7, 10.2]), 2.0)
+    assert list(one.found) == [0, 1] and list(one.true) == [0, 1]
+    assert not len(pair(np.array([10.0]), np.array([10.41]), 2.0).found)
+
+
+def test_false_missed_amplitudes_and_switches_are_counted():
+    true = reflections([130.0, 134.0], [0.4, 0.2], [7, 9])
+    records = [
+        record(reflections([130.1, 134.1], [4.0, 2.0], [1, 2]), true, 1),
+        record(reflections([130.1, 134.1, 150.0], [4.0, 2.2, 1.0], [1, 3, 4]), true, 2),
+        record(reflections([129.9], [4.0], [1]), true, 3, order=2),
+        record(reflections([]), true, 4, order=5, preview=True),
+    ]
+    metrics = score(records)
+    assert metrics['records'] == 3 and metrics['previews'] == 1
+    assert metrics['order_right'] == pytest.approx(2 / 3)
+    assert metrics['false_per_record'] == pytest.approx(1 / 3)
+    assert metrics['missed_per_record'] == pytest.approx(1 / 3)
+    assert metrics['depth']['rmse_m'] == pytest.approx(0.1)
+    assert metrics['depth']['inside_2_sigma'] == pytest.approx(1.0)
+    assert metrics['amplitude']['factor'] == pytest.approx(10.0)
+    assert metrics['amplitude']['p95_relative_error'] == pytest.approx(0.08, abs=1e-9)
+    assert metrics['identity_switches'] == 1 and metrics['ids'] == 4
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('fathometer')
+    assert (
+        main(
+            [
+                'simulate',
+                'fathometer',
+                str(folder / 'bag'),
+                '--scenario',
+                'drift_traces',
+                '--seed',
+                '4',
+                '--set',
+                'records=12',
+                '--set',
+                'layers=3',
+                '--set',
+                'fading=',
+                '--set',
+                'appearing=',
+                '--set',
+                'depth_step=0.0625',
+            ]
+        )
+        == 0
+    )
+    assert (
+        main(
+            [
+                'track',
+                str(folder / 'bag'),
+                str(folder / 'out'),
+                '--system',
+                'fathometer',
+                '--set',
+                'particles=4000',
+            ]
+        )
+        == 0
+    )
+    return RunFolder(folder / 'out')
+
+
+def test_a_whole_run_is_judged_and_told(run, capsys):
+    judgement = judge(run)
+    assert judgement.metrics['scored_records'] == 12
+    assert judgement.accuracy(None).good and not judgement.accuracy(1e-6).good
+    assert judgement.accuracy(None).name == f'{LIMIT.meaning} against truth'
+    titles = [section.title for section in judgement.part([]).sections]
+    assert titles[:4] == [
+        'Depth response and reflectors',
+        'How many there are',
+        'Amplitudes',
+        'Distance from the truth',
+    ]
+    assert main(['evaluate', str(run.path), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['ospa_m'] == judgement.metrics['ospa_m']
+
+
+def test_the_image_is_what_the_tracker_saw(run):
+    content = run.read_run()
+    traces = [one for one in read_measurements(content) if isinstance(one, Trace)]
+    image = response_image(content)
+    assert image.value.shape == (len(traces[0]), len(traces))
+    expected = traces[5].amplitude / traces[5].sigma
+    assert np.allclose(image.value[:, 5], expected, rtol=1e-4, atol=1e-4)
+    assert image.stamp_ns[5] == traces[5].stamp_ns
+
+
+def test_without_truth_there_is_a_page_and_no_verdict(run):
+    records = records_of(run.read_estimates())
+    assert 'scored_records' not in score(records)
+    blind = judge(run).metrics
+    assert blind['truth_lag_s'] == 0.0
+
+
+def test_other_estimates_and_other_truth_are_one_sentence(run):
+    import attrs
+
+    some = run.read_estimates()
+    bare = [attrs.evolve(one, extras={}) for one in some]
+    with pytest.raises(BagError, match='not estimates of reflectors'):
+        records_of(bare)
+    divers = [attrs.evolve(one, state_names=('px', 'py')) for one in some]
+    with pytest.raises(BagError, match='truth is not that of reflectors'):
+        records_of(some, divers)
+
+
+def test_truth_further_away_than_the_gap_is_none(run):
+    some = run.read_estimates()
+    early, late = records_of(some[:1], some[1:], gap=60.0), records_of(some[:1], some[1:], gap=100)
+    assert early[0].true is None and late[0].true is not None
+
+
+def test_both_ways_to_the_likelihood_agree():
+    result = bench_likelihood(rounds=1, sets=10)
+    assert result['good'] and result['largest_relative_difference'] < 1e-6
+    assert result['least_squares_numpy_us'] > result['gram_numpy_us']
+    assert bench_record(2)['reflectors'] == 8

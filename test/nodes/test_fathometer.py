@@ -1,0 +1,205 @@
+"""The fathometer node: an estimate a record, pressure in blocks, displays, hostility."""
+
+import attrs
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState, PointCloud2
+
+from msg_adapters.array_depth import write_array_depth
+from msg_adapters.array_records import read_trace, write_csdm, write_pressure, write_trace
+from msg_adapters.estimates import read_estimate
+from msg_adapters.table import encode_table
+from sonar_imm.measurements import ArrayDepth, Pressure
+from sonar_imm.nodes.fathometer import FathometerNode
+from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.qos import input_qos, lockstep_qos
+from sonar_imm.simulation.fathometer import scenario, simulate
+from sonar_imm.trackers import SYSTEMS
+
+SMALL = ('phones:=8', 'element_spacing:=0.36', 'frequency_max:=2000.0', 'particles:=2000')
+START = 1_700_000_000 * 10**9
+
+
+class Rig:
+    def __init__(self, bench):
+        self.bench = bench
+        self.node = bench.add(FathometerNode(context=bench.context))
+        self.tables = bench.listen(PointCloud2, '/fathometer/estimate', lockstep_qos())
+        self.publishers = {
+            name: bench.peer.create_publisher(PointCloud2, f'/{name}', lockstep_qos())
+            for name in ('csdm', 'pressure', 'trace')
+        }
+        self.publishers['array_depth'] = bench.peer.create_publisher(
+            message_class('geometry_msgs/msg/PointStamped'), '/array_depth', lockstep_qos()
+        )
+        bench.spin_until(
+            lambda: (
+                all(one.get_subscription_count() for one in self.publishers.values())
+                and self.node.count_subscribers('/fathometer/estimate')
+            )
+        )
+
+    def send(self, name, *messages):
+        received = self.node._meter.received
+        for message in messages:
+            before = received.total()
+            self.publishers[name].publish(message)
+            self.bench.spin_until(lambda want=before: received.total() > want)
+        self.bench.spin_until(lambda: len(self.tables) == self.node._published)
+
+
+def rig_of(make_bench, *parameters):
+    return Rig(make_bench(*(word for text in parameters for word in ('-p', text))))
+
+
+@pytest.fixture
+def rig(make_bench):
+    return rig_of(make_bench, *SMALL)
+
+
+def traces(**values):
+    scene = simulate(scenario('drift_traces', {'records': 4, 'appearing': (), **values}), 3)
+    return [one.measurement for one in scene.measurements], scene.truth
+
+
+def table(**columns):
+    """A message that no adapter of ours would write."""
+    return encode_table(columns, stamp_ns=START, frame_id='array', make=make)
+
+
+def test_traces_become_reflectors_with_ids_and_displays(rig):
+    responses = rig.bench.listen(PointCloud2, '/fathometer/response')
+    numbers = rig.bench.listen(JointState, '/fathometer/model_probabilities')
+    rig.bench.spin_until(
+        lambda: (
+            rig.node.count_subscribers('/fathometer/response')
+            and rig.node.count_subscribers('/fathometer/model_probabilities')
+        )
+    )
+    measured, truth = traces(fading=(), layers=4)
+    rig.send('trace', *[write_trace(one, make) for one in measured])
+    rig.bench.spin_until(lambda: len(responses) == len(numbers) == len(rig.tables) == 4)
+    estimate = read_estimate(rig.tables[-1])
+    assert estimate.stamp_ns == measured[-1].stamp_ns
+    assert np.allclose(np.sort(estimate.state[:, 0]), np.sort(truth[-1].depth), atol=0.2)
+    assert len(set(estimate.extras['track_id'])) == 4
+    best = int(np.argmax(numbers[-1].position))
+    assert numbers[-1].name[best] == 'order_4'
+    shown = read_trace(responses[-1])
+    assert len(shown) == len(measured[-1])
+    assert np.corrcoef(shown.amplitude, measured[-1].amplitude)[0, 1] > 0.999
+
+
+def test_cross_spectra_use_the_depth_that_a_companion_tells(rig):
+    scene = simulate(scenario('small', {'records': 3, 'fading': ()}), 2)
+    for item in scene.measurements:
+        one = item.measurement
+        if isinstance(one, ArrayDepth):
+            rig.send('array_depth', write_array_depth(one, make))
+        else:
+            rig.send('csdm', write_csdm(one, make))
+    assert len(rig.tables) == 3 and not rig.node._meter.refused
+    estimate = read_estimate(rig.tables[-1])
+    distance = np.abs(estimate.state[:, :1] - scene.truth[-1].depth)
+    assert (distance.min(axis=1) < 0.2).all()
+
+
+def blocks_of(seconds, *, phones=8, rate=4000.0, block=0.5, seed=5):
+    rng = np.random.default_rng(seed)
+    n = round(block * rate)
+    return [
+        Pressure(
+            stamp_ns=START + round(k * block * 1e9),
+            frame_id='array',
+            pressure=rng.normal(size=(n, phones)),
+            sample_rate=rate,
+            reference_depth=70.0,
+        )
+        for k in range(round(seconds / block))
+    ]
+
+
+def test_pressure_makes_records_and_previews_between_them(make_bench):
+    rig = rig_of(
+        make_bench, *SMALL, 'snapshot_seconds:=0.4', 'record_seconds:=4.0', 'preview_seconds:=1.0'
+    )
+    rig.send('pressure', *[write_pressure(one, make, scale=1e-3) for one in blocks_of(10.0)])
+    preview = [int(read_estimate(one).extras['preview'][0]) for one in rig.tables]
+    assert preview.count(0) == 2
+    assert preview.count(1) >= 2
+    assert rig.node.tracker.counts['blocks'] == 20
+
+
+def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
+    """1.4 s of 32 phones at 12 kHz, 2 MB each, ten times as fast, as a driver publishes them."""
+    rig = rig_of(make_bench, 'particles:=200', 'record_seconds:=28.0')
+    driver = rig.bench.peer.create_publisher(PointCloud2, '/pressure', input_qos(50))
+    rig.bench.spin_until(driver.get_subscription_count)
+    blocks = blocks_of(28.0, phones=32, rate=12000.0, block=1.4)
+    for message in [write_pressure(one, make) for one in blocks]:
+        driver.publish(message)
+        rig.bench.executor.spin_once(timeout_sec=0.02)
+    rig.bench.spin_until(lambda: rig.node._meter.received['pressure'] == len(blocks), 30.0)
+    assert rig.node.tracker.counts['blocks'] == len(blocks)
+    assert rig.node.tracker.counts['gaps'] == 0
+    assert rig.node.tracker.counts['used'] == 1
+    assert not rig.node._meter.refused
+
+
+def test_hostile_records_are_named_and_counted_and_harm_nobody(rig):
+    flat = np.zeros((6, 2 * 64), np.float32)
+    frequency = np.float32(100.0 * np.arange(1, 7))
+    depth = np.float32(120.0 + 0.1 * np.arange(60))
+    upper = np.tile(
+        (np.eye(8) + np.triu(0.5 * np.ones((8, 8)), 1)).astype(np.complex64), (6, 1, 1)
+    )
+    lopsided = upper.reshape(6, -1).view(np.float32)
+    rig.send('csdm', table(frequency=frequency, csdm=flat))
+    rig.send('csdm', table(frequency=frequency, csdm=np.full_like(flat, np.nan)))
+    rig.send('csdm', table(frequency=frequency, csdm=lopsided))
+    rig.send('csdm', table(frequency=frequency, csdm=flat[:, :30]))
+    rig.send('trace', table(depth=depth[:1], amplitude=depth[:1]))
+    rig.send('pressure', table(p=np.zeros((10, 8), np.float32)))
+    refused = rig.node._meter.refused
+    assert refused == {
+        'silent': 1,
+        'nan': 1,
+        'not_hermitian': 1,
+        'bad_field': 1,
+        'too_short': 1,
+        'missing_column': 1,
+    }
+    assert not rig.tables and not rig.node._errors
+    measured, _ = traces(fading=(), layers=4)
+    rig.send('trace', write_trace(measured[0], make))
+    assert len(rig.tables) == 1
+
+
+def test_an_array_of_another_size_is_counted_and_a_dead_phone_masked(rig):
+    scene = simulate(scenario('small', {'records': 2, 'fading': (), 'depth_companion': False}), 2)
+    first, second = (item.measurement for item in scene.measurements)
+    wrong = simulate(
+        scenario('small', {'records': 1, 'fading': (), 'phones': 6, 'depth_companion': False}), 2
+    )
+    rig.send('csdm', write_csdm(wrong.measurements[0].measurement, make))
+    assert rig.node.tracker.counts['wrong_phones'] == 1 and not rig.tables
+    dead = np.array(second.csdm)
+    dead[:, 5], dead[:, :, 5] = 0.0, 0.0
+
+    rig.send('csdm', write_csdm(attrs.evolve(second, csdm=dead), make))
+    assert rig.node.tracker.counts['dead_phones_masked'] == 1
+    assert len(rig.tables) == 1 and not rig.node._errors
+    assert first.phones == 8
+
+
+def test_offline_says_the_same_to_the_bit(rig):
+    measured, _ = traces(fading=(), layers=4)
+    rig.send('trace', *[write_trace(one, make) for one in measured])
+    system = SYSTEMS['fathometer']
+    tracker = system.build(
+        system.config_type()(phones=8, element_spacing=0.36, frequency_max=2000.0, particles=2000)
+    )
+    expected = [one for m in measured for one in tracker.process(read_trace(write_trace(m, make)))]
+    for message, one in zip(rig.tables, expected, strict=True):
+        live, offline = read_estimate(message).columns(), one.columns()
+        assert all(live[name].tobytes() == offline[name].tobytes() for name in offline)

@@ -1,0 +1,41 @@
+"""``check fathometer``: the real node and the offline tracker, on the shipped recordings."""
+
+import json
+
+import pytest
+
+from sonar_imm.cli import main
+
+pytestmark = pytest.mark.system
+
+
+def test_the_shipped_recordings_pass(tmp_path, capsys):
+    assert main(['check', 'fathometer', '--json', '--out', str(tmp_path)]) == 0
+    outcomes = json.loads(capsys.readouterr().out)
+    assert [outcome['bag'].rsplit('/', 1)[-1] for outcome in outcomes] == [
+        'fathometer_array',
+        'fathometer_drift',
+    ]
+    for outcome in outcomes:
+        assert outcome['good'] and len(outcome['checks']) == 4
+        assert outcome['checks'][1]['result'] == 'equal bytes'
+
+
+def test_a_limit_that_cannot_be_met_fails(tmp_path, capsys):
+    from sonar_imm.resources import share_folder
+
+    bag = share_folder() / 'bags' / 'fathometer_array'
+    assert main(['check', 'fathometer', '--json', '--bag', str(bag), '--limit', '1e-6']) == 1
+    (outcome,) = json.loads(capsys.readouterr().out)
+    assert [check['good'] for check in outcome['checks']] == [True, True, True, False]
+
+
+def test_without_the_parameters_it_brings_a_recording_of_another_array_is_counted_out(
+    tmp_path, capsys
+):
+    from sonar_imm.resources import share_folder
+
+    bag = share_folder() / 'bags' / 'fathometer_array'
+    assert main(['track', str(bag), str(tmp_path / 'out'), '--json']) == 0
+    run = json.loads(capsys.readouterr().out)
+    assert run['counts']['wrong_phones'] == 12 and run['estimates'] == 0
