@@ -180,6 +180,13 @@ def gate(
         return np.where(inside, np.log(np.sum(weight * np.exp(log_density), axis=-1)), -np.inf)
 
 
+def pairs_inside(fit: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Target and detection (pairs,) of the finite entries of a table from `gate`, in order."""
+    # Flat indices: for a million entries several times faster than two-dimensional ones.
+    target, detection = np.divmod(np.flatnonzero(fit > -np.inf), max(fit.shape[1], 1))
+    return target, detection
+
+
 def embed(
     F: ArrayLike,
     Q: ArrayLike,

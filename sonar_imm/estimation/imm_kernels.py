@@ -205,10 +205,10 @@ def gate(
                     high[r] = max(high[r], h[t, j, r] + reach)
         for d in range(D):
             out[t, d] = -np.inf
-            near = True
-            for r in range(m):
-                near = near and low[r] <= z[d, r] <= high[r]
-            if not near:
+            r = 0
+            while r < m and low[r] <= z[d, r] <= high[r]:
+                r += 1
+            if r < m:
                 continue
             total, inside = 0.0, False
             for j in range(M):

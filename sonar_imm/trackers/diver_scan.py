@@ -10,7 +10,7 @@ from typing import NamedTuple
 from attrs import evolve, frozen
 import numpy as np
 
-from ..estimation import imm_kernels
+from ..estimation import imm, imm_kernels
 from ..estimation.adaptation import AdaptiveChain
 from ..estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
 from ..measurements import FloatArray
@@ -200,7 +200,7 @@ class Scan:
         chosen = np.full(len(self.x), -1)
         free = np.ones(len(group.z), bool)
         fit = self._fit(group)
-        target, detection = np.nonzero(np.isfinite(fit))
+        target, detection = imm.pairs_inside(fit)
         likelihood = fit[target, detection]
         if group.clutter == 0.0:
             cost = -1e6 - likelihood  # nothing to compare with but the other tracks

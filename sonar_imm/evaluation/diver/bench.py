@@ -14,7 +14,7 @@ from typing import Any
 from attrs import frozen
 import numpy as np
 
-from ...estimation import imm_kernels
+from ...estimation import imm, imm_kernels
 from ...estimation.association import assign, association_cost, gate_threshold
 from ...measurements import FloatArray
 from ..benching import Bench
@@ -138,7 +138,7 @@ def _scan(p: Problem, x: FloatArray, P: FloatArray, mu: FloatArray, z: FloatArra
     expected = np.ascontiguousarray(x[:, :, :2])
     fit = imm_kernels.gate(expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)),
                            gate_threshold(0.999, 2))
-    target, detection = np.nonzero(np.isfinite(fit))
+    target, detection = imm.pairs_inside(fit)
     cost = association_cost(fit[target, detection], 0.95, 1e-4)
     chosen = assign(target, detection, cost, targets, len(z))
     innovation = z[chosen][:, None] - expected
