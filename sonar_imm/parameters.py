@@ -205,6 +205,16 @@ class Config:
             and not isinstance(value, bool)
         ]
 
+    def require_changeable(self, other: Config) -> None:
+        """Raise ValueError naming the parameters of `other` that differ and are read-only."""
+        fixed = [
+            spec.name
+            for spec in self.specs()
+            if spec.read_only and getattr(other, spec.name) != getattr(self, spec.name)
+        ]
+        if fixed:
+            raise ValueError(f'these parameters need a new tracker: {", ".join(fixed)}')
+
     def as_dict(self) -> dict[str, Any]:
         """Plain Python values, lists instead of tuples: fit for YAML, JSON and ROS."""
         return {

@@ -10,11 +10,11 @@ from functools import partial
 import math
 
 from attrs import frozen
-import numpy as np
 
 from ..acoustics.laplace import LAWS
 from ..parameters import Config
 from ..parameters import parameter as fixed_parameter
+from .model_checks import chain_problems
 
 parameter = partial(fixed_parameter, read_only=False)
 
@@ -194,29 +194,9 @@ class BathymetryConfig(Config):
     def check(self) -> list[str]:
         problems = self._check_sigmas()
         models = self.model_count()
-        if self.transition_matrix:
-            if len(self.transition_matrix) != models * models:
-                problems.append(
-                    f'transition_matrix needs {models} x {models} = {models * models} values for '
-                    f'model_set {self.model_set}, got {len(self.transition_matrix)}'
-                )
-            else:
-                sums = np.reshape(self.transition_matrix, (models, models)).sum(axis=1)
-                problems += [
-                    f'row {row} of transition_matrix sums to {total:.6g}, not 1'
-                    for row, total in enumerate(sums)
-                    if abs(total - 1.0) > 1e-6
-                ]
-        if self.initial_probabilities:
-            if len(self.initial_probabilities) != models:
-                problems.append(
-                    f'initial_probabilities needs {models} values, got '
-                    f'{len(self.initial_probabilities)}'
-                )
-            elif abs(sum(self.initial_probabilities) - 1.0) > 1e-6:
-                problems.append(
-                    f'initial_probabilities sum to {sum(self.initial_probabilities):.6g}, not 1'
-                )
+        problems += chain_problems(
+            self.transition_matrix, self.initial_probabilities, models, self.model_set
+        )
         if self.engine == 'grid' and self.model_set not in SCALAR_SETS:
             problems.append(
                 f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '

@@ -58,13 +58,7 @@ class DiverTracker:
         self._history = self._new_history(Tracks.none(_rules(self.config)))
 
     def reconfigure(self, config: DiverConfig) -> None:
-        frozen_now = [
-            spec.name
-            for spec in config.specs()
-            if spec.read_only and getattr(config, spec.name) != getattr(self.config, spec.name)
-        ]
-        if frozen_now:
-            raise ValueError(f'these parameters need a new tracker: {", ".join(frozen_now)}')
+        self.config.require_changeable(config)
         self.config = config
 
     def warm(self) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from attrs import frozen
-import numpy as np
 
 from ..parameters import Config, parameter
+from .model_checks import chain_problems
 
 MODEL_SETS = (
     'heading_speed',
@@ -305,29 +305,9 @@ class DiverConfig(Config):
                 f'acceleration_noise needs one value for each of the {models} models of '
                 f'{self.model_set}, got {len(self.acceleration_noise)}'
             )
-        if self.transition_matrix:
-            if len(self.transition_matrix) != models * models:
-                problems.append(
-                    f'transition_matrix needs {models} x {models} = {models * models} values for '
-                    f'model_set {self.model_set}, got {len(self.transition_matrix)}'
-                )
-            else:
-                sums = np.reshape(self.transition_matrix, (models, models)).sum(axis=1)
-                problems += [
-                    f'row {row} of transition_matrix sums to {total:.6g}, not 1'
-                    for row, total in enumerate(sums)
-                    if abs(total - 1.0) > 1e-6
-                ]
-        if self.initial_probabilities:
-            if len(self.initial_probabilities) != models:
-                problems.append(
-                    f'initial_probabilities needs {models} values, got '
-                    f'{len(self.initial_probabilities)}'
-                )
-            elif abs(sum(self.initial_probabilities) - 1.0) > 1e-6:
-                problems.append(
-                    f'initial_probabilities sum to {sum(self.initial_probabilities):.6g}, not 1'
-                )
+        problems += chain_problems(
+            self.transition_matrix, self.initial_probabilities, models, self.model_set
+        )
         return problems
 
     def model_count(self) -> int:

@@ -110,13 +110,7 @@ class FathometerTracker:
         self._health: dict[str, float] = {}
 
     def reconfigure(self, config: FathometerConfig) -> None:
-        frozen_now = [
-            spec.name
-            for spec in config.specs()
-            if spec.read_only and getattr(config, spec.name) != getattr(self.config, spec.name)
-        ]
-        if frozen_now:
-            raise ValueError(f'these parameters need a new tracker: {", ".join(frozen_now)}')
+        self.config.require_changeable(config)
         self.config = config
 
     def warm(self) -> None:

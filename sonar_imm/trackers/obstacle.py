@@ -97,13 +97,7 @@ class ObstacleTracker:
         )
 
     def reconfigure(self, config: ObstacleConfig) -> None:
-        frozen_now = [
-            spec.name
-            for spec in config.specs()
-            if spec.read_only and getattr(config, spec.name) != getattr(self.config, spec.name)
-        ]
-        if frozen_now:
-            raise ValueError(f'these parameters need a new tracker: {", ".join(frozen_now)}')
+        self.config.require_changeable(config)
         self.config = config
 
     def warm(self) -> None:
