@@ -39,7 +39,7 @@ $(STAMP): setup.py pyproject.toml
 	    'venv: on Debian and Ubuntu, sudo apt install python3-venv' >&2; exit 1; }
 	@echo 'Building $(VENV) with '"$$($(PYTHON) --version)"'; the first time takes a minute or two.'
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test,lint]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test,lint,sweep]'
 	@touch $@
 
 demo: venv ## track a shipped bag with the live node and offline, score both, write a report

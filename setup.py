@@ -32,6 +32,7 @@ EXTRAS = {
              'stonesoup'],
     'lint': ['mypy', 'ruff'],
     'segy': ['segyio>=1.9'],
+    'sweep': ['dask[distributed]>=2024.1'],
 }
 
 

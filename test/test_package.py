@@ -71,6 +71,7 @@ ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
 # those that some commands need, each with an extra of its own.
 PEERS = {'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
          'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'},
+         'sonar_imm.evaluation.sweep': {'distributed'},
          'sonar_imm.recordings.convert_segy': {'segyio'}}
 
 # Path below the root: why it may exceed 400 lines.

@@ -26,6 +26,7 @@ COMMANDS = {
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
     'play': 'Publish a bag to live nodes.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
+    'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
     'bench': 'Measure speed against other libraries, in one run.',
     'demo': 'Live node, offline tracker, score and report on a shipped bag.',
 }
@@ -91,6 +92,8 @@ def _what_the_user_can_mend(error: Exception) -> str | None:
 def missing_package(name: str) -> str | None:
     """How to come by a package that only some commands need; None for one that all need."""
     remedies = {
+        'distributed': "dask.distributed, which shares out the runs, is not here: pip install "
+                       "'sonar_imm[sweep]', or say --workers 1",
         'rclpy': "ROS 2 is not here: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
         'segyio': "segyio, which reads SEG-Y, is not here: pip install 'sonar_imm[segy]'",
         'filterpy': "FilterPy is not here: pip install 'sonar_imm[test]'",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-import time
 from typing import Any
 
 import click
@@ -84,25 +83,15 @@ def track_recording(bag: Path, out_dir: Path, system: System, config: Any, optio
                     overwrite: bool = False, strict: bool = False,
                     quiet: bool = False) -> dict[str, Any]:
     """Track `bag` into `out_dir`; gives the content of run.json. Raises `BagError`."""
-    from ..evaluation.run_folder import fingerprint, RUN, run_record, RunFolder
-    from ..evaluation.tracking import OfflineRun
+    from ..evaluation.run_folder import RunFolder
+    from ..evaluation.tracking import OfflineRun, write_run
     from ..recordings.reader import BagReader
-    begin = time.perf_counter()
     with BagReader(bag, strict=strict) as reader:
         offline = OfflineRun(reader, system, config, options)
         folder = RunFolder(out_dir)
         folder.prepare(overwrite=overwrite)
         with progress('tracking', offline.total, quiet=quiet) as advance:
-            written = folder.write_estimates(offline.estimates(advance), system.name)
-        problems = list(reader.problems)
-    run = run_record(
-        system=system.name, bag=str(bag.resolve()), **fingerprint(bag), topics=offline.topics,
-        order=options.order, smoothed=options.smooth, world_frame=options.world_frame,
-        messages=offline.messages, **written, counts=offline.outcomes(),
-        refused=offline.refusals(), problems=problems, parameters=config.as_dict(),
-        timings={'wall_s': time.perf_counter() - begin, **offline.timings()})
-    folder.write_json(RUN, run)
-    return run
+            return write_run(folder, offline, advance)
 
 
 def _print(run: dict[str, Any], out_dir: Path) -> None:

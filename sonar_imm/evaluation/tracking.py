@@ -24,6 +24,7 @@ from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
 from ..trackers import System
 from . import SECOND
+from .run_folder import fingerprint, RUN, run_record, RunFolder
 
 TO_THE_END = 2**62
 
@@ -107,8 +108,8 @@ class OfflineRun:
     def __init__(self, bag: BagReader, system: System, config: Config,
                  options: InputOptions | None = None):
         self.options = options or InputOptions()
-        self._bag = bag
-        self._system = system
+        self.bag = bag
+        self.system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
         self.topics = {name: entry.name for name, entry in chosen.items()}
         build = system.build_smoother if self.options.smooth else system.build
@@ -121,7 +122,7 @@ class OfflineRun:
     @property
     def total(self) -> int:
         """How many messages there are to read."""
-        return sum(topic.count for topic in self._bag.topics if topic.name in self.topics)
+        return sum(topic.count for topic in self.bag.topics if topic.name in self.topics)
 
     def estimates(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Estimate]:
         """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
@@ -142,7 +143,7 @@ class OfflineRun:
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
         guard = FrameGuard(self.options.frame_id)
-        for heard in measurements_of(self._bag, self._system.name, self.topics,
+        for heard in measurements_of(self.bag, self.system.name, self.topics,
                                      world_frame=self.options.world_frame,
                                      order=self.options.order,
                                      settings=self.tracker.config.as_dict()):
@@ -179,3 +180,20 @@ class OfflineRun:
             return {}
         return {'tracker_total_ms': float(spent.sum()), 'tracker_p50_ms': float(np.median(spent)),
                 'tracker_p99_ms': float(np.percentile(spent, 99.0))}
+
+
+def write_run(folder: RunFolder, offline: OfflineRun,
+              advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
+    """Track into a prepared folder; gives the content of run.json, which is written last."""
+    begin = time.perf_counter()
+    written = folder.write_estimates(offline.estimates(advance), offline.system.name)
+    path, options = offline.bag.path, offline.options
+    run = run_record(
+        system=offline.system.name, bag=str(path.resolve()), **fingerprint(path),
+        topics=offline.topics, order=options.order, smoothed=options.smooth,
+        world_frame=options.world_frame, messages=offline.messages, **written,
+        counts=offline.outcomes(), refused=offline.refusals(),
+        problems=list(offline.bag.problems), parameters=offline.tracker.config.as_dict(),
+        timings={'wall_s': time.perf_counter() - begin, **offline.timings()})
+    folder.write_json(RUN, run)
+    return run

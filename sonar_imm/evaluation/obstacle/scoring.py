@@ -5,6 +5,8 @@ vertical_offset_near              the same within 50 m, where a vehicle has to d
 consistency                       NEES, NIS, and how often the 90 % band holds the truth
 above                             whether stated probabilities of being above come true
 gospa                             several obstacles: distance, missed and false a ping
+tracks                            how many, found and false, and identity switches: an obstacle
+                                  taken over by another track
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...estimation.consistency import interval_coverage
+from ...estimation.consistency import identity_switches, interval_coverage
 from .. import SECOND
 from ..numbers import chi2_summary, error_summary, usable_nees
 from .series import match, Matching, Series, TruePath
@@ -48,7 +51,8 @@ def score(series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, 
                    'found_obstacles': len(np.unique(found.target)),
                    'tracks': metrics['tracks_confirmed'],
                    'false_tracks': metrics['tracks_confirmed']
-                   - len(np.unique(series.track_id[found.row]))}}
+                   - len(np.unique(series.track_id[found.row])),
+                   'identity_switches': identity_switches(followed_by(found, len(truth)))}}
     metrics['consistency'] |= truth_consistency(found)
     return metrics, found
 
@@ -61,6 +65,15 @@ def truth_consistency(found: Matching) -> dict[str, Any]:
     return {'nees_offset': chi2_summary(offset, 1),
             'nees_state': chi2_summary(usable_nees(error, covariance), 3),
             'band_coverage': interval_coverage(found.truth[:, 2], low, high)}
+
+
+def followed_by(found: Matching, obstacles: int) -> NDArray[np.int64]:
+    """(pings, obstacles) id of the track on each obstacle, -1 without."""
+    series = found.series
+    followed = np.full((len(series.ping_ns), obstacles), -1, np.int64)
+    ping = np.searchsorted(series.ping_ns, series.stamp_ns[found.row])
+    followed[ping, found.target] = series.track_id[found.row]
+    return followed
 
 
 def above_calibration(found: Matching) -> dict[str, Any]:

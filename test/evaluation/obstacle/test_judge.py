@@ -64,8 +64,24 @@ def test_scores_are_those_done_by_hand():
     assert metrics['gospa']['mean_m'] == pytest.approx((np.sqrt(0.09 + 12.5) + chord) / 2.0)
     assert metrics['gospa']['false_per_ping'] == pytest.approx(0.5)
     assert metrics['tracks'] == {'true_obstacles': 1, 'found_obstacles': 1, 'tracks': 2,
-                                 'false_tracks': 1}
+                                 'false_tracks': 1, 'identity_switches': 0}
     assert found.target.tolist() == [0, 0]
+
+
+def test_an_obstacle_taken_over_by_another_track_is_a_switch():
+    # At second t the range is 62 - 2 t. Track 4 is lost at 8 and comes back as 9 (a switch); the
+    # other obstacle, 0.4 rad to port, loses track 5 for a ping only (none).
+    def row(track_id, second, bearing):
+        return [track_id, 1, 62.0 - 2.0 * second, bearing, 3.0, 1.0, 2.0, 4.0, 0.1]
+    estimates = [estimate(7, [row(4, 7, 0.0), row(5, 7, 0.4)]), estimate(8, []),
+                 estimate(9, [row(5, 9, 0.4), row(9, 9, 0.0)]), estimate(10, [row(9, 10, 0.0)])]
+    truth = (straight(1, 3.0), straight(2, 3.0, bearing=0.4))
+    metrics, _ = score(series_of(estimates), truth, cutoff=5.0, gap=60.0)
+    assert metrics['tracks']['identity_switches'] == 1
+    # Had the tracks changed places, both obstacles would have been taken over.
+    swapped = [estimates[0], estimate(9, [row(4, 9, 0.4), row(5, 9, 0.0)])]
+    metrics, _ = score(series_of(swapped), truth, cutoff=5.0, gap=60.0)
+    assert metrics['tracks']['identity_switches'] == 2
 
 
 def test_an_obstacle_is_asked_for_from_its_sixth_ping_until_it_is_passed():

@@ -1,0 +1,155 @@
+"""``sonar-imm sweep``."""
+
+from __future__ import annotations
+
+from importlib import import_module
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..trackers import SYSTEMS
+from .common import (
+    example,
+    json_option,
+    load_config,
+    print_json,
+    progress,
+    say,
+    set_option,
+    topic_option,
+    typed_overrides,
+)
+
+
+@click.command(
+    epilog=example(
+        'sonar-imm sweep diver --runs 100',
+        'sonar-imm sweep diver --runs 500 --seed 1 --scenario circle --set speed=0.5 --out circle',
+        'sonar-imm sweep obstacle --runs 2000 --scheduler tcp://10.0.0.5:8786 --json',
+    )
+)
+@click.argument('system', type=click.Choice(list(SYSTEMS)))
+@click.option('--runs', type=click.IntRange(min=1), required=True, help='How many runs.')
+@click.option(
+    '--seed',
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help='Seed of the first scene; each further run takes the next number.',
+)
+@click.option(
+    '--scenario',
+    default=None,
+    help='Which scene; the first one by default. `sonar-imm simulate SYSTEM --list` lists them.',
+)
+@set_option
+@click.option(
+    '--params',
+    type=click.Path(path_type=Path, dir_okay=False),
+    help='Parameter file of the tracker: ROS 2 form or a plain mapping.',
+)
+@topic_option
+@click.option(
+    '--workers',
+    type=click.IntRange(min=1),
+    help='Processes on this machine; by default one a core. With 1 all runs are in this '
+    'process and dask is not needed.',
+)
+@click.option(
+    '--scheduler',
+    metavar='ADDRESS',
+    help='Run on the cluster of this dask scheduler instead; its workers need the same sonar_imm.',
+)
+@click.option(
+    '--out',
+    type=click.Path(path_type=Path, file_okay=False),
+    help='Folder for sweep.csv, a row a run, and sweep.json.',
+)
+@click.option('--overwrite', is_flag=True, help='Replace an earlier sweep in --out.')
+@json_option
+def command(
+    system: str,
+    runs: int,
+    seed: int,
+    scenario: str | None,
+    overrides: dict[str, str],
+    params: Path | None,
+    topics: dict[str, str],
+    workers: int | None,
+    scheduler: str | None,
+    out: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Simulate, track and score SYSTEM under many seeds, and say what comes out on average.
+
+    --set changes the scene, --params the tracker. The score of a seed is that of `sonar-imm
+    evaluate`, however many processes there are. A run that fails is named and left out; the exit
+    code is 1 when more than half of them did.
+    """
+    if scheduler is not None and workers is not None:
+        raise click.UsageError('--workers and --scheduler exclude each other')
+    from ..evaluation import sweep as sweeps
+    from ..evaluation.tracking import InputOptions
+    from .track import inputs_by_topic
+
+    scenes = import_module(f'sonar_imm.simulation.{system}')
+    name = scenario or next(iter(scenes.SCENARIOS))
+    scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
+    config, node = load_config(SYSTEMS[system], params, {})
+    sweep = sweeps.Sweep(
+        system=system,
+        scenario=name,
+        scene=scene,
+        config=config,
+        options=InputOptions(
+            topics=inputs_by_topic(topics),
+            frame_id=node.frame_id,
+            world_frame=node.world_frame_convention,
+        ),
+    )
+    if out is not None:
+        sweeps.prepare(out, overwrite=overwrite)
+    seeds = range(seed, seed + runs)
+    if scheduler is not None:
+        coming = sweeps.run_on_cluster(
+            sweep, seeds, scheduler, lambda sentence: click.echo(sentence, err=True)
+        )
+    elif (count := min(runs, workers or len(os.sched_getaffinity(0)))) == 1:
+        coming = sweeps.run_here(sweep, seeds)
+    else:
+        coming = sweeps.run_on_processes(sweep, seeds, count)
+    outcomes = []
+    with progress('runs', runs, quiet=as_json) as advance:
+        for outcome in coming:
+            outcomes.append(outcome)
+            advance(1)
+    content = sweeps.record(sweep, outcomes)
+    if out is not None:
+        sweeps.write(out, content, outcomes)
+    print_json(content) if as_json else _print(content, out)
+    if 2 * len(content['failures']) > runs:
+        raise click.exceptions.Exit(1)
+
+
+def _print(content: dict[str, Any], out: Path | None) -> None:
+    seeds, summary, failures = content['seeds'], content['summary'], content['failures']
+    say(
+        f'{content["system"]} {content["scenario"]}: {len(seeds)} runs, seeds {seeds[0]} to '
+        f'{seeds[-1]}' + (f', {len(failures)} failed' if failures else '')
+    )
+    if summary:
+        width = max(map(len, summary))
+        say(f'  {"metric":<{width}} {"mean":>11} {"std":>11} {"std error":>11} {"runs":>6}')
+    for name, one in summary.items():
+        numbers = ' '.join(f'{one[key]:11.4g}' for key in ('mean', 'std', 'stderr'))
+        say(f'  {name:<{width}} {numbers} {one["runs"]:6d}')
+    alike: dict[str, list[str]] = {}
+    for seed, sentence in failures.items():
+        alike.setdefault(sentence, []).append(seed)
+    for sentence, which in alike.items():
+        click.echo(f'failed: seed {", ".join(which)}: {sentence}', err=True)
+    if out is not None:
+        say(f'written to {out}')
