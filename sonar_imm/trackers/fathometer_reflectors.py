@@ -100,12 +100,11 @@ def reflectors_of(
     covariance[:, 0, 0] += 1.0 / 12.0
     covariance[:, 1, 1] += _conditional_variance(depth, pulse, config)
     scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
-    return Reflectors(
-        depth,
-        sigma * members.amplitude,
-        covariance * scale[:, :, None] * scale[:, None, :],
-        members.existence,
-    )
+    covariance *= scale[:, :, None] * scale[:, None, :]
+    # The particles know depths as they follow from the depth told with this record: it alone fixes
+    # them to some centimetres, so that the errors of earlier records have no say.
+    covariance[:, 0, 0] += config.array_depth_std**2
+    return Reflectors(depth, sigma * members.amplitude, covariance, members.existence)
 
 
 def _conditional_variance(depth: FloatArray, pulse: Pulse, config: FathometerConfig) -> FloatArray:
