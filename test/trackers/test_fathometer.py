@@ -107,6 +107,30 @@ def test_a_perfect_depth_sensor_needs_no_allowance():
     assert 0.6 < depth_nees(found, {one.stamp_ns: one.depth for one in scene.truth}) < 1.2
 
 
+@pytest.mark.parametrize('memory', [0.0, 0.98])
+def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
+    """A scene of known level: amplitudes change by a twentieth from record to record. What an
+    amplitude was before makes its variance smaller by a fourth."""
+    scene = simulate(scenario('drift_traces', {'records': 100}), 1)
+    _, found = run(
+        [one.measurement for one in scene.measurements], particles=3000, amplitude_memory=memory
+    )
+    error, variance = [], []
+    for received, truth in zip(scene.measurements, scene.truth, strict=True):
+        estimate = found[truth.stamp_ns]
+        way = 2.0 * (truth.depth - received.measurement.reference_depth) + 32 * 0.18
+        level = 12.0 * truth.amplitude / way
+        distance = np.abs(estimate.state[:, :1] - truth.depth)
+        near = distance.min(axis=1) < 0.3
+        error.append((estimate.state[:, 1] - level[distance.argmin(axis=1)])[near])
+        variance.append(estimate.covariance[near, 1, 1])
+    error, variance = np.concatenate(error), np.concatenate(variance)
+    assert len(error) > 700
+    assert 0.85 < nees(error[:, None], variance[:, None, None]).mean() < 1.25
+    expected = 0.8 if memory else 1.0
+    assert np.median(variance) == pytest.approx(expected * 1.3e-3**2, rel=0.1)
+
+
 def test_what_came_later_corrects_an_estimate(vectors):
     options = {'particles': 3000, 'seed': 4}
     now = score(run(traces(vectors, range(80, 280)), **options)[1], vectors)
