@@ -4,12 +4,20 @@ import attrs
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState, PointCloud2
+from std_srvs.srv import Trigger
 
 from msg_adapters.array_depth import write_array_depth
-from msg_adapters.array_records import read_trace, write_csdm, write_pressure, write_trace
+from msg_adapters.array_records import (
+    read_pressure,
+    read_trace,
+    write_csdm,
+    write_pressure,
+    write_trace,
+)
 from msg_adapters.estimates import read_estimate
 from msg_adapters.table import encode_table
-from sonar_imm.measurements import ArrayDepth, Pressure
+from sonar_imm.acoustics.spectra import BlockAverage, SnapshotStream
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import input_qos, lockstep_qos
@@ -128,6 +136,84 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
     assert preview.count(0) == 2
     assert preview.count(1) >= 2
     assert rig.node.tracker.counts['blocks'] == 20
+
+
+HEARD = (
+    'phones:=8',
+    'frequency_max:=2000.0',
+    'snapshot_seconds:=0.5',
+    'record_seconds:=9.5',
+    'depth_min:=122.0',
+    'depth_max:=172.0',
+    'particles:=2000',
+)
+
+
+@pytest.fixture(scope='module')
+def heard():
+    """Ten seconds of pressure over two layers, in blocks of 0.5 s."""
+    small = {'phones': 8, 'sample_rate': 6000.0, 'frequency_max': 2000.0, 'snapshot_seconds': 0.5}
+    scene = simulate(scenario('pressure', {**small, 'record_seconds': 9.5}), 1)
+    return [write_pressure(one.measurement, make) for one in scene.measurements]
+
+
+def spectra_of(messages, stamp_ns):
+    """The cross-spectra of all the pressure, averaged at once."""
+    blocks = [read_pressure(one) for one in messages]
+    length, first, last = 3000, 25, 1000
+    stream = SnapshotStream(length, length // 2, slice(first, last + 1))
+    parts = stream.push(np.concatenate([one.pressure for one in blocks]))
+    (average,) = BlockAverage(len(parts)).push(parts)
+    return CrossSpectra(
+        stamp_ns=stamp_ns,
+        frame_id=blocks[0].frame_id,
+        frequency=2.0 * np.arange(first, last + 1),
+        csdm=average.csdm,
+        snapshots=average.snapshots,
+        reference_depth=blocks[0].reference_depth,
+    )
+
+
+def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, heard):
+    rig = rig_of(make_bench, *HEARD)
+    rig.send('pressure', *heard)
+    assert len(rig.tables) == 1 and not rig.node._meter.refused
+    live = read_estimate(rig.tables[0])
+    assert len(live) >= 2 and np.isfinite(live.state).all()
+    rig.bench.call(Trigger, '/fathometer/reset', Trigger.Request())
+    rig.send('csdm', write_csdm(spectra_of(heard, live.stamp_ns), make))
+    other = read_estimate(rig.tables[1])
+    assert other.stamp_ns == live.stamp_ns
+    columns, expected = live.columns(), other.columns()
+    assert list(columns) == list(expected)
+    for name, column in columns.items():
+        # Single precision, and what it moves on 2000 particles.
+        assert np.allclose(column, expected[name], rtol=1e-3, atol=1e-4), name
+
+
+def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, heard):
+    rig = rig_of(make_bench, *HEARD)
+    more = [write_pressure(one, make) for one in follow(heard, 3)]
+    blocks = [*heard, *more]
+    order = [0, 1, 1, 2, 4, 3, 5, *range(7, len(blocks))]
+    rig.send('pressure', *[blocks[k] for k in order])
+    counts = rig.node.tracker.counts
+    assert counts['duplicate'] == 1 and counts['too_late'] == 1
+    # Block 3 was missing when 4 came; 6 never came.
+    assert counts['gaps'] == 2 and not counts['records_abandoned']
+    assert counts['blocks'] == len(order) - 2
+    assert len(rig.tables) == 1 and not rig.node._errors
+    assert len(read_estimate(rig.tables[0])) >= 2
+
+
+def follow(messages, count):
+    """The first `count` blocks again, as if they came after the last."""
+    blocks = [read_pressure(one) for one in messages]
+    end = blocks[-1].stamp_ns + blocks[-1].duration_ns
+    return [
+        attrs.evolve(one, stamp_ns=one.stamp_ns - blocks[0].stamp_ns + end)
+        for one in blocks[:count]
+    ]
 
 
 def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
