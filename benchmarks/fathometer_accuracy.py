@@ -71,6 +71,7 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
         ('mvdr', 'mvdr', 50.0, False),
         ('envelope', 'mvdr', 50.0, True),
         ('conventional', 'conventional', 200.0, False),
+        ('conventional_envelope', 'conventional', 200.0, True),
     ):
         band = spectra.frequency >= low
         gamma = coherence(spectra.csdm[band], w[band], processor)
@@ -95,7 +96,7 @@ def drift(seed: int, records: int, cache: Path | None) -> tuple[dict[str, list[T
         config = FathometerScenario(
             records=records,
             appearing=(int(140 * scale), int(262 * scale)),
-            fading=(int(75 * scale),),
+            fading=(int(85 * scale),),
         )
         traces: dict[str, list[Trace]] = {}
         truth = []
@@ -143,7 +144,7 @@ def _load(file: Path) -> tuple[dict[str, list[Trace]], list]:
                 )
                 for k, (amplitude, sigma) in enumerate(zip(kept[name], kept[f'{name}_sigma']))
             ]
-            for name in ('mvdr', 'envelope', 'conventional')
+            for name in ('mvdr', 'envelope', 'conventional', 'conventional_envelope')
         }
     return traces, truth
 

@@ -31,6 +31,7 @@ CASES = {
     'approach': ('gaussian_sum', 'landmark', 'seafloor', 'deferred', 'refit'),
     'nearly_level': ('gaussian_sum', 'deferred', 'refit'),
     'above': ('gaussian_sum',),
+    'float': ('gaussian_sum',),
     'rolling': ('gaussian_sum',),
     'calm': ('gaussian_sum',),
     'stress': ('gaussian_sum',),

@@ -46,7 +46,8 @@ class FathometerScenario(Config):
     sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
 
     array_depth: float = parameter(73.5, 'mean depth of the deepest phone', unit='m', low=0.0)
-    heave: float = parameter(3.0, 'amplitude of its slow heave', unit='m', low=0.0)
+    heave: float = parameter(2.5, 'amplitude of its slow heave', unit='m', low=0.0)
+    heave_records: float = parameter(180.0, 'records to a period of the heave', low=2.0)
     array_depth_std: float = parameter(0.03, 'error of the depth that is told', unit='m', low=0.0)
     depth_companion: bool = parameter(
         False, 'the depth of the array is told beside the records, not in them'
@@ -56,20 +57,23 @@ class FathometerScenario(Config):
     layers: int = parameter(8, 'layers that are there from the beginning', low=1, high=64)
     layer_spacing: float = parameter(4.0, 'mean distance of layers', unit='m', low=0.1, high=100.0)
     depth_walk: float = parameter(
-        0.03, 'how far each layer wanders from record to record', unit='m', low=0.0
+        0.01, 'how far each layer wanders from record to record', unit='m', low=0.0
     )
     tilt_walk: float = parameter(
-        0.03, 'how far all wander together from record to record', unit='m', low=0.0
+        0.04, 'how far all wander together from record to record', unit='m', low=0.0
     )
     first_amplitude: float = parameter(0.35, 'of the first layer', low=0.0, high=1.0)
-    amplitude: float = parameter(0.12, 'of the others', low=0.0, high=1.0)
+    amplitude: float = parameter(0.11, 'of the others', low=0.0, high=1.0)
+    amplitude_swing: float = parameter(
+        0.15, 'share by which amplitudes rise and fall over 70 to 150 records', low=0.0, high=1.0
+    )
     appearing: tuple[int, ...] = parameter(
         (140, 262), 'records at which one more layer begins to appear', kind='int[]', low=0
     )
     fading: tuple[int, ...] = parameter(
-        (75,), 'records at which a layer begins to fade', kind='int[]', low=0
+        (85,), 'records at which a layer begins to fade', kind='int[]', low=0
     )
-    fade_records: int = parameter(12, 'records that takes', low=1, high=10_000)
+    fade_records: int = parameter(5, 'records that takes', low=1, high=10_000)
 
     phone_noise: float = parameter(
         0.01, 'noise power of a phone against the surface noise', low=1e-6, high=1e6
@@ -199,7 +203,7 @@ def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:
     # Layers that appear lie below the others.
     depth = config.first_depth + config.layer_spacing * np.arange(K) + jitter
     depth = depth + together[:, None] + alone
-    level = config.amplitude * rng.uniform(0.8, 1.3, K)
+    level = config.amplitude * rng.uniform(0.8, 1.25, K)
     level[0] = config.first_amplitude
     share = np.ones((T, K))
     record = np.arange(T)
@@ -210,10 +214,11 @@ def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:
         share[:, 1 + (2 + 2 * k) % (config.layers - 1)] *= np.clip(
             1.0 - (record - begin) / config.fade_records, 0.0, 1.0
         )
-    flicker = 1.0 + 0.05 * rng.standard_normal((T, K))
-    phase = rng.uniform(0.0, 2.0 * np.pi)
-    array_depth = config.array_depth + config.heave * np.sin(phase + 2.0 * np.pi * record / 80.0)
+    turns = record[:, None] / rng.uniform(70.0, 150.0, K) + rng.uniform(size=K)
+    swing = np.exp(config.amplitude_swing * np.sin(2.0 * np.pi * turns))
+    turns = record / config.heave_records + rng.uniform()
+    array_depth = config.array_depth + config.heave * np.sin(2.0 * np.pi * turns)
     told = array_depth + config.array_depth_std * rng.standard_normal(T)
     return Drift(
-        depth, np.clip(level * share * flicker, 0.0, 1.0), share > PRESENT, array_depth, told
+        depth, np.clip(level * share * swing, 0.0, 1.0), share > PRESENT, array_depth, told
     )

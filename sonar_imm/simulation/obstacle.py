@@ -30,8 +30,9 @@ __all__ = ['ObstacleScenario', 'SCENARIOS', 'TrueObstacle', 'scenario', 'simulat
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 LEAD_IN = 1.0
 """Seconds of navigation before the first ping and after the last."""
-WAVES = 6
-"""Sinusoids that make up a swinging angle: narrow-band, as swell is."""
+WAVES = 3
+"""Sinusoids that make up a swing, with periods of 0.75 to 1.3 times the stated one: narrow-band,
+as swell is. The study whose numbers docs/obstacle.md compares with swings like this."""
 _FINE = 0.02
 
 
@@ -89,12 +90,13 @@ class _Swing:
     """A random narrow-band oscillation: `value` at any time (n,)."""
 
     def __init__(self, rms: float, period: float, rng: np.random.Generator):
-        self.rate = 2.0 * np.pi / period * rng.uniform(0.65, 1.5, WAVES)
+        self.rate = 2.0 * np.pi / (period * rng.uniform(0.75, 1.3, WAVES))
         self.phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
-        self.amplitude = rms * np.sqrt(2.0 / WAVES)
+        share = rng.uniform(0.6, 1.0, WAVES)
+        self.amplitude = rms * np.sqrt(2.0 / np.sum(share**2)) * share
 
     def __call__(self, t: FloatArray) -> FloatArray:
-        return self.amplitude * np.sin(np.multiply.outer(t, self.rate) + self.phase).sum(axis=-1)
+        return np.sin(np.multiply.outer(t, self.rate) + self.phase) @ self.amplitude
 
 
 class _Vehicle:
@@ -109,7 +111,7 @@ class _Vehicle:
         self.pitch = _Swing(np.radians(config.pitch_rms_deg), config.pitch_period, rng)
         self.yaw = _Swing(np.radians(config.yaw_rms_deg), config.yaw_period, rng)
         self.heave = _Swing(config.heave_rms, config.heave_period, rng)
-        self.sway = _Swing(config.sway_rms, config.yaw_period, rng)
+        self.sway = _Swing(config.sway_rms, config.sway_period, rng)
         self.lever = geometry.flip_body(config.sonar_lever)
         roll, pitch, yaw = np.radians(config.sonar_mount_rpy_deg)
         self.mount = geometry.rotation(roll, -pitch, -yaw)  # stated in FLU

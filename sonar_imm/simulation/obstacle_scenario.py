@@ -36,9 +36,10 @@ class ObstacleScenario(Config):
     pitch_period: float = parameter(8.0, 'its period', unit='s', low=0.5, high=600.0)
     yaw_rms_deg: float = parameter(1.5, 'swing in yaw', unit='deg', low=0.0, high=30.0)
     yaw_period: float = parameter(11.0, 'its period', unit='s', low=0.5, high=600.0)
-    heave_rms: float = parameter(0.2, 'swing of the depth', unit='m', low=0.0, high=20.0)
+    heave_rms: float = parameter(0.21, 'swing of the depth', unit='m', low=0.0, high=20.0)
     heave_period: float = parameter(20.0, 'its period', unit='s', low=0.5, high=600.0)
     sway_rms: float = parameter(0.14, 'swing across the course', unit='m', low=0.0, high=20.0)
+    sway_period: float = parameter(20.0, 'its period', unit='s', low=0.5, high=600.0)
 
     # -- navigation ------------------------------------------------------------------------------
     ideal_navigation: bool = parameter(False, 'navigation without errors')
@@ -177,10 +178,22 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'approach': ('an obstacle 3 m below the sonar', {}),
     'nearly_level': ('an obstacle 0.5 m below the sonar', {'vertical_offset': 0.5}),
     'above': ('an obstacle 6 m above the sonar', {'vertical_offset': -6.0}),
+    'float': (
+        'a float at the surface, 6 m above the sonar',
+        {'vertical_offset': -6.0, 'depth': 6.0, 'altitude': 29.0},
+    ),
     'rolling': ('3 m below, and the vehicle rolls 4 degrees rms', {'roll_rms_deg': 4.0}),
     'calm': (
-        'anywhere within 10 m above or below, and the vehicle hardly rolls',
-        {'vertical_offset': 0.0, 'offset_spread': 10.0, 'roll_rms_deg': 0.3},
+        'anywhere within 10 m above or below, and the vehicle moves a fifth as much as usual',
+        {
+            'vertical_offset': 0.0,
+            'offset_spread': 10.0,
+            'roll_rms_deg': 0.3,
+            'pitch_rms_deg': 0.2,
+            'yaw_rms_deg': 0.3,
+            'heave_rms': 0.042,
+            'sway_rms': 0.028,
+        },
     ),
     'mirror': (
         'a level path with perfect navigation: above and below look the same',
