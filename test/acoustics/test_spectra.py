@@ -6,6 +6,7 @@ from scipy.signal import csd
 
 from sonar_imm.acoustics.spectra import (
     BlockAverage,
+    noise_taper,
     outer_sum,
     SlidingAverage,
     SnapshotStream,
@@ -92,3 +93,18 @@ def test_spectra_of_nothing():
         SnapshotStream(8, 9, slice(0, 2))
     with pytest.raises(ValueError):
         SlidingAverage(3, 4)
+
+
+@pytest.mark.parametrize('window, overlap', [('hann', 0.5), ('rectangular', 0.5), ('hann', 0.75)])
+def test_the_taper_of_noise_is_that_of_correlated_noise(window, overlap):
+    """Two unrelated noises, correlated by averaged cross-spectra, many times over."""
+    rng = np.random.default_rng(2)
+    n, total = 64, np.zeros(64)
+    for _ in range(1500):
+        stream = SnapshotStream(n, round(n * (1.0 - overlap)), slice(None), window)
+        spectra = stream.push(rng.standard_normal((12 * n, 2)))
+        total += np.fft.irfft(np.mean(spectra[:, :, 0] * spectra[:, :, 1].conj(), axis=0), n) ** 2
+    lags = np.arange(4, 60, 8)
+    taper = noise_taper(window, overlap, lags / n)
+    assert np.sqrt(total[lags] / total[0]) == pytest.approx(taper, rel=0.12, abs=0.01)
+    assert taper.min() < 0.8

@@ -4,13 +4,19 @@ import json
 import os
 from pathlib import Path
 
+import attrs
 import numpy as np
 import pytest
 
+from msg_adapters.array_records import write_csdm
+from msg_adapters.table import encode_table
 from sonar_imm.cli import main
 from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.recordings.measurements import measurements_of
+from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.writer import BagWriter
+from sonar_imm.simulation.fathometer import scenario, simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'
@@ -49,6 +55,58 @@ def test_the_drift_of_the_vectors_is_tracked_as_well_as_can_be(call, tmp_path):
     assert metrics['ospa_m'] <= 0.07
     assert metrics['depth']['rmse_m'] <= 0.04
     assert metrics['identity_switches'] == 0
+
+
+def test_hostile_records_of_a_bag_are_named_and_counted_and_the_rest_is_tracked(call, tmp_path):
+    """One dead phone in every other record, and of each kind of useless record one."""
+    scene = simulate(scenario('small', {'records': 6, 'fading': (), 'depth_companion': False}), 2)
+    good = [one.measurement for one in scene.measurements]
+    one = np.arange(6, dtype=np.float32)
+    identity = np.tile(np.eye(8, dtype=np.complex64), (6, 1, 1))
+    upper, dead, same = identity + np.triu(0.5 * np.ones((8, 8)), 1), identity.copy(), identity * 0
+    dead[:] = np.nan
+    same += 1.0
+    hostile = [
+        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(upper)}),
+        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(same)}),
+        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(dead)}),
+        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(identity)[:, :30]}),
+        ('csdm', {'frequency': 100.0 + one, 'csdm': flat(identity[:, :6, :6])}),
+        ('trace', {'depth': one[:1], 'amplitude': one[:1]}),
+    ]
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k, record in enumerate(good):
+            csdm = record.csdm.copy()
+            if k % 2:
+                csdm[:, 3], csdm[:, :, 3] = np.nan, np.nan
+            record = attrs.evolve(record, csdm=csdm)
+            bag.write('/csdm', write_csdm(record, ros_message), record.stamp_ns)
+            topic, columns = hostile[k]
+            stamp_ns = record.stamp_ns + 10**9
+            message = encode_table(columns, stamp_ns=stamp_ns, frame_id='array', make=ros_message)
+            bag.write(f'/{topic}', message, stamp_ns)
+    settings = {'phones': 8, 'element_spacing': 0.36, 'frequency_max': 2000.0, 'loading': 0.0}
+    words = [word for name, value in settings.items() for word in ('--set', f'{name}={value}')]
+    call('track', tmp_path / 'bag', tmp_path / 'out', *words)
+    run = json.loads((tmp_path / 'out' / 'run.json').read_text())
+    assert {reason: entry['count'] for reason, entry in run['refused'].items()} == {
+        'not_hermitian': 1,
+        'nan': 1,
+        'bad_field': 1,
+        'too_short': 1,
+    }
+    counts = run['counts']
+    assert counts['singular'] == 1 and counts['wrong_phones'] == 1
+    assert counts['dead_phones_masked'] == 3 and counts['used'] == 6
+    last = RunFolder(tmp_path / 'out').read_estimates()[-1]
+    assert last.stamp_ns == good[-1].stamp_ns
+    offset = np.abs(last.state[:, :1] - scene.truth[-1].depth)
+    assert (offset.min(axis=1) < 0.2).all()
+
+
+def flat(csdm):
+    """Matrices (F, N, N) as a column of a table."""
+    return csdm.astype(np.complex64).reshape(len(csdm), -1).view(np.float32)
 
 
 @pytest.mark.parametrize('line', LINES)

@@ -1,18 +1,27 @@
 """The fathometer node: an estimate a record, pressure in blocks, displays, hostility."""
 
 import attrs
+from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState, PointCloud2
+from std_srvs.srv import Trigger
 
 from msg_adapters.array_depth import write_array_depth
-from msg_adapters.array_records import read_trace, write_csdm, write_pressure, write_trace
+from msg_adapters.array_records import (
+    read_pressure,
+    read_trace,
+    write_csdm,
+    write_pressure,
+    write_trace,
+)
 from msg_adapters.estimates import read_estimate
 from msg_adapters.table import encode_table
-from sonar_imm.measurements import ArrayDepth, Pressure
+from sonar_imm.acoustics.spectra import BlockAverage, SnapshotStream
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.messages import make, message_class
-from sonar_imm.nodes.qos import input_qos, lockstep_qos
+from sonar_imm.nodes.qos import input_qos, lockstep_qos, output_qos
 from sonar_imm.simulation.fathometer import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 
@@ -130,6 +139,87 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
     assert rig.node.tracker.counts['blocks'] == 20
 
 
+HEARD = (
+    'phones:=12',
+    'element_spacing:=0.36',
+    'frequency_max:=2000.0',
+    'snapshot_seconds:=0.5',
+    'record_seconds:=19.5',
+    'depth_min:=122.0',
+    'depth_max:=172.0',
+    'particles:=2000',
+)
+
+
+@pytest.fixture(scope='module')
+def heard():
+    """Twenty seconds of pressure over two layers, at 132 m and 137 m, in blocks of 0.5 s."""
+    array = {'phones': 12, 'element_spacing': 0.36, 'sample_rate': 6000.0}
+    times = {'snapshot_seconds': 0.5, 'record_seconds': 19.5}
+    scene = simulate(scenario('pressure', {**array, **times, 'frequency_max': 2000.0}), 1)
+    assert scene.truth[0].depth == pytest.approx([131.8, 137.3], abs=0.05)
+    return [write_pressure(one.measurement, make) for one in scene.measurements]
+
+
+def spectra_of(messages, stamp_ns):
+    """The cross-spectra of all the pressure, averaged at once."""
+    blocks = [read_pressure(one) for one in messages]
+    length, first, last = 3000, 25, 1000
+    stream = SnapshotStream(length, length // 2, slice(first, last + 1))
+    parts = stream.push(np.concatenate([one.pressure for one in blocks]))
+    (average,) = BlockAverage(len(parts)).push(parts)
+    return CrossSpectra(
+        stamp_ns=stamp_ns,
+        frame_id=blocks[0].frame_id,
+        frequency=2.0 * np.arange(first, last + 1),
+        csdm=average.csdm,
+        snapshots=average.snapshots,
+        reference_depth=blocks[0].reference_depth,
+    )
+
+
+def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, heard):
+    rig = rig_of(make_bench, *HEARD)
+    rig.send('pressure', *heard)
+    assert len(rig.tables) == 1 and not rig.node._meter.refused
+    live = read_estimate(rig.tables[0])
+    assert live.state[:, 0] == pytest.approx([131.8, 137.3], abs=0.2)
+    rig.bench.call(Trigger, '/fathometer/reset', Trigger.Request())
+    rig.send('csdm', write_csdm(spectra_of(heard, live.stamp_ns), make))
+    other = read_estimate(rig.tables[1])
+    assert other.stamp_ns == live.stamp_ns
+    columns, expected = live.columns(), other.columns()
+    assert list(columns) == list(expected)
+    for name, column in columns.items():
+        # Single precision, and what it moves on 2000 particles.
+        assert np.allclose(column, expected[name], rtol=1e-3, atol=1e-4), name
+
+
+def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, heard):
+    rig = rig_of(make_bench, *HEARD)
+    more = [write_pressure(one, make) for one in follow(heard, 3)]
+    blocks = [*heard, *more]
+    order = [0, 1, 1, 2, 4, 3, 5, *range(7, len(blocks))]
+    rig.send('pressure', *[blocks[k] for k in order])
+    counts = rig.node.tracker.counts
+    assert counts['duplicate'] == 1 and counts['too_late'] == 1
+    # Block 3 was missing when 4 came; 6 never came.
+    assert counts['gaps'] == 2 and not counts['records_abandoned']
+    assert counts['blocks'] == len(order) - 2
+    assert len(rig.tables) == 1 and not rig.node._errors
+    assert read_estimate(rig.tables[0]).state[0, 0] == pytest.approx(131.8, abs=0.2)
+
+
+def follow(messages, count):
+    """The first `count` blocks again, as if they came after the last."""
+    blocks = [read_pressure(one) for one in messages]
+    end = blocks[-1].stamp_ns + blocks[-1].duration_ns
+    return [
+        attrs.evolve(one, stamp_ns=one.stamp_ns - blocks[0].stamp_ns + end)
+        for one in blocks[:count]
+    ]
+
+
 def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
     """1.4 s of 32 phones at 12 kHz, 2 MB each, ten times as fast, as a driver publishes them."""
     rig = rig_of(make_bench, 'particles:=200', 'record_seconds:=28.0')
@@ -173,6 +263,39 @@ def test_hostile_records_are_named_and_counted_and_harm_nobody(rig):
     measured, _ = traces(fading=(), layers=4)
     rig.send('trace', write_trace(measured[0], make))
     assert len(rig.tables) == 1
+
+
+def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
+    rig = rig_of(make_bench, *SMALL, 'loading:=0.0', 'diagnostics_period:=0.05')
+    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    scene = simulate(scenario('small', {'records': 4, 'fading': (), 'depth_companion': False}), 2)
+    records = [one.measurement for one in scene.measurements]
+    for k, record in enumerate(records):
+        csdm = np.array(record.csdm)
+        csdm[:, 5], csdm[:, :, 5] = np.nan, np.nan
+        rig.send('csdm', write_csdm(attrs.evolve(record, csdm=csdm) if k else record, make))
+    late = records[-1].stamp_ns + 10**9
+    rig.send(
+        'csdm',
+        write_csdm(
+            attrs.evolve(records[0], stamp_ns=late, csdm=np.ones_like(records[0].csdm)), make
+        ),
+    )
+    upper = np.triu(0.5 * np.ones((8, 8))) + 0.5 * np.eye(8)
+    csdm = np.broadcast_to(upper.astype(np.complex64), (6, 8, 8)).reshape(6, -1).view(np.float32)
+    rig.send('csdm', table(frequency=np.float32(100.0 + np.arange(6)), csdm=csdm))
+
+    def told():
+        return {
+            pair.key: pair.value for one in heard[-1:] for s in one.status for pair in s.values
+        }
+
+    rig.bench.spin_until(lambda: told().get('refused: not_hermitian') == '1')
+    values = told()
+    assert values['count: singular'] == '1' and values['count: dead_phones_masked'] == '3'
+    assert values['count: used'] == '4' and len(rig.tables) == 4
+    offset = np.abs(read_estimate(rig.tables[-1]).state[:, :1] - scene.truth[-1].depth)
+    assert (offset.min(axis=1) < 0.2).all()
 
 
 def test_an_array_of_another_size_is_counted_and_a_dead_phone_masked(rig):

@@ -32,6 +32,11 @@ def cut(path, share):
 
 
 class TestWhole:
+    @pytest.mark.parametrize('name', ['dive.bag', 'dive.v2'])
+    def test_a_folder_of_any_name(self, write_fixes, name):
+        items, problems = read(write_fixes(3, name=name))
+        assert len(items) == 3 and not problems
+
     @pytest.mark.parametrize('version', [8, 9])
     @pytest.mark.parametrize('plugin, mode', KINDS)
     def test_every_kind_of_rosbag2(self, tmp_path, fix_message, plugin, version, mode):

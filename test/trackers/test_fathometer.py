@@ -6,9 +6,10 @@ from fathometer_runs import run
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.consistency import ospa
+from sonar_imm.estimation.consistency import nees, ospa
 from sonar_imm.measurements import Fix, Trace
 from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.fathometer import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.fathometer import FathometerConfig, FathometerTracker
 
@@ -63,6 +64,71 @@ def test_the_simulated_drift_is_followed(vectors, given):
     # Ten reflectors; what else got an id was soon gone.
     assert np.count_nonzero(lives > 20) in (10, 11)
     assert np.count_nonzero(lives <= 20) <= 15
+
+
+def depth_nees(found, true_depths):
+    """Mean of error^2 / variance over the reflectors that are near a true one."""
+    error, variance = [], []
+    for stamp, estimate in found.items():
+        offset = estimate.state[:, :1] - true_depths[stamp]
+        nearest = offset[np.arange(len(offset)), np.abs(offset).argmin(axis=1)]
+        near = np.abs(nearest) < 0.3
+        error.append(nearest[near])
+        variance.append(estimate.covariance[near, 0, 0])
+    error, variance = np.concatenate(error), np.concatenate(variance)
+    assert len(error) > 500
+    return nees(error[:, None], variance[:, None, None]).mean()
+
+
+def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
+    """All reflectors of a record share the error of the array's depth, 0.03 m in the vectors and
+    the scenes, and it is greater than what the trace leaves open."""
+    options = {'particles': 3000}
+    true = {
+        (k + 1) * RECORD_NS: vectors['reflector_depth'][k][vectors['present'][k]]
+        for k in range(300)
+    }
+    _, found = run(traces(vectors, range(300)), **options)
+    assert 0.8 < depth_nees(found, true) < 1.2
+    scene = simulate(scenario('drift_traces', {'records': 100}), 0)
+    measured = [one.measurement for one in scene.measurements]
+    true = {one.stamp_ns: one.depth for one in scene.truth}
+    _, found = run(measured, **options)
+    assert 0.7 < depth_nees(found, true) < 1.3
+    _, found = run(measured, array_depth_std=0.0, **options)
+    assert depth_nees(found, true) > 4.0
+
+
+def test_a_perfect_depth_sensor_needs_no_allowance():
+    scene = simulate(scenario('drift_traces', {'records': 100, 'array_depth_std': 0.0}), 0)
+    _, found = run(
+        [one.measurement for one in scene.measurements], particles=3000, array_depth_std=0.0
+    )
+    assert 0.6 < depth_nees(found, {one.stamp_ns: one.depth for one in scene.truth}) < 1.2
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.98])
+def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
+    """A scene of known level: amplitudes change by a twentieth from record to record. What an
+    amplitude was before makes its variance smaller by a fourth."""
+    scene = simulate(scenario('drift_traces', {'records': 100}), 1)
+    _, found = run(
+        [one.measurement for one in scene.measurements], particles=3000, amplitude_memory=memory
+    )
+    error, variance = [], []
+    for received, truth in zip(scene.measurements, scene.truth, strict=True):
+        estimate = found[truth.stamp_ns]
+        way = 2.0 * (truth.depth - received.measurement.reference_depth) + 32 * 0.18
+        level = 12.0 * truth.amplitude / way
+        distance = np.abs(estimate.state[:, :1] - truth.depth)
+        near = distance.min(axis=1) < 0.3
+        error.append((estimate.state[:, 1] - level[distance.argmin(axis=1)])[near])
+        variance.append(estimate.covariance[near, 1, 1])
+    error, variance = np.concatenate(error), np.concatenate(variance)
+    assert len(error) > 700
+    assert 0.85 < nees(error[:, None], variance[:, None, None]).mean() < 1.25
+    expected = 0.8 if memory else 1.0
+    assert np.median(variance) == pytest.approx(expected * 1.3e-3**2, rel=0.1)
 
 
 def test_what_came_later_corrects_an_estimate(vectors):
