@@ -48,7 +48,7 @@ def score(found, vectors):
         order = int(estimate.model_names[estimate.probabilities[0].argmax()].split('_')[1])
         right.append(order == len(there))
         seen = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
-        distance.append(ospa(seen, there[:, None], cutoff=2.0, order=1.0))
+        distance.append(ospa(seen, there[:, None], cutoff=2.0, order=2.0))
     return np.mean(right), np.mean(distance)
 
 

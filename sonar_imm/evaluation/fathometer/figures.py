@@ -4,15 +4,20 @@ amplitudes, distance from the truth."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from attrs import frozen
 import numpy as np
 import plotly.graph_objects as go
+from plotly.subplots import make_subplots
 
 from ...measurements import FloatArray
 from .. import SECOND
 from ..plotting import COLOURS, INK, styled
 from .records import Record
+
+if TYPE_CHECKING:
+    from .fixed_order import FixedOrder
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
 
@@ -137,6 +142,43 @@ def distance_figure(records: Sequence[Record], ospa: FloatArray, start_ns: int) 
     figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='OSPA [m]', rangemode='tozero')
     return styled(figure, height=280)
+
+
+def fixed_order_figure(
+    fixed: Sequence[FixedOrder], records: Sequence[Record], start_ns: int
+) -> go.Figure:
+    """Beside each other, what filters of a fixed number of reflectors find, and the truth."""
+    titles = [f'{one.order} reflectors' for one in fixed]
+    figure = make_subplots(
+        cols=len(fixed), shared_yaxes=True, subplot_titles=titles, horizontal_spacing=0.02
+    )
+    true = [record for record in records if record.true is not None]
+    for column, one in enumerate(fixed, start=1):
+        if true:
+            figure.add_scattergl(
+                x=np.concatenate([np.full(len(r.true), _seconds(r, start_ns)) for r in true]),
+                y=np.concatenate([r.true.depth for r in true]),
+                mode='markers',
+                name='truth',
+                marker={'size': 3, 'color': COLOURS[4]},
+                showlegend=False,
+                row=1,
+                col=column,
+            )
+        figure.add_scattergl(
+            x=np.concatenate([np.full(len(r.found), _seconds(r, start_ns)) for r in one.records]),
+            y=np.concatenate([r.found.depth for r in one.records]),
+            mode='markers',
+            name='found',
+            marker={'size': 3, 'color': COLOURS[0]},
+            showlegend=False,
+            row=1,
+            col=column,
+        )
+    figure.update_xaxes(title='time [s]', showgrid=False)
+    figure.update_yaxes(autorange='reversed', showgrid=False)
+    figure.update_yaxes(title='depth [m]', col=1)
+    return styled(figure, height=380)
 
 
 def _tracks(records: Sequence[Record]) -> list[tuple[int, list[tuple[int, int]]]]:

@@ -1,6 +1,6 @@
 """How far sets of reflectors lie from the true sets.
 
-OSPA of first order (Schuhmacher, Vo and Vo 2008) says it in one number, in metres: the mean error
+OSPA of second order (Schuhmacher, Vo and Vo 2008) says it in one number, in metres: the RMS error
 of a reflector, where one too many or too few counts as one that is the cutoff away. For everything
 else found and true reflectors are paired so that the sum of distances is least, none further apart
 than `NEAR` of the cutoff: who has no partner is false, or missed.
@@ -42,7 +42,7 @@ def pair(found: FloatArray, true: FloatArray, cutoff: float) -> Pairing:
     distance = np.abs(found[:, None] - true)
     rows, columns = linear_sum_assignment(np.minimum(distance, NEAR * cutoff))
     near = distance[rows, columns] < NEAR * cutoff
-    apart = ospa(true[:, None], found[:, None], cutoff, order=1.0)
+    apart = ospa(true[:, None], found[:, None], cutoff, order=2.0)
     return Pairing(rows[near], columns[near], apart)
 
 

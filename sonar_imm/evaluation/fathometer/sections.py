@@ -14,6 +14,7 @@ from ..page import Card, Part, Section
 from ..report import run_part
 from ..run_folder import read_measurements
 from . import figures
+from .fixed_order import fixed_orders
 from .records import Record
 from .scoring import pair
 from .words import summary_sentence
@@ -98,12 +99,13 @@ def _sections(
 ) -> list[Section]:
     committed = [record for record in records if not record.preview]
     start = records[0].stamp_ns
+    image = response_image(run)
     sections = [
         Section(
             'Depth response and reflectors',
             'Grey: what the records show. Lines: the reflectors that were found, a colour an '
             'identity. Yellow: where they truly are, when that is known.',
-            figures.response_figure(response_image(run), committed, start),
+            figures.response_figure(image, committed, start),
         )
     ]
     if committed:
@@ -128,9 +130,29 @@ def _sections(
         sections.append(
             Section(
                 'Distance from the truth',
-                'OSPA: depth errors, and reflectors too many or too few as if they were the '
+                'OSPA: depth errors (RMS), and reflectors too many or too few as if they were the '
                 'cutoff away.',
                 figures.distance_figure(true, np.array(ospa), start),
             )
         )
+    if image is not None and committed:
+        sections.append(_fixed_section(run, image, committed, metrics['cutoff_m'], start))
     return sections
+
+
+def _fixed_section(
+    run: Mapping[str, Any],
+    image: figures.Image,
+    records: Sequence[Record],
+    cutoff: float,
+    start_ns: int,
+) -> Section:
+    fixed = fixed_orders(run, image, records, cutoff)
+    text = 'Bootstrap filters that are told how many reflectors there are, on the same responses. '
+    text += 'Blue: what they find. Yellow: where reflectors truly are, when that is known.'
+    if np.isfinite([one.ospa for one in fixed]).all():
+        apart = ', '.join(f'{one.ospa:.2f} m with {one.order}' for one in fixed)
+        text += f' OSPA: {apart}.'
+    return Section(
+        'Had the number been fixed', text, figures.fixed_order_figure(fixed, records, start_ns)
+    )

@@ -8,11 +8,12 @@ import pytest
 from sonar_imm.cli import main
 from sonar_imm.evaluation.fathometer import LIMIT
 from sonar_imm.evaluation.fathometer.bench import bench_likelihood, bench_record
+from sonar_imm.evaluation.fathometer.fixed_order import fixed_orders
 from sonar_imm.evaluation.fathometer.records import Record, records_of, Reflections
 from sonar_imm.evaluation.fathometer.scoring import pair, score
 from sonar_imm.evaluation.fathometer.sections import response_image
 from sonar_imm.evaluation.judging import judge
-from sonar_imm.evaluation.run_folder import read_measurements, RunFolder
+from sonar_imm.evaluation.run_folder import read_measurements, read_truth, RunFolder
 from sonar_imm.measurements import Trace
 from sonar_imm.recordings.sources import BagError
 
@@ -55,7 +56,7 @@ def test_ospa_in_closed_form():
     assert pair(np.array([10.0]), np.array([15.0]), 2.0).ospa == pytest.approx(2.0)
     assert pair(np.array([]), np.array([15.0, 16.0]), 2.0).ospa == pytest.approx(2.0)
     one = pair(np.array([10.0, 20.0, 30.0]), np.array([10.3, 20.0]), 2.0)
-    assert one.ospa == pytest.approx((0.3 + 2.0) / 3.0)
+    assert one.ospa == pytest.approx(((0.3**2 + 2.0**2) / 3.0) ** 0.5)
     assert list(one.found) == [0, 1] and list(one.true) == [0, 1]
 
 
@@ -135,11 +136,12 @@ def test_a_whole_run_is_judged_and_told(run, capsys):
     assert judgement.accuracy(None).good and not judgement.accuracy(1e-6).good
     assert judgement.accuracy(None).name == f'{LIMIT.meaning} against truth'
     titles = [section.title for section in judgement.part([]).sections]
-    assert titles[:4] == [
+    assert titles[:5] == [
         'Depth response and reflectors',
         'How many there are',
         'Amplitudes',
         'Distance from the truth',
+        'Had the number been fixed',
     ]
     assert main(['evaluate', str(run.path), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['ospa_m'] == judgement.metrics['ospa_m']
@@ -153,6 +155,19 @@ def test_the_image_is_what_the_tracker_saw(run):
     expected = traces[5].amplitude / traces[5].sigma
     assert np.allclose(image.value[:, 5], expected, rtol=1e-4, atol=1e-4)
     assert image.stamp_ns[5] == traces[5].stamp_ns
+
+
+def test_filters_of_a_fixed_order_see_the_same_records(run):
+    content = run.read_run()
+    records = records_of(run.read_estimates(), read_truth(content, None))
+    fixed = fixed_orders(content, response_image(content), records, 2.0)
+    assert [one.order for one in fixed] == [2, 3, 4]
+    for one in fixed:
+        assert [r.stamp_ns for r in one.records] == [r.stamp_ns for r in records]
+        assert all(r.order == one.order for r in one.records)
+        assert one.ospa > 2.0 * judge(run).metrics['ospa_m']
+    untold = fixed_orders(content, response_image(content), records_of(run.read_estimates()), 2.0)
+    assert np.isnan([one.ospa for one in untold]).all()
 
 
 def test_without_truth_there_is_a_page_and_no_verdict(run):
