@@ -17,7 +17,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from attrs import evolve
 import numpy as np
 
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
@@ -219,8 +218,8 @@ def main() -> None:
         for seed in range(options.runs):
             traces, truth = drift(seed, options.records, options.cache)
             for label, (processor, values) in CONFIGURATIONS.items():
-                config = FathometerConfig(**{'particles': options.particles, **values})
-                config = evolve(config, seed=seed, pulse_file=str(pulse))
+                given = {'particles': options.particles, 'pulse_file': str(pulse), **values}
+                config = FathometerConfig(**given, seed=seed)
                 scores.setdefault(label, []).append(score(config, traces[processor], truth))
     table = {
         label: {name: float(np.mean([one[name] for one in each])) for name in each[0]}

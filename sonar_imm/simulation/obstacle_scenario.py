@@ -80,7 +80,7 @@ class ObstacleScenario(Config):
 
     # -- the sonar -------------------------------------------------------------------------------
     sonar_lever: tuple[float, ...] = parameter(
-        (2.0, 0.0, -0.3), 'from the navigation reference to the sonar, vehicle FLU', unit='m'
+        (0.0, 0.0, 0.0), 'from the navigation reference to the sonar, vehicle FLU', unit='m'
     )
     sonar_mount_rpy_deg: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0), 'roll, pitch, yaw of the sonar in the vehicle, FLU', unit='deg'
@@ -200,7 +200,6 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         {
             **_LEVEL,
             'vertical_offset': 4.0,
-            'sonar_lever': (0.0, 0.0, 0.0),
             'ideal_navigation': True,
             'sound_speed_error': 0.0,
         },

@@ -8,6 +8,6 @@ def tracked(folder, scenario='tethers', seed=1, **settings):
     changed = [part for name, value in settings.items() for part in ('--set', f'{name}={value}')]
     bag = folder / 'scene'
     assert main(['simulate', 'obstacle', str(bag), '--scenario', scenario, '--seed', str(seed),
-                 '--set', 'sonar_lever=0,0,0', *changed]) == 0
+                 *changed]) == 0
     assert main(['track', str(bag), str(folder / 'run')]) == 0
     return folder / 'run'

@@ -32,8 +32,8 @@ def test_live_lockstep_equals_offline(bag, tmp_path, capsys):
 
 def test_inputs_that_interleave_and_come_late_give_equal_bytes_too(tmp_path, capsys):
     bag = tmp_path / 'approach'
-    assert main(['simulate', 'obstacle', str(bag), '--scenario', 'late', '--set',
-                 'sonar_lever=0,0,0', '--set', 'last_range=45', '--set', 'clutter=2']) == 0
+    assert main(['simulate', 'obstacle', str(bag), '--scenario', 'late',
+                 '--set', 'last_range=45', '--set', 'clutter=2']) == 0
     assert main(['check', 'obstacle', '--bag', str(bag), '--limit', '8', '--out', str(tmp_path),
                  '--json']) == 0
     outcome, = json.loads(capsys.readouterr().out.partition('\n')[2])
