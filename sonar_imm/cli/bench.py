@@ -62,6 +62,7 @@ def _measure(system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
 
 def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
     from ..nodes.harness import run_lockstep
-    from .checking import own_parameters, shipped_bags
+    from ..recordings.own_parameters import own_parameters
+    from .checking import shipped_bags
     bag = bag or shipped_bags(system)[0]
     return run_lockstep(bag, system, params_file=own_parameters(bag)).latency_ms()

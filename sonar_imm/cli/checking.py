@@ -16,14 +16,12 @@ from ..evaluation.run_folder import BAG, CSV, RunFolder
 from ..evaluation.tracking import final_estimates, InputOptions
 from ..nodes.harness import LockstepResult, run_lockstep
 from ..parameters import Config
+from ..recordings.own_parameters import own_parameters
 from ..resources import share_folder
 from ..trackers import SYSTEMS
 from .common import load_config, progress
 from .evaluate import evaluate_run
 from .track import track_recording
-
-OWN_PARAMETERS = 'parameters.yaml'
-"""Beside the files of a bag: what a tracker has to be told to make sense of it."""
 
 
 @frozen
@@ -58,13 +56,6 @@ def shipped_bags(system: str) -> list[Path]:
     if not found:
         raise FileNotFoundError(f'no recordings for {system} in {share_folder() / "bags"}')
     return found
-
-
-def own_parameters(bag: Path) -> Path | None:
-    """The parameter file that a recording brings along, as one of an unusual array may have to;
-    None without."""
-    path = bag / OWN_PARAMETERS
-    return path if path.is_file() else None
 
 
 def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None = None,

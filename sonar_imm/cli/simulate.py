@@ -33,6 +33,7 @@ def command(system: str, out_bag: Path | None, scenario: str | None, seed: int,
         return
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
+    from ..recordings.own_parameters import unusual, write_own_parameters
     from ..recordings.scenes import write_scene
     from ..simulation.scene import TrueTrack
     name = scenario or next(iter(scenes.SCENARIOS))
@@ -42,15 +43,19 @@ def command(system: str, out_bag: Path | None, scenario: str | None, seed: int,
         'source': f'simulated: {system} {name}', 'seed': str(seed),
         'sonar_imm': __version__,
         **{f'set {key}': value for key, value in sorted(overrides.items())}})
+    told = unusual(config.told(), SYSTEMS[system].config_type())
+    parameters = write_own_parameters(out_bag, system, told)
     targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
     result = {'bag': str(out_bag), 'scenario': name, 'seed': seed, 'messages': report.messages,
-              'targets': targets}
+              'targets': targets, 'parameters': told}
     if as_json:
         print_json(result)
         return
     what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
     say(f'{out_bag}: {what} ({name}, seed {seed}'
         + (f', {targets} targets)' if targets else ')'))
+    if parameters:
+        say(f'  what a tracker has to know of the instruments: {parameters}')
 
 
 def _list(scenes: Any, as_json: bool) -> None:

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from attrs import evolve
 import click
 
 from ..trackers import SYSTEMS
@@ -85,7 +86,8 @@ def command(
 ) -> None:
     """Simulate, track and score SYSTEM under many seeds, and say what comes out on average.
 
-    --set changes the scene, --params the tracker. The score of a seed is that of `sonar-imm
+    --set changes the scene, --params the tracker, which knows of its instruments what the scene
+    says without. The score of a seed is that of `sonar-imm
     evaluate`, however many processes there are. A run that fails is named and left out; the exit
     code is 1 when more than half of them did.
     """
@@ -93,12 +95,15 @@ def command(
         raise click.UsageError('--workers and --scheduler exclude each other')
     from ..evaluation import sweep as sweeps
     from ..evaluation.tracking import InputOptions
+    from ..recordings.own_parameters import unusual
     from .track import inputs_by_topic
 
     scenes = import_module(f'sonar_imm.simulation.{system}')
     name = scenario or next(iter(scenes.SCENARIOS))
     scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     config, node = load_config(SYSTEMS[system], params, {})
+    if params is None:
+        config = evolve(config, **unusual(scene.told(), type(config)))
     sweep = sweeps.Sweep(
         system=system,
         scenario=name,

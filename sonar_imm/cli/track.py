@@ -45,9 +45,13 @@ def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
     OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
-    same bytes in bag and CSV.
+    same bytes in bag and CSV. Without --params those that BAG brings along are used, if any
+    (`parameters.yaml` in its folder); --set changes single ones.
     """
     from ..evaluation.tracking import InputOptions
+    from ..recordings.own_parameters import own_parameters
+    if params is None and (params := own_parameters(bag)) and not as_json:
+        say(f'with the parameters of the recording, {params}')
     chosen = choose_system(bag, system, topics)
     config, node = load_config(chosen, params, overrides)
     options = InputOptions(topics=inputs_by_topic(topics), order=order, frame_id=node.frame_id,

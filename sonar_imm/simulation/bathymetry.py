@@ -23,8 +23,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from ..acoustics import array
 from ..measurements import FloatArray, Snapshot
-from ..parameters import Config, ConfigError, did_you_mean, parameter
-from .scene import Received, Scene, TrueProfile
+from ..parameters import ConfigError, did_you_mean, parameter
+from .scene import Received, Scenario, Scene, TrueProfile
 
 ComplexArray = NDArray[np.complex128]
 
@@ -34,8 +34,10 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
 @frozen(kw_only=True)
-class BathymetryScenario(Config):
+class BathymetryScenario(Scenario):
     """Everything a bathymetry scene can be told; the defaults are the scene of the paper."""
+
+    INSTRUMENT = ('tilt_deg', 'conjugate', 'sonar_height', 'sonar_depth')
 
     pings: int = parameter(20, 'number of pings', low=1, high=1_000_000)
     ping_rate: float = parameter(10.0, 'pings a second', unit='Hz', low=0.01, high=1000.0)

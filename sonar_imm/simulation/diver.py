@@ -18,8 +18,8 @@ from ..acoustics import multistatic
 from ..acoustics.localisation import Localisation, localise
 from ..acoustics.polar import unbiased_polar_to_cartesian
 from ..measurements import Arrivals, Fix, FloatArray
-from ..parameters import Config, ConfigError, did_you_mean, parameter
-from .scene import Received, Scene, TrueTrack
+from ..parameters import ConfigError, did_you_mean, parameter
+from .scene import Received, Scenario, Scene, TrueTrack
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still')
 SENSORS = ('polar', 'multistatic_fixes', 'arrivals')
@@ -32,7 +32,7 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
 @frozen(kw_only=True)
-class DiverScenario(Config):
+class DiverScenario(Scenario):
     """Everything a diver scene can be told; the defaults are Table 1 of the paper."""
 
     motion: str = parameter('legs', 'how the diver moves', choices=MOTIONS)

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ..acoustics.fathometer import PROCESSORS
 from ..measurements import FloatArray
-from ..parameters import Config, ConfigError, did_you_mean, parameter
+from ..parameters import ConfigError, did_you_mean, parameter
+from .scene import Scenario
 
 LEVELS = ('csdm', 'response', 'trace', 'pressure')
 MOST_MEMORY = 2e9
@@ -26,8 +27,18 @@ PRESENT = 0.4
 
 
 @frozen(kw_only=True)
-class FathometerScenario(Config):
+class FathometerScenario(Scenario):
     """Everything a fathometer scene can be told; the defaults are like the drift of the paper."""
+
+    INSTRUMENT = (
+        'record_seconds',
+        'snapshot_seconds',
+        'frequency_min',
+        'frequency_max',
+        'phones',
+        'element_spacing',
+        'sound_speed',
+    )
 
     level: str = parameter('response', 'what is written of the scene', choices=LEVELS)
     records: int = parameter(300, 'number of records', low=1, high=100_000)
@@ -116,6 +127,14 @@ class FathometerScenario(Config):
         if len(self.fading) >= self.layers:
             problems.append('fading would leave no layer')
         return problems
+
+    def told(self) -> dict[str, Any]:
+        """See `Scenario.told`."""
+        told = Scenario.told(self)
+        if self.level == 'csdm':
+            # They are drawn frequency by frequency: no window fades their noise with depth.
+            told |= {'window': 'rectangular', 'overlap': 0.0}
+        return told
 
     def spectra_bytes(self) -> float:
         """Size of all cross-spectra of the scene."""

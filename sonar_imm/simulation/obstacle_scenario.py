@@ -7,14 +7,25 @@ from typing import Any
 from attrs import frozen
 
 from ..acoustics.geometry import AZIMUTH_MODELS
-from ..parameters import Config, parameter
+from ..parameters import parameter
+from .scene import Scenario
 
 PLACEMENTS = ('offset', 'tether', 'seabed', 'surface')
 
 
 @frozen(kw_only=True)
-class ObstacleScenario(Config):
+class ObstacleScenario(Scenario):
     """Everything an obstacle scene can be told; the defaults are the first case of the docs."""
+
+    INSTRUMENT = (
+        'sonar_lever',
+        'sonar_mount_rpy_deg',
+        'azimuth_model',
+        'ping_timing',
+        'max_range',
+        'horizontal_fov_deg',
+        'vertical_fov_deg',
+    )
 
     # -- the vehicle -----------------------------------------------------------------------------
     speed: float = parameter(1.5, 'over ground', unit='m/s', low=0.05, high=20.0)

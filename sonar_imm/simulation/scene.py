@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
 from ..measurements import FloatArray
+from ..parameters import Config
+
+
+@frozen(kw_only=True)
+class Scenario(Config):
+    """Base of what a scene of a system can be told.
+
+    INSTRUMENT: names that the tracker's parameters have too, and mean the same instrument by.
+    """
+
+    INSTRUMENT: ClassVar[tuple[str, ...]] = ()
+
+    def told(self) -> dict[str, Any]:
+        """What a tracker has to know of the instruments, by the names of its parameters."""
+        return {name: getattr(self, name) for name in self.INSTRUMENT}
 
 
 @frozen(eq=False)

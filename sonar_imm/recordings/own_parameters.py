@@ -1,0 +1,42 @@
+"""What a recording itself says of the instrument it was made with: a parameter file beside it.
+
+Most recordings fit the defaults of a tracker. Where the sonar sits elsewhere, or the array is
+another one, a tracker that is not told makes nothing, or nonsense, of the measurements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ..parameters import Config
+
+NAME = 'parameters.yaml'
+_HEAD = '# What the tracker has to be told of the instruments of this recording.\n'
+
+
+def own_parameters(bag: Path) -> Path | None:
+    """The parameter file in the folder of a recording; None without."""
+    path = bag / NAME
+    return path if path.is_file() else None
+
+
+def unusual(told: Mapping[str, Any], tracker: type[Config]) -> dict[str, Any]:
+    """Those of `told` that differ from the defaults of `tracker`."""
+    defaults = {spec.name: spec.default for spec in tracker.specs()}
+    return {name: value for name, value in told.items() if value != defaults[name]}
+
+
+def write_own_parameters(bag: Path, node_name: str, values: Mapping[str, Any]) -> Path | None:
+    """Write `values` as a ROS 2 parameter file of the node into the folder of a recording; without
+    values nothing is written."""
+    if not values:
+        return None
+    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
+    path = bag / NAME
+    tree = {node_name: {'ros__parameters': plain}}
+    path.write_text(_HEAD + yaml.safe_dump(tree, sort_keys=False), encoding='utf-8')
+    return path

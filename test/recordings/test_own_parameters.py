@@ -1,0 +1,79 @@
+"""What a recording says of its instruments reaches the tracker."""
+
+import json
+
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.parameters import parameters_from_yaml
+from sonar_imm.recordings.own_parameters import own_parameters, unusual, write_own_parameters
+from sonar_imm.simulation.fathometer import scenario as fathometer_scenario
+from sonar_imm.simulation.obstacle import scenario as obstacle_scenario
+from sonar_imm.trackers import SYSTEMS
+
+
+def test_only_what_differs_from_the_defaults_is_told():
+    config = SYSTEMS['obstacle'].config_type()
+    assert unusual(obstacle_scenario('approach').told(), config) == {}
+    moved = obstacle_scenario('approach', {'sonar_lever': (2.0, 0.0, -0.3), 'roll_rms_deg': 4.0})
+    assert unusual(moved.told(), config) == {'sonar_lever': (2.0, 0.0, -0.3)}
+
+
+def test_drawn_cross_spectra_have_no_window():
+    config = SYSTEMS['fathometer'].config_type()
+    assert unusual(fathometer_scenario('drift_traces').told(), config) == {}
+    told = unusual(fathometer_scenario('drift_spectra').told(), config)
+    assert told == {'window': 'rectangular', 'overlap': 0.0}
+
+
+def test_the_file_is_one_of_ros(tmp_path):
+    assert write_own_parameters(tmp_path, 'obstacle', {}) is None
+    assert own_parameters(tmp_path) is None
+    values = {'sonar_lever': (2.0, 0.0, -0.3), 'azimuth_model': 'cone', 'max_range': 50.0}
+    path = write_own_parameters(tmp_path, 'obstacle', values)
+    assert own_parameters(tmp_path) == path
+    text = path.read_text()
+    read = parameters_from_yaml(text, node_name='obstacle')
+    assert SYSTEMS['obstacle'].config_type().from_mapping(read).sonar_lever == (2.0, 0.0, -0.3)
+    # A recording that another tracker reads too does not tell it strange words.
+    assert parameters_from_yaml(text, node_name='diver') == {}
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    bag = tmp_path_factory.mktemp('own') / 'scene'
+    assert main(['simulate', 'obstacle', str(bag), '--set', 'sonar_lever=2,0,-0.3',
+                 '--set', 'last_range=80']) == 0
+    return bag
+
+
+def parameters_of(bag, folder, *options):
+    assert main(['track', str(bag), str(folder), *options]) == 0
+    return json.loads((folder / 'run.json').read_text())['parameters']
+
+
+def test_track_uses_them_unless_told_otherwise(bag, tmp_path, capsys):
+    assert parameters_of(bag, tmp_path / 'own')['sonar_lever'] == [2.0, 0.0, -0.3]
+    assert f'with the parameters of the recording, {bag}' in capsys.readouterr().out
+    changed = parameters_of(bag, tmp_path / 'set', '--set', 'components=5')
+    assert changed['sonar_lever'] == [2.0, 0.0, -0.3] and changed['components'] == 5
+    other = tmp_path / 'other.yaml'
+    other.write_text('components: 7\n')
+    given = parameters_of(bag, tmp_path / 'given', '--params', str(other))
+    assert given['sonar_lever'] == [0.0, 0.0, 0.0] and given['components'] == 7
+
+
+def test_a_spoilt_file_is_one_sentence(bag, tmp_path, capsys):
+    (tmp_path / 'bag').mkdir()
+    for file in bag.iterdir():
+        (tmp_path / 'bag' / file.name).write_bytes(file.read_bytes())
+    (tmp_path / 'bag' / 'parameters.yaml').write_text('obstacle: {ros__parameters: {levr: 1}}\n')
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'out')]) == 2
+    assert "unknown parameter 'levr'" in capsys.readouterr().err
+
+
+def test_a_sweep_knows_the_instruments_of_its_scene(tmp_path):
+    assert main(['sweep', 'obstacle', '--runs', '1', '--workers', '1', '--set', 'last_range=80',
+                 '--set', 'sonar_lever=2,0,-0.3', '--out', str(tmp_path)]) == 0
+    told = json.loads((tmp_path / 'sweep.json').read_text())['parameters']
+    assert told['sonar_lever'] == [2.0, 0.0, -0.3]
