@@ -3,7 +3,7 @@ amplitudes, distance from the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from attrs import frozen
@@ -50,13 +50,7 @@ def response_figure(image: Image | None, records: Sequence[Record], start_ns: in
         )
     true = [record for record in records if record.true is not None]
     if true:
-        figure.add_scattergl(
-            x=np.concatenate([np.full(len(r.true), _seconds(r, start_ns)) for r in true]),
-            y=np.concatenate([r.true.depth for r in true]),
-            mode='markers',
-            name='truth',
-            marker={'size': 3, 'color': COLOURS[4]},
-        )
+        figure.add_trace(_dots(true, lambda r: r.true.depth, start_ns, 'truth'))
     for index, (track_id, rows) in enumerate(_tracks(records)):
         figure.add_scattergl(
             x=[_seconds(records[k], start_ns) for k, _ in rows],
@@ -109,13 +103,8 @@ def amplitude_figure(
     figure = go.Figure()
     if factor:
         true = [record for record in records if record.true is not None]
-        figure.add_scattergl(
-            x=np.concatenate([np.full(len(r.true), _seconds(r, start_ns)) for r in true]),
-            y=factor * np.concatenate([r.true.strength for r in true]),
-            mode='markers',
-            name='truth, at the same scale',
-            marker={'size': 3, 'color': COLOURS[4]},
-        )
+        name = 'truth, at the same scale'
+        figure.add_trace(_dots(true, lambda r: factor * r.true.strength, start_ns, name))
     for index, (track_id, rows) in enumerate(_tracks(records)):
         figure.add_scattergl(
             x=[_seconds(records[k], start_ns) for k, _ in rows],
@@ -155,30 +144,33 @@ def fixed_order_figure(
     true = [record for record in records if record.true is not None]
     for column, one in enumerate(fixed, start=1):
         if true:
-            figure.add_scattergl(
-                x=np.concatenate([np.full(len(r.true), _seconds(r, start_ns)) for r in true]),
-                y=np.concatenate([r.true.depth for r in true]),
-                mode='markers',
-                name='truth',
-                marker={'size': 3, 'color': COLOURS[4]},
-                showlegend=False,
-                row=1,
-                col=column,
-            )
-        figure.add_scattergl(
-            x=np.concatenate([np.full(len(r.found), _seconds(r, start_ns)) for r in one.records]),
-            y=np.concatenate([r.found.depth for r in one.records]),
-            mode='markers',
-            name='found',
-            marker={'size': 3, 'color': COLOURS[0]},
-            showlegend=False,
-            row=1,
-            col=column,
-        )
+            dots = _dots(true, lambda r: r.true.depth, start_ns, 'truth')
+            figure.add_trace(dots, row=1, col=column)
+        dots = _dots(one.records, lambda r: r.found.depth, start_ns, 'found', COLOURS[0])
+        figure.add_trace(dots, row=1, col=column)
+    figure.update_traces(showlegend=False)
     figure.update_xaxes(title='time [s]', showgrid=False)
     figure.update_yaxes(autorange='reversed', showgrid=False)
     figure.update_yaxes(title='depth [m]', col=1)
     return styled(figure, height=380)
+
+
+def _dots(
+    records: Sequence[Record],
+    values: Callable[[Record], FloatArray],
+    start_ns: int,
+    name: str,
+    colour: str = COLOURS[4],
+) -> go.Scattergl:
+    """All `values` of each record at its time."""
+    each = [(values(record), _seconds(record, start_ns)) for record in records]
+    return go.Scattergl(
+        x=np.concatenate([np.full(len(value), seconds) for value, seconds in each]),
+        y=np.concatenate([value for value, _ in each]),
+        mode='markers',
+        name=name,
+        marker={'size': 3, 'color': colour},
+    )
 
 
 def _tracks(records: Sequence[Record]) -> list[tuple[int, list[tuple[int, int]]]]:
