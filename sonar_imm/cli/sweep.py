@@ -86,10 +86,10 @@ def command(
 ) -> None:
     """Simulate, track and score SYSTEM under many seeds, and say what comes out on average.
 
-    --set changes the scene, --params the tracker, which knows of its instruments what the scene
-    says without. The score of a seed is that of `sonar-imm
-    evaluate`, however many processes there are. A run that fails is named and left out; the exit
-    code is 1 when more than half of them did.
+    --set changes the scene, --params the tracker; without --params the tracker is told what the
+    scene says of its instruments. The score of a seed is that of `sonar-imm evaluate`, however
+    many processes there are. A run that fails is named and left out; the exit code is 1 when more
+    than half of them did.
     """
     if scheduler is not None and workers is not None:
         raise click.UsageError('--workers and --scheduler exclude each other')
