@@ -30,12 +30,12 @@ def test_a_limit_that_cannot_be_met_fails(tmp_path, capsys):
     assert [check['good'] for check in outcome['checks']] == [True, True, True, False]
 
 
-def test_without_the_parameters_it_brings_a_recording_of_another_array_is_counted_out(
+def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out(
     tmp_path, capsys
 ):
     from sonar_imm.resources import share_folder
 
     bag = share_folder() / 'bags' / 'fathometer_array'
-    assert main(['track', str(bag), str(tmp_path / 'out'), '--json']) == 0
+    assert main(['track', str(bag), str(tmp_path / 'out'), '--set', 'phones=32', '--json']) == 0
     run = json.loads(capsys.readouterr().out)
     assert run['counts']['wrong_phones'] == 12 and run['estimates'] == 0
