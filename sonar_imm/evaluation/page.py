@@ -48,6 +48,12 @@ footer { color: var(--soft); font-size: 12.5px; padding-bottom: 40px; }
 """
 
 
+LEAST_GL_POINTS = 2000
+MOST_GL_FIGURES = 4
+"""A browser keeps 16 drawings by the graphics card, of which a figure takes up to three, and
+blanks the oldest beyond. So only the largest figures of a page are drawn by it."""
+
+
 @frozen
 class Card:
     """One key number: the number, what it is, one line that puts it in relation."""
@@ -80,7 +86,8 @@ class Part:
 
 def render(title: str, parts: Sequence[Part], *, footer: str) -> str:
     """The whole page as text. The same arguments give the same bytes."""
-    body = '\n'.join(_part(part, f'figure-{index}') for index, part in enumerate(parts))
+    fast = _accelerated(parts)
+    body = '\n'.join(_part(part, f'figure-{index}', fast) for index, part in enumerate(parts))
     return f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -93,11 +100,31 @@ def render(title: str, parts: Sequence[Part], *, footer: str) -> str:
 """
 
 
-def _part(part: Part, name: str) -> str:
+def _accelerated(parts: Sequence[Part]) -> list[go.Figure]:
+    """The figures that are drawn by the graphics card: the few that have most points."""
+    figures = [one.figure for part in parts for one in part.sections if one.figure is not None]
+    heavy = [one for one in figures if _gl_points(one) >= LEAST_GL_POINTS]
+    return sorted(heavy, key=_gl_points, reverse=True)[:MOST_GL_FIGURES]
+
+
+def _gl_points(figure: go.Figure) -> int:
+    return sum(len(trace.x) for trace in figure.data if trace.type == 'scattergl')
+
+
+def _without_gl(figure: go.Figure) -> go.Figure:
+    """The same, drawn without the graphics card."""
+    content = figure.to_dict()
+    for trace in content['data']:
+        if trace['type'] == 'scattergl':
+            trace['type'] = 'scatter'
+    return go.Figure(content)
+
+
+def _part(part: Part, name: str, fast: Sequence[go.Figure]) -> str:
     boxes = '\n'.join(f'<div class="card"><span>{escape(card.title)}</span>'
                       f'<b>{escape(card.value)}</b><i>{_prose(card.remark)}</i></div>'
                       for card in part.cards)
-    body = '\n'.join(_section(section, f'{name}-{index}')
+    body = '\n'.join(_section(section, f'{name}-{index}', fast)
                      for index, section in enumerate(part.sections))
     return (f'<header><div class="wrap"><small>{escape(part.kicker)}</small>'
             f'<h1>{escape(part.title)}</h1><p>{_prose(part.summary)}</p></div></header>\n'
@@ -134,10 +161,14 @@ def _cell(value: object) -> str:
     return f'<td{kind}>{escape(text)}</td>'
 
 
-def _section(section: Section, name: str) -> str:
-    figure = '' if section.figure is None else section.figure.to_html(
-        full_html=False, include_plotlyjs=False, div_id=name,
-        config={'displaylogo': False, 'responsive': True,
-                'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d']})
+def _section(section: Section, name: str, fast: Sequence[go.Figure]) -> str:
+    figure = ''
+    if section.figure is not None:
+        accelerated = any(one is section.figure for one in fast)
+        drawn = section.figure if accelerated else _without_gl(section.figure)
+        figure = drawn.to_html(
+            full_html=False, include_plotlyjs=False, div_id=name,
+            config={'displaylogo': False, 'responsive': True,
+                    'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d']})
     return (f'<section><h2>{escape(section.title)}</h2><p>{_prose(section.text)}</p>'
             f'{figure}{section.html}</section>')

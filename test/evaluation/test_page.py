@@ -1,0 +1,27 @@
+"""The page of a report: what the browser is asked to draw."""
+
+import re
+
+import plotly.graph_objects as go
+
+from sonar_imm.evaluation.page import LEAST_GL_POINTS, MOST_GL_FIGURES, Part, render, Section
+
+
+def kinds(sizes):
+    """The kinds of traces on a page with a figure of each size."""
+    parts = []
+    for size in sizes:
+        figure = go.Figure(go.Scattergl(x=list(range(size)), y=list(range(size)), name=f'n{size}'))
+        parts.append(Part('', 'run', '', (), (Section('figure', 'text', figure),)))
+    html = render('title', parts, footer='')
+    # Templates of figures name every kind of trace: look at the ones with a name.
+    return re.findall(r'"name":"n\d+"[^{]*?"type":"(\w+)"', html[html.index('<body>'):])
+
+
+def test_only_the_largest_figures_use_the_graphics_card():
+    sizes = [LEAST_GL_POINTS + k for k in range(MOST_GL_FIGURES + 3)]
+    assert kinds(sizes) == 3 * ['scatter'] + MOST_GL_FIGURES * ['scattergl']
+
+
+def test_small_figures_never_do():
+    assert kinds([10, 100, LEAST_GL_POINTS - 1]) == 3 * ['scatter']
