@@ -11,11 +11,11 @@ their own (other seeds). RMSE is over all stamps from the first fix on.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import markdown, write_json
 from sonar_imm.estimation import imm_kernels
 from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.consistency import average_bounds, nees
@@ -243,16 +243,6 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
     return table
 
 
-def markdown(table: dict[str, dict[str, float]]) -> str:
-    columns = list(next(iter(table.values())))
-    lines = ['| | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 1) + '|']
-    lines += [
-        f'| {row} | ' + ' | '.join(f'{values[column]:.3f}' for column in columns) + ' |'
-        for row, values in table.items()
-    ]
-    return '\n'.join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -269,9 +259,7 @@ def main() -> None:
     }
     for title, table in tables.items():
         print(f'\n{title} ({options.runs} runs at most)\n\n{markdown(table)}', flush=True)
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps({'runs': options.runs, **tables}, indent=1) + '\n')
+    write_json(options.out, {'runs': options.runs, **tables})
 
 
 if __name__ == '__main__':

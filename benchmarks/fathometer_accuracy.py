@@ -12,13 +12,13 @@ takes about 15 minutes a run, so they can be kept (`--cache`).
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
+from benchmarks.tables import markdown, write_json
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra, Trace
@@ -231,20 +231,8 @@ def main() -> None:
         }
         for label, each in scores.items()
     }
-    columns = list(next(iter(table.values())))
-    print(f'{options.runs} runs of {options.records} records\n')
-    print('| | ' + ' | '.join(columns) + ' |')
-    print('|---' * (len(columns) + 1) + '|')
-    for label, values in table.items():
-        print(f'| {label} | ' + ' | '.join(f'{values[name]:.3f}' for name in columns) + ' |')
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(
-            json.dumps(
-                {'runs': options.runs, 'records': options.records, 'table': table}, indent=1
-            )
-            + '\n'
-        )
+    print(f'{options.runs} runs of {options.records} records\n\n{markdown(table)}')
+    write_json(options.out, {'runs': options.runs, 'records': options.records, 'table': table})
 
 
 if __name__ == '__main__':

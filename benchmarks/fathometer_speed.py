@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-import json
 from pathlib import Path
 import time
 
 import numpy as np
 
+from benchmarks.tables import write_json
 from sonar_imm.acoustics.fathometer import coherence, steering
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.acoustics.spectra import outer_sum, SnapshotStream
@@ -112,11 +112,7 @@ def main() -> None:
     for name, value in seconds.items():
         print(f'{name:50s} {1e3 * value:12.4f} ms')
     print(f'the same bytes on 1 and 4 threads: {states == same}')
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(
-            json.dumps({'seconds': seconds, 'same_bytes': states == same}, indent=1) + '\n'
-        )
+    write_json(options.out, {'seconds': seconds, 'same_bytes': states == same})
 
 
 if __name__ == '__main__':

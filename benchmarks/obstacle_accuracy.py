@@ -13,11 +13,11 @@ third of the runs.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Detections, Navigation
@@ -206,16 +206,6 @@ def ahead(truth: TrueObstacle, ping: int) -> bool:
     return bool(np.sqrt(max(r**2 - offset**2, 0.0)) * np.cos(truth.bearing[ping]) > 0.2 * r)
 
 
-def markdown(table: dict[str, dict[str, float]]) -> str:
-    columns = list(next(iter(table.values())))
-    lines = ['| | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 1) + '|']
-    lines += [
-        f'| {row} | ' + ' | '.join(f'{values[column]:.2f}' for column in columns) + ' |'
-        for row, values in table.items()
-    ]
-    return '\n'.join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -227,10 +217,8 @@ def main() -> None:
     tables: dict[str, dict[str, dict[str, float]]] = {}
     for name in options.cases:
         tables[name] = several(options.runs // 3) if name == 'six' else case(name, options.runs)
-        print(f'\n{markdown(tables[name])}', flush=True)
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps({'runs': options.runs, **tables}, indent=1) + '\n')
+        print(f'\n{markdown(tables[name], 2)}', flush=True)
+    write_json(options.out, {'runs': options.runs, **tables})
 
 
 if __name__ == '__main__':

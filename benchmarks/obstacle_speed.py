@@ -10,12 +10,12 @@ moment.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 import time
 
 import numpy as np
 
+from benchmarks.tables import write_json
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
@@ -91,9 +91,7 @@ def main() -> None:
         print(f'{name}: {numbers}', flush=True)
     good = table['gaussian_sum']['median_ms'] <= WANTED_MS
     print(f'{options.obstacles} obstacles within {WANTED_MS} ms: {"yes" if good else "no"}')
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(table, indent=1) + '\n')
+    write_json(options.out, table)
 
 
 if __name__ == '__main__':

@@ -13,7 +13,14 @@ from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .measurement_checks import check_stamp, FloatArray, floats, Rejection
+from .measurement_checks import (
+    check_stamp,
+    complexes,
+    FloatArray,
+    floats,
+    positives,
+    Rejection,
+)
 
 MAX_SAMPLES, MAX_PHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
 LEAST_PHONES = 3
@@ -37,24 +44,6 @@ def _depth(value: Any) -> float | None:
             f'the array is said to be {depth:g} m deep; -100 to {DEEPEST:g} m are possible',
         )
     return depth
-
-
-def _sigma(value: Any) -> FloatArray | None:
-    """Read-only (n,), NaN where the value is no standard deviation; None when none is."""
-    if value is None:
-        return None
-    array = np.array(value, np.float64)
-    array[~(np.isfinite(array) & (array > 0.0))] = np.nan
-    array.flags.writeable = False
-    return None if np.isnan(array).all() else array
-
-
-def _complex(value: Any) -> NDArray[np.complexfloating]:
-    array = np.asarray(value)
-    kept = array.dtype in (np.dtype(np.complex64), np.dtype(np.complex128))
-    array = array.astype(array.dtype if kept else np.complex128, copy=True)
-    array.flags.writeable = False
-    return array
 
 
 def _samples(value: Any) -> NDArray[np.float32]:
@@ -90,7 +79,7 @@ class Trace:
     depth: FloatArray = field(converter=floats(None))
     amplitude: FloatArray = field(converter=floats(None))
     frame_id: str = ''
-    sigma: FloatArray | None = field(default=None, converter=_sigma)
+    sigma: FloatArray | None = field(default=None, converter=positives)
     reference_depth: float | None = field(default=None, converter=_depth)
 
     def __attrs_post_init__(self) -> None:
@@ -144,7 +133,7 @@ class CrossSpectra:
 
     stamp_ns: int
     frequency: FloatArray = field(converter=floats(None))
-    csdm: NDArray[np.complexfloating] = field(converter=_complex)
+    csdm: NDArray[np.complexfloating] = field(converter=complexes)
     frame_id: str = ''
     snapshots: int = 0
     reference_depth: float | None = field(default=None, converter=_depth)

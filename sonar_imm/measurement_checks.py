@@ -35,6 +35,11 @@ def floats(*shape: int | None) -> Any:
     return convert
 
 
+def nanoseconds(seconds: float) -> int:
+    """`seconds` in the unit of stamps."""
+    return round(seconds * 1e9)
+
+
 def check_stamp(stamp_ns: int) -> None:
     """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
     2262."""
@@ -42,3 +47,23 @@ def check_stamp(stamp_ns: int) -> None:
         raise Rejection(
             'bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in'
         )
+
+
+def positives(value: Any) -> FloatArray | None:
+    """Read-only (n,), NaN where the value is no variance or standard deviation, which are finite
+    and positive; None when none is."""
+    if value is None:
+        return None
+    array = np.array(value, np.float64)
+    array[~(np.isfinite(array) & (array > 0.0))] = np.nan
+    array.flags.writeable = False
+    return None if np.isnan(array).all() else array
+
+
+def complexes(value: Any) -> NDArray[np.complexfloating]:
+    """Read-only copy, complex64 or complex128 as it came, anything else as complex128."""
+    array = np.asarray(value)
+    kept = array.dtype in (np.dtype(np.complex64), np.dtype(np.complex128))
+    array = array.astype(array.dtype if kept else np.complex128, copy=True)
+    array.flags.writeable = False
+    return array

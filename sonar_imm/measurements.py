@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from .acoustics.variances import usable_bins
 from .fathometer_measurements import ArrayDepth, CrossSpectra, Pressure, Trace
-from .measurement_checks import check_stamp, FloatArray, floats, Rejection
+from .measurement_checks import (
+    check_stamp,
+    complexes,
+    FloatArray,
+    floats,
+    nanoseconds,
+    positives,
+    Rejection,
+)
 from .obstacle_measurements import Altitude, Detections, Navigation
 
 __all__ = [
@@ -29,6 +37,7 @@ __all__ = [
     'Fix',
     'FloatArray',
     'Measurement',
+    'nanoseconds',
     'Navigation',
     'Pressure',
     'Rejection',
@@ -140,20 +149,7 @@ def _snapshots(value: Any) -> NDArray[np.complexfloating]:
         raise Rejection(
             'bad_shape', f'iq needs a row a bin and a column a stave, not {array.ndim} dimensions'
         )
-    kept = array.dtype in (np.dtype(np.complex64), np.dtype(np.complex128))
-    array = array.astype(array.dtype if kept else np.complex128, copy=True)
-    array.flags.writeable = False
-    return array
-
-
-def _variances(value: Any) -> FloatArray | None:
-    """Read-only (n,), NaN where the value is no variance; None when none is."""
-    if value is None:
-        return None
-    array = np.array(value, np.float64)
-    array[~(np.isfinite(array) & (array > 0.0))] = np.nan
-    array.flags.writeable = False
-    return None if np.isnan(array).all() else array
+    return complexes(array)
 
 
 @frozen(eq=False, kw_only=True)
@@ -172,8 +168,8 @@ class Snapshot:
     range: FloatArray = field(converter=floats(None))
     iq: NDArray[np.complexfloating] = field(converter=_snapshots)
     frame_id: str = ''
-    noise_variance: FloatArray | None = field(default=None, converter=_variances)
-    signal_variance: FloatArray | None = field(default=None, converter=_variances)
+    noise_variance: FloatArray | None = field(default=None, converter=positives)
+    signal_variance: FloatArray | None = field(default=None, converter=positives)
     two_way_time: FloatArray | None = None
     sound_speed: float | None = None
     frequency: float | None = None

@@ -22,6 +22,7 @@ Times are integer nanoseconds; there is no clock here.
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Generic, Literal, TypeVar
 
@@ -48,6 +49,15 @@ class Judgement(Generic[Item]):
     released: tuple[Item, ...] = ()
     abandoned: int = 0
     reinstated: int = 0
+
+    def count_in(self, counts: Counter[str]) -> None:
+        """Add this decision to `doubted`, `too_late` and `restarts`."""
+        counts['doubted'] += self.abandoned
+        if self.verdict == 'too_late':
+            counts['too_late'] += 1
+        elif self.verdict == 'restart':
+            counts['restarts'] += 1
+            counts['too_late'] -= self.reinstated
 
 
 @frozen

@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from ..acoustics import array
 from ..measurements import FloatArray, Snapshot
-from ..parameters import ConfigError, did_you_mean, parameter
+from ..parameters import parameter
 from .scene import Received, Scenario, Scene, TrueProfile
 
 ComplexArray = NDArray[np.complex128]
@@ -145,12 +145,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> BathymetryScenario:
     """The scenario called `name` with some values replaced. Raises `ConfigError` naming
     mistakes."""
-    if name not in SCENARIOS:
-        raise ConfigError(
-            f"unknown scenario '{name}'{did_you_mean(name, SCENARIOS)}; there are "
-            f'{", ".join(SCENARIOS)}'
-        )
-    return BathymetryScenario.from_mapping({**SCENARIOS[name][1], **(overrides or {})})
+    return BathymetryScenario.named(name, SCENARIOS, overrides)
 
 
 def simulate(config: BathymetryScenario, seed: int) -> Scene:

@@ -18,7 +18,7 @@ from ..acoustics import multistatic
 from ..acoustics.localisation import Localisation, localise
 from ..acoustics.polar import unbiased_polar_to_cartesian
 from ..measurements import Arrivals, Fix, FloatArray
-from ..parameters import ConfigError, did_you_mean, parameter
+from ..parameters import parameter
 from .scene import Received, Scenario, Scene, TrueTrack
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still')
@@ -150,12 +150,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> DiverScenario:
     """The scenario called `name` with some values replaced. Raises `ConfigError` naming
     mistakes."""
-    if name not in SCENARIOS:
-        raise ConfigError(
-            f"unknown scenario '{name}'{did_you_mean(name, SCENARIOS)}; there are "
-            f'{", ".join(SCENARIOS)}'
-        )
-    return DiverScenario.from_mapping({**SCENARIOS[name][1], **(overrides or {})})
+    return DiverScenario.named(name, SCENARIOS, overrides)
 
 
 def simulate(config: DiverScenario, seed: int) -> Scene:

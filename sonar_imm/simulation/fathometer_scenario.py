@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..acoustics.fathometer import PROCESSORS
 from ..measurements import FloatArray
-from ..parameters import ConfigError, did_you_mean, parameter
+from ..parameters import parameter
 from .scene import Scenario
 
 LEVELS = ('csdm', 'response', 'trace', 'pressure')
@@ -193,12 +193,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> FathometerScenario:
     """The scenario called `name` with some values replaced. Raises `ConfigError` naming
     mistakes."""
-    if name not in SCENARIOS:
-        raise ConfigError(
-            f"unknown scenario '{name}'{did_you_mean(name, SCENARIOS)}; there are "
-            f'{", ".join(SCENARIOS)}'
-        )
-    return FathometerScenario.from_mapping({**SCENARIOS[name][1], **(overrides or {})})
+    return FathometerScenario.named(name, SCENARIOS, overrides)
 
 
 @frozen(eq=False)

@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ..acoustics import geometry
 from ..acoustics.geometry import Pose
-from ..measurements import Altitude, Detections, FloatArray, Navigation
-from ..parameters import ConfigError, did_you_mean
+from ..measurements import Altitude, Detections, FloatArray, nanoseconds, Navigation
 from .obstacle_scenario import ObstacleScenario, SCENARIOS
 from .scene import Received, Scene
 
@@ -56,12 +55,7 @@ class TrueObstacle:
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> ObstacleScenario:
     """The scenario called `name` with some values replaced. Raises `ConfigError` naming
     mistakes."""
-    if name not in SCENARIOS:
-        raise ConfigError(
-            f"unknown scenario '{name}'{did_you_mean(name, SCENARIOS)}; there are "
-            f'{", ".join(SCENARIOS)}'
-        )
-    return ObstacleScenario.from_mapping({**SCENARIOS[name][1], **(overrides or {})})
+    return ObstacleScenario.named(name, SCENARIOS, overrides)
 
 
 def simulate(config: ObstacleScenario, seed: int) -> Scene:
@@ -222,7 +216,7 @@ def _navigate(
     gaps = _gaps(config, t, rng)
     received = [
         Received(
-            int(stamps[k]) + _ns(config.navigation_latency),
+            int(stamps[k]) + nanoseconds(config.navigation_latency),
             Navigation(
                 stamp_ns=int(stamps[k]),
                 position=geometry.flip_world(position[k]),
@@ -323,7 +317,7 @@ def _pings(
             stamp_ns=int(stamp), range=z[:, 0], bearing=-z[:, 1], frame_id='sonar'
         )
         late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
-        received.append(Received(int(stamp) + _ns(late), detections))
+        received.append(Received(int(stamp) + nanoseconds(late), detections))
     return received
 
 
@@ -350,7 +344,3 @@ def _truth(
 
 def _stamps(t: FloatArray) -> np.ndarray:
     return FIRST_STAMP_NS + np.round(t * 1e9).astype(np.int64)
-
-
-def _ns(seconds: float) -> int:
-    return round(seconds * 1e9)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar
 
 from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
 from ..measurements import FloatArray
-from ..parameters import Config
+from ..parameters import Config, ConfigError, did_you_mean
+
+S = TypeVar('S', bound='Scenario')
 
 
 @frozen(kw_only=True)
@@ -20,6 +23,22 @@ class Scenario(Config):
     """
 
     INSTRUMENT: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def named(
+        cls: type[S],
+        name: str,
+        scenarios: Mapping[str, tuple[str, dict[str, Any]]],
+        overrides: Mapping[str, Any] | None,
+    ) -> S:
+        """The one of `scenarios` (name: description, values) called `name`, with some values
+        replaced. Raises `ConfigError` naming mistakes."""
+        if name not in scenarios:
+            raise ConfigError(
+                f"unknown scenario '{name}'{did_you_mean(name, scenarios)}; there are "
+                f'{", ".join(scenarios)}'
+            )
+        return cls.from_mapping({**scenarios[name][1], **(overrides or {})})
 
     def told(self) -> dict[str, Any]:
         """What a tracker has to know of the instruments, by the names of its parameters."""

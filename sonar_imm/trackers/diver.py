@@ -23,14 +23,15 @@ import numpy as np
 from ..estimates import Estimate
 from ..estimation import imm_kernels
 from ..estimation.adaptation import AdaptiveChain
-from ..estimation.association import TrackRules, Tracks, TrackStatus
+from ..estimation.association import Tracks, TrackStatus
 from ..estimation.history import ReplayHistory, StampGate
-from ..measurements import Arrivals, Fix, Measurement
+from ..measurements import Arrivals, Fix, Measurement, nanoseconds
 from .diver_births import Birth, births_from_fixes, births_from_ping
 from .diver_config import DiverConfig
 from .diver_models import build_models, OUTPUTS
 from .diver_scan import Divers, Scan
 from .diver_sensing import Group, groups_of, Positions
+from .model_checks import track_rules
 
 __all__ = ['DiverConfig', 'Divers', 'DiverTracker']
 
@@ -53,9 +54,11 @@ class DiverTracker:
         self.counts: Counter[str] = Counter()
         self._frame_id = ''
         self._gate: StampGate[Measurement] = StampGate(
-            _ns(self.config.history), _ns(self.config.max_gap), self.config.restart_after
+            nanoseconds(self.config.history),
+            nanoseconds(self.config.max_gap),
+            self.config.restart_after,
         )
-        self._history = self._new_history(Tracks.none(_rules(self.config)))
+        self._history = self._new_history(Tracks.none(track_rules(self.config)))
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
@@ -95,12 +98,8 @@ class DiverTracker:
             self.counts['other_frame'] += 1
             return []
         judgement = self._gate.judge(measurement.stamp_ns, measurement)
-        self.counts['doubted'] += judgement.abandoned
-        if judgement.verdict == 'too_late':
-            self.counts['too_late'] += 1
-        elif judgement.verdict == 'restart':
-            self.counts['restarts'] += 1
-            self.counts['too_late'] -= judgement.reinstated
+        judgement.count_in(self.counts)
+        if judgement.verdict == 'restart':
             life = self._history.state.life
             self._history = self._new_history(life.only(np.zeros(len(life), bool)))
         revised: dict[int, Divers] = {}
@@ -131,7 +130,7 @@ class DiverTracker:
             score=np.empty(0),
             scale=np.zeros((2, 2)),
         )
-        return ReplayHistory(nobody, _ns(self.config.history))
+        return ReplayHistory(nobody, nanoseconds(self.config.history))
 
     # -- one scan ------------------------------------------------------------------------------
 
@@ -164,7 +163,7 @@ class DiverTracker:
 
     def _census(self, now: Divers, births: list[Birth]) -> Divers:
         """End the tracks that are over and begin new ones."""
-        config, rules = self.config, _rules(self.config)
+        config, rules = self.config, track_rules(self.config)
         sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
         life, kept = now.life.scan(
             now.nis_dof > 0,
@@ -218,16 +217,6 @@ class DiverTracker:
                 'nis_dof': state.nis_dof,
             },
         )
-
-
-def _rules(config: DiverConfig) -> TrackRules:
-    return TrackRules(
-        config.confirm_hits, config.confirm_window, config.delete_misses, _ns(config.max_coast)
-    )
-
-
-def _ns(seconds: float) -> int:
-    return round(seconds * 1e9)
 
 
 def _key(measurement: Measurement) -> bytes:

@@ -140,12 +140,8 @@ class FathometerTracker:
             self.counts['duplicate'] += 1
             return []
         judgement = self._gate.judge(measurement.stamp_ns, measurement)
-        self.counts['doubted'] += judgement.abandoned
-        if judgement.verdict == 'too_late':
-            self.counts['too_late'] += 1
-        elif judgement.verdict == 'restart':
-            self.counts['restarts'] += 1
-            self.counts['too_late'] -= judgement.reinstated
+        judgement.count_in(self.counts)
+        if judgement.verdict == 'restart':
             self._forget()
         estimates: list[Estimate] = []
         for item in sorted(judgement.released, key=lambda one: one.stamp_ns):

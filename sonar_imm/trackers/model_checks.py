@@ -3,8 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
+
+from ..estimation.association import TrackRules
+from ..measurements import nanoseconds
+
+
+class TrackParameters(Protocol):
+    """The parameters of confirmation and deletion; max_coast in seconds."""
+
+    confirm_hits: int
+    confirm_window: int
+    delete_misses: int
+    max_coast: float
+
+
+def track_rules(config: TrackParameters) -> TrackRules:
+    """The rules of tracks that `config` states."""
+    return TrackRules(
+        config.confirm_hits,
+        config.confirm_window,
+        config.delete_misses,
+        nanoseconds(config.max_coast),
+    )
 
 
 def chain_problems(

@@ -28,12 +28,19 @@ from ..estimation.association import (
     assign,
     association_cost,
     gate_threshold,
-    TrackRules,
     Tracks,
     TrackStatus,
 )
 from ..estimation.history import ReplayHistory, StampGate
-from ..measurements import Altitude, Detections, FloatArray, Measurement, Navigation
+from ..measurements import (
+    Altitude,
+    Detections,
+    FloatArray,
+    Measurement,
+    nanoseconds,
+    Navigation,
+)
+from .model_checks import track_rules
 from .obstacle_config import ObstacleConfig
 from .obstacle_filters import build_filter, Mixture, Sonar
 from .obstacle_navigation import Mount, NavigationBuffer
@@ -90,10 +97,12 @@ class ObstacleTracker:
         self.counts: Counter[str] = Counter()
         self._frames: dict[type, str] = {}
         self._gate: StampGate[Measurement] = StampGate(
-            _ns(self.config.history), _ns(self.config.max_gap), self.config.restart_after
+            nanoseconds(self.config.history),
+            nanoseconds(self.config.max_gap),
+            self.config.restart_after,
         )
         self._history = ReplayHistory[Obstacles, Measurement](
-            Obstacles(), _ns(self.config.history)
+            Obstacles(), nanoseconds(self.config.history)
         )
 
     def reconfigure(self, config: ObstacleConfig) -> None:
@@ -135,14 +144,10 @@ class ObstacleTracker:
             self.counts['other_frame'] += 1
             return []
         judgement = self._gate.judge(measurement.stamp_ns, measurement)
-        self.counts['doubted'] += judgement.abandoned
-        if judgement.verdict == 'too_late':
-            self.counts['too_late'] += 1
-        elif judgement.verdict == 'restart':
-            self.counts['restarts'] += 1
-            self.counts['too_late'] -= judgement.reinstated
+        judgement.count_in(self.counts)
+        if judgement.verdict == 'restart':
             self._history = ReplayHistory(
-                self._after_restart(self._history.state), _ns(self.config.history)
+                self._after_restart(self._history.state), nanoseconds(self.config.history)
             )
         revised: dict[int, Ping] = {}
         for item in judgement.released:
@@ -204,15 +209,15 @@ class ObstacleTracker:
         return buffer.readiness(
             ping.stamp_ns,
             ping.stamp_ns + self._late_ns(),
-            _ns(self.config.max_navigation_gap),
-            _ns(self.config.max_extrapolation),
+            nanoseconds(self.config.max_navigation_gap),
+            nanoseconds(self.config.max_extrapolation),
         )
 
     def _late_ns(self) -> int:
         """How long after the transmission a pose is needed."""
         if self.config.ping_timing == 'instant':
             return 0
-        return _ns(2.0 * self.config.max_range / self.config.sound_speed)
+        return nanoseconds(2.0 * self.config.max_range / self.config.sound_speed)
 
     def _sonar(
         self, buffer: NavigationBuffer, ping: Detections, altitude: Altitude | None
@@ -221,7 +226,7 @@ class ObstacleTracker:
         height = np.nan
         if altitude is not None:
             age = ping.stamp_ns - altitude.stamp_ns
-            if age <= _ns(self.config.max_altitude_age):
+            if age <= nanoseconds(self.config.max_altitude_age):
                 height = altitude.altitude
         late_ns = self._late_ns()
         if not late_ns:
@@ -297,7 +302,7 @@ class ObstacleTracker:
 
     def _census(self, now: Ping, hit: np.ndarray, z: FloatArray, R: FloatArray) -> Ping:
         """End the tracks that are over or passed, begin one at each detection left."""
-        rules = _rules(self.config)
+        rules = track_rules(self.config)
         tentative = now.life.status == TrackStatus.TENTATIVE
         in_beam, ahead = self.filter.outlook(now.known, now.sonar)
         looked = tentative | (in_beam > IN_BEAM)
@@ -320,7 +325,7 @@ class ObstacleTracker:
     def _nobody(self, sonar: Sonar, stamp_ns: int) -> Ping:
         K, n = self.filter.K, self.filter.n
         nothing = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
-        life = Tracks.none(_rules(self.config))
+        life = Tracks.none(track_rules(self.config))
         return Ping(stamp_ns=stamp_ns, sonar=sonar, life=life, known=nothing, nis=np.empty(0))
 
     @staticmethod
@@ -354,16 +359,6 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
-
-
-def _rules(config: ObstacleConfig) -> TrackRules:
-    return TrackRules(
-        config.confirm_hits, config.confirm_window, config.delete_misses, _ns(config.max_coast)
-    )
-
-
-def _ns(seconds: float) -> int:
-    return round(seconds * 1e9)
 
 
 def _key(measurement: Measurement) -> bytes:
