@@ -1,5 +1,6 @@
 """Playing bags: pace, selection, clock, pause and lock-step, with real publishers."""
 
+from contextlib import ExitStack
 import threading
 import time
 
@@ -216,17 +217,23 @@ def start(walker, domain):
         live.end()
 
 
-def stepping(bag, link, **options):
-    """A player in lock-step with the walker, and the recorder of its estimates."""
-    reader = BagReader(bag).__enter__()
-    recorder = Recorder(link, '/walker')
-    step = LockStep(link, '/walker', recorder=recorder)
-    return Player(reader, link, PlayOptions(lockstep='/walker', **options), step), recorder, step
+@pytest.fixture
+def stepping(bag, link):
+    """Make a player in lock-step with the walker, and the recorder of its estimates."""
+    with ExitStack() as stack:
+
+        def stepping(**options):
+            reader = stack.enter_context(BagReader(bag))
+            recorder = Recorder(link, '/walker')
+            step = LockStep(link, '/walker', recorder=recorder)
+            chosen = PlayOptions(lockstep='/walker', **options)
+            return Player(reader, link, chosen, step), recorder, step
+        yield stepping
 
 
-def test_lockstep_gets_the_estimate_of_every_message(bag, link, start):
+def test_lockstep_gets_the_estimate_of_every_message(link, start, stepping):
     start(*RELIABLE)
-    player, recorder, step = stepping(bag, link)
+    player, recorder, step = stepping()
     player.run()
     assert player.result().published == COUNT + 1  # the other topic goes along, unanswered
     assert step.counts == (COUNT, 1, COUNT - 1)
@@ -236,11 +243,11 @@ def test_lockstep_gets_the_estimate_of_every_message(bag, link, start):
         pytest.approx(np.mean(used[:k + 1])) for k in range(COUNT - 1)]
 
 
-def test_a_second_player_counts_from_where_the_node_stands(bag, link, start):
+def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping):
     start(*RELIABLE)
-    first, _, _ = stepping(bag, link)
+    first, _, _ = stepping()
     first.run()
-    second, recorder, step = stepping(bag, link, start_offset=0.1)
+    second, recorder, step = stepping(start_offset=0.1)
     second.run()
     assert step.counts == (COUNT - 10, 0, 0)  # all duplicates: answered without an estimate
     assert len(recorder) == 0
@@ -257,34 +264,34 @@ def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(bag, start, d
         play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
 
 
-def test_lockstep_without_a_node_says_so(bag, link):
-    player, _, _ = stepping(bag, link)
+def test_lockstep_without_a_node_says_so(link, stepping):
+    player, _, _ = stepping()
     with pytest.raises(LinkError, match="no answer from a node '/walker'"):
         player.run(start_limit=0.3)
 
 
-def test_lockstep_names_the_type_the_node_expects(bag, link, start, monkeypatch):
+def test_lockstep_names_the_type_the_node_expects(link, start, monkeypatch, stepping):
     monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 3.0)
     start('-p', 'fix_type:=geometry_msgs/msg/PointStamped')
-    player, _, _ = stepping(bag, link, topics=('/fix',))
+    player, _, _ = stepping(topics=('/fix',))
     with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
         player.run()
 
 
-def test_lockstep_says_when_no_topic_fits(bag, link, start, monkeypatch):
+def test_lockstep_says_when_no_topic_fits(link, start, monkeypatch, stepping):
     monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 0.5)
     start()
-    player, _, _ = stepping(bag, link, topics=('/other',))
+    player, _, _ = stepping(topics=('/other',))
     with pytest.raises(LinkError, match=r'listens to none of the topics of the bag \(/other\)'):
         player.run()
 
 
-def test_lockstep_notices_a_node_that_does_not_answer(bag, link, start, monkeypatch):
+def test_lockstep_notices_a_node_that_does_not_answer(link, start, monkeypatch, stepping):
     monkeypatch.setattr(lockstep_module, 'ANSWER_LIMIT', 0.3)
     live = start(*RELIABLE)
     release = threading.Event()
     monkeypatch.setattr(live.node.tracker, 'process', lambda m: release.wait(20.0) and [])
-    player, _, _ = stepping(bag, link)
+    player, _, _ = stepping()
     try:
         with pytest.raises(LinkError, match='did not answer message 1 on /fix within 0.3 s'):
             player.run()
@@ -292,10 +299,10 @@ def test_lockstep_notices_a_node_that_does_not_answer(bag, link, start, monkeypa
         release.set()
 
 
-def test_lockstep_notices_somebody_else_who_publishes(bag, link, start):
+def test_lockstep_notices_somebody_else_who_publishes(link, start, stepping):
     start(*RELIABLE)
     other = link.node.create_publisher(PoseWithCovarianceStamped, '/fix', lockstep_qos())
-    player, _, _ = stepping(bag, link)
+    player, _, _ = stepping()
     link.wait_for(other.get_subscription_count, 15.0)
 
     def meddle(count):
@@ -305,9 +312,9 @@ def test_lockstep_notices_somebody_else_who_publishes(bag, link, start):
         player.run(meddle)
 
 
-def test_recorded_estimates_read_back(bag, link, start):
+def test_recorded_estimates_read_back(link, start, stepping):
     start(*RELIABLE)
-    player, recorder, _ = stepping(bag, link, topics=('/fix',))
+    player, recorder, _ = stepping(topics=('/fix',))
     player.run()
     estimate = recorder.estimates()[0]
     assert estimate.frame_id == 'map'
