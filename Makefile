@@ -55,6 +55,7 @@ test-system: venv ## run the tests that start real nodes, one at a time
 
 lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 docs: venv ## write config/*.yaml and docs/parameters/*.md anew from the code

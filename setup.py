@@ -28,8 +28,15 @@ REQUIRES = [
 ]
 EXTRAS = {
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
-    'test': ['filterpy', 'hypothesis', 'pytest>=7.4', 'pytest-benchmark', 'pytest-xdist',
-             'segyio>=1.9', 'stonesoup'],
+    'test': [
+        'filterpy',
+        'hypothesis',
+        'pytest>=7.4',
+        'pytest-benchmark',
+        'pytest-xdist',
+        'segyio>=1.9',
+        'stonesoup',
+    ],
     'lint': ['mypy', 'ruff'],
     'segy': ['segyio>=1.9'],
     'sweep': ['dask[distributed]>=2024.1'],
@@ -44,8 +51,10 @@ def version() -> str:
 
 def shared_files() -> list[tuple[str, list[str]]]:
     """What goes below `share/`: the ament index marker, package.xml, all of config/ and bags/."""
-    files = {'share/ament_index/resource_index/packages': [f'resource/{PACKAGE}'],
-             f'share/{PACKAGE}': ['package.xml']}
+    files = {
+        'share/ament_index/resource_index/packages': [f'resource/{PACKAGE}'],
+        f'share/{PACKAGE}': ['package.xml'],
+    }
     for room in ('bags', 'config'):
         for path in sorted((ROOT / room).rglob('*')):
             if path.is_file():

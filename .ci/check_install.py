@@ -27,22 +27,27 @@ def main(prefix: Path) -> None:
     expect(Path(get_package_prefix('sonar_imm')) == prefix, 'the ament index knows the package')
     expect(prefix in Path(sonar_imm.__file__).parents, 'Python imports the installed package')
     for system in SYSTEMS:
-        expect(prefix in shared_file(f'config/{system}.yaml').parents,
-               f'the shared files of {system} are installed')
+        expect(
+            prefix in shared_file(f'config/{system}.yaml').parents,
+            f'the shared files of {system} are installed',
+        )
     command = prefix / 'lib' / 'sonar_imm' / 'sonar-imm'
     said = subprocess.run([command, '--version'], capture_output=True, text=True, check=True)
     expect(sonar_imm.__version__ in said.stdout, f'sonar-imm says {said.stdout.strip()!r}')
     # It needs marine_acoustic_msgs, which are not on PyPI, so it is not started.
-    expect((prefix / 'lib' / 'sonar_imm' / 'fls_detector_node').is_file(),
-           'fls_detector_node is installed')
+    expect(
+        (prefix / 'lib' / 'sonar_imm' / 'fls_detector_node').is_file(),
+        'fls_detector_node is installed',
+    )
     for system in SYSTEMS:
         start_and_interrupt(prefix / 'lib' / 'sonar_imm' / f'{system}_node')
 
 
 def start_and_interrupt(executable: Path) -> None:
     """Start the node, wait until it says it is ready, press Ctrl-C: it has to leave with 0."""
-    node = subprocess.Popen([executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                            text=True)
+    node = subprocess.Popen(
+        [executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     lines: queue.Queue[str] = queue.Queue()
     reader = threading.Thread(target=forward, args=(node, lines), daemon=True)
     reader.start()
@@ -53,12 +58,14 @@ def start_and_interrupt(executable: Path) -> None:
     except subprocess.TimeoutExpired:
         node.kill()
         raise SystemExit(
-            f'{executable.name} did not stop on SIGINT within {STOP_LIMIT} s') from None
+            f'{executable.name} did not stop on SIGINT within {STOP_LIMIT} s'
+        ) from None
     reader.join(STOP_LIMIT)
     while not lines.empty():
         said += lines.get()
-    expect(status == 0 and 'Traceback' not in said,
-           f'{executable.name} stops on SIGINT with {status}')
+    expect(
+        status == 0 and 'Traceback' not in said, f'{executable.name} stops on SIGINT with {status}'
+    )
 
 
 def forward(node: subprocess.Popen[str], lines: queue.Queue[str]) -> None:
@@ -66,8 +73,9 @@ def forward(node: subprocess.Popen[str], lines: queue.Queue[str]) -> None:
         lines.put(line)
 
 
-def wait_for(word: str, lines: queue.Queue[str], node: subprocess.Popen[str],
-             executable: Path) -> str:
+def wait_for(
+    word: str, lines: queue.Queue[str], node: subprocess.Popen[str], executable: Path
+) -> str:
     """Collect what the node says until a line holds `word`; fail when it does not come."""
     said, end = '', time.monotonic() + START_LIMIT
     while time.monotonic() < end:

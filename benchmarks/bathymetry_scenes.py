@@ -17,9 +17,9 @@ from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
 from msg_adapters.estimates import read_estimate
 from sonar_imm.evaluation.bathymetry.profiles import profiles_of
 from sonar_imm.evaluation.bathymetry.scoring import score
-from sonar_imm.recordings.scenes import profile_record
-from sonar_imm.simulation.bathymetry import scenario, simulate
-from sonar_imm.trackers.bathymetry import BathymetryConfig, BathymetryTracker
+from sonar_imm.recordings.truth import profile_record
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 OPEN = {'shadow_gate': False}
 SLOPE = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}

@@ -36,7 +36,7 @@ from sonar_imm.evaluation.bathymetry.peers import (
     stone_soup_filter,
 )
 from sonar_imm.measurements import Snapshot
-from sonar_imm.trackers.bathymetry import BathymetryConfig, BathymetryTracker
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 
 def peers(ping: Snapshot, rounds: int) -> dict[str, float]:

@@ -19,8 +19,8 @@ from sonar_imm.acoustics.fathometer import coherence, steering
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.acoustics.spectra import outer_sum, SnapshotStream
 from sonar_imm.measurements import CrossSpectra
-from sonar_imm.simulation.fathometer import FathometerScenario, simulate
-from sonar_imm.trackers.fathometer import FathometerConfig, FathometerTracker
+from sonar_imm.simulation.fathometer.simulator import FathometerScenario, simulate
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 
 def median_seconds(work: Callable[[], object], repetitions: int) -> float:

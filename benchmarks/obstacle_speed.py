@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.tables import write_json
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 WANTED_MS = 2.0
 SECOND = 10**9

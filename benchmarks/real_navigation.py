@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 SECOND = 10**9
 DEPTH = 2.0
@@ -60,11 +60,15 @@ def dead_reckoned(folder: Path) -> Path3D:
     t = attitude['stamp_s']
     keep = np.append(True, np.diff(t) > 0.0) & (t >= log['stamp_s'][0]) & (t <= log['stamp_s'][-1])
     t = t[keep]
-    turns = Rotation.from_euler('ZYX', np.column_stack(
-        [attitude[f'{name}_deg'][keep] for name in ('yaw', 'pitch', 'roll')]), degrees=True)
+    turns = Rotation.from_euler(
+        'ZYX',
+        np.column_stack([attitude[f'{name}_deg'][keep] for name in ('yaw', 'pitch', 'roll')]),
+        degrees=True,
+    )
     speed = [uniform_filter1d(log[f'bottom_velocity_{axis}_cm_s'] / 100.0, 9) for axis in 'xy']
-    body = np.column_stack([*(np.interp(t, log['stamp_s'], one) for one in speed),
-                            np.zeros(len(t))])
+    body = np.column_stack(
+        [*(np.interp(t, log['stamp_s'], one) for one in speed), np.zeros(len(t))]
+    )
     over_ground = turns.apply(body)
     over_ground[:, 2] = 0.0
     steps = 0.5 * (over_ground[1:] + over_ground[:-1]) * np.diff(t)[:, None]
@@ -72,8 +76,9 @@ def dead_reckoned(folder: Path) -> Path3D:
     return Path3D(t - t[0] + 1.0, place, turns)
 
 
-def encounter(path: Path3D, start: float, offset: float, seed: int
-              ) -> tuple[list[Navigation | Detections], np.ndarray]:
+def encounter(
+    path: Path3D, start: float, offset: float, seed: int
+) -> tuple[list[Navigation | Detections], np.ndarray]:
     """Measurements of one obstacle `offset` m below the sonar, and its true place, NED."""
     rng = np.random.default_rng(seed)
     here = path.at(np.array([start]))
@@ -85,8 +90,14 @@ def encounter(path: Path3D, start: float, offset: float, seed: int
     poses = path.at(times)
     turns = Rotation.from_matrix(geometry.flip_rotation(poses.R)).as_quat()
     for t, position, q in zip(times, geometry.flip_world(poses.position), turns):
-        received.append((t, Navigation(stamp_ns=round(t * SECOND), position=position,
-                                       orientation=q, frame_id='odom')))
+        received.append(
+            (
+                t,
+                Navigation(
+                    stamp_ns=round(t * SECOND), position=position, orientation=q, frame_id='odom'
+                ),
+            )
+        )
     pings = np.arange(start, start + WINDOW, PING_STEP)
     m = geometry.to_body(path.at(pings), place)
     d, delta = geometry.project(m)
@@ -95,9 +106,17 @@ def encounter(path: Path3D, start: float, offset: float, seed: int
     noise = rng.normal(size=(len(pings), 2)) * STD
     for k, t in enumerate(pings):
         rows = [k] if seen[k] else []
-        received.append((t, Detections(
-            stamp_ns=round(t * SECOND), range=(d + noise[:, 0])[rows],
-            bearing=-(delta + noise[:, 1])[rows], frame_id='sonar')))
+        received.append(
+            (
+                t,
+                Detections(
+                    stamp_ns=round(t * SECOND),
+                    range=(d + noise[:, 0])[rows],
+                    bearing=-(delta + noise[:, 1])[rows],
+                    frame_id='sonar',
+                ),
+            )
+        )
     received.sort(key=lambda one: one[0])
     return [measurement for _, measurement in received], place
 
@@ -124,20 +143,30 @@ def judged(path: Path3D, start: float, seed: int) -> tuple[float, float, bool, f
 def summary(path: Path3D, runs: int = 40) -> dict[str, float]:
     """RMSE, NEES, coverage and mean band width over encounters all along the recording."""
     starts = np.linspace(path.t[0] + 1.0, path.t[-1] - WINDOW - 2.0, runs)
-    found = [one for seed, start in enumerate(starts)
-             if (one := judged(path, float(start), seed)) is not None]
+    found = [
+        one
+        for seed, start in enumerate(starts)
+        if (one := judged(path, float(start), seed)) is not None
+    ]
     error, squared, inside, width = np.array(found, float).T
-    return {'encounters': runs, 'tracked': len(found), 'rmse_m': float(np.sqrt(np.mean(error**2))),
-            'nees': float(np.mean(squared)), 'band_coverage': float(np.mean(inside)),
-            'band_width_m': float(np.mean(width)),
-            'spread_of_truth_m': 1.2 / np.sqrt(3.0)}
+    return {
+        'encounters': runs,
+        'tracked': len(found),
+        'rmse_m': float(np.sqrt(np.mean(error**2))),
+        'nees': float(np.mean(squared)),
+        'band_coverage': float(np.mean(inside)),
+        'band_width_m': float(np.mean(width)),
+        'spread_of_truth_m': 1.2 / np.sqrt(3.0),
+    }
 
 
 def main() -> None:
     path = dead_reckoned(data_folder())
     roll = np.degrees(path.attitude.as_euler('ZYX')[:, 2])
-    print(f'{path.t[-1] - path.t[0]:.0f} s, roll {roll.std():.2f} deg rms, travelled '
-          f'{np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum():.0f} m')
+    print(
+        f'{path.t[-1] - path.t[0]:.0f} s, roll {roll.std():.2f} deg rms, travelled '
+        f'{np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum():.0f} m'
+    )
     for name, value in summary(path).items():
         print(f'{name}: {value:.2f}')
 

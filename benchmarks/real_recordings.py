@@ -22,9 +22,9 @@ from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.recordings.convert import convert_arrivals, convert_autoferry, convert_fixes
 from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.reader import BagReader
-from sonar_imm.trackers.diver import DiverConfig, DiverTracker
-from sonar_imm.trackers.diver_sensing import locate
-from sonar_imm.trackers.diver_smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.sensing import locate
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
 LAG = 3.4

@@ -19,8 +19,8 @@ sys.path.insert(0, str(ROOT))
 from matplotlib import pyplot as plt  # noqa: E402
 
 from sonar_imm.acoustics import array, spatial  # noqa: E402
-from sonar_imm.simulation.bathymetry import scenario, simulate, snr  # noqa: E402
-from sonar_imm.trackers.bathymetry import BathymetryConfig, BathymetryTracker  # noqa: E402
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate, snr  # noqa: E402
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'
 BLUE, RED, AMBER, INK = '#0072B2', '#D55E00', '#E69F00', '#1b2733'

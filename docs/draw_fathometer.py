@@ -25,8 +25,8 @@ from sonar_imm.evaluation.fathometer.records import records_of  # noqa: E402
 from sonar_imm.recordings.convert import convert_segy  # noqa: E402
 from sonar_imm.recordings.measurements import measurements_of  # noqa: E402
 from sonar_imm.recordings.reader import BagReader  # noqa: E402
-from sonar_imm.simulation.fathometer import scenario, simulate  # noqa: E402
-from sonar_imm.trackers.fathometer import FathometerConfig, FathometerTracker  # noqa: E402
+from sonar_imm.simulation.fathometer.simulator import scenario, simulate  # noqa: E402
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'
 DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'

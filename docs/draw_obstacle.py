@@ -21,8 +21,8 @@ from matplotlib.axes import Axes  # noqa: E402
 from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Detections, Navigation  # noqa: E402
-from sonar_imm.simulation.obstacle import scenario, simulate  # noqa: E402
-from sonar_imm.trackers.obstacle_deferred import deferred, sonar_poses  # noqa: E402
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
+from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images' / 'obstacle_offset.png'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'

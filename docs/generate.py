@@ -10,7 +10,7 @@ import textwrap
 
 import yaml
 
-from sonar_imm.nodes.config import node_config_type, type_specs
+from sonar_imm.node_config import node_config_type, type_specs
 from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
 
@@ -52,9 +52,11 @@ def generated() -> dict[str, str]:
     for system in SYSTEMS.values():
         files[f'config/{system.name}.yaml'] = parameter_file(system)
         files[f'docs/parameters/{system.name}.md'] = MARKDOWN.format(
-            name=system.name, summary=system.summary[0].upper() + system.summary[1:],
+            name=system.name,
+            summary=system.summary[0].upper() + system.summary[1:],
             tracker=markdown_table(system.config_type().specs()),
-            node=markdown_table(node_specs(system)))
+            node=markdown_table(node_specs(system)),
+        )
     return files
 
 

@@ -55,12 +55,17 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
     if not keep.any():
         raise Rejection('nan', f'none of the {rows} arrivals has a usable time and positions')
     arrivals = Arrivals(
-        stamp_ns=stamp_ns(message), frame_id=str(message.header.frame_id),
-        tx_id=_ids(values['tx_id'][keep], 'tx_id'), rx_id=_ids(values['rx_id'][keep], 'rx_id'),
-        tx=tx[keep], rx=rx[keep], toa=values['toa'][keep],
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        tx_id=_ids(values['tx_id'][keep], 'tx_id'),
+        rx_id=_ids(values['rx_id'][keep], 'rx_id'),
+        tx=tx[keep],
+        rx=rx[keep],
+        toa=values['toa'][keep],
         var_toa=_variances(columns, 'var_toa', rows, LEAST_VAR_TOA)[keep],
         bearing=_bearings(columns, rows)[keep],
-        var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep])
+        var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep],
+    )
     return to_enu(arrivals, world_frame)
 
 
@@ -90,8 +95,10 @@ def _ids(values: NDArray, name: str) -> NDArray[np.uint16]:
     """Check that identifiers are whole numbers of 16 bits."""
     good = (values >= 0) & (values <= 65535) & (values == np.floor(values))
     if not good.all():
-        raise Rejection('out_of_range', f'arrivals: {name} {values[~good][0]:g} is not a whole '
-                                        'number from 0 to 65535')
+        raise Rejection(
+            'out_of_range',
+            f'arrivals: {name} {values[~good][0]:g} is not a whole number from 0 to 65535',
+        )
     return values.astype(np.uint16)
 
 
@@ -110,6 +117,9 @@ def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
     values = scalar_column(columns, 'bearing')
     values = np.where(np.isfinite(values), values, np.nan)
     if (np.abs(values) > 2.0 * np.pi + 1e-6).any():
-        raise Rejection('out_of_range', f'arrivals: a bearing of {np.nanmax(np.abs(values)):g} is '
-                                        'beyond 2 pi; bearings are in radians')
+        raise Rejection(
+            'out_of_range',
+            f'arrivals: a bearing of {np.nanmax(np.abs(values)):g} is '
+            'beyond 2 pi; bearings are in radians',
+        )
     return np.where(np.abs(values) < np.pi, values, wrap(values))

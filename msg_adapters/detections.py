@@ -50,8 +50,11 @@ def read_detections(message: Any, **_: Any) -> Detections:
         distance, bearing = _polar(*(scalar_column(columns, name) for name in 'xyz'))
     else:
         distance = bearing = np.empty(0)
-    optional = {name: scalar_column(columns, name)
-                for name in ('var_range', 'var_bearing', 'intensity') if name in columns}
+    optional = {
+        name: scalar_column(columns, name)
+        for name in ('var_range', 'var_bearing', 'intensity')
+        if name in columns
+    }
     for name in ('var_range', 'var_bearing'):
         if name in optional:
             optional[name] = _variances(optional[name])
@@ -60,8 +63,9 @@ def read_detections(message: Any, **_: Any) -> Detections:
 
 def read_pose_array(message: Any, **_: Any) -> Detections:
     """Read a PoseArray: positions in the sonar's frame, x forward, y to port, z up."""
-    places = np.array([[pose.position.x, pose.position.y, pose.position.z]
-                       for pose in message.poses], np.float64).reshape(-1, 3)
+    places = np.array(
+        [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses], np.float64
+    ).reshape(-1, 3)
     return _detections(message, *_polar(*places.T))
 
 
@@ -83,13 +87,19 @@ def read_sonar_ranges(message: Any, *, beam_axes: str = 'auto', **_: Any) -> Det
     y to port; ``'auto'``: forward is the one of x and z along which the beams point more.
     """
     distance = np.array(message.ranges, np.float64)
-    beams = np.array([[beam.x, beam.y, beam.z] for beam in message.beam_unit_vec],
-                     np.float64).reshape(-1, 3)
+    beams = np.array(
+        [[beam.x, beam.y, beam.z] for beam in message.beam_unit_vec], np.float64
+    ).reshape(-1, 3)
     if len(beams) != len(distance):
-        raise Rejection('bad_shape', f'SonarRanges has {len(distance)} ranges and {len(beams)} '
-                                     'beams')
-    return _detections(message, _good(distance, message.flags), beam_bearings(beams, beam_axes),
-                       intensity=_one_each(message.intensities, len(distance), 'intensities'))
+        raise Rejection(
+            'bad_shape', f'SonarRanges has {len(distance)} ranges and {len(beams)} beams'
+        )
+    return _detections(
+        message,
+        _good(distance, message.flags),
+        beam_bearings(beams, beam_axes),
+        intensity=_one_each(message.intensities, len(distance), 'intensities'),
+    )
 
 
 def read_sonar_detections(message: Any, *, sound_speed: float = 1500.0, **_: Any) -> Detections:
@@ -102,24 +112,31 @@ def read_sonar_detections(message: Any, *, sound_speed: float = 1500.0, **_: Any
     angles = _one_each(message.rx_angles, len(times), 'rx_angles')
     stated = float(message.ping_info.sound_speed)
     speed = stated if SOUND_SPEEDS[0] <= stated <= SOUND_SPEEDS[1] else sound_speed
-    return _detections(message, _good(0.5 * speed * times, message.flags), -angles,
-                       intensity=_one_each(message.intensities, len(times), 'intensities'))
+    return _detections(
+        message,
+        _good(0.5 * speed * times, message.flags),
+        -angles,
+        intensity=_one_each(message.intensities, len(times), 'intensities'),
+    )
 
 
 def write_detections(detections: Detections, make: Make) -> Any:
-    """Write our table, with z = 0 for display; the optional columns only when something is known.
-    """
+    """Write our table, with z = 0 for display; optional columns only when something is known."""
     distance, bearing = detections.range, detections.bearing
     columns: dict[str, NDArray] = {
         'x': (distance * np.cos(bearing)).astype(np.float32),
         'y': (distance * np.sin(bearing)).astype(np.float32),
-        'z': np.zeros(len(distance), np.float32), 'range': distance, 'bearing': bearing}
+        'z': np.zeros(len(distance), np.float32),
+        'range': distance,
+        'bearing': bearing,
+    }
     for name in ('var_range', 'var_bearing', 'intensity'):
         values = getattr(detections, name)
         if np.isfinite(values).any():
             columns[name] = values.astype(np.float32)
-    return encode_table(columns, stamp_ns=detections.stamp_ns, frame_id=detections.frame_id,
-                        make=make)
+    return encode_table(
+        columns, stamp_ns=detections.stamp_ns, frame_id=detections.frame_id, make=make
+    )
 
 
 def beam_bearings(beams: FloatArray, beam_axes: str) -> FloatArray:
@@ -133,21 +150,29 @@ def beam_bearings(beams: FloatArray, beam_axes: str) -> FloatArray:
     return np.arctan2(-y, z) if beam_axes == 'marine' else np.arctan2(y, x)
 
 
-def _detections(message: Any, distance: FloatArray, bearing: FloatArray, **optional: FloatArray
-                ) -> Detections:
+def _detections(
+    message: Any, distance: FloatArray, bearing: FloatArray, **optional: FloatArray
+) -> Detections:
     """Put columns (n,) together without the rows that are no echo."""
     if len(distance) > MAX_DETECTIONS:
-        raise Rejection('too_large', f'a ping of {len(distance)} detections; at most '
-                                     f'{MAX_DETECTIONS} are read')
+        raise Rejection(
+            'too_large', f'a ping of {len(distance)} detections; at most {MAX_DETECTIONS} are read'
+        )
     seen = np.abs(bearing[np.isfinite(bearing)])
     if len(seen) and seen.max() > 2.0 * np.pi:
-        raise Rejection('out_of_range', f'detections: a bearing of {seen.max():g} is beyond 2 pi; '
-                                        'bearings are in radians')
+        raise Rejection(
+            'out_of_range',
+            f'detections: a bearing of {seen.max():g} is beyond 2 pi; bearings are in radians',
+        )
     keep = np.isfinite(distance) & np.isfinite(bearing) & (distance >= NEAREST)
     keep &= distance <= FARTHEST
     return Detections(
-        stamp_ns=stamp_ns(message), frame_id=str(message.header.frame_id), range=distance[keep],
-        bearing=bearing[keep], **{name: column[keep] for name, column in optional.items()})
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        range=distance[keep],
+        bearing=bearing[keep],
+        **{name: column[keep] for name, column in optional.items()},
+    )
 
 
 def _polar(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -169,8 +194,7 @@ def _good(distance: FloatArray, flags: Any) -> FloatArray:
 
 
 def _one_each(values: ArrayLike, count: int, name: str) -> FloatArray:
-    """(count,) of an array that may be empty (unknown), of length one (the same for all) or full.
-    """
+    """(count,) of an array that is empty (unknown), of length one (the same for all) or full."""
     array = np.array(values, np.float64).ravel()
     if len(array) == count:
         return array

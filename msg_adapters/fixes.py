@@ -33,8 +33,12 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
     block = _xy_covariance(message)
     if block is not None and (not block.any() or (np.diag(block) < 0.0).any()):
         block = None
-    fix = Fix(stamp_ns=stamp_ns(message), position=(x, y, z if np.isfinite(z) else 0.0),
-              covariance=block, frame_id=str(message.header.frame_id))
+    fix = Fix(
+        stamp_ns=stamp_ns(message),
+        position=(x, y, z if np.isfinite(z) else 0.0),
+        covariance=block,
+        frame_id=str(message.header.frame_id),
+    )
     check_size(fix)
     return to_enu(fix, world_frame)
 
@@ -45,8 +49,11 @@ def check_size(fix: Fix) -> None:
         return
     least, most = np.linalg.eigvalsh(fix.covariance)
     if least < LEAST_VARIANCE or most > MOST_VARIANCE:
-        raise Rejection('out_of_range', 'the fix states a standard deviation from '
-                                        f'{np.sqrt(least):g} m to {np.sqrt(most):g} m')
+        raise Rejection(
+            'out_of_range',
+            'the fix states a standard deviation from '
+            f'{np.sqrt(least):g} m to {np.sqrt(most):g} m',
+        )
 
 
 def doubt_fix(message: Any) -> str | None:
@@ -64,13 +71,18 @@ def write_fix(fix: Fix, make: Make) -> Any:
         np.fill_diagonal(covariance, UNKNOWN_VARIANCE)
         covariance[:2, :2] = fix.covariance
     x, y, z = (float(value) for value in fix.position)
-    pose = make('geometry_msgs/msg/Pose',
-                position=make('geometry_msgs/msg/Point', x=x, y=y, z=z),
-                orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0))
-    return make('geometry_msgs/msg/PoseWithCovarianceStamped',
-                header=make_header(fix.stamp_ns, fix.frame_id, make),
-                pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose,
-                          covariance=covariance.ravel()))
+    pose = make(
+        'geometry_msgs/msg/Pose',
+        position=make('geometry_msgs/msg/Point', x=x, y=y, z=z),
+        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    return make(
+        'geometry_msgs/msg/PoseWithCovarianceStamped',
+        header=make_header(fix.stamp_ns, fix.frame_id, make),
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=covariance.ravel()
+        ),
+    )
 
 
 def _xy_covariance(message: Any) -> NDArray[np.float64] | None:
@@ -79,6 +91,7 @@ def _xy_covariance(message: Any) -> NDArray[np.float64] | None:
         return None
     covariance = np.array(message.pose.covariance, np.float64)
     if covariance.size != 36:
-        raise Rejection('bad_shape', f'the covariance of a pose has {covariance.size} numbers, '
-                                     '36 are needed')
+        raise Rejection(
+            'bad_shape', f'the covariance of a pose has {covariance.size} numbers, 36 are needed'
+        )
     return covariance.reshape(6, 6)[:2, :2].copy()

@@ -38,8 +38,11 @@ class FrameGuard:
         if not self._frame_id:
             self._frame_id = measurement.frame_id
         elif measurement.frame_id != self._frame_id:
-            raise Rejection('frame', f"the frame '{measurement.frame_id}' is not the frame "
-                                     f"'{self._frame_id}' of {whose}")
+            raise Rejection(
+                'frame',
+                f"the frame '{measurement.frame_id}' is not the frame "
+                f"'{self._frame_id}' of {whose}",
+            )
 
     def reset(self) -> None:
         """Let the measurements decide again, unless a frame was told."""

@@ -28,8 +28,9 @@ def stamp_ns(message: Any) -> int:
     stamp = message.header.stamp
     seconds, nanoseconds = int(stamp.sec), int(stamp.nanosec)
     if not 0 <= nanoseconds < _NANO:
-        raise Rejection('bad_stamp', f'the header stamp has {nanoseconds} nanoseconds, '
-                                     'a full second or more')
+        raise Rejection(
+            'bad_stamp', f'the header stamp has {nanoseconds} nanoseconds, a full second or more'
+        )
     return seconds * _NANO + nanoseconds
 
 
@@ -39,7 +40,7 @@ def make_header(stamp: int, frame_id: str, make: Make) -> Any:
     Raises ValueError for a stamp that the 32-bit seconds of ROS 2 cannot hold (after 2038-01-19).
     """
     seconds, nanoseconds = divmod(int(stamp), _NANO)
-    if not -2**31 <= seconds < 2**31:
+    if not -(2**31) <= seconds < 2**31:
         raise ValueError(f'a ROS 2 header cannot hold the stamp {stamp} ns')
     time = make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
     return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
@@ -53,11 +54,15 @@ def to_enu(measurement: Any, world_frame: str) -> Any:
     if world_frame == 'ned':
         return ned_to_enu(measurement)
     if world_frame != 'enu':
-        raise ValueError(f"world_frame must be one of {', '.join(WORLD_FRAMES)}, "
-                         f"got '{world_frame}'")
+        raise ValueError(
+            f"world_frame must be one of {', '.join(WORLD_FRAMES)}, got '{world_frame}'"
+        )
     if measurement.frame_id.endswith('_ned'):
-        raise Rejection('frame_ned', f"the frame '{measurement.frame_id}' is north-east-down but "
-                                     'east-north-up is expected; set the world frame to ned')
+        raise Rejection(
+            'frame_ned',
+            f"the frame '{measurement.frame_id}' is north-east-down but "
+            'east-north-up is expected; set the world frame to ned',
+        )
     return measurement
 
 
@@ -70,11 +75,20 @@ def ned_to_enu(measurement: Any) -> Any:
     frame_id = measurement.frame_id.removesuffix('_ned')
     if isinstance(measurement, Fix):
         covariance = measurement.covariance
-        return evolve(measurement, frame_id=frame_id, position=_swap(measurement.position),
-                      covariance=None if covariance is None else covariance[::-1, ::-1])
+        return evolve(
+            measurement,
+            frame_id=frame_id,
+            position=_swap(measurement.position),
+            covariance=None if covariance is None else covariance[::-1, ::-1],
+        )
     if isinstance(measurement, Arrivals):
-        return evolve(measurement, frame_id=frame_id, tx=_swap(measurement.tx),
-                      rx=_swap(measurement.rx), bearing=wrap(np.pi / 2 - measurement.bearing))
+        return evolve(
+            measurement,
+            frame_id=frame_id,
+            tx=_swap(measurement.tx),
+            rx=_swap(measurement.rx),
+            bearing=wrap(np.pi / 2 - measurement.bearing),
+        )
     raise TypeError(f'no north-east-down rule for {type(measurement).__name__}')
 
 

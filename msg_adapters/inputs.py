@@ -49,58 +49,110 @@ class InputTopic:
     one_topic: bool = False
     settings: tuple[str, ...] = ()
 
-    def reader(self, type_name: str, world_frame: str, settings: Mapping[str, Any]
-               ) -> Callable[[Any], Any]:
+    def reader(
+        self, type_name: str, world_frame: str, settings: Mapping[str, Any]
+    ) -> Callable[[Any], Any]:
         """Give the reader of a message type, told everything; `settings` may hold more."""
         told = {name: settings[name] for name in self.settings if name in settings}
         return partial(self.readers[type_name], world_frame=world_frame, **told)
+
     companion: bool = False
 
 
 INPUTS: dict[str, tuple[InputTopic, ...]] = {
     'bathymetry': (
-        InputTopic('snapshot', 'complex snapshots of a side-scan array, one row a range bin', {
-            'sensor_msgs/msg/PointCloud2': read_snapshot,
-        }, one_topic=True),
+        InputTopic(
+            'snapshot',
+            'complex snapshots of a side-scan array, one row a range bin',
+            {
+                'sensor_msgs/msg/PointCloud2': read_snapshot,
+            },
+            one_topic=True,
+        ),
     ),
     'diver': (
-        InputTopic('fix', 'position fixes in a local metric frame', {
-            'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
-            'geometry_msgs/msg/PointStamped': read_fix,
-        }, doubt=doubt_fix, scans=True),
-        InputTopic('arrivals', 'arrival times of one ping, one row a transmitter-receiver pair', {
-            'sensor_msgs/msg/PointCloud2': read_arrivals,
-        }),
+        InputTopic(
+            'fix',
+            'position fixes in a local metric frame',
+            {
+                'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
+                'geometry_msgs/msg/PointStamped': read_fix,
+            },
+            doubt=doubt_fix,
+            scans=True,
+        ),
+        InputTopic(
+            'arrivals',
+            'arrival times of one ping, one row a transmitter-receiver pair',
+            {
+                'sensor_msgs/msg/PointCloud2': read_arrivals,
+            },
+        ),
     ),
     'fathometer': (
-        InputTopic('csdm', 'cross-spectra of a vertical array, one row a frequency', {
-            'sensor_msgs/msg/PointCloud2': read_csdm,
-        }, one_topic=True),
-        InputTopic('pressure', 'pressure at the phones of a vertical array, one row a sample', {
-            'sensor_msgs/msg/PointCloud2': read_pressure,
-        }, one_topic=True),
-        InputTopic('trace', 'ready-made traces, one row a depth', {
-            'sensor_msgs/msg/PointCloud2': read_trace,
-        }, one_topic=True),
-        InputTopic('array_depth', 'depth of the deepest phone, from a companion instrument', {
-            'geometry_msgs/msg/PointStamped': read_array_depth,
-            'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
-        }, companion=True),
+        InputTopic(
+            'csdm',
+            'cross-spectra of a vertical array, one row a frequency',
+            {
+                'sensor_msgs/msg/PointCloud2': read_csdm,
+            },
+            one_topic=True,
+        ),
+        InputTopic(
+            'pressure',
+            'pressure at the phones of a vertical array, one row a sample',
+            {
+                'sensor_msgs/msg/PointCloud2': read_pressure,
+            },
+            one_topic=True,
+        ),
+        InputTopic(
+            'trace',
+            'ready-made traces, one row a depth',
+            {
+                'sensor_msgs/msg/PointCloud2': read_trace,
+            },
+            one_topic=True,
+        ),
+        InputTopic(
+            'array_depth',
+            'depth of the deepest phone, from a companion instrument',
+            {
+                'geometry_msgs/msg/PointStamped': read_array_depth,
+                'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
+            },
+            companion=True,
+        ),
     ),
     'obstacle': (
-        InputTopic('detections', 'echoes of one ping of a forward-looking sonar, also none', {
-            'sensor_msgs/msg/PointCloud2': read_detections,
-            'sensor_msgs/msg/LaserScan': read_laser_scan,
-            'geometry_msgs/msg/PoseArray': read_pose_array,
-            'marine_acoustic_msgs/msg/SonarDetections': read_sonar_detections,
-            'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
-        }, settings=('beam_axes', 'sound_speed')),
-        InputTopic('nav', 'pose of the vehicle', {
-            'nav_msgs/msg/Odometry': read_navigation,
-        }, doubt=doubt_navigation, settings=('nav_twist_frame',)),
-        InputTopic('altitude', 'height above the sea floor', {
-            'sensor_msgs/msg/Range': read_range,
-            'marine_acoustic_msgs/msg/Dvl': read_dvl,
-        }),
+        InputTopic(
+            'detections',
+            'echoes of one ping of a forward-looking sonar, also none',
+            {
+                'sensor_msgs/msg/PointCloud2': read_detections,
+                'sensor_msgs/msg/LaserScan': read_laser_scan,
+                'geometry_msgs/msg/PoseArray': read_pose_array,
+                'marine_acoustic_msgs/msg/SonarDetections': read_sonar_detections,
+                'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
+            },
+            settings=('beam_axes', 'sound_speed'),
+        ),
+        InputTopic(
+            'nav',
+            'pose of the vehicle',
+            {
+                'nav_msgs/msg/Odometry': read_navigation,
+            },
+            doubt=doubt_navigation,
+            settings=('nav_twist_frame',),
+        ),
+        InputTopic(
+            'altitude',
+            'height above the sea floor',
+            {
+                'sensor_msgs/msg/Range': read_range,
+                'marine_acoustic_msgs/msg/Dvl': read_dvl,
+            },
+        ),
     ),
 }

@@ -22,24 +22,32 @@ HIGHEST = 1.2e4
 """Metres above the sea floor: no sea is deeper."""
 
 
-def read_navigation(message: Any, *, world_frame: str = 'enu', nav_twist_frame: str = 'child',
-                    **_: Any) -> Navigation:
+def read_navigation(
+    message: Any, *, world_frame: str = 'enu', nav_twist_frame: str = 'child', **_: Any
+) -> Navigation:
     """Read an Odometry. Raises `Rejection`."""
     if world_frame not in WORLD_FRAMES or nav_twist_frame not in TWIST_FRAMES:
         raise ValueError(f'unknown axes {world_frame}, {nav_twist_frame}')
     frame_id = str(message.header.frame_id)
     if frame_id.endswith('_ned') and world_frame == 'enu':
-        raise Rejection('frame_ned', f"the frame '{frame_id}' is north-east-down but "
-                                     'east-north-up is expected; set the world frame to ned')
+        raise Rejection(
+            'frame_ned',
+            f"the frame '{frame_id}' is north-east-down but "
+            'east-north-up is expected; set the world frame to ned',
+        )
     pose, twist = message.pose.pose, message.twist.twist
     q = pose.orientation
     navigation = Navigation(
-        stamp_ns=stamp_ns(message), frame_id=frame_id,
-        child_frame_id=str(message.child_frame_id), position=_vector(pose.position),
+        stamp_ns=stamp_ns(message),
+        frame_id=frame_id,
+        child_frame_id=str(message.child_frame_id),
+        position=_vector(pose.position),
         orientation=(float(q.x), float(q.y), float(q.z), float(q.w)),
-        velocity=_vector(twist.linear), turn_rate=_vector(twist.angular),
+        velocity=_vector(twist.linear),
+        turn_rate=_vector(twist.angular),
         pose_covariance=_covariance(message.pose.covariance),
-        twist_covariance=_covariance(message.twist.covariance))
+        twist_covariance=_covariance(message.twist.covariance),
+    )
     return _in_child_frame(navigation) if nav_twist_frame == 'world' else navigation
 
 
@@ -53,14 +61,16 @@ def read_range(message: Any, **_: Any) -> Altitude:
     height = float(message.range)
     low, high = float(message.min_range), float(message.max_range)
     if np.isfinite(height) and high > low and not low <= height <= high:
-        raise Rejection('out_of_range', f'the altitude of {height:g} m lies outside the limits '
-                                        f'of the sensor, {low:g} to {high:g} m')
+        raise Rejection(
+            'out_of_range',
+            f'the altitude of {height:g} m lies outside the limits '
+            f'of the sensor, {low:g} to {high:g} m',
+        )
     return _altitude(message, height, float(getattr(message, 'variance', 0.0)))
 
 
 def read_dvl(message: Any, **_: Any) -> Altitude:
-    """Read the altitude of a marine_acoustic_msgs/Dvl, which is not positive without bottom lock.
-    """
+    """Read the altitude of a marine_acoustic_msgs/Dvl; not positive means no bottom lock."""
     height = float(message.altitude)
     if np.isfinite(height) and height <= 0.0:
         raise Rejection('no_bottom', 'the Doppler log has no bottom lock')
@@ -70,29 +80,46 @@ def read_dvl(message: Any, **_: Any) -> Altitude:
 def write_navigation(navigation: Navigation, make: Make) -> Any:
     """Write an Odometry; unknown covariances start with -1, unknown velocities are NaN."""
     x, y, z, w = (float(value) for value in navigation.orientation)
-    pose = make('geometry_msgs/msg/Pose',
-                position=_named(navigation.position, 'Point', make),
-                orientation=make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w))
-    twist = make('geometry_msgs/msg/Twist',
-                 linear=_named(navigation.velocity, 'Vector3', make),
-                 angular=_named(navigation.turn_rate, 'Vector3', make))
-    return make('nav_msgs/msg/Odometry',
-                header=make_header(navigation.stamp_ns, navigation.frame_id, make),
-                child_frame_id=navigation.child_frame_id,
-                pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose,
-                          covariance=_written(navigation.pose_covariance)),
-                twist=make('geometry_msgs/msg/TwistWithCovariance', twist=twist,
-                           covariance=_written(navigation.twist_covariance)))
+    pose = make(
+        'geometry_msgs/msg/Pose',
+        position=_named(navigation.position, 'Point', make),
+        orientation=make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
+    )
+    twist = make(
+        'geometry_msgs/msg/Twist',
+        linear=_named(navigation.velocity, 'Vector3', make),
+        angular=_named(navigation.turn_rate, 'Vector3', make),
+    )
+    return make(
+        'nav_msgs/msg/Odometry',
+        header=make_header(navigation.stamp_ns, navigation.frame_id, make),
+        child_frame_id=navigation.child_frame_id,
+        pose=make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=pose,
+            covariance=_written(navigation.pose_covariance),
+        ),
+        twist=make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=twist,
+            covariance=_written(navigation.twist_covariance),
+        ),
+    )
 
 
 def write_range(altitude: Altitude, make: Make) -> Any:
     """Write a sensor_msgs/Range; a variance of zero means unknown there."""
     known = np.isfinite(altitude.variance)
-    return make('sensor_msgs/msg/Range',
-                header=make_header(altitude.stamp_ns, altitude.frame_id, make),
-                radiation_type=0, field_of_view=0.1, min_range=0.0, max_range=HIGHEST,
-                range=float(altitude.altitude),
-                variance=float(altitude.variance) if known else 0.0)
+    return make(
+        'sensor_msgs/msg/Range',
+        header=make_header(altitude.stamp_ns, altitude.frame_id, make),
+        radiation_type=0,
+        field_of_view=0.1,
+        min_range=0.0,
+        max_range=HIGHEST,
+        range=float(altitude.altitude),
+        variance=float(altitude.variance) if known else 0.0,
+    )
 
 
 def _altitude(message: Any, height: float, variance: float) -> Altitude:
@@ -100,8 +127,12 @@ def _altitude(message: Any, height: float, variance: float) -> Altitude:
         raise Rejection('out_of_range', f'the altitude is {height:g} m, more than any sea is deep')
     if not (np.isfinite(variance) and variance > 1e-12):
         variance = np.nan
-    return Altitude(stamp_ns=stamp_ns(message), altitude=height, variance=variance,
-                    frame_id=str(message.header.frame_id))
+    return Altitude(
+        stamp_ns=stamp_ns(message),
+        altitude=height,
+        variance=variance,
+        frame_id=str(message.header.frame_id),
+    )
 
 
 def _in_child_frame(navigation: Navigation) -> Navigation:
@@ -113,8 +144,12 @@ def _in_child_frame(navigation: Navigation) -> Navigation:
         across = 2.0 * np.cross(axis, vector)
         return vector + w * across + np.cross(axis, across)
 
-    return evolve(navigation, velocity=back(navigation.velocity),
-                  turn_rate=back(navigation.turn_rate), twist_covariance=None)
+    return evolve(
+        navigation,
+        velocity=back(navigation.velocity),
+        turn_rate=back(navigation.turn_rate),
+        twist_covariance=None,
+    )
 
 
 def _vector(value: Any) -> tuple[float, float, float]:
@@ -130,8 +165,10 @@ def _covariance(values: Any) -> FloatArray | None:
     """(6, 6), or None when it is all zero, negative on the diagonal, or not numbers: unknown."""
     covariance = np.array(values, np.float64).ravel()
     if covariance.size != 36:
-        raise Rejection('bad_shape', f'a covariance of the navigation has {covariance.size} '
-                                     'numbers, 36 are needed')
+        raise Rejection(
+            'bad_shape',
+            f'a covariance of the navigation has {covariance.size} numbers, 36 are needed',
+        )
     covariance = covariance.reshape(6, 6)
     diagonal = np.diag(covariance)
     usable = np.isfinite(covariance).all() and covariance.any() and (diagonal >= 0.0).all()

@@ -29,12 +29,16 @@ SURE = 0.9
 def write_poses(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
     """Write a PoseArray of the obstacles in `rows`, without orientation."""
     poses = [_pose(make, *(float(value) for value in estimate.xyz[row])) for row in rows]
-    return make('geometry_msgs/msg/PoseArray',
-                header=make_header(estimate.stamp_ns, estimate.frame_id, make), poses=poses)
+    return make(
+        'geometry_msgs/msg/PoseArray',
+        header=make_header(estimate.stamp_ns, estimate.frame_id, make),
+        poses=poses,
+    )
 
 
-def write_markers(estimate: Estimate, rows: Iterable[int], make: Make, *, down: bool = False
-                  ) -> Any:
+def write_markers(
+    estimate: Estimate, rows: Iterable[int], make: Make, *, down: bool = False
+) -> Any:
     """Write a MarkerArray of bars, balls and labels; `down`: z of the frame points down."""
     markers = [marker for row in rows for marker in _obstacle(estimate, row, make, down)]
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
@@ -42,9 +46,16 @@ def write_markers(estimate: Estimate, rows: Iterable[int], make: Make, *, down: 
 
 def write_no_markers(frame_id: str, make: Make) -> Any:
     """Write what removes every marker that was drawn before."""
-    return make('visualization_msgs/msg/MarkerArray', markers=[
-        make('visualization_msgs/msg/Marker', header=make_header(0, frame_id, make),
-             action=_DELETE_ALL)])
+    return make(
+        'visualization_msgs/msg/MarkerArray',
+        markers=[
+            make(
+                'visualization_msgs/msg/Marker',
+                header=make_header(0, frame_id, make),
+                action=_DELETE_ALL,
+            )
+        ],
+    )
 
 
 def band(estimate: Estimate, row: int, *, down: bool = False) -> tuple[float, float]:
@@ -60,23 +71,44 @@ def _obstacle(estimate: Estimate, row: int, make: Make, down: bool) -> list[Any]
     bottom, top = band(estimate, row, down=down)
     track_id = int(estimate.extras['track_id'][row])
     colour = _colour(float(estimate.probabilities[row, estimate.model_names.index('above')]))
-    label = (f'{track_id}: {estimate.state[row, 0]:.0f} m ahead, '
-             f'{estimate.state[row, 2]:+.1f} m down')
+    label = (
+        f'{track_id}: {estimate.state[row, 0]:.0f} m ahead, {estimate.state[row, 2]:+.1f} m down'
+    )
 
-    def marker(name: str, kind: int, height: float, size: tuple[float, float, float],
-               alpha: float, **more: Any) -> Any:
-        return make('visualization_msgs/msg/Marker',
-                    header=make_header(estimate.stamp_ns, estimate.frame_id, make), ns=name,
-                    id=track_id, type=kind, action=_ADD, pose=_pose(make, x, y, height),
-                    scale=make('geometry_msgs/msg/Vector3', x=size[0], y=size[1], z=size[2]),
-                    color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgb', colour)), a=alpha),
-                    lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
-                    **more)
+    def marker(
+        name: str,
+        kind: int,
+        height: float,
+        size: tuple[float, float, float],
+        alpha: float,
+        **more: Any,
+    ) -> Any:
+        return make(
+            'visualization_msgs/msg/Marker',
+            header=make_header(estimate.stamp_ns, estimate.frame_id, make),
+            ns=name,
+            id=track_id,
+            type=kind,
+            action=_ADD,
+            pose=_pose(make, x, y, height),
+            scale=make('geometry_msgs/msg/Vector3', x=size[0], y=size[1], z=size[2]),
+            color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgb', colour)), a=alpha),
+            lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
+            **more,
+        )
 
-    return [marker('band', _CUBE, 0.5 * (bottom + top), (0.4, 0.4, max(top - bottom, 0.05)), 0.5),
-            marker('obstacle', _SPHERE, z, (0.8, 0.8, 0.8), 1.0),
-            marker('label', _TEXT, (bottom - 1.0) if down else (top + 1.0), (0.0, 0.0, 1.0), 1.0,
-                   text=label)]
+    return [
+        marker('band', _CUBE, 0.5 * (bottom + top), (0.4, 0.4, max(top - bottom, 0.05)), 0.5),
+        marker('obstacle', _SPHERE, z, (0.8, 0.8, 0.8), 1.0),
+        marker(
+            'label',
+            _TEXT,
+            (bottom - 1.0) if down else (top + 1.0),
+            (0.0, 0.0, 1.0),
+            1.0,
+            text=label,
+        ),
+    ]
 
 
 def _colour(above: float) -> tuple[float, float, float]:
@@ -87,6 +119,8 @@ def _colour(above: float) -> tuple[float, float, float]:
 
 def _pose(make: Make, x: float, y: float, z: float) -> Any:
     finite = [value if np.isfinite(value) else 0.0 for value in (x, y, z)]
-    return make('geometry_msgs/msg/Pose',
-                position=make('geometry_msgs/msg/Point', **dict(zip('xyz', finite))),
-                orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0))
+    return make(
+        'geometry_msgs/msg/Pose',
+        position=make('geometry_msgs/msg/Point', **dict(zip('xyz', finite))),
+        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+    )

@@ -40,11 +40,15 @@ def decode_table(message: Any) -> dict[str, NDArray]:
     data = _bytes_of(message.data)
     fields = _checked_fields(message.fields, point_step)
     if row_step < width * point_step:
-        raise Rejection('bad_layout', f'row_step is {row_step} bytes, too short for '
-                                      f'{width} points of {point_step} bytes')
+        raise Rejection(
+            'bad_layout',
+            f'row_step is {row_step} bytes, too short for {width} points of {point_step} bytes',
+        )
     if len(data) < row_step * height:
-        raise Rejection('short_data', f'the table holds {len(data)} bytes, its layout needs '
-                                      f'{row_step * height}')
+        raise Rejection(
+            'short_data',
+            f'the table holds {len(data)} bytes, its layout needs {row_step * height}',
+        )
     rows = height * width
     if rows and not point_step:
         raise Rejection('bad_layout', f'point_step is 0 for {rows} points')
@@ -57,8 +61,13 @@ def decode_table(message: Any) -> dict[str, NDArray]:
         if not rows:
             columns[name] = np.empty(shape, dtype)
             continue
-        view = np.ndarray((height, width, count), dtype.newbyteorder(order), buffer=data,
-                          offset=offset, strides=(row_step, point_step, dtype.itemsize))
+        view = np.ndarray(
+            (height, width, count),
+            dtype.newbyteorder(order),
+            buffer=data,
+            offset=offset,
+            strides=(row_step, point_step, dtype.itemsize),
+        )
         columns[name] = view.astype(dtype).reshape(shape)
     return columns
 
@@ -75,41 +84,72 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
     arrays = {name: _encodable(name, columns[name]) for name in order}
     rows = len(next(iter(arrays.values()))) if arrays else 0
     if uneven := [name for name, array in arrays.items() if len(array) != rows]:
-        raise ValueError(f"column '{uneven[0]}' has {len(arrays[uneven[0]])} rows, "
-                         f"'{order[0]}' has {rows}")
-    packed = np.empty(rows, np.dtype([(name, array.dtype.newbyteorder('<'), array.shape[1:])
-                                      for name, array in arrays.items()]))
+        raise ValueError(
+            f"column '{uneven[0]}' has {len(arrays[uneven[0]])} rows, '{order[0]}' has {rows}"
+        )
+    packed = np.empty(
+        rows,
+        np.dtype(
+            [
+                (name, array.dtype.newbyteorder('<'), array.shape[1:])
+                for name, array in arrays.items()
+            ]
+        ),
+    )
     for name, array in arrays.items():
         packed[name] = array
-    fields = _point_fields(make, tuple(
-        (name, packed.dtype.fields[name][1], _CODES[array.dtype.str[1:]],
-         math.prod(array.shape[1:])) for name, array in arrays.items()))
+    fields = _point_fields(
+        make,
+        tuple(
+            (
+                name,
+                packed.dtype.fields[name][1],
+                _CODES[array.dtype.str[1:]],
+                math.prod(array.shape[1:]),
+            )
+            for name, array in arrays.items()
+        ),
+    )
     step = packed.dtype.itemsize if arrays else 0
     finite = all(np.isfinite(array).all() for array in arrays.values())
-    return make('sensor_msgs/msg/PointCloud2', header=make_header(stamp_ns, frame_id, make),
-                height=1, width=rows, fields=list(fields), is_bigendian=False, point_step=step,
-                row_step=step * rows, data=np.frombuffer(packed.tobytes(), np.uint8),
-                is_dense=bool(finite))
+    return make(
+        'sensor_msgs/msg/PointCloud2',
+        header=make_header(stamp_ns, frame_id, make),
+        height=1,
+        width=rows,
+        fields=list(fields),
+        is_bigendian=False,
+        point_step=step,
+        row_step=step * rows,
+        data=np.frombuffer(packed.tobytes(), np.uint8),
+        is_dense=bool(finite),
+    )
 
 
 @lru_cache(maxsize=64)
 def _point_fields(make: Make, layout: tuple[tuple[str, int, int, int], ...]) -> tuple[Any, ...]:
     """Build the PointFields of a layout once: they are most of the work of a small live table."""
-    return tuple(make('sensor_msgs/msg/PointField', name=name, offset=offset, datatype=datatype,
-                      count=count) for name, offset, datatype, count in layout)
+    return tuple(
+        make(
+            'sensor_msgs/msg/PointField', name=name, offset=offset, datatype=datatype, count=count
+        )
+        for name, offset, datatype, count in layout
+    )
 
 
 def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float64]:
     """Give the column `name` as (rows,) float64. Raises `Rejection` when it is a vector column."""
     column = columns[name]
     if column.ndim != 1:
-        raise Rejection('bad_field', f"column '{name}' holds {column.shape[1]} values a row, "
-                                     'one is needed')
+        raise Rejection(
+            'bad_field', f"column '{name}' holds {column.shape[1]} values a row, one is needed"
+        )
     return column.astype(np.float64)
 
 
-def constant_column(columns: Mapping[str, NDArray], name: str, *, zero_is_known: bool = False
-                    ) -> float | None:
+def constant_column(
+    columns: Mapping[str, NDArray], name: str, *, zero_is_known: bool = False
+) -> float | None:
     """Give the one value of a column that holds for the whole message; None when it is not known.
 
     NaN is unknown; so is 0, which drivers leave in what they do not know, unless `zero_is_known`.
@@ -129,8 +169,9 @@ def constant_column(columns: Mapping[str, NDArray], name: str, *, zero_is_known:
 def require_columns(columns: Mapping[str, NDArray], names: tuple[str, ...], what: str) -> None:
     """Raise `Rejection` naming the columns that are missing from a table of `what`."""
     if missing := [name for name in names if name not in columns]:
-        raise Rejection('missing_column', f'a table of {what} needs the column '
-                                          f'{" and ".join(missing)}')
+        raise Rejection(
+            'missing_column', f'a table of {what} needs the column {" and ".join(missing)}'
+        )
 
 
 def _bytes_of(data: Any) -> memoryview:
@@ -138,15 +179,18 @@ def _bytes_of(data: Any) -> memoryview:
     try:
         return memoryview(data).cast('B')
     except (TypeError, ValueError):
-        raise Rejection('bad_layout', f'the data of the table are a {type(data).__name__}, '
-                                      'not contiguous bytes') from None
+        raise Rejection(
+            'bad_layout',
+            f'the data of the table are a {type(data).__name__}, not contiguous bytes',
+        ) from None
 
 
 def _checked_fields(fields: Any, point_step: int) -> list[tuple[str, int, np.dtype, int]]:
     """Check every PointField: (name, offset, native dtype, count). Overlapping fields are fine."""
     if len(fields) > MAX_FIELDS:
-        raise Rejection('too_large', f'the table has {len(fields)} fields, at most {MAX_FIELDS} '
-                                     'are read')
+        raise Rejection(
+            'too_large', f'the table has {len(fields)} fields, at most {MAX_FIELDS} are read'
+        )
     checked: dict[str, tuple[str, int, np.dtype, int]] = {}
     for field in fields:
         name, offset, count = str(field.name), int(field.offset), int(field.count)
@@ -155,15 +199,19 @@ def _checked_fields(fields: Any, point_step: int) -> list[tuple[str, int, np.dty
         if name in checked:
             raise Rejection('bad_field', f"the table has two fields named '{name}'")
         if int(field.datatype) not in DATATYPES:
-            raise Rejection('bad_field', f"field '{name}' has the unknown datatype "
-                                         f'{int(field.datatype)}')
+            raise Rejection(
+                'bad_field', f"field '{name}' has the unknown datatype {int(field.datatype)}"
+            )
         if count < 1:
             raise Rejection('bad_field', f"field '{name}' has a count of {count}")
         dtype = np.dtype(DATATYPES[int(field.datatype)])
         if offset < 0 or offset + dtype.itemsize * count > point_step:
-            raise Rejection('bad_field', f"field '{name}' ends at byte "
-                                         f'{offset + dtype.itemsize * count}, beyond the '
-                                         f'point_step of {point_step}')
+            raise Rejection(
+                'bad_field',
+                f"field '{name}' ends at byte "
+                f'{offset + dtype.itemsize * count}, beyond the '
+                f'point_step of {point_step}',
+            )
         checked[name] = (name, offset, dtype, count)
     return list(checked.values())
 
@@ -174,9 +222,11 @@ def _encodable(name: str, values: Any) -> NDArray:
     if array.dtype == np.bool_:
         array = array.astype(np.uint8)
     if array.dtype.str[1:] not in _CODES:
-        raise ValueError(f"column '{name}' has the dtype {array.dtype}, "
-                         'which a PointField cannot name')
+        raise ValueError(
+            f"column '{name}' has the dtype {array.dtype}, which a PointField cannot name"
+        )
     if array.ndim not in (1, 2) or 0 in array.shape[1:]:
-        raise ValueError(f"column '{name}' has the shape {array.shape}, (rows,) or "
-                         '(rows, count) is needed')
+        raise ValueError(
+            f"column '{name}' has the shape {array.shape}, (rows,) or (rows, count) is needed"
+        )
     return array

@@ -13,9 +13,11 @@ def _check_adapters() -> None:
     version = getattr(_adapters, '__version__', None)
     if (owner, version) != ('sonar_imm', __version__):
         found = getattr(_adapters, '__file__', None) or list(_adapters.__path__)
-        raise ImportError(f'sonar_imm {__version__} ({__file__}) needs its own module '
-                          f'msg_adapters, but Python found {found} (owner {owner}, version '
-                          f'{version}); another package or an older install hides it')
+        raise ImportError(
+            f'sonar_imm {__version__} ({__file__}) needs its own module '
+            f'msg_adapters, but Python found {found} (owner {owner}, version '
+            f'{version}); another package or an older install hides it'
+        )
 
 
 _check_adapters()

@@ -26,7 +26,8 @@ def share_folder(start: Path | None = None) -> Path:
             return above / 'share' / _PACKAGE
     raise FileNotFoundError(
         f'the shared files of {_PACKAGE} (config, bags) were not installed beside {start}; '
-        'install the package with pip or colcon instead of copying its modules')
+        'install the package with pip or colcon instead of copying its modules'
+    )
 
 
 def shared_file(name: str) -> Path:

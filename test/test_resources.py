@@ -15,12 +15,15 @@ def touch(path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize('place', [
-    'lib/python3.12/site-packages',        # pip in a venv, colcon
-    'lib/python3.12/dist-packages',        # Debian's Python
-    'local/lib/python3.12/dist-packages',  # the same, colcon on Ubuntu
-    '.',                                   # pip install --target
-])
+@pytest.mark.parametrize(
+    'place',
+    [
+        'lib/python3.12/site-packages',  # pip in a venv, colcon
+        'lib/python3.12/dist-packages',  # Debian's Python
+        'local/lib/python3.12/dist-packages',  # the same, colcon on Ubuntu
+        '.',  # pip install --target
+    ],
+)
 def test_installed_files_lie_in_share_of_the_prefix(tmp_path: Path, place: str) -> None:
     module = touch(tmp_path / place / 'sonar_imm' / 'resources.py')
     touch(tmp_path / 'share' / 'sonar_imm' / 'package.xml')

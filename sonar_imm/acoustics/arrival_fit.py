@@ -67,7 +67,7 @@ class ArrivalFit:
         """Residuals (k, m) and Jacobian of the prediction (k, m, 2) at positions (k, 2), the
         emission time at its best for the `weight` (m,) or (k, m)."""
         distance, jacobian = slant_range(position, self.rx, self.target_z)
-        residual = self.observed[:len(self.rx)] - distance
+        residual = self.observed[: len(self.rx)] - distance
         if self.active.any():
             distance, direction = slant_range(position, self.tx, self.target_z)
             residual = residual - self.active * distance
@@ -87,14 +87,14 @@ class ArrivalFit:
         """Chi-square (k,) at positions (k, 2) for `weight` (m,): the residuals alone, for many
         positions."""
         place = np.column_stack([position, np.full(len(position), self.target_z)])
-        residual = self.observed[:len(self.rx)] - cdist(place, self.rx)
+        residual = self.observed[: len(self.rx)] - cdist(place, self.rx)
         if self.active.any():
             residual -= self.active * cdist(place, self.tx)
         if not self.active.all():
             residual -= ~self.active * (residual @ self._emission_share(weight))[:, None]
-        cost = np.square(residual) @ weight[:len(self.rx)]
+        cost = np.square(residual) @ weight[: len(self.rx)]
         if len(self.bearing_rx):
-            cost = cost + np.square(self._bearing_residual(position)) @ weight[len(self.rx):]
+            cost = cost + np.square(self._bearing_residual(position)) @ weight[len(self.rx) :]
         return cost
 
     def curvature(self, position: FloatArray, pull: FloatArray) -> FloatArray:
@@ -104,22 +104,22 @@ class ArrivalFit:
         for points, share in ((self.rx, np.ones(len(self.rx))), (self.tx, self.active)):
             if share.any():
                 distance, direction = slant_range(position, points, self.target_z)
-                bend = share * pull[:, :len(points)] / np.maximum(distance, 1e-3)
+                bend = share * pull[:, : len(points)] / np.maximum(distance, 1e-3)
                 along = np.swapaxes(direction * bend[..., None], -1, -2) @ direction
                 total += bend.sum(axis=-1)[:, None, None] * np.eye(2) - along
         return total
 
     def _bearing_residual(self, position: FloatArray) -> FloatArray:
-        return wrap_angle(self.observed[len(self.rx):] - bearing(position, self.bearing_rx))
+        return wrap_angle(self.observed[len(self.rx) :] - bearing(position, self.bearing_rx))
 
     def _emission_share(self, weight: FloatArray) -> FloatArray:
         """Share (..., n) of each passive row in the estimate of the time of emission."""
-        passive = weight[..., :len(self.rx)] * ~self.active
+        passive = weight[..., : len(self.rx)] * ~self.active
         return passive / np.maximum(passive.sum(axis=-1, keepdims=True), 1e-300)
 
     def starts(self, weight: FloatArray) -> FloatArray:
         """Positions (k, 2) near which the minima for `weight` (m,) must be, best first."""
-        kept = weight[:len(self.rx)] > 0.0
+        kept = weight[: len(self.rx)] > 0.0
         ellipses, passive = np.flatnonzero(self.active & kept), np.flatnonzero(~self.active & kept)
         grid = self._ellipses(ellipses) if len(ellipses) else self._polar_grid()
         cost = self.cost(grid.reshape(-1, 2), weight).reshape(grid.shape[:2])
@@ -235,8 +235,9 @@ def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
     return Minima(position, cost, information, converged)
 
 
-def _expansion(fit: ArrivalFit, position: FloatArray, weight: FloatArray,
-               curved: bool) -> tuple[FloatArray, ...]:
+def _expansion(
+    fit: ArrivalFit, position: FloatArray, weight: FloatArray, curved: bool
+) -> tuple[FloatArray, ...]:
     """Cost (k,), half its downhill gradient (k, 2), half its Hessian, whole where `curved`, and
     the information (k, 2, 2)."""
     residual, jacobian = fit.residuals(position, weight)
@@ -248,8 +249,9 @@ def _expansion(fit: ArrivalFit, position: FloatArray, weight: FloatArray,
     return (pull * residual).sum(axis=-1), gradient, hessian, information
 
 
-def _damped_step(hessian: FloatArray, information: FloatArray, gradient: FloatArray,
-                 damping: FloatArray) -> FloatArray:
+def _damped_step(
+    hessian: FloatArray, information: FloatArray, gradient: FloatArray, damping: FloatArray
+) -> FloatArray:
     """Solve (H + lift I) step = gradient for 2 x 2 matrices in closed form, the lift making H
     positive definite."""
     a, b, d = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]

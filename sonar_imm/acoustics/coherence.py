@@ -29,7 +29,7 @@ from scipy.optimize import brentq
 
 from .array import direction_grid, phase_step
 from .laplace import autocorrelation
-from .law_kernels import beam_peaks
+from .likelihood_kernels import beam_peaks
 from .variances import moving_mean
 
 FloatArray = NDArray[np.float64]

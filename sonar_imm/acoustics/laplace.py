@@ -22,7 +22,7 @@ autocorrelation c_k = sum_p y_{p+k} conj(y_p) of the snapshot. `form_coefficient
 this into P complex numbers g with q(u) = Re sum_k g_k exp(-i k w u), w = 2 pi spacing, which
 Horner's rule sums in O(P) for each of thousands of candidate directions.
 
-Compiled loops take the law from a table: see `law_kernels`.
+Compiled loops take the law from a table: see `likelihood_kernels`.
 """
 
 from __future__ import annotations

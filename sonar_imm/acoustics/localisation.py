@@ -120,10 +120,18 @@ QUADRATIC = (0.3, 3.5)
 ASIDE^2 it rises by where the covariance describes the likelihood."""
 
 
-def localise(rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike, *, tx: ArrayLike | None = None,
-             bearing: ArrayLike | None = None, var_bearing: ArrayLike | None = None,
-             target_z: float = 0.0, sound_speed: float = 1500.0,
-             limits: Limits = DEFAULT_LIMITS) -> Localisation | Refusal:
+def localise(
+    rx: ArrayLike,
+    toa: ArrayLike,
+    var_toa: ArrayLike,
+    *,
+    tx: ArrayLike | None = None,
+    bearing: ArrayLike | None = None,
+    var_bearing: ArrayLike | None = None,
+    target_z: float = 0.0,
+    sound_speed: float = 1500.0,
+    limits: Limits = DEFAULT_LIMITS,
+) -> Localisation | Refusal:
     """Find the target of one ping from its n arrivals.
 
     rx (n, 3) m; toa (n,) s and var_toa (n,) s^2; tx (n, 3) m, rows of NaN (or None) where the
@@ -142,34 +150,54 @@ def localise(rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike, *, tx: ArrayLike
         return Refusal('diverged', 'the search for the position did not converge')
     candidates = _candidates(fit, minima)
     if not candidates:
-        return Refusal('out_of_range', 'the position lies further than '
-                       f'{limits.max_range:g} m from the instruments')
+        return Refusal(
+            'out_of_range',
+            f'the position lies further than {limits.max_range:g} m from the instruments',
+        )
     best, *rivals = candidates
     dof = _dof(fit, kept)
     refusal = _doubt(fit, fit.weight * kept, best, dof, limits)
     if refusal is not None:
         return refusal
     if rivals and limits.refuse_ambiguous:
-        return Refusal('ambiguous', f'{len(candidates)} positions explain the arrivals about '
-                       'equally well', tuple(candidates))
+        return Refusal(
+            'ambiguous',
+            f'{len(candidates)} positions explain the arrivals about equally well',
+            tuple(candidates),
+        )
     emission, var_emission = _emission(fit, kept, best, sound_speed)
     return Localisation(
-        position=best.position, covariance=best.covariance, cost=best.cost, dof=dof,
-        p_value=_p_value(best.cost, dof), ambiguous=bool(rivals), alternatives=tuple(rivals),
-        used=_spread(kept[:len(fit.rx)], _usable(times)),
-        used_bearing=_spread(kept[len(fit.rx):], _usable(bearings)),
-        emission_time=emission, var_emission_time=var_emission)
+        position=best.position,
+        covariance=best.covariance,
+        cost=best.cost,
+        dof=dof,
+        p_value=_p_value(best.cost, dof),
+        ambiguous=bool(rivals),
+        alternatives=tuple(rivals),
+        used=_spread(kept[: len(fit.rx)], _usable(times)),
+        used_bearing=_spread(kept[len(fit.rx) :], _usable(bearings)),
+        emission_time=emission,
+        var_emission_time=var_emission,
+    )
 
 
-def _checked(tx: ArrayLike | None, rx: ArrayLike, toa: ArrayLike, var_toa: ArrayLike,
-             bearing: ArrayLike | None, var_bearing: ArrayLike | None) -> tuple[FloatArray, ...]:
+def _checked(
+    tx: ArrayLike | None,
+    rx: ArrayLike,
+    toa: ArrayLike,
+    var_toa: ArrayLike,
+    bearing: ArrayLike | None,
+    var_bearing: ArrayLike | None,
+) -> tuple[FloatArray, ...]:
     """tx (n, 3), rx (n, 3), and times (n, 2), bearings (n, 2) as pairs of value and variance."""
     rx_ = np.asarray(rx, np.float64)
     n = len(rx_)
     tx_ = np.full((n, 3), np.nan) if tx is None else np.asarray(tx, np.float64)
     missing = np.full(n, np.nan)
-    columns = [missing if values is None else np.asarray(values, np.float64)
-               for values in (toa, var_toa, bearing, var_bearing)]
+    columns = [
+        missing if values is None else np.asarray(values, np.float64)
+        for values in (toa, var_toa, bearing, var_bearing)
+    ]
     if rx_.shape != (n, 3) or tx_.shape != (n, 3) or any(each.shape != (n,) for each in columns):
         raise ValueError('every arrival needs tx and rx positions (n, 3), a time and a variance')
     if not (np.abs(rx_) <= LARGEST).all():
@@ -177,8 +205,15 @@ def _checked(tx: ArrayLike | None, rx: ArrayLike, toa: ArrayLike, var_toa: Array
     return tx_, rx_, np.column_stack(columns[:2]), np.column_stack(columns[2:])
 
 
-def _problem(tx: FloatArray, rx: FloatArray, times: FloatArray, bearings: FloatArray,
-             target_z: float, sound_speed: float, max_range: float) -> ArrivalFit:
+def _problem(
+    tx: FloatArray,
+    rx: FloatArray,
+    times: FloatArray,
+    bearings: FloatArray,
+    target_z: float,
+    sound_speed: float,
+    max_range: float,
+) -> ArrivalFit:
     """The least-squares problem of the usable rows."""
     hears, sees = _usable(times), _usable(bearings)
     active: BoolArray = np.asarray(np.isfinite(tx[hears]).all(axis=-1))
@@ -188,16 +223,24 @@ def _problem(tx: FloatArray, rx: FloatArray, times: FloatArray, bearings: FloatA
     path = sound_speed * (toa - np.where(active, 0.0, epoch))
     variance = np.concatenate([sound_speed**2 * var_toa, bearings[sees, 1]])
     return ArrivalFit(
-        tx=np.where(active[:, None], tx[hears], rx[hears]), rx=rx[hears], active=active,
-        bearing_rx=rx[sees], observed=np.concatenate([path, bearings[sees, 0]]),
-        weight=1.0 / variance, target_z=target_z, max_range=max_range, epoch=epoch)
+        tx=np.where(active[:, None], tx[hears], rx[hears]),
+        rx=rx[hears],
+        active=active,
+        bearing_rx=rx[sees],
+        observed=np.concatenate([path, bearings[sees, 0]]),
+        weight=1.0 / variance,
+        target_z=target_z,
+        max_range=max_range,
+        epoch=epoch,
+    )
 
 
 def _usable(rows: FloatArray) -> BoolArray:
     """Which (n,) of the pairs of value and variance (n, 2) hold a measurement."""
     value, variance = rows.T
-    return np.asarray((np.abs(value) <= LARGEST) & (variance >= LARGEST**-2)
-                      & (variance <= LARGEST**2))
+    return np.asarray(
+        (np.abs(value) <= LARGEST) & (variance >= LARGEST**-2) & (variance <= LARGEST**2)
+    )
 
 
 def _spread(kept: BoolArray, usable: BoolArray) -> BoolArray:
@@ -209,7 +252,7 @@ def _spread(kept: BoolArray, usable: BoolArray) -> BoolArray:
 
 def _dof(fit: ArrivalFit, kept: BoolArray) -> int:
     """Rows less unknowns: x, y and, where passive rows are kept, the time of emission."""
-    return int(kept.sum()) - 2 - int((kept[:len(fit.rx)] & ~fit.active).any())
+    return int(kept.sum()) - 2 - int((kept[: len(fit.rx)] & ~fit.active).any())
 
 
 def _p_value(cost: float, dof: int) -> float:
@@ -227,8 +270,9 @@ def _search(fit: ArrivalFit, limits: Limits) -> tuple[BoolArray, Minima]:
         suspects = np.flatnonzero(kept)
         seeds = minima.position[:SEEDS]
         all_but_one = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
-        trials = minimise(fit, np.tile(seeds, (len(suspects), 1)),
-                          np.repeat(all_but_one, len(seeds), axis=0))
+        trials = minimise(
+            fit, np.tile(seeds, (len(suspects), 1)), np.repeat(all_but_one, len(seeds), axis=0)
+        )
         kept[suspects[int(np.argmin(trials.cost)) // len(seeds)]] = False
         weight = fit.weight * kept
         afresh = minimise(fit, fit.starts(weight), weight)
@@ -252,34 +296,48 @@ def _candidates(fit: ArrivalFit, minima: Minima) -> list[Candidate]:
     return found
 
 
-def _doubt(fit: ArrivalFit, weight: FloatArray, best: Candidate, dof: int,
-           limits: Limits) -> Refusal | None:
+def _doubt(
+    fit: ArrivalFit, weight: FloatArray, best: Candidate, dof: int, limits: Limits
+) -> Refusal | None:
     """Why the best candidate must not be believed, or None."""
     variances, axes = np.linalg.eigh(best.covariance)
     if variances[1] > limits.max_std**2 or variances[1] > limits.max_condition * variances[0]:
-        return Refusal('singular_geometry', 'the geometry leaves a standard deviation of '
-                       f'{np.sqrt(variances[1]):.3g} m')
+        return Refusal(
+            'singular_geometry',
+            f'the geometry leaves a standard deviation of {np.sqrt(variances[1]):.3g} m',
+        )
     aside = ASIDE * (axes * np.sqrt(variances)).T
     around = fit.cost(best.position + np.concatenate([aside, -aside]), weight)
     rise = (around - best.cost) / ASIDE**2
     if rise.min() < QUADRATIC[0] or rise.max() > QUADRATIC[1]:
-        return Refusal('singular_geometry', 'around the fix the likelihood is not what its '
-                       'covariance says, as near the line between transmitter and receiver')
+        return Refusal(
+            'singular_geometry',
+            'around the fix the likelihood is not what its '
+            'covariance says, as near the line between transmitter and receiver',
+        )
     p_value = _p_value(best.cost, dof)
     if p_value < limits.min_p_value:
-        return Refusal('poor_fit', f'chi-square {best.cost:.4g} with {dof} degrees of freedom '
-                       f'(p = {p_value:.2g})')
+        return Refusal(
+            'poor_fit',
+            f'chi-square {best.cost:.4g} with {dof} degrees of freedom (p = {p_value:.2g})',
+        )
     return None
 
 
-def _emission(fit: ArrivalFit, kept: BoolArray, best: Candidate,
-              sound_speed: float) -> tuple[float | None, float | None]:
+def _emission(
+    fit: ArrivalFit, kept: BoolArray, best: Candidate, sound_speed: float
+) -> tuple[float | None, float | None]:
     """Time of emission and its variance from the passive rows kept; None without such rows."""
-    rows = np.flatnonzero(kept[:len(fit.rx)] & ~fit.active)
+    rows = np.flatnonzero(kept[: len(fit.rx)] & ~fit.active)
     if not len(rows):
         return None, None
     time, variance = emission_time(
-        fit.observed[rows] / sound_speed, 1.0 / (sound_speed**2 * fit.weight[rows]),
-        fit.rx[rows], best.position, target_z=fit.target_z, sound_speed=sound_speed,
-        covariance=best.covariance)
+        fit.observed[rows] / sound_speed,
+        1.0 / (sound_speed**2 * fit.weight[rows]),
+        fit.rx[rows],
+        best.position,
+        target_z=fit.target_z,
+        sound_speed=sound_speed,
+        covariance=best.covariance,
+    )
     return fit.epoch + time, variance

@@ -41,8 +41,9 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
     return np.mod(np.asarray(angle, np.float64) + np.pi, 2.0 * np.pi) - np.pi
 
 
-def slant_range(position: ArrayLike, points: ArrayLike,
-                target_z: float) -> tuple[FloatArray, FloatArray]:
+def slant_range(
+    position: ArrayLike, points: ArrayLike, target_z: float
+) -> tuple[FloatArray, FloatArray]:
     """Distance (..., n) from points (n, 3) to the target, and its Jacobian (..., n, 2)."""
     offset, height = _offset(position, points, target_z)
     distance = np.sqrt(np.square(offset).sum(axis=-1) + np.square(height))
@@ -54,8 +55,9 @@ def range_sum(position: ArrayLike, tx: ArrayLike, rx: ArrayLike, target_z: float
     return slant_range(position, tx, target_z)[0] + slant_range(position, rx, target_z)[0]
 
 
-def range_sum_jacobian(position: ArrayLike, tx: ArrayLike, rx: ArrayLike,
-                       target_z: float) -> FloatArray:
+def range_sum_jacobian(
+    position: ArrayLike, tx: ArrayLike, rx: ArrayLike, target_z: float
+) -> FloatArray:
     """Derivative (..., n, 2) of `range_sum`: the sum of two unit vectors, zero on the baseline."""
     return slant_range(position, tx, target_z)[1] + slant_range(position, rx, target_z)[1]
 
@@ -75,8 +77,9 @@ def bearing_jacobian(position: ArrayLike, rx: ArrayLike) -> FloatArray:
     return np.stack([-offset[..., 1] * inverse, offset[..., 0] * inverse], axis=-1)
 
 
-def pseudo_range(position: ArrayLike, rx: ArrayLike, target_z: float,
-                 offset: ArrayLike = 0.0) -> FloatArray:
+def pseudo_range(
+    position: ArrayLike, rx: ArrayLike, target_z: float, offset: ArrayLike = 0.0
+) -> FloatArray:
     """One-way range (..., n) plus the common `offset` (...) in metres: sound speed times time of
     emission."""
     return slant_range(position, rx, target_z)[0] + np.asarray(offset, np.float64)[..., None]
@@ -111,8 +114,9 @@ class DifferenceMeasurement:
         return self.projection @ pseudo_range_jacobian(position, rx, target_z)
 
 
-def difference_measurement(toa: ArrayLike, var_toa: ArrayLike,
-                           sound_speed: float) -> DifferenceMeasurement:
+def difference_measurement(
+    toa: ArrayLike, var_toa: ArrayLike, sound_speed: float
+) -> DifferenceMeasurement:
     """Take the unknown time of emission out of the arrival times `toa` (n,) s with variances
     `var_toa` (n,) s^2.
 
@@ -133,13 +137,23 @@ def difference_measurement(toa: ArrayLike, var_toa: ArrayLike,
     reflection = np.eye(len(weight)) - np.outer(axis, axis) * (2.0 / (axis @ axis))
     projection = reflection[1:] * weight
     # The projection ignores a constant: taking one off keeps the digits of times since 1970.
-    return DifferenceMeasurement(z=projection @ (sound_speed * (times - times[0])),
-                                 R=np.eye(len(weight) - 1), projection=projection)
+    return DifferenceMeasurement(
+        z=projection @ (sound_speed * (times - times[0])),
+        R=np.eye(len(weight) - 1),
+        projection=projection,
+    )
 
 
-def emission_time(toa: ArrayLike, var_toa: ArrayLike, rx: ArrayLike, position: ArrayLike, *,
-                  target_z: float, sound_speed: float,
-                  covariance: ArrayLike | None = None) -> tuple[float, float]:
+def emission_time(
+    toa: ArrayLike,
+    var_toa: ArrayLike,
+    rx: ArrayLike,
+    position: ArrayLike,
+    *,
+    target_z: float,
+    sound_speed: float,
+    covariance: ArrayLike | None = None,
+) -> tuple[float, float]:
     """When a target at `position` (2,) emitted what arrived at `toa` (n,): the time in s and its
     variance in s^2.
 
@@ -158,9 +172,17 @@ def emission_time(toa: ArrayLike, var_toa: ArrayLike, rx: ArrayLike, position: A
     return float(time), float(variance)
 
 
-def crlb(position: ArrayLike, tx: ArrayLike | None, rx: ArrayLike, var_toa: ArrayLike, *,
-         target_z: float, sound_speed: float, sound_speed_std: float = 0.0,
-         var_bearing: ArrayLike | None = None) -> FloatArray:
+def crlb(
+    position: ArrayLike,
+    tx: ArrayLike | None,
+    rx: ArrayLike,
+    var_toa: ArrayLike,
+    *,
+    target_z: float,
+    sound_speed: float,
+    sound_speed_std: float = 0.0,
+    var_bearing: ArrayLike | None = None,
+) -> FloatArray:
     """Cramer-Rao bound (..., 2, 2) in m^2 on any unbiased fix at `position` (..., 2).
 
     tx (n, 3), a row NaN or the whole of it None where the target itself emits at an unknown time;
@@ -187,13 +209,17 @@ def crlb(position: ArrayLike, tx: ArrayLike | None, rx: ArrayLike, var_toa: Arra
         across = bearing_jacobian(position, rx_)
         weight = _inverse_variance(var_bearing, len(rx_))
         information[..., :2, :2] += np.swapaxes(across, -1, -2) @ (weight[:, None] * across)
-    information = information[..., :3, :3] if sound_speed_std <= 0.0 else _without_last(
-        information + np.diag([0.0, 0.0, 0.0, sound_speed_std**-2]))
+    information = (
+        information[..., :3, :3]
+        if sound_speed_std <= 0.0
+        else _without_last(information + np.diag([0.0, 0.0, 0.0, sound_speed_std**-2]))
+    )
     return _inverse_or_infinite(_without_last(information))
 
 
-def _offset(position: ArrayLike, points: ArrayLike,
-            target_z: float) -> tuple[FloatArray, FloatArray]:
+def _offset(
+    position: ArrayLike, points: ArrayLike, target_z: float
+) -> tuple[FloatArray, FloatArray]:
     """Horizontal vectors (..., n, 2) from points to position, and heights (n,) of the target above
     the points."""
     place, points_ = np.asarray(position, np.float64), np.asarray(points, np.float64)

@@ -26,8 +26,9 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 
-def unbiased_polar_to_cartesian(range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike,
-                                var_bearing: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def unbiased_polar_to_cartesian(
+    range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike, var_bearing: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
     """Mean (..., 2) and covariance (..., 2, 2) of the true position given a measured range (m) and
     bearing (rad).
 
@@ -35,8 +36,9 @@ def unbiased_polar_to_cartesian(range_: ArrayLike, bearing: ArrayLike, var_range
     variances are var_r (1 + lambda^4) / 2 + r^2 (1 - lambda^2)^2 / 2 along it and (r^2 + var_r) (1
     - lambda^4) / 2 across it.
     """
-    r, v_range, v_bearing = (np.asarray(value, np.float64)
-                             for value in (range_, var_range, var_bearing))
+    r, v_range, v_bearing = (
+        np.asarray(value, np.float64) for value in (range_, var_range, var_bearing)
+    )
     # expm1 because 1 - lambda^2 is about 1e-3 and is squared: the printed equations lose it.
     one_less_lambda2, one_less_lambda4 = -np.expm1(-v_bearing), -np.expm1(-2.0 * v_bearing)
     along = v_range * (1.0 - 0.5 * one_less_lambda4) + 0.5 * np.square(r * one_less_lambda2)
@@ -44,17 +46,23 @@ def unbiased_polar_to_cartesian(range_: ArrayLike, bearing: ArrayLike, var_range
     return _along_bearing(r * np.exp(-0.5 * v_bearing), bearing, along, across)
 
 
-def linearised_polar_to_cartesian(range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike,
-                                  var_bearing: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def linearised_polar_to_cartesian(
+    range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike, var_bearing: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
     """The conventional conversion, biased at long range: position (..., 2) and first-order
     covariance (..., 2, 2)."""
     r = np.asarray(range_, np.float64)
-    return _along_bearing(r, bearing, np.asarray(var_range, np.float64),
-                          np.square(r) * np.asarray(var_bearing, np.float64))
+    return _along_bearing(
+        r,
+        bearing,
+        np.asarray(var_range, np.float64),
+        np.square(r) * np.asarray(var_bearing, np.float64),
+    )
 
 
-def _along_bearing(distance: FloatArray, bearing: ArrayLike, along: FloatArray,
-                   across: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _along_bearing(
+    distance: FloatArray, bearing: ArrayLike, along: FloatArray, across: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """A point at `distance` on the line of sight, with its variances along and across that
     line."""
     cosine, sine = np.cos(np.asarray(bearing, np.float64)), np.sin(np.asarray(bearing, np.float64))

@@ -32,10 +32,15 @@ COMMANDS = {
 }
 
 
-@click.group(name=PROGRAM, cls=LazyGroup, package=__name__, summaries=COMMANDS,
-             invoke_without_command=True,
-             context_settings={'help_option_names': ['-h', '--help'], 'max_content_width': 100},
-             epilog=f'`{PROGRAM} COMMAND --help` shows the options of a command and an example.')
+@click.group(
+    name=PROGRAM,
+    cls=LazyGroup,
+    package=__name__,
+    summaries=COMMANDS,
+    invoke_without_command=True,
+    context_settings={'help_option_names': ['-h', '--help'], 'max_content_width': 100},
+    epilog=f'`{PROGRAM} COMMAND --help` shows the options of a command and an example.',
+)
 @click.version_option(__version__, prog_name=PROGRAM)
 @click.pass_context
 def command(ctx: click.Context) -> None:
@@ -79,6 +84,7 @@ def _what_the_user_can_mend(error: Exception) -> str | None:
     from ..measurements import Rejection
     from ..parameters import ConfigError
     from ..recordings.reader import BagError
+
     if isinstance(error, (ConfigError, Rejection, BagError)):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and error.name:
@@ -92,8 +98,8 @@ def _what_the_user_can_mend(error: Exception) -> str | None:
 def missing_package(name: str) -> str | None:
     """How to come by a package that only some commands need; None for one that all need."""
     remedies = {
-        'distributed': "dask.distributed, which shares out the runs, is not here: pip install "
-                       "'sonar_imm[sweep]', or say --workers 1",
+        'distributed': 'dask.distributed, which shares out the runs, is not here: pip install '
+        "'sonar_imm[sweep]', or say --workers 1",
         'rclpy': "ROS 2 is not here: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
         'segyio': "segyio, which reads SEG-Y, is not here: pip install 'sonar_imm[segy]'",
         'filterpy': "FilterPy is not here: pip install 'sonar_imm[test]'",

@@ -13,14 +13,25 @@ from .common import BAG, example, json_option, print_json, say
 
 @click.command(epilog=example('sonar-imm bench', 'sonar-imm bench diver --json --skip-node'))
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
-@click.option('--rounds', type=click.IntRange(min=1), default=7, show_default=True,
-              help='Paired rounds against other programs.')
+@click.option(
+    '--rounds',
+    type=click.IntRange(min=1),
+    default=7,
+    show_default=True,
+    help='Paired rounds against other programs.',
+)
 @click.option('--bag', type=BAG, help='What the node is timed with; by default a shipped bag.')
 @click.option('--skip-node', is_flag=True, help='Leave out the live node (needs ROS 2).')
 @click.option('--strict', is_flag=True, help='Exit with 1 when a figure misses its goal.')
 @json_option
-def command(systems: tuple[str, ...], rounds: int, bag: Path | None, skip_node: bool, strict: bool,
-            as_json: bool) -> None:
+def command(
+    systems: tuple[str, ...],
+    rounds: int,
+    bag: Path | None,
+    skip_node: bool,
+    strict: bool,
+    as_json: bool,
+) -> None:
     """Measure the filters, beside FilterPy in one run where it does the same, and the live nodes.
 
     Times depend on the machine and on what else it does; the ratio to another program hardly does.
@@ -34,19 +45,24 @@ def command(systems: tuple[str, ...], rounds: int, bag: Path | None, skip_node: 
         results[system] = _measure(system, rounds, quiet=as_json)
         if not skip_node:
             results[system]['node_ms'] = latency = _node_latency(system, bag)
-            say(f'  live node, message to estimate: p50 {latency["p50"]:.2f} ms, '
-                f'p99 {latency["p99"]:.2f} ms', quiet=as_json)
+            say(
+                f'  live node, message to estimate: p50 {latency["p50"]:.2f} ms, '
+                f'p99 {latency["p99"]:.2f} ms',
+                quiet=as_json,
+            )
     if as_json:
         print_json(results)
-    if strict and not all(part.get('good', True) for result in results.values()
-                          for part in result.values()):
+    if strict and not all(
+        part.get('good', True) for result in results.values() for part in result.values()
+    ):
         raise click.exceptions.Exit(1)
 
 
 def _measure(system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
     """The benches of one system, without those whose other program is not installed."""
-    from ..evaluation.benching import benches_of
+    from ..evaluation.benches import benches_of
     from . import missing_package
+
     result = {}
     for bench in benches_of(system):
         try:
@@ -64,5 +80,6 @@ def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
     from ..nodes.harness import run_lockstep
     from ..recordings.own_parameters import own_parameters
     from .checking import shipped_bags
+
     bag = bag or shipped_bags(system)[0]
     return run_lockstep(bag, system, params_file=own_parameters(bag)).latency_ms()

@@ -15,20 +15,37 @@ if TYPE_CHECKING:
     from .checking import Outcome
 
 
-@click.command(epilog=example('sonar-imm check diver',
-                              'sonar-imm check diver --bag dive.bag --limit 3'))
+@click.command(
+    epilog=example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3')
+)
 @click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
 @click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
-@click.option('--params', type=click.Path(path_type=Path, dir_okay=False),
-              help='Parameter file, for the node and offline alike.')
-@click.option('--limit', type=click.FloatRange(min=0.0), metavar='ERROR',
-              help='Error to stay within, of the kind and in the unit that the check prints: '
-                   'position RMSE in metres for the diver.')
-@click.option('--out', type=click.Path(path_type=Path, file_okay=False),
-              help='Keep both runs in this folder.')
+@click.option(
+    '--params',
+    type=click.Path(path_type=Path, dir_okay=False),
+    help='Parameter file, for the node and offline alike.',
+)
+@click.option(
+    '--limit',
+    type=click.FloatRange(min=0.0),
+    metavar='ERROR',
+    help='Error to stay within, of the kind and in the unit that the check prints: '
+    'position RMSE in metres for the diver.',
+)
+@click.option(
+    '--out',
+    type=click.Path(path_type=Path, file_okay=False),
+    help='Keep both runs in this folder.',
+)
 @json_option
-def command(systems: tuple[str, ...], bag: Path | None, params: Path | None,
-            limit: float | None, out: Path | None, as_json: bool) -> None:
+def command(
+    systems: tuple[str, ...],
+    bag: Path | None,
+    params: Path | None,
+    limit: float | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
     """Start the real nodes, play recordings to them in lock-step and check what they say.
 
     The estimates have to equal those of `track`, byte for byte, and to lie near the truth. SYSTEMS
@@ -37,8 +54,14 @@ def command(systems: tuple[str, ...], bag: Path | None, params: Path | None,
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
     with tempfile.TemporaryDirectory(prefix='sonar_imm_check_') as scratch:
-        outcomes = run_checks(systems or tuple(SYSTEMS), out or Path(scratch), bag=bag,
-                              params=params, limit=limit, quiet=as_json)
+        outcomes = run_checks(
+            systems or tuple(SYSTEMS),
+            out or Path(scratch),
+            bag=bag,
+            params=params,
+            limit=limit,
+            quiet=as_json,
+        )
     if as_json:
         print_json([outcome.as_dict() for outcome in outcomes])
     else:
@@ -48,21 +71,34 @@ def command(systems: tuple[str, ...], bag: Path | None, params: Path | None,
         raise click.exceptions.Exit(1)
 
 
-def run_checks(systems: tuple[str, ...], folder: Path, *, bag: Path | None = None,
-               params: Path | None = None, limit: float | None = None,
-               quiet: bool = False) -> list[Outcome]:
+def run_checks(
+    systems: tuple[str, ...],
+    folder: Path,
+    *,
+    bag: Path | None = None,
+    params: Path | None = None,
+    limit: float | None = None,
+    quiet: bool = False,
+) -> list[Outcome]:
     """Check `bag`, or all shipped recordings, of each system; runs go below `folder`."""
     from .checking import check_recording, shipped_bags
-    return [check_recording(path, system, folder / path.stem, params=params, limit=limit,
-                            quiet=quiet)
-            for system in systems for path in ([bag] if bag else shipped_bags(system))]
+
+    return [
+        check_recording(path, system, folder / path.stem, params=params, limit=limit, quiet=quiet)
+        for system in systems
+        for path in ([bag] if bag else shipped_bags(system))
+    ]
 
 
 def print_outcome(outcome: Outcome) -> None:
     """The checks of one recording as a table."""
     say(f'{outcome.system}: {outcome.bag.name}')
     for check in outcome.checks:
-        say(f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
-            f' (wanted: {check.wanted})')
-    say(f'        latency of an estimate: p50 {outcome.latency_ms["p50"]:.1f} ms, '
-        f'p99 {outcome.latency_ms["p99"]:.1f} ms')
+        say(
+            f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
+            f' (wanted: {check.wanted})'
+        )
+    say(
+        f'        latency of an estimate: p50 {outcome.latency_ms["p50"]:.1f} ms, '
+        f'p99 {outcome.latency_ms["p99"]:.1f} ms'
+    )

@@ -45,9 +45,13 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
-        return {'system': self.system, 'bag': str(self.bag), 'good': self.good,
-                'checks': [asdict(check) for check in self.checks],
-                'latency_ms': self.latency_ms}
+        return {
+            'system': self.system,
+            'bag': str(self.bag),
+            'good': self.good,
+            'checks': [asdict(check) for check in self.checks],
+            'latency_ms': self.latency_ms,
+        }
 
 
 def shipped_bags(system: str) -> list[Path]:
@@ -58,8 +62,15 @@ def shipped_bags(system: str) -> list[Path]:
     return found
 
 
-def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None = None,
-                    limit: float | None = None, quiet: bool = False) -> Outcome:
+def check_recording(
+    bag: Path,
+    system: str,
+    folder: Path,
+    *,
+    params: Path | None = None,
+    limit: float | None = None,
+    quiet: bool = False,
+) -> Outcome:
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
     params: None for those that the recording brings along, if any. limit: error to stay within, in
@@ -69,8 +80,9 @@ def check_recording(bag: Path, system: str, folder: Path, *, params: Path | None
     params = params or own_parameters(bag)
     config, node = load_config(SYSTEMS[system], params, {})
     options = InputOptions(frame_id=node.frame_id, world_frame=node.world_frame_convention)
-    run = track_recording(bag, folder / 'offline', SYSTEMS[system], config, options,
-                          overwrite=True, quiet=quiet)
+    run = track_recording(
+        bag, folder / 'offline', SYSTEMS[system], config, options, overwrite=True, quiet=quiet
+    )
     with progress('playing to the node', run['messages'], quiet=quiet) as advance:
         live = run_lockstep(bag, system, params_file=params, progress=advance)
     _keep(live, config, system, folder / 'live')
@@ -91,9 +103,12 @@ def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None
 def _answered(live: LockstepResult, run: dict[str, Any]) -> Check:
     taken, refused = live.counts.messages, live.counts.refused
     offline_refused = sum(entry['count'] for entry in run['refused'].values())
-    return Check('messages taken / refused by the node', f'{taken} / {refused}',
-                 f'{run["messages"]} / {offline_refused}',
-                 (taken, refused) == (run['messages'], offline_refused))
+    return Check(
+        'messages taken / refused by the node',
+        f'{taken} / {refused}',
+        f'{run["messages"]} / {offline_refused}',
+        (taken, refused) == (run['messages'], offline_refused),
+    )
 
 
 def _equal(folder: Path) -> Check:
@@ -101,8 +116,10 @@ def _equal(folder: Path) -> Check:
     first, second = folder / 'offline', folder / 'live'
     names = sorted(path.name for path in (first / BAG).iterdir())
     files = [Path(CSV), *(Path(BAG) / name for name in names)]
-    same = all((second / file).is_file()
-               and (first / file).read_bytes() == (second / file).read_bytes() for file in files)
+    same = all(
+        (second / file).is_file() and (first / file).read_bytes() == (second / file).read_bytes()
+        for file in files
+    )
     result = 'equal bytes' if same else f'{_rows_apart(first / CSV, second / CSV)} rows differ'
     return Check('estimates of the node against offline', result, 'equal bytes', same)
 
@@ -114,6 +131,9 @@ def _rows_apart(first: Path, second: Path) -> int:
 
 def _ended(live: LockstepResult) -> Check:
     clean = live.exit_code == 0 and 'Traceback' not in live.log
-    return Check('end of the node after Ctrl-C',
-                 f'exit code {live.exit_code}{"" if clean else ", see its log"}', 'exit code 0',
-                 clean)
+    return Check(
+        'end of the node after Ctrl-C',
+        f'exit code {live.exit_code}{"" if clean else ", see its log"}',
+        'exit code 0',
+        clean,
+    )

@@ -12,14 +12,8 @@ from typing import Any
 
 import click
 
-from ..nodes.config import node_config_type, NodeConfig, type_specs
-from ..parameters import (
-    Config,
-    ConfigError,
-    did_you_mean,
-    parameters_from_yaml,
-    ParameterSpec,
-)
+from ..node_config import node_config_type, NodeConfig, type_specs
+from ..parameters import Config, ConfigError, did_you_mean, parameters_from_yaml, ParameterSpec
 from ..trackers import System, SYSTEMS
 
 Advance = Callable[[int], None]
@@ -35,20 +29,27 @@ def example(*lines: str) -> str:
 
 def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """``--json``: the result as one JSON object on standard output."""
-    return click.option('--json', 'as_json', is_flag=True,
-                        help='Print the result as JSON.')(function)
+    return click.option('--json', 'as_json', is_flag=True, help='Print the result as JSON.')(
+        function
+    )
 
 
 def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """``--set name=value``, as often as needed."""
-    return pairs_option('--set', 'overrides', metavar='NAME=VALUE',
-                        help='Change one parameter; may be given several times.')(function)
+    return pairs_option(
+        '--set',
+        'overrides',
+        metavar='NAME=VALUE',
+        help='Change one parameter; may be given several times.',
+    )(function)
 
 
 def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
     """An option of the form NAME=VALUE, as often as needed; the command gets a dict."""
-    def split(_ctx: click.Context, _param: click.Parameter, values: Iterable[str]
-              ) -> dict[str, str]:
+
+    def split(
+        _ctx: click.Context, _param: click.Parameter, values: Iterable[str]
+    ) -> dict[str, str]:
         pairs = {}
         for value in values:
             name, equals, text = value.partition('=')
@@ -56,20 +57,28 @@ def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
                 raise click.BadParameter(f"'{value}' is not of the form {metavar}")
             pairs[name.strip()] = text.strip()
         return pairs
+
     return click.option(*names, metavar=metavar, multiple=True, callback=split, help=help)
 
 
 def topic_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """``--topic input=topic``, as often as needed; the command gets topics by input."""
-    return pairs_option('--topic', 'topics', metavar='INPUT=TOPIC', help='Which topic is which '
-                        'input, e.g. fix=/usbl/pose; may be given several times.')(function)
+    return pairs_option(
+        '--topic',
+        'topics',
+        metavar='INPUT=TOPIC',
+        help='Which topic is which input, e.g. fix=/usbl/pose; may be given several times.',
+    )(function)
 
 
 def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """``--system``: which tracker; not needed while the bag fits one only."""
-    return click.option('--system', type=click.Choice(list(SYSTEMS)), default=None,
-                        help='Which tracker; by default the one whose inputs are in the bag.'
-                        )(function)
+    return click.option(
+        '--system',
+        type=click.Choice(list(SYSTEMS)),
+        default=None,
+        help='Which tracker; by default the one whose inputs are in the bag.',
+    )(function)
 
 
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
@@ -98,8 +107,9 @@ def _scalar(text: str, kind: str) -> Any:
         return text
 
 
-def load_config(system: System, params: Path | None,
-                overrides: dict[str, str]) -> tuple[Config, NodeConfig]:
+def load_config(
+    system: System, params: Path | None, overrides: dict[str, str]
+) -> tuple[Config, NodeConfig]:
     """The parameters of tracker and node: defaults, then the file, then ``--set``.
 
     Raises `ConfigError` with one sentence for each mistake.
@@ -109,15 +119,22 @@ def load_config(system: System, params: Path | None,
     values = _parameters_of(params, system.name) if params else {}
     specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
-    unknown = [f"unknown parameter '{name}'{did_you_mean(name, specs)}"
-               for name in values if name not in specs]
+    unknown = [
+        f"unknown parameter '{name}'{did_you_mean(name, specs)}"
+        for name in values
+        if name not in specs
+    ]
     # Which message types a live node subscribes to: checked, though a recording knows its own.
-    problems = unknown + [trouble for name, spec in choices.items()
-                          if name in values and (trouble := spec.problem(values[name]))]
+    problems = unknown + [
+        trouble
+        for name, spec in choices.items()
+        if name in values and (trouble := spec.problem(values[name]))
+    ]
     if problems:
         raise ConfigError(*problems)
-    tracker, node = (config_type.from_mapping(values, ignore_unknown=True)
-                     for config_type in types)
+    tracker, node = (
+        config_type.from_mapping(values, ignore_unknown=True) for config_type in types
+    )
     return tracker, node
 
 
@@ -129,13 +146,15 @@ def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
     # What every ROS 2 node understands and no tracker needs.
-    return {key: value for key, value in values.items()
-            if key not in ('use_sim_time', 'qos_overrides')}
+    return {
+        key: value for key, value in values.items() if key not in ('use_sim_time', 'qos_overrides')
+    }
 
 
 def print_json(result: Any) -> None:
     """Print `result` as JSON; NaN and infinity, which JSON lacks, become null."""
     from ..evaluation.run_folder import finite
+
     click.echo(json.dumps(finite(result), indent=2))
 
 
@@ -153,6 +172,7 @@ def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[A
     elif sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import Progress
+
         with Progress(console=Console(stderr=True), transient=True) as bar:
             task = bar.add_task(what, total=total)
             yield lambda count: bar.advance(task, count)
@@ -170,4 +190,5 @@ def _plain_progress(what: str, total: int) -> Advance:
         if time.monotonic() - told > SECONDS_BETWEEN_LINES:
             told = time.monotonic()
             click.echo(f'{what}: {done} of {total}', err=True)
+
     return advance

@@ -10,34 +10,70 @@ from ..evaluation.judging import judge, Judgement, JudgeOptions, TRUTH_GAP
 from .common import BAG, example, json_option, print_json, say
 
 
-@click.command(epilog=example('sonar-imm evaluate out',
-                              'sonar-imm evaluate out --truth gps.bag --report gps.html'))
+@click.command(
+    epilog=example(
+        'sonar-imm evaluate out', 'sonar-imm evaluate out --truth gps.bag --report gps.html'
+    )
+)
 @click.argument('out_dir', type=click.Path(path_type=Path))
-@click.option('--truth', 'truth_bag', type=BAG,
-              help='Bag with /truth/estimate; by default the tracked bag itself.')
-@click.option('--truth-lag', type=float, default=0.0, show_default=True, metavar='SECONDS',
-              help='Compare an estimate with truth this much later.')
-@click.option('--truth-gap', type=click.FloatRange(min=0.0), default=TRUTH_GAP, show_default=True,
-              metavar='SECONDS', help='Truth is not interpolated across longer gaps.')
-@click.option('--cutoff', type=click.FloatRange(min=0.0, min_open=True), metavar='METRES',
-              help='With several targets, an estimate further away is on none; by default what is '
-                   'usual in the system, 10 for divers.')
-@click.option('--report', type=click.Path(path_type=Path, dir_okay=False),
-              help='Where to write the report; by default OUT_DIR/report.html.')
+@click.option(
+    '--truth',
+    'truth_bag',
+    type=BAG,
+    help='Bag with /truth/estimate; by default the tracked bag itself.',
+)
+@click.option(
+    '--truth-lag',
+    type=float,
+    default=0.0,
+    show_default=True,
+    metavar='SECONDS',
+    help='Compare an estimate with truth this much later.',
+)
+@click.option(
+    '--truth-gap',
+    type=click.FloatRange(min=0.0),
+    default=TRUTH_GAP,
+    show_default=True,
+    metavar='SECONDS',
+    help='Truth is not interpolated across longer gaps.',
+)
+@click.option(
+    '--cutoff',
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar='METRES',
+    help='With several targets, an estimate further away is on none; by default what is '
+    'usual in the system, 10 for divers.',
+)
+@click.option(
+    '--report',
+    type=click.Path(path_type=Path, dir_okay=False),
+    help='Where to write the report; by default OUT_DIR/report.html.',
+)
 @click.option('--no-report', is_flag=True, help='Only write metrics.json.')
 @json_option
-def command(out_dir: Path, truth_bag: Path | None, truth_lag: float, truth_gap: float,
-            cutoff: float | None, report: Path | None, no_report: bool, as_json: bool) -> None:
+def command(
+    out_dir: Path,
+    truth_bag: Path | None,
+    truth_lag: float,
+    truth_gap: float,
+    cutoff: float | None,
+    report: Path | None,
+    no_report: bool,
+    as_json: bool,
+) -> None:
     """Score the run that `sonar-imm track` left in OUT_DIR.
 
     Writes metrics.json and one self-contained HTML report. Without truth only what needs none is
     judged: the surprise of the measurements (NIS) and the models.
     """
-    judgement = evaluate_run(out_dir, JudgeOptions(truth_bag=truth_bag, lag=truth_lag,
-                                                   gap=truth_gap, cutoff=cutoff))
+    judgement = evaluate_run(
+        out_dir, JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
+    )
     page = None if no_report else report or out_dir / 'report.html'
     if page is not None:
         from ..evaluation.report import write_report
+
         write_report(page, [judgement.part([])])
     print_json(judgement.metrics) if as_json else _print(judgement, page)
 
@@ -48,6 +84,7 @@ def evaluate_run(out_dir: Path, options: JudgeOptions | None = None) -> Judgemen
     Raises `BagError` when the folder or the truth cannot be read.
     """
     from ..evaluation.run_folder import METRICS, RunFolder
+
     folder = RunFolder(out_dir)
     judgement = judge(folder, options)
     folder.write_json(METRICS, judgement.metrics)

@@ -22,6 +22,7 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     """
     from ..evaluation.inspection import inspect
     from ..recordings.reader import BagReader
+
     with BagReader(bag, strict=strict) as reader:
         total = sum(topic.count for topic in reader.topics)
         with progress('reading', total, quiet=as_json) as advance:
@@ -36,8 +37,10 @@ def _print(found: dict[str, Any]) -> None:
     for topic in found['topics']:
         rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
         frames = f', frame {", ".join(topic["frames"])}' if any(topic['frames']) else ''
-        click.echo(f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}'
-                   f'{_scans(topic["scans"])}{frames}')
+        click.echo(
+            f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}'
+            f'{_scans(topic["scans"])}{frames}'
+        )
         for suited in topic['suits']:
             click.echo(f'      fits {suited}')
         for problem in topic['problems']:
@@ -57,6 +60,9 @@ def _scans(scans: dict[str, int] | None) -> str:
 
 def _track_line(bag: str, system: str, inputs: dict[str, list[str]]) -> str:
     """The command that tracks the recording; topics are named where their names do not fit."""
-    named = [f' --topic {name}={topics[0]}' for name, topics in inputs.items()
-             if not any(topic.split('/')[-1] == name for topic in topics)]
+    named = [
+        f' --topic {name}={topics[0]}'
+        for name, topics in inputs.items()
+        if not any(topic.split('/')[-1] == name for topic in topics)
+    ]
     return f'sonar-imm track {bag} OUT_DIR --system {system}{"".join(named)}'

@@ -30,8 +30,9 @@ class LazyGroup(click.Group):
             return None
         return import_module(f'{self._package}.{name}').command
 
-    def resolve_command(self, ctx: click.Context,
-                        args: list[str]) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
         if args[0] not in self._summaries and not args[0].startswith('-'):
             ctx.fail(f"there is no command '{args[0]}'{did_you_mean(args[0], self._summaries)}")
         return super().resolve_command(ctx, args)

@@ -9,27 +9,69 @@ import click
 from .common import BAG, example, progress, say
 
 
-@click.command(epilog=example('sonar-imm play dive.bag --clock',
-                              'sonar-imm play dive.bag --lockstep /diver',
-                              'sonar-imm play dive.bag --remap /usbl/pose:=/fix --rate 5'))
+@click.command(
+    epilog=example(
+        'sonar-imm play dive.bag --clock',
+        'sonar-imm play dive.bag --lockstep /diver',
+        'sonar-imm play dive.bag --remap /usbl/pose:=/fix --rate 5',
+    )
+)
 @click.argument('bag', type=BAG)
-@click.option('-r', '--rate', type=click.FloatRange(min=0.0, min_open=True), default=1.0,
-              show_default=True, help='Speed: 2 is twice as fast.')
+@click.option(
+    '-r',
+    '--rate',
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help='Speed: 2 is twice as fast.',
+)
 @click.option('-l', '--loop', is_flag=True, help='Start over at the end, until Ctrl-C.')
-@click.option('--start-offset', type=click.FloatRange(min=0.0), default=0.0, metavar='SECONDS',
-              help='Part of the recording to skip.')
-@click.option('-d', '--delay', type=click.FloatRange(min=0.0), default=0.0, metavar='SECONDS',
-              help='Wait before the first message.')
-@click.option('-p', '--start-paused', is_flag=True,
-              help='Wait for the service /sonar_imm_player/resume.')
-@click.option('--clock', type=click.FloatRange(min=0.0, min_open=True), is_flag=False,
-              flag_value=40.0, default=None, metavar='[HZ]', help='Publish /clock, at 40 Hz.')
-@click.option('--topics', multiple=True, metavar='TOPIC',
-              help='Only this topic; may be given several times.')
-@click.option('-m', '--remap', 'remaps', multiple=True, metavar='OLD:=NEW',
-              help='Publish under another name; may be given several times.')
-@click.option('--lockstep', is_flag=False, flag_value='auto', default='', metavar='[NODE]',
-              help='Send a message when NODE, or the only node there is, has answered the last.')
+@click.option(
+    '--start-offset',
+    type=click.FloatRange(min=0.0),
+    default=0.0,
+    metavar='SECONDS',
+    help='Part of the recording to skip.',
+)
+@click.option(
+    '-d',
+    '--delay',
+    type=click.FloatRange(min=0.0),
+    default=0.0,
+    metavar='SECONDS',
+    help='Wait before the first message.',
+)
+@click.option(
+    '-p', '--start-paused', is_flag=True, help='Wait for the service /sonar_imm_player/resume.'
+)
+@click.option(
+    '--clock',
+    type=click.FloatRange(min=0.0, min_open=True),
+    is_flag=False,
+    flag_value=40.0,
+    default=None,
+    metavar='[HZ]',
+    help='Publish /clock, at 40 Hz.',
+)
+@click.option(
+    '--topics', multiple=True, metavar='TOPIC', help='Only this topic; may be given several times.'
+)
+@click.option(
+    '-m',
+    '--remap',
+    'remaps',
+    multiple=True,
+    metavar='OLD:=NEW',
+    help='Publish under another name; may be given several times.',
+)
+@click.option(
+    '--lockstep',
+    is_flag=False,
+    flag_value='auto',
+    default='',
+    metavar='[NODE]',
+    help='Send a message when NODE, or the only node there is, has answered the last.',
+)
 def command(bag: Path, remaps: tuple[str, ...], **options: object) -> None:
     """Publish the recording BAG to live nodes, byte for byte, stamps included.
 
@@ -38,6 +80,7 @@ def command(bag: Path, remaps: tuple[str, ...], **options: object) -> None:
     """
     from ..nodes.player import play, PlayOptions
     from ..recordings.reader import BagReader
+
     with BagReader(bag) as reader:
         chosen = options['topics'] or [topic.name for topic in reader.topics]
         total = sum(topic.count for topic in reader.topics if topic.name in chosen)

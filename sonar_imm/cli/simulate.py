@@ -13,19 +13,36 @@ from ..trackers import SYSTEMS
 from .common import example, json_option, print_json, say, set_option, typed_overrides
 
 
-@click.command(epilog=example('sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
-                              'sonar-imm simulate diver --list'))
+@click.command(
+    epilog=example(
+        'sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
+        'sonar-imm simulate diver --list',
+    )
+)
 @click.argument('system', type=click.Choice(list(SYSTEMS)))
 @click.argument('out_bag', type=click.Path(path_type=Path), required=False)
 @click.option('--scenario', default=None, help='Which scene; the first one by default.')
-@click.option('--seed', type=click.IntRange(min=0), default=0, show_default=True,
-              help='Same scenario and seed, same bag.')
+@click.option(
+    '--seed',
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help='Same scenario and seed, same bag.',
+)
 @set_option
-@click.option('--list', 'list_scenarios', is_flag=True,
-              help='Only list scenarios and what --set can change.')
+@click.option(
+    '--list', 'list_scenarios', is_flag=True, help='Only list scenarios and what --set can change.'
+)
 @json_option
-def command(system: str, out_bag: Path | None, scenario: str | None, seed: int,
-            overrides: dict[str, str], list_scenarios: bool, as_json: bool) -> None:
+def command(
+    system: str,
+    out_bag: Path | None,
+    scenario: str | None,
+    seed: int,
+    overrides: dict[str, str],
+    list_scenarios: bool,
+    as_json: bool,
+) -> None:
     """Write a bag of simulated measurements with their truth to OUT_BAG."""
     scenes = import_module(f'sonar_imm.simulation.{system}')
     if list_scenarios:
@@ -36,24 +53,36 @@ def command(system: str, out_bag: Path | None, scenario: str | None, seed: int,
     from ..recordings.own_parameters import unusual, write_own_parameters
     from ..recordings.scenes import write_scene
     from ..simulation.scene import TrueTrack
+
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
-    report = write_scene(scene, out_bag, provenance={
-        'source': f'simulated: {system} {name}', 'seed': str(seed),
-        'sonar_imm': __version__,
-        **{f'set {key}': value for key, value in sorted(overrides.items())}})
+    report = write_scene(
+        scene,
+        out_bag,
+        provenance={
+            'source': f'simulated: {system} {name}',
+            'seed': str(seed),
+            'sonar_imm': __version__,
+            **{f'set {key}': value for key, value in sorted(overrides.items())},
+        },
+    )
     told = unusual(config.told(), SYSTEMS[system].config_type())
     parameters = write_own_parameters(out_bag, system, told)
     targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
-    result = {'bag': str(out_bag), 'scenario': name, 'seed': seed, 'messages': report.messages,
-              'targets': targets, 'parameters': told}
+    result = {
+        'bag': str(out_bag),
+        'scenario': name,
+        'seed': seed,
+        'messages': report.messages,
+        'targets': targets,
+        'parameters': told,
+    }
     if as_json:
         print_json(result)
         return
     what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
-    say(f'{out_bag}: {what} ({name}, seed {seed}'
-        + (f', {targets} targets)' if targets else ')'))
+    say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
         say(f'  what a tracker has to know of the instruments: {parameters}')
 
@@ -62,12 +91,15 @@ def _list(scenes: Any, as_json: bool) -> None:
     described = {name: entry[0] for name, entry in scenes.SCENARIOS.items()}
     specs = type(scenes.scenario(next(iter(described)))).specs()
     if as_json:
-        print_json({'scenarios': described,
-                    'parameters': {spec.name: spec.description for spec in specs}})
+        print_json(
+            {'scenarios': described, 'parameters': {spec.name: spec.description for spec in specs}}
+        )
         return
     for name, description in described.items():
         say(f'{name:<20} {description}')
     say()
     for spec in specs:
-        say(f'--set {spec.name + "=" + str(spec.default):<34} {spec.description}'
-            + (f' [{spec.unit}]' if spec.unit else ''))
+        say(
+            f'--set {spec.name + "=" + str(spec.default):<34} {spec.description}'
+            + (f' [{spec.unit}]' if spec.unit else '')
+        )

@@ -22,26 +22,47 @@ from .common import (
 )
 
 
-@click.command(epilog=example(
-    'sonar-imm track dive.bag out', 'sonar-imm track dive.bag out --set model_set=cv_cv',
-    'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml'))
+@click.command(
+    epilog=example(
+        'sonar-imm track dive.bag out',
+        'sonar-imm track dive.bag out --set model_set=cv_cv',
+        'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
+    )
+)
 @click.argument('bag', type=BAG)
 @click.argument('out_dir', type=click.Path(path_type=Path))
 @system_option
-@click.option('--params', type=click.Path(path_type=Path, dir_okay=False),
-              help='Parameter file: ROS 2 form or a plain mapping.')
+@click.option(
+    '--params',
+    type=click.Path(path_type=Path, dir_okay=False),
+    help='Parameter file: ROS 2 form or a plain mapping.',
+)
 @set_option
 @topic_option
-@click.option('--order', type=click.Choice(['recorded', 'stamp']), default='recorded',
-              show_default=True, help='As the messages arrived, or sorted by their stamps.')
-@click.option('--smooth', is_flag=True,
-              help='Give each estimate what came after it, too.')
+@click.option(
+    '--order',
+    type=click.Choice(['recorded', 'stamp']),
+    default='recorded',
+    show_default=True,
+    help='As the messages arrived, or sorted by their stamps.',
+)
+@click.option('--smooth', is_flag=True, help='Give each estimate what came after it, too.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
-def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
-            overrides: dict[str, str], topics: dict[str, str], order: str, smooth: bool,
-            overwrite: bool, strict: bool, as_json: bool) -> None:
+def command(
+    bag: Path,
+    out_dir: Path,
+    system: str | None,
+    params: Path | None,
+    overrides: dict[str, str],
+    topics: dict[str, str],
+    order: str,
+    smooth: bool,
+    overwrite: bool,
+    strict: bool,
+    as_json: bool,
+) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
     OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
@@ -50,14 +71,21 @@ def command(bag: Path, out_dir: Path, system: str | None, params: Path | None,
     """
     from ..evaluation.tracking import InputOptions
     from ..recordings.own_parameters import own_parameters
+
     if params is None and (params := own_parameters(bag)) and not as_json:
         say(f'with the parameters of the recording, {params}')
     chosen = choose_system(bag, system, topics)
     config, node = load_config(chosen, params, overrides)
-    options = InputOptions(topics=inputs_by_topic(topics), order=order, frame_id=node.frame_id,
-                           world_frame=node.world_frame_convention, smooth=smooth)
-    run = track_recording(bag, out_dir, chosen, config, options, overwrite=overwrite,
-                          strict=strict, quiet=as_json)
+    options = InputOptions(
+        topics=inputs_by_topic(topics),
+        order=order,
+        frame_id=node.frame_id,
+        world_frame=node.world_frame_convention,
+        smooth=smooth,
+    )
+    run = track_recording(
+        bag, out_dir, chosen, config, options, overwrite=overwrite, strict=strict, quiet=as_json
+    )
     print_json(run) if as_json else _print(run, out_dir)
 
 
@@ -70,6 +98,7 @@ def choose_system(bag: Path, name: str | None, topics: dict[str, str]) -> System
     """The tracker called `name`, or else the first one that finds its inputs in `bag`."""
     from ..recordings.measurements import fitting_topics
     from ..recordings.reader import BagError, BagReader
+
     if name is not None:
         return SYSTEMS[name]
     failures = []
@@ -83,13 +112,22 @@ def choose_system(bag: Path, name: str | None, topics: dict[str, str]) -> System
     raise failures[0]
 
 
-def track_recording(bag: Path, out_dir: Path, system: System, config: Any, options: Any, *,
-                    overwrite: bool = False, strict: bool = False,
-                    quiet: bool = False) -> dict[str, Any]:
+def track_recording(
+    bag: Path,
+    out_dir: Path,
+    system: System,
+    config: Any,
+    options: Any,
+    *,
+    overwrite: bool = False,
+    strict: bool = False,
+    quiet: bool = False,
+) -> dict[str, Any]:
     """Track `bag` into `out_dir`; gives the content of run.json. Raises `BagError`."""
     from ..evaluation.run_folder import RunFolder
     from ..evaluation.tracking import OfflineRun, write_run
     from ..recordings.reader import BagReader
+
     with BagReader(bag, strict=strict) as reader:
         offline = OfflineRun(reader, system, config, options)
         folder = RunFolder(out_dir)
@@ -99,8 +137,10 @@ def track_recording(bag: Path, out_dir: Path, system: System, config: Any, optio
 
 
 def _print(run: dict[str, Any], out_dir: Path) -> None:
-    say(f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
-        f'written to {out_dir}')
+    say(
+        f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
+        f'written to {out_dir}'
+    )
     say('  ' + ', '.join(f'{name} {count}' for name, count in run['counts'].items()))
     for reason, entry in run['refused'].items():
         say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')

@@ -17,8 +17,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .elementary import exponentials
 from .jit import kernel
-from .rows import exponentials
 
 FloatArray = NDArray[np.float64]
 

@@ -41,7 +41,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .rows import exponentials
+from .elementary import exponentials
 
 FloatArray = NDArray[np.float64]
 

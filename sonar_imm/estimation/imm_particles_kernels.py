@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .elementary import exponentials, ROUND
 from .jit import kernel
-from .rows import exponentials, ROUND
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]

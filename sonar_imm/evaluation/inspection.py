@@ -49,9 +49,14 @@ def inspect(bag: BagReader, advance: Callable[[int], None] = lambda count: None)
     topics = [_topic_entry(entry) for entry in heard.values()]
     first = min((entry.logs[0] for entry in heard.values() if entry.logs), default=0)
     last = max((entry.logs[-1] for entry in heard.values() if entry.logs), default=0)
-    return {'bag': str(bag.path), 'duration_s': (last - first) / SECOND,
-            'messages': sum(len(entry.logs) for entry in heard.values()), 'topics': topics,
-            'systems': _systems(topics), 'problems': list(bag.problems)}
+    return {
+        'bag': str(bag.path),
+        'duration_s': (last - first) / SECOND,
+        'messages': sum(len(entry.logs) for entry in heard.values()),
+        'topics': topics,
+        'systems': _systems(topics),
+        'problems': list(bag.problems),
+    }
 
 
 def _look_at(item: BagMessage, heard: _Heard) -> None:
@@ -86,9 +91,13 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     """The tracker inputs a message could be for. Truth is nobody's input."""
     if _is_truth(item.topic):
         return []
-    return [(system, entry) for system, entries in INPUTS.items() for entry in entries
-            if item.type_name in entry.readers
-            and (not entry.companion or item.topic.split('/')[-1] == entry.name)]
+    return [
+        (system, entry)
+        for system, entries in INPUTS.items()
+        for entry in entries
+        if item.type_name in entry.readers
+        and (not entry.companion or item.topic.split('/')[-1] == entry.name)
+    ]
 
 
 def _is_truth(topic: str) -> bool:
@@ -98,15 +107,20 @@ def _is_truth(topic: str) -> bool:
 def _topic_entry(heard: _Heard) -> dict[str, Any]:
     span = (heard.logs[-1] - heard.logs[0]) / SECOND if heard.logs else 0.0
     suits = [f'{system} {name}' for system, name in heard.good]
-    return {'name': heard.topic.name, 'type': heard.topic.type_name, 'count': heard.topic.count,
-            'rate_hz': (len(heard.logs) - 1) / span if span > 0 else None,
-            'frames': list(heard.frames), 'suits': suits, 'scans': _scans(heard),
-            'problems': _stamp_problems(heard) + _content_problems(heard)}
+    return {
+        'name': heard.topic.name,
+        'type': heard.topic.type_name,
+        'count': heard.topic.count,
+        'rate_hz': (len(heard.logs) - 1) / span if span > 0 else None,
+        'frames': list(heard.frames),
+        'suits': suits,
+        'scans': _scans(heard),
+        'problems': _stamp_problems(heard) + _content_problems(heard),
+    }
 
 
 def _scans(heard: _Heard) -> dict[str, int] | None:
-    """How many stamps a topic of scans has, and how many messages share one at most; else None.
-    """
+    """How many stamps a topic of scans has, and how many messages share one at most; else None."""
     if not heard.stamps or not _holds_scans(heard):
         return None
     counts = np.unique(np.array(heard.stamps, np.int64), return_counts=True)[1]
@@ -116,8 +130,11 @@ def _scans(heard: _Heard) -> dict[str, int] | None:
 def _holds_scans(heard: _Heard) -> bool:
     """Whether equal stamps are one look at several targets, not one message twice."""
     return _is_truth(heard.topic.name) or any(
-        entry.scans for system, name in heard.good for entry in INPUTS[system]
-        if entry.name == name)
+        entry.scans
+        for system, name in heard.good
+        for entry in INPUTS[system]
+        if entry.name == name
+    )
 
 
 def _stamp_problems(heard: _Heard) -> list[str]:
@@ -126,16 +143,19 @@ def _stamp_problems(heard: _Heard) -> list[str]:
         problems.append(f'{heard.no_stamp} messages without a usable stamp')
     steps = np.diff(np.array(heard.stamps, np.int64))
     if backward := int(np.count_nonzero(steps < 0)):
-        problems.append(f'{backward} stamps older than the one before, by up to '
-                        f'{-steps.min() / SECOND:.3g} s')
+        problems.append(
+            f'{backward} stamps older than the one before, by up to {-steps.min() / SECOND:.3g} s'
+        )
     repeated = int(np.count_nonzero(steps == 0))
     if repeated and not _holds_scans(heard):
         problems.append(f'{repeated} stamps equal to the one before')
     forward = steps[steps > 0]
     if len(forward) > 2 and forward.max() > LONG_GAP * np.median(forward):
         gaps = int(np.count_nonzero(forward > LONG_GAP * np.median(forward)))
-        problems.append(f'{gaps} gaps in the stamps, the longest {forward.max() / SECOND:.3g} s '
-                        f'against {np.median(forward) / SECOND:.3g} s as a rule')
+        problems.append(
+            f'{gaps} gaps in the stamps, the longest {forward.max() / SECOND:.3g} s '
+            f'against {np.median(forward) / SECOND:.3g} s as a rule'
+        )
     return problems
 
 
@@ -146,10 +166,13 @@ def _content_problems(heard: _Heard) -> list[str]:
         problems.append(f'several frames: {", ".join(map(repr, heard.frames))}')
     for key, reasons in heard.refused.items():
         if key in heard.good or heard.topic.name.split('/')[-1] == key[1]:
-            problems += [f'{count} messages refused as {key[1]} ({reason}): '
-                         f'{heard.examples[reason]}' for reason, count in reasons.items()]
-    problems += [f'{count} messages with {code.replace("_", " ")}'
-                 for code, count in heard.doubts.items()]
+            problems += [
+                f'{count} messages refused as {key[1]} ({reason}): {heard.examples[reason]}'
+                for reason, count in reasons.items()
+            ]
+    problems += [
+        f'{count} messages with {code.replace("_", " ")}' for code, count in heard.doubts.items()
+    ]
     return problems
 
 
@@ -160,7 +183,14 @@ def _systems(topics: list[dict[str, Any]]) -> dict[str, dict[str, list[str]]]:
         for suited in topic['suits']:
             system, name = suited.split(' ')
             systems.setdefault(system, {}).setdefault(name, []).append(topic['name'])
-    companions = {(system, entry.name) for system, entries in INPUTS.items() for entry in entries
-                  if entry.companion}
-    return {system: found for system, found in systems.items()
-            if any((system, name) not in companions for name in found)}
+    companions = {
+        (system, entry.name)
+        for system, entries in INPUTS.items()
+        for entry in entries
+        if entry.companion
+    }
+    return {
+        system: found
+        for system, found in systems.items()
+        if any((system, name) not in companions for name in found)
+    }

@@ -54,8 +54,12 @@ class Limit:
     def check(self, error: float, *, at_most: float | None = None, remark: str = '') -> Check:
         """Compare `error` with the limit, or with `at_most` instead; `remark` follows it."""
         limit = self.value if at_most is None else at_most
-        return Check(f'{self.meaning} against truth', f'{error:.2f} {self.unit}{remark}',
-                     f'at most {limit:g} {self.unit}', error <= limit)
+        return Check(
+            f'{self.meaning} against truth',
+            f'{error:.2f} {self.unit}{remark}',
+            f'at most {limit:g} {self.unit}',
+            error <= limit,
+        )
 
 
 @frozen(kw_only=True)

@@ -23,9 +23,12 @@ def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
     """RMSE, median and 95 % point of non-negative errors; NaN when there are none."""
     if not len(error):
         return {'n': 0, **{f'{name}_{unit}': float('nan') for name in ('rmse', 'median', 'p95')}}
-    return {'n': len(error), f'rmse_{unit}': float(np.sqrt(np.mean(error**2))),
-            f'median_{unit}': float(np.median(error)),
-            f'p95_{unit}': float(np.percentile(error, 95.0))}
+    return {
+        'n': len(error),
+        f'rmse_{unit}': float(np.sqrt(np.mean(error**2))),
+        f'median_{unit}': float(np.median(error)),
+        f'p95_{unit}': float(np.percentile(error, 95.0)),
+    }
 
 
 def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -46,8 +49,14 @@ def chi2_summary(values: FloatArray, dof: int) -> dict[str, Any]:
         return {'n': 0, 'dof': dof, 'mean': float('nan'), 'believable': None}
     low, high = average_bounds(len(values), dof)
     mean = float(np.mean(values))
-    return {'n': len(values), 'dof': dof, 'mean': mean, 'low': low, 'high': high,
-            'believable': bool(low <= mean <= high)}
+    return {
+        'n': len(values),
+        'dof': dof,
+        'mean': mean,
+        'low': low,
+        'high': high,
+        'believable': bool(low <= mean <= high),
+    }
 
 
 def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
@@ -56,8 +65,15 @@ def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
         return chi2_summary(nis, int(dof[0]) if len(nis) else 2)
     low, high = average_bounds(1, int(dof.sum()))
     mean, low, high = (float(value / dof.sum()) for value in (nis.sum(), low, high))
-    return {'n': len(nis), 'dof': 1, 'mean': mean, 'low': low, 'high': high,
-            'believable': low <= mean <= high, 'divided_by_dof': True}
+    return {
+        'n': len(nis),
+        'dof': 1,
+        'mean': mean,
+        'low': low,
+        'high': high,
+        'believable': low <= mean <= high,
+        'divided_by_dof': True,
+    }
 
 
 def belief_sentence(coverage: float) -> str:
@@ -75,15 +91,17 @@ def bounds_remark(summary: Mapping[str, Any]) -> str:
     if 'low' not in summary:
         return f'{summary["n"]} values'
     if summary.get('divided_by_dof'):
-        return (f'per degree of freedom: 1 expected, {summary["low"]:.2f} to '
-                f'{summary["high"]:.2f} believable')
+        return (
+            f'per degree of freedom: 1 expected, {summary["low"]:.2f} to '
+            f'{summary["high"]:.2f} believable'
+        )
     return f'{summary["dof"]} expected, {summary["low"]:.2f} to {summary["high"]:.2f} believable'
 
 
-def error_line(title: str, summary: Mapping[str, Any], unit: str, shown: str = ''
-               ) -> list[tuple[str, str]]:
-    """Title and value of an `error_summary` in `unit` (printed as `shown`); none without errors.
-    """
+def error_line(
+    title: str, summary: Mapping[str, Any], unit: str, shown: str = ''
+) -> list[tuple[str, str]]:
+    """Title and value of an `error_summary` in `unit` (printed as `shown`), if it has errors."""
     if not summary.get('n'):
         return []
     values = (f'{summary[f"{name}_{unit}"]:.3f}' for name in ('rmse', 'median', 'p95'))
@@ -94,5 +112,6 @@ def chi2_line(title: str, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Title and value of a `chi2_summary` or `nis_summary`; none without values."""
     if not summary.get('n'):
         return []
-    return [(title, f'{summary["mean"]:.2f}, believable {summary["low"]:.2f} to '
-                    f'{summary["high"]:.2f}')]
+    return [
+        (title, f'{summary["mean"]:.2f}, believable {summary["low"]:.2f} to {summary["high"]:.2f}')
+    ]

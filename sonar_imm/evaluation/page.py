@@ -121,14 +121,19 @@ def _without_gl(figure: go.Figure) -> go.Figure:
 
 
 def _part(part: Part, name: str, fast: Sequence[go.Figure]) -> str:
-    boxes = '\n'.join(f'<div class="card"><span>{escape(card.title)}</span>'
-                      f'<b>{escape(card.value)}</b><i>{_prose(card.remark)}</i></div>'
-                      for card in part.cards)
-    body = '\n'.join(_section(section, f'{name}-{index}', fast)
-                     for index, section in enumerate(part.sections))
-    return (f'<header><div class="wrap"><small>{escape(part.kicker)}</small>'
-            f'<h1>{escape(part.title)}</h1><p>{_prose(part.summary)}</p></div></header>\n'
-            f'<main class="wrap"><div class="cards">{boxes}</div>\n{body}</main>')
+    boxes = '\n'.join(
+        f'<div class="card"><span>{escape(card.title)}</span>'
+        f'<b>{escape(card.value)}</b><i>{_prose(card.remark)}</i></div>'
+        for card in part.cards
+    )
+    body = '\n'.join(
+        _section(section, f'{name}-{index}', fast) for index, section in enumerate(part.sections)
+    )
+    return (
+        f'<header><div class="wrap"><small>{escape(part.kicker)}</small>'
+        f'<h1>{escape(part.title)}</h1><p>{_prose(part.summary)}</p></div></header>\n'
+        f'<main class="wrap"><div class="cards">{boxes}</div>\n{body}</main>'
+    )
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
@@ -167,8 +172,16 @@ def _section(section: Section, name: str, fast: Sequence[go.Figure]) -> str:
         accelerated = any(one is section.figure for one in fast)
         drawn = section.figure if accelerated else _without_gl(section.figure)
         figure = drawn.to_html(
-            full_html=False, include_plotlyjs=False, div_id=name,
-            config={'displaylogo': False, 'responsive': True,
-                    'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d']})
-    return (f'<section><h2>{escape(section.title)}</h2><p>{_prose(section.text)}</p>'
-            f'{figure}{section.html}</section>')
+            full_html=False,
+            include_plotlyjs=False,
+            div_id=name,
+            config={
+                'displaylogo': False,
+                'responsive': True,
+                'modeBarButtonsToRemove': ['lasso2d', 'select2d', 'autoScale2d'],
+            },
+        )
+    return (
+        f'<section><h2>{escape(section.title)}</h2><p>{_prose(section.text)}</p>'
+        f'{figure}{section.html}</section>'
+    )

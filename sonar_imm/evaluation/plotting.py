@@ -30,32 +30,55 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
     nis = nis if same else nis / dof
     figure = go.Figure()
     shown = thin(len(nis), MOST_POINTS)
-    figure.add_scattergl(x=time[shown], y=nis[shown], mode='markers', name='NIS of a hit',
-                         marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6})
+    figure.add_scattergl(
+        x=time[shown],
+        y=nis[shown],
+        mode='markers',
+        name='NIS of a hit',
+        marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6},
+    )
     width = max(5, min(50, len(nis) // 8))
     if len(nis) > width:
         mean = np.convolve(nis, np.full(width, 1.0 / width), mode='valid')
-        figure.add_scattergl(x=time[width - 1:], y=mean, mode='lines',
-                             name=f'mean of {width}', line={'color': INK, 'width': 2})
+        figure.add_scattergl(
+            x=time[width - 1 :],
+            y=mean,
+            mode='lines',
+            name=f'mean of {width}',
+            line={'color': INK, 'width': 2},
+        )
         if shared:
             low, high = chi2.ppf([0.025, 0.975], width * shared) / width
             figure.add_hrect(y0=low, y1=high, fillcolor=AMBER, opacity=0.25, line_width=0)
     if shared:
-        figure.add_hline(y=chi2.ppf(0.95, shared), line={'color': COLOURS[1], 'dash': 'dash'},
-                         annotation_text='95 % of hits should lie below')
+        figure.add_hline(
+            y=chi2.ppf(0.95, shared),
+            line={'color': COLOURS[1], 'dash': 'dash'},
+            annotation_text='95 % of hits should lie below',
+        )
     figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='NIS' if same else 'NIS / degrees of freedom', rangemode='tozero')
     return styled(figure, height=340)
 
 
-def add_band(figure: go.Figure, time: FloatArray, half: FloatArray, *, first: bool,
-             row: int) -> None:
+def add_band(
+    figure: go.Figure, time: FloatArray, half: FloatArray, *, first: bool, row: int
+) -> None:
     """Add the band from -half to half to subplot `row`; `first`: with an entry in the legend."""
-    figure.add_scatter(x=np.concatenate([time, time[::-1]]), y=np.concatenate([half, -half[::-1]]),
-                       fill='toself', fillcolor=transparent(AMBER, 0.28), mode='lines',
-                       line={'color': transparent(AMBER, 0.6), 'width': 0.5}, hoverinfo='skip',
-                       name='95 % band it predicted', legendgroup='band', showlegend=first,
-                       row=row, col=1)
+    figure.add_scatter(
+        x=np.concatenate([time, time[::-1]]),
+        y=np.concatenate([half, -half[::-1]]),
+        fill='toself',
+        fillcolor=transparent(AMBER, 0.28),
+        mode='lines',
+        line={'color': transparent(AMBER, 0.6), 'width': 0.5},
+        hoverinfo='skip',
+        name='95 % band it predicted',
+        legendgroup='band',
+        showlegend=first,
+        row=row,
+        col=1,
+    )
 
 
 def seconds(stamp_ns: NDArray[np.int64], scan_ns: NDArray[np.int64]) -> FloatArray:
@@ -70,16 +93,21 @@ def thin(count: int, most: int) -> slice:
 
 def transparent(colour: str, opacity: float) -> str:
     """A colour ``#rrggbb`` that lets others through."""
-    red, green, blue = (int(colour[place:place + 2], 16) for place in (1, 3, 5))
+    red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
     return f'rgba({red},{green},{blue},{opacity})'
 
 
 def styled(figure: go.Figure, *, height: int) -> go.Figure:
     """Give `figure` the style of the page; `height` in pixels."""
     figure.update_layout(
-        height=height, margin={'l': 64, 'r': 24, 't': 44, 'b': 52}, paper_bgcolor='white',
-        plot_bgcolor='white', font={'family': FONT, 'size': 13, 'color': INK}, hovermode='closest',
-        legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0})
+        height=height,
+        margin={'l': 64, 'r': 24, 't': 44, 'b': 52},
+        paper_bgcolor='white',
+        plot_bgcolor='white',
+        font={'family': FONT, 'size': 13, 'color': INK},
+        hovermode='closest',
+        legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0},
+    )
     axis = {'gridcolor': GRID, 'zerolinecolor': '#c3ccd5', 'linecolor': '#c3ccd5', 'ticks': ''}
     figure.update_xaxes(**axis)
     figure.update_yaxes(**axis)

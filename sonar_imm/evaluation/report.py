@@ -22,57 +22,98 @@ def write_report(path: Path, parts: Sequence[Part]) -> None:
 
 def report_html(parts: Sequence[Part]) -> str:
     """The report as text; the same parts give the same bytes."""
-    return render(', '.join(part.title for part in parts), parts,
-                  footer=f'Made by sonar_imm {__version__}. Times are seconds since the first '
-                         'estimate of a run.')
+    return render(
+        ', '.join(part.title for part in parts),
+        parts,
+        footer=f'Made by sonar_imm {__version__}. Times are seconds since the first '
+        'estimate of a run.',
+    )
 
 
-def run_part(run: Mapping[str, Any], metrics: Mapping[str, Any], checks: Sequence[Check], *,
-             summary: str, cards: Iterable[Card], sections: Iterable[Section]) -> Part:
+def run_part(
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    checks: Sequence[Check],
+    *,
+    summary: str,
+    cards: Iterable[Card],
+    sections: Iterable[Section],
+) -> Part:
     """One run on the page: `checks` first, then the sections of its system, then the rest.
 
     run: the content of ``run.json``; metrics: that of ``metrics.json``.
     """
-    return Part(f'sonar_imm · {run["system"]} tracker', Path(run['bag']).name, summary,
-                tuple(cards),
-                (*_comparison(checks), *sections, _numbers(metrics), *_about(run)))
+    return Part(
+        f'sonar_imm · {run["system"]} tracker',
+        Path(run['bag']).name,
+        summary,
+        tuple(cards),
+        (*_comparison(checks), *sections, _numbers(metrics), *_about(run)),
+    )
 
 
 def _comparison(checks: Sequence[Check]) -> list[Section]:
     if not checks:
         return []
-    rows = [(check.name, check.result, check.wanted, 'yes' if check.good else 'NO')
-            for check in checks]
-    return [Section(
-        'Live node against offline tracker', 'The recording was played to a real ROS 2 node, '
-        'message by message, and what the node published was compared with the offline run.',
-        html=table(('check', 'result', 'wanted', 'good'), rows))]
+    rows = [
+        (check.name, check.result, check.wanted, 'yes' if check.good else 'NO') for check in checks
+    ]
+    return [
+        Section(
+            'Live node against offline tracker',
+            'The recording was played to a real ROS 2 node, '
+            'message by message, and what the node published was compared with the offline run.',
+            html=table(('check', 'result', 'wanted', 'good'), rows),
+        )
+    ]
 
 
 def _numbers(metrics: Mapping[str, Any]) -> Section:
-    return Section('All numbers', 'The content of metrics.json. Bounds take successive errors as '
-                   'independent, which those of one track are not quite.',
-                   html=folded('Show them', mapping_table(('metric', 'value'), flat(metrics))))
+    return Section(
+        'All numbers',
+        'The content of metrics.json. Bounds take successive errors as '
+        'independent, which those of one track are not quite.',
+        html=folded('Show them', mapping_table(('metric', 'value'), flat(metrics))),
+    )
 
 
 def _about(run: Mapping[str, Any]) -> list[Section]:
     counts = run.get('counts', {})
     refused = run.get('refused', {})
-    sections = [Section('What happened to the input', 'Every message is accounted for.',
-                        html=table(('outcome', 'messages'), counts.items()))]
+    sections = [
+        Section(
+            'What happened to the input',
+            'Every message is accounted for.',
+            html=table(('outcome', 'messages'), counts.items()),
+        )
+    ]
     if refused:
         rows = [(reason, entry['count'], entry['example']) for reason, entry in refused.items()]
-        sections.append(Section('Refused input', 'Messages that could not be used, with the first '
-                                'of each kind.', html=table(('reason', 'messages', 'why'), rows)))
-    parameters = folded('Show them', mapping_table(('parameter', 'value'),
-                                                   run.get('parameters', {})))
-    about = {key: run[key] for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed',
-                                     'topics')
-             if key in run} | dict(run.get('versions', {}))
+        sections.append(
+            Section(
+                'Refused input',
+                'Messages that could not be used, with the first of each kind.',
+                html=table(('reason', 'messages', 'why'), rows),
+            )
+        )
+    parameters = folded(
+        'Show them', mapping_table(('parameter', 'value'), run.get('parameters', {}))
+    )
+    about = {
+        key: run[key]
+        for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed', 'topics')
+        if key in run
+    } | dict(run.get('versions', {}))
     about['topics'] = [f'{topic} as {name}' for topic, name in run['topics'].items()]
-    return [*sections, Section('Parameters', 'What the tracker was told.', html=parameters),
-            Section('Where this comes from', 'Input and versions, to do it again.',
-                    html=mapping_table(('what', 'value'), about))]
+    return [
+        *sections,
+        Section('Parameters', 'What the tracker was told.', html=parameters),
+        Section(
+            'Where this comes from',
+            'Input and versions, to do it again.',
+            html=mapping_table(('what', 'value'), about),
+        ),
+    ]
 
 
 def flat(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:

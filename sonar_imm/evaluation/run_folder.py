@@ -36,8 +36,13 @@ from ..recordings.reader import BagError, BagReader
 from ..recordings.writer import BagWriter, ros_message
 from .judging import JUDGES
 
-BAG, CSV, RUN, METRICS, REPORT = ('estimate', 'estimate.csv', 'run.json', 'metrics.json',
-                                  'report.html')
+BAG, CSV, RUN, METRICS, REPORT = (
+    'estimate',
+    'estimate.csv',
+    'run.json',
+    'metrics.json',
+    'report.html',
+)
 TRUTH_TOPIC = '/truth/estimate'
 
 
@@ -57,8 +62,10 @@ class RunFolder:
         old = [self.path / name for name in (BAG, CSV, RUN, METRICS, REPORT)]
         old = [path for path in old if path.exists()]
         if old and not overwrite:
-            raise BagError(f'{self.path} holds a run already ({old[0].name}); choose another '
-                           'folder or say --overwrite')
+            raise BagError(
+                f'{self.path} holds a run already ({old[0].name}); choose another '
+                'folder or say --overwrite'
+            )
         for path in old:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -68,8 +75,9 @@ class RunFolder:
         written = {'estimates': 0, 'rows': 0}
         with BagWriter(self.path / BAG) as bag, CsvTable(self.path / CSV) as table:
             for estimate in estimates:
-                bag.write(f'/{system}/estimate', write_estimate(estimate, ros_message),
-                          estimate.stamp_ns)
+                bag.write(
+                    f'/{system}/estimate', write_estimate(estimate, ros_message), estimate.stamp_ns
+                )
                 table.write(estimate)
                 written['estimates'] += 1
                 written['rows'] += len(estimate)
@@ -85,8 +93,10 @@ class RunFolder:
         """The content of run.json. Raises `BagError` when the folder holds no finished run."""
         path = self.path / RUN
         if not path.is_file():
-            raise BagError(f'{self.path} holds no finished run: {RUN} is missing; '
-                           'make one with sonar-imm track')
+            raise BagError(
+                f'{self.path} holds no finished run: {RUN} is missing; '
+                'make one with sonar-imm track'
+            )
         try:
             run = json.loads(path.read_text(encoding='utf-8'))
             if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
@@ -128,8 +138,9 @@ class CsvTable:
             self._writer.writerow([estimate.stamp_ns, *row])
 
 
-def read_truth(run: Mapping[str, Any], truth_bag: Path | None = None,
-               topic: str = TRUTH_TOPIC) -> list[Estimate] | None:
+def read_truth(
+    run: Mapping[str, Any], truth_bag: Path | None = None, topic: str = TRUTH_TOPIC
+) -> list[Estimate] | None:
     """The truth tables in `truth_bag`, by default in the recording that was tracked.
 
     None when the recording has no truth or is gone. Raises `BagError`, also when `truth_bag` holds
@@ -152,9 +163,13 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
     if not Path(run['bag']).exists():
         return
     with BagReader(run['bag']) as bag:
-        for heard in measurements_of(bag, run['system'], run['topics'],
-                                     world_frame=run.get('world_frame', 'enu'),
-                                     settings=run.get('parameters')):
+        for heard in measurements_of(
+            bag,
+            run['system'],
+            run['topics'],
+            world_frame=run.get('world_frame', 'enu'),
+            settings=run.get('parameters'),
+        ):
             if not isinstance(heard.measurement, Rejection):
                 yield heard.measurement
 
@@ -169,9 +184,14 @@ def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimat
 
 def run_record(**facts: Any) -> dict[str, Any]:
     """The content of run.json: `facts` and the versions of what computes."""
-    versions = {'sonar_imm': __version__, 'python': platform.python_version(),
-                'numpy': numpy.__version__, 'scipy': scipy.__version__,
-                'numba': numba.__version__, 'rosbags': version('rosbags')}
+    versions = {
+        'sonar_imm': __version__,
+        'python': platform.python_version(),
+        'numpy': numpy.__version__,
+        'scipy': scipy.__version__,
+        'numba': numba.__version__,
+        'rosbags': version('rosbags'),
+    }
     return {**facts, 'versions': versions}
 
 

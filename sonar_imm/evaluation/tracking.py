@@ -87,8 +87,10 @@ class Revisions:
 def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
     """The last word on each stamp out of everything a live tracker of `config` published."""
     revisions = Revisions(window_ns(config))
-    return [*(final for estimate in estimates for final in revisions.add([estimate])),
-            *revisions.finish()]
+    return [
+        *(final for estimate in estimates for final in revisions.add([estimate])),
+        *revisions.finish(),
+    ]
 
 
 def window_ns(config: Config) -> int:
@@ -105,8 +107,9 @@ class OfflineRun:
     of the tracker. Raises `BagError` when no topic fits the tracker.
     """
 
-    def __init__(self, bag: BagReader, system: System, config: Config,
-                 options: InputOptions | None = None):
+    def __init__(
+        self, bag: BagReader, system: System, config: Config, options: InputOptions | None = None
+    ):
         self.options = options or InputOptions()
         self.bag = bag
         self.system = system
@@ -143,10 +146,14 @@ class OfflineRun:
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
         guard = FrameGuard(self.options.frame_id)
-        for heard in measurements_of(self.bag, self.system.name, self.topics,
-                                     world_frame=self.options.world_frame,
-                                     order=self.options.order,
-                                     settings=self.tracker.config.as_dict()):
+        for heard in measurements_of(
+            self.bag,
+            self.system.name,
+            self.topics,
+            world_frame=self.options.world_frame,
+            order=self.options.order,
+            settings=self.tracker.config.as_dict(),
+        ):
             self.messages += 1
             advance(1)
             try:
@@ -159,8 +166,9 @@ class OfflineRun:
             yield heard.measurement
 
     def _refuse(self, topic: str, rejection: Rejection) -> None:
-        entry = self.refused.setdefault(rejection.reason,
-                                        Refused(0, f'{topic}: {rejection.sentence}'))
+        entry = self.refused.setdefault(
+            rejection.reason, Refused(0, f'{topic}: {rejection.sentence}')
+        )
         entry.count += 1
 
     def outcomes(self) -> dict[str, int]:
@@ -178,22 +186,35 @@ class OfflineRun:
         spent = np.array(self.durations) * 1e3
         if not len(spent):
             return {}
-        return {'tracker_total_ms': float(spent.sum()), 'tracker_p50_ms': float(np.median(spent)),
-                'tracker_p99_ms': float(np.percentile(spent, 99.0))}
+        return {
+            'tracker_total_ms': float(spent.sum()),
+            'tracker_p50_ms': float(np.median(spent)),
+            'tracker_p99_ms': float(np.percentile(spent, 99.0)),
+        }
 
 
-def write_run(folder: RunFolder, offline: OfflineRun,
-              advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
+def write_run(
+    folder: RunFolder, offline: OfflineRun, advance: Callable[[int], None] = lambda count: None
+) -> dict[str, Any]:
     """Track into a prepared folder; gives the content of run.json, which is written last."""
     begin = time.perf_counter()
     written = folder.write_estimates(offline.estimates(advance), offline.system.name)
     path, options = offline.bag.path, offline.options
     run = run_record(
-        system=offline.system.name, bag=str(path.resolve()), **fingerprint(path),
-        topics=offline.topics, order=options.order, smoothed=options.smooth,
-        world_frame=options.world_frame, messages=offline.messages, **written,
-        counts=offline.outcomes(), refused=offline.refusals(),
-        problems=list(offline.bag.problems), parameters=offline.tracker.config.as_dict(),
-        timings={'wall_s': time.perf_counter() - begin, **offline.timings()})
+        system=offline.system.name,
+        bag=str(path.resolve()),
+        **fingerprint(path),
+        topics=offline.topics,
+        order=options.order,
+        smoothed=options.smooth,
+        world_frame=options.world_frame,
+        messages=offline.messages,
+        **written,
+        counts=offline.outcomes(),
+        refused=offline.refusals(),
+        problems=list(offline.bag.problems),
+        parameters=offline.tracker.config.as_dict(),
+        timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
+    )
     folder.write_json(RUN, run)
     return run

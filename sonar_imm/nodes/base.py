@@ -41,9 +41,9 @@ from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
 from ..measurements import Rejection
+from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
-from .config import node_config_type, NodeConfig, type_spec, type_specs
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
@@ -65,8 +65,9 @@ class TrackerNode(Node):
         self._topics = INPUTS[system]
         config_type = SYSTEMS[system].config_type()
         self._node_config_type = node_config_type(system)
-        self._settings = NodeParameters(self, (config_type, self._node_config_type),
-                                        type_specs(system))
+        self._settings = NodeParameters(
+            self, (config_type, self._node_config_type), type_specs(system)
+        )
         self.tracker = SYSTEMS[system].build(self._settings[config_type])
         self._guard = FrameGuard(self._node_config.frame_id)
         self._warm()
@@ -82,16 +83,21 @@ class TrackerNode(Node):
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)
         self._jumps = self.get_clock().create_jump_callback(
-            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
-                          on_clock_change=False), post_callback=self._on_clock_back)
+            JumpThreshold(
+                min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
+            ),
+            post_callback=self._on_clock_back,
+        )
         self._reporter = Reporter(self.get_fully_qualified_name().lstrip('/'), hears, self._meter)
-        self.create_timer(self._node_config.diagnostics_period, self._report,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._settings.on_change(
-            lambda: self.tracker.reconfigure(self._settings[config_type]))
+        self.create_timer(
+            self._node_config.diagnostics_period,
+            self._report,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        self._settings.on_change(lambda: self.tracker.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
-        self.get_logger().info(f"ready, hears {', '.join(hears.values())}")
+        self.get_logger().info(f'ready, hears {", ".join(hears.values())}')
 
     def advertise(self, type_name: str, topic: str) -> Any:
         """Offer an output; to be used by `advertise_displays`."""
@@ -112,9 +118,14 @@ class TrackerNode(Node):
 
     def _warm(self) -> None:
         """Compile or load the kernels, with a word to the user when that takes long."""
-        notice = threading.Timer(_PATIENCE, self.get_logger().info, [
-            'compiling numerical kernels, which takes up to 20 s at the very first start; '
-            'later starts load them from the cache'])
+        notice = threading.Timer(
+            _PATIENCE,
+            self.get_logger().info,
+            [
+                'compiling numerical kernels, which takes up to 20 s at the very first start; '
+                'later starts load them from the cache'
+            ],
+        )
         notice.start()
         try:
             self.tracker.warm()
@@ -123,26 +134,36 @@ class TrackerNode(Node):
 
     def _advertise(self) -> None:
         self._estimates = self.advertise(TABLE, '~/estimate')
-        self._processed = self._endpoints.advertise(message_class(TABLE), '~/processed',
-                                                    latched_qos())
+        self._processed = self._endpoints.advertise(
+            message_class(TABLE), '~/processed', latched_qos()
+        )
         self._diagnostics = self._endpoints.advertise(
-            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos())
+            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
+        )
         self.advertise_displays()
 
     def _listen(self, topic: InputTopic) -> str:
         """Subscribe to one input and give the resolved name of its topic."""
         spec = type_spec(topic)
         type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
-        reader = topic.reader(type_name, self._node_config.world_frame_convention,
-                              self.tracker.config.as_dict())
+        reader = topic.reader(
+            type_name, self._node_config.world_frame_convention, self.tracker.config.as_dict()
+        )
         subscription = self._endpoints.subscribe(
-            message_class(type_name), topic.name,
+            message_class(type_name),
+            topic.name,
             functools.partial(self._receive, topic, reader),
-            input_qos(self._node_config.queue_depth))
+            input_qos(self._node_config.queue_depth),
+        )
         return subscription.topic_name
 
-    def _receive(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any,
-                 info: Mapping[str, Any]) -> None:
+    def _receive(
+        self,
+        topic: InputTopic,
+        reader: Callable[[Any], Any],
+        message: Any,
+        info: Mapping[str, Any],
+    ) -> None:
         """Take one message all the way; whatever it holds, the node goes on."""
         start = time.monotonic()
         self._meter.arrived(topic.name, start)
@@ -172,7 +193,8 @@ class TrackerNode(Node):
         if not self._meter.dropped:
             self.get_logger().warning(
                 f"messages on '{topic.name}' come faster than they can be processed: those that "
-                f'waited more than {limit:g} s are dropped (said once, counted in /diagnostics)')
+                f'waited more than {limit:g} s are dropped (said once, counted in /diagnostics)'
+            )
         self._meter.dropped[topic.name] += 1
         return True
 
@@ -195,29 +217,40 @@ class TrackerNode(Node):
         if reason not in self._meter.doubted:
             self.get_logger().warning(
                 f"a message on '{topic.name}' is used but deserves a look: {reason} "
-                '(said once, counted in /diagnostics)')
+                '(said once, counted in /diagnostics)'
+            )
         self._meter.doubted[reason] += 1
 
     def _refuse(self, topic: InputTopic, rejection: Rejection) -> None:
         if rejection.reason not in self._meter.refused:
             self.get_logger().warning(
                 f"a message on '{topic.name}' is refused: {rejection.sentence} "
-                f"(said once; '{rejection.reason}' is counted in /diagnostics)")
+                f"(said once; '{rejection.reason}' is counted in /diagnostics)"
+            )
         self._meter.refused[rejection.reason] += 1
 
     def _recover(self, topic: InputTopic) -> None:
         """Outlive a bug: a node at sea must not end because of one message."""
         self._errors['internal_error'] += 1
-        self.get_logger().error(f"internal error on a message on '{topic.name}', the tracker "
-                                f'starts afresh; please report this:\n{traceback.format_exc()}')
+        self.get_logger().error(
+            f"internal error on a message on '{topic.name}', the tracker "
+            f'starts afresh; please report this:\n{traceback.format_exc()}'
+        )
         self._start_afresh()
 
     def _acknowledge(self, stamp: Any) -> None:
         """Say on ~/processed that everything so far is answered; `stamp` is the message's."""
-        row = {'messages': self._meter.received.total(), 'refused': self._meter.refused.total(),
-               'estimates': self._published}
-        answer = encode_table({name: np.array([n], np.uint32) for name, n in row.items()},
-                              stamp_ns=0, frame_id='', make=make)
+        row = {
+            'messages': self._meter.received.total(),
+            'refused': self._meter.refused.total(),
+            'estimates': self._published,
+        }
+        answer = encode_table(
+            {name: np.array([n], np.uint32) for name, n in row.items()},
+            stamp_ns=0,
+            frame_id='',
+            make=make,
+        )
         if stamp is not None:
             answer.header.stamp = stamp
         self._processed.publish(answer)
@@ -242,18 +275,26 @@ class TrackerNode(Node):
 
     def _on_clock_back(self, jump: Any) -> None:
         self.get_logger().warning(
-            f'/clock is back by {-jump.delta.nanoseconds / 1e9:.3f} s: the tracker starts afresh')
+            f'/clock is back by {-jump.delta.nanoseconds / 1e9:.3f} s: the tracker starts afresh'
+        )
         self._start_afresh()
 
     def _report(self) -> None:
         counts = Counter(self.tracker.counts) + self._errors
         if self._ignored:
             counts['ignored_while_disabled'] = self._ignored
-        self._diagnostics.publish(self._reporter.report(
-            self.get_clock().now().to_msg(), time.monotonic(), enabled=self._enabled,
-            stale_after=self._node_config.stale_after, counts=counts,
-            health=self.tracker.health(), lost=self._endpoints.lost,
-            incompatible=self._endpoints.incompatible))
+        self._diagnostics.publish(
+            self._reporter.report(
+                self.get_clock().now().to_msg(),
+                time.monotonic(),
+                enabled=self._enabled,
+                stale_after=self._node_config.stale_after,
+                counts=counts,
+                health=self.tracker.health(),
+                lost=self._endpoints.lost,
+                incompatible=self._endpoints.incompatible,
+            )
+        )
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:

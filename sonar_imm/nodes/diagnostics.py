@@ -58,9 +58,18 @@ class Reporter:
         self._meter = meter
         self._before = (None, Counter(), Counter(), 0)
 
-    def report(self, stamp: Any, now: float, *, enabled: bool, stale_after: float,
-               counts: Mapping[str, int], health: Mapping[str, float], lost: Mapping[str, int],
-               incompatible: Mapping[str, str]) -> DiagnosticArray:
+    def report(
+        self,
+        stamp: Any,
+        now: float,
+        *,
+        enabled: bool,
+        stale_after: float,
+        counts: Mapping[str, int],
+        health: Mapping[str, float],
+        lost: Mapping[str, int],
+        incompatible: Mapping[str, str],
+    ) -> DiagnosticArray:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds."""
         then, received_before, refused_before, dropped_before = self._before
         meter = self._meter
@@ -73,17 +82,26 @@ class Reporter:
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
-            self._input_status(now, elapsed, fresh, refused, enabled, stale_after, lost,
-                               incompatible),
-            self._tracker_status(fresh.total() / elapsed, dropped - dropped_before, enabled,
-                                 counts, health),
+            self._input_status(
+                now, elapsed, fresh, refused, enabled, stale_after, lost, incompatible
+            ),
+            self._tracker_status(
+                fresh.total() / elapsed, dropped - dropped_before, enabled, counts, health
+            ),
         ]
         return message
 
-    def _input_status(self, now: float, elapsed: float, fresh: Counter[str],
-                      refused: Counter[str], enabled: bool, stale_after: float,
-                      lost: Mapping[str, int],
-                      incompatible: Mapping[str, str]) -> DiagnosticStatus:
+    def _input_status(
+        self,
+        now: float,
+        elapsed: float,
+        fresh: Counter[str],
+        refused: Counter[str],
+        enabled: bool,
+        stale_after: float,
+        lost: Mapping[str, int],
+        incompatible: Mapping[str, str],
+    ) -> DiagnosticStatus:
         meter = self._meter
         values: dict[str, Any] = {}
         for name, topic in self._topics.items():
@@ -96,8 +114,10 @@ class Reporter:
         values |= {f'refused: {reason}': n for reason, n in sorted(meter.refused.items())}
         values |= {f'doubtful: {reason}': n for reason, n in sorted(meter.doubted.items())}
         values |= {f'lost on {topic}': n for topic, n in sorted(lost.items())}
-        values |= {f'incompatible peer on {topic}': policy
-                   for topic, policy in sorted(incompatible.items())}
+        values |= {
+            f'incompatible peer on {topic}': policy
+            for topic, policy in sorted(incompatible.items())
+        }
         silence = now - max(meter.last.values(), default=-np.inf)
         level, text = DiagnosticStatus.OK, 'receiving'
         if not meter.last:
@@ -116,29 +136,44 @@ class Reporter:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
 
-    def _tracker_status(self, rate: float, dropped: int, enabled: bool,
-                        counts: Mapping[str, int],
-                        health: Mapping[str, float]) -> DiagnosticStatus:
+    def _tracker_status(
+        self,
+        rate: float,
+        dropped: int,
+        enabled: bool,
+        counts: Mapping[str, int],
+        health: Mapping[str, float],
+    ) -> DiagnosticStatus:
         p50, p99 = self._meter.compute_ms()
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
         level, text = DiagnosticStatus.OK, 'tracking' if enabled else 'disabled'
         if dropped:
-            level, text = DiagnosticStatus.WARN, (
-                f'input comes faster than it can be processed: {dropped} messages dropped')
+            level, text = (
+                DiagnosticStatus.WARN,
+                (f'input comes faster than it can be processed: {dropped} messages dropped'),
+            )
         elif rate * p50 > 1000.0:
             level, text = DiagnosticStatus.WARN, 'input comes faster than it can be processed'
         if counts.get('internal_error'):
             level, text = DiagnosticStatus.ERROR, 'an internal error was caught, see the log'
         return self._status('tracker', level, text, values)
 
-    def _status(self, part: str, level: bytes, text: str,
-                values: Mapping[str, Any]) -> DiagnosticStatus:
-        pairs = [KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else
-                          str(value)) for key, value in values.items()]
-        return DiagnosticStatus(level=level, name=f'{self._name}: {part}', message=text,
-                                hardware_id='sonar_imm', values=pairs)
+    def _status(
+        self, part: str, level: bytes, text: str, values: Mapping[str, Any]
+    ) -> DiagnosticStatus:
+        pairs = [
+            KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
+            for key, value in values.items()
+        ]
+        return DiagnosticStatus(
+            level=level,
+            name=f'{self._name}: {part}',
+            message=text,
+            hardware_id='sonar_imm',
+            values=pairs,
+        )
 
 
 def _most(refused: Counter[str]) -> str:

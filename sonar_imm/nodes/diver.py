@@ -35,8 +35,7 @@ class DiverNode(TrackerNode):
 
     def advertise_displays(self) -> None:
         self._odometry = self.advertise('nav_msgs/msg/Odometry', '~/odometry')
-        self._probabilities = self.advertise('sensor_msgs/msg/JointState',
-                                             '~/model_probabilities')
+        self._probabilities = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
 
     def show(self, newest: Estimate) -> None:
         confirmed = np.flatnonzero(newest.extras['track_state'] >= CONFIRMED)

@@ -45,9 +45,9 @@ class FlsDetectorNode(Node):
         except ImportError as error:
             raise ConfigError(str(error)) from None
         self._detections = self.create_publisher(
-            message_class('sensor_msgs/msg/PointCloud2'), 'detections', output_qos())
-        self.create_subscription(image_class, 'image', self.receive,
-                                 input_qos(heard.queue_depth))
+            message_class('sensor_msgs/msg/PointCloud2'), 'detections', output_qos()
+        )
+        self.create_subscription(image_class, 'image', self.receive, input_qos(heard.queue_depth))
         settings.warn_of_unknown()
         self.get_logger().info('ready')
 

@@ -58,9 +58,14 @@ class LockstepResult:
         return {'p50': 1e3 * float(values[0]), 'p99': 1e3 * float(values[1])}
 
 
-def run_lockstep(path: Path | str, system: str, *, params_file: Path | str | None = None,
-                 topics: Mapping[str, str] | None = None,
-                 progress: Callable[[int], None] = lambda count: None) -> LockstepResult:
+def run_lockstep(
+    path: Path | str,
+    system: str,
+    *,
+    params_file: Path | str | None = None,
+    topics: Mapping[str, str] | None = None,
+    progress: Callable[[int], None] = lambda count: None,
+) -> LockstepResult:
     """Start the node of `system` as a process and play the bag at `path` to it in lock-step.
 
     topics: recorded topic names to input names, as in `fitting_topics`; by default those that fit.
@@ -71,39 +76,71 @@ def run_lockstep(path: Path | str, system: str, *, params_file: Path | str | Non
         bag = stack.enter_context(BagReader(path))
         inputs = fitting_topics(bag, system, topics)
         domain = stack.enter_context(reserved_domain_id())
-        stack.enter_context(_environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
-                                         ROS_LOCALHOST_ONLY=None))
-        node = stack.enter_context(NodeProcess(system, domain_id=domain, arguments=_arguments(
-            bag, system, inputs, params_file)))
+        stack.enter_context(
+            _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
+        )
+        node = stack.enter_context(
+            NodeProcess(
+                system, domain_id=domain, arguments=_arguments(bag, system, inputs, params_file)
+            )
+        )
         link = stack.enter_context(Link(NAME, domain_id=domain))
         recorder = Recorder(link, f'/{system}')
         lockstep = LockStep(link, f'/{system}', recorder=recorder, trouble=node.trouble)
-        player = Player(bag, link, PlayOptions(
-            topics=tuple(inputs), lockstep=f'/{system}',
-            remap={name: f'/{entry.name}' for name, entry in inputs.items()}), lockstep)
+        player = Player(
+            bag,
+            link,
+            PlayOptions(
+                topics=tuple(inputs),
+                lockstep=f'/{system}',
+                remap={name: f'/{entry.name}' for name, entry in inputs.items()},
+            ),
+            lockstep,
+        )
         player.run(progress, START_LIMIT)
         exit_code = node.stop()
         result = player.result()
-        return LockstepResult(recorder.estimates(), lockstep.counts, result.delays, exit_code,
-                              node.log(), result.problems)
+        return LockstepResult(
+            recorder.estimates(),
+            lockstep.counts,
+            result.delays,
+            exit_code,
+            node.log(),
+            result.problems,
+        )
 
 
 class NodeProcess:
     """A node of this package as a process of its own; stopped at the end of ``with``."""
 
-    def __init__(self, system: str, *, domain_id: int, arguments: Sequence[str] = (),
-                 module: str = ''):
+    def __init__(
+        self, system: str, *, domain_id: int, arguments: Sequence[str] = (), module: str = ''
+    ):
         """Start it. `arguments` follow ``--ros-args``; `module` is where its ``main`` is."""
         self.system = system
         root = str(Path(__file__).resolve().parents[2])
-        environment = dict(os.environ, ROS_DOMAIN_ID=str(domain_id), PYTHONUNBUFFERED='1',
-                           RCUTILS_COLORIZED_OUTPUT='0', PYTHONPATH=os.pathsep.join(
-                               filter(None, [root, os.environ.get('PYTHONPATH')])))
+        environment = dict(
+            os.environ,
+            ROS_DOMAIN_ID=str(domain_id),
+            PYTHONUNBUFFERED='1',
+            RCUTILS_COLORIZED_OUTPUT='0',
+            PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])),
+        )
         self._log = tempfile.NamedTemporaryFile(mode='ab', prefix=f'sonar_imm_{system}_')
         self.process = subprocess.Popen(
-            [sys.executable, '-m', module or f'sonar_imm.nodes.{system}', '--ros-args',
-             '-r', f'__node:={system}', *arguments],
-            env=environment, stdout=self._log, stderr=subprocess.STDOUT)
+            [
+                sys.executable,
+                '-m',
+                module or f'sonar_imm.nodes.{system}',
+                '--ros-args',
+                '-r',
+                f'__node:={system}',
+                *arguments,
+            ],
+            env=environment,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+        )
 
     def __enter__(self) -> NodeProcess:
         return self
@@ -173,11 +210,14 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
             os.environ[name] = value
 
 
-def _arguments(bag: BagReader, system: str, inputs: Mapping[str, InputTopic],
-               params_file: Path | str | None) -> list[str]:
+def _arguments(
+    bag: BagReader, system: str, inputs: Mapping[str, InputTopic], params_file: Path | str | None
+) -> list[str]:
     """Write the ROS arguments of a node that loses nothing and expects the types of the bag."""
-    parameters = {f'qos_overrides./{system}/estimate.publisher.history': 'keep_all',
-                  'max_wait': '0.0'}
+    parameters = {
+        f'qos_overrides./{system}/estimate.publisher.history': 'keep_all',
+        'max_wait': '0.0',
+    }
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():
         parameters[f'qos_overrides./{entry.name}.subscription.history'] = 'keep_all'
@@ -186,8 +226,11 @@ def _arguments(bag: BagReader, system: str, inputs: Mapping[str, InputTopic],
             continue
         known = parameters.setdefault(f'{entry.name}_type', types[topic])
         if known != types[topic]:
-            raise LinkError(f"the input '{entry.name}' would come as {known} and as "
-                            f'{types[topic]}: a node can hear only one of them')
+            raise LinkError(
+                f"the input '{entry.name}' would come as {known} and as "
+                f'{types[topic]}: a node can hear only one of them'
+            )
     arguments = ['--params-file', str(params_file)] if params_file else []
-    return arguments + [word for name, value in parameters.items()
-                        for word in ('-p', f'{name}:={value}')]
+    return arguments + [
+        word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')
+    ]

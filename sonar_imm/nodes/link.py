@@ -30,8 +30,12 @@ class Link:
     def __init__(self, name: str, *, domain_id: int | None = None):
         """Open a node called `name`; `domain_id` None means the one of the environment."""
         self.context = Context()
-        rclpy.init(args=[name], context=self.context, domain_id=domain_id,
-                   signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(
+            args=[name],
+            context=self.context,
+            domain_id=domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
         self.node = Node(name, context=self.context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
@@ -48,8 +52,12 @@ class Link:
         """Serve callbacks for at most `seconds`; returns after the first one."""
         self._executor.spin_once(timeout_sec=max(seconds, 0.0))
 
-    def wait_for(self, predicate: Callable[[], Any], limit: float,
-                 trouble: Callable[[], str | None] = lambda: None) -> bool:
+    def wait_for(
+        self,
+        predicate: Callable[[], Any],
+        limit: float,
+        trouble: Callable[[], str | None] = lambda: None,
+    ) -> bool:
         """Spin until `predicate()` holds: True, or False after `limit` seconds.
 
         `trouble` is asked ten times a second; a sentence from it is raised as `LinkError`.

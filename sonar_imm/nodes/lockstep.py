@@ -37,9 +37,11 @@ def only_node(link: Link) -> str:
     found: list[str] = []
 
     def look() -> int:
-        found[:] = [topic.removesuffix(_ANSWERS) for topic, types
-                    in link.node.get_topic_names_and_types()
-                    if topic.endswith(_ANSWERS) and 'sensor_msgs/msg/PointCloud2' in types]
+        found[:] = [
+            topic.removesuffix(_ANSWERS)
+            for topic, types in link.node.get_topic_names_and_types()
+            if topic.endswith(_ANSWERS) and 'sensor_msgs/msg/PointCloud2' in types
+        ]
         return len(found)
 
     if not link.wait_for(look, MATCH_LIMIT):
@@ -62,8 +64,9 @@ class Recorder:
 
     def __init__(self, link: Link, node_name: str):
         self._raw: list[bytes] = []
-        link.node.create_subscription(PointCloud2, f'{node_name}/estimate', self._raw.append,
-                                      lockstep_qos(), raw=True)
+        link.node.create_subscription(
+            PointCloud2, f'{node_name}/estimate', self._raw.append, lockstep_qos(), raw=True
+        )
 
     def __len__(self) -> int:
         return len(self._raw)
@@ -80,8 +83,14 @@ class LockStep:
     the messages that brought an estimate.
     """
 
-    def __init__(self, link: Link, node_name: str, *, recorder: Recorder | None = None,
-                 trouble: Callable[[], str | None] = lambda: None):
+    def __init__(
+        self,
+        link: Link,
+        node_name: str,
+        *,
+        recorder: Recorder | None = None,
+        trouble: Callable[[], str | None] = lambda: None,
+    ):
         """Listen to the node `node_name` (full name, e.g. ``/diver``).
 
         With a `recorder` a step also waits for the estimates to arrive there. `trouble` gives a
@@ -95,8 +104,9 @@ class LockStep:
         self._start = Counts(0, 0, 0)
         self._sent = 0
         self.delays: list[float] = []
-        link.node.create_subscription(PointCloud2, node_name + _ANSWERS, self._answered,
-                                      latched_qos())
+        link.node.create_subscription(
+            PointCloud2, node_name + _ANSWERS, self._answered, latched_qos()
+        )
 
     @property
     def counts(self) -> Counts:
@@ -112,14 +122,19 @@ class LockStep:
         """
         publishers = list(publishers)
         if not self._link.wait_for(lambda: self._counts is not None, limit, self._trouble):
-            raise LinkError(f"no answer from a node '{self._name}': is it running, in this ROS "
-                            'domain, and one of this package?')
+            raise LinkError(
+                f"no answer from a node '{self._name}': is it running, in this ROS "
+                'domain, and one of this package?'
+            )
         heard: set[str] = set()
 
         def connected() -> bool:
             heard.update(self._heard(publishers))
-            return bool(heard) and all(p.get_subscription_count() for p in publishers
-                                       if p.topic_name in heard) and self._recorded()
+            return (
+                bool(heard)
+                and all(p.get_subscription_count() for p in publishers if p.topic_name in heard)
+                and self._recorded()
+            )
 
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
             raise LinkError(self._silence(publishers, heard))
@@ -133,13 +148,17 @@ class LockStep:
         publisher.publish(message)
         self._sent += 1
         if not self._link.wait_for(self._caught_up, ANSWER_LIMIT, self._lost):
-            raise LinkError(f"node '{self._name}' did not answer message {self._sent} on "
-                            f'{publisher.topic_name} within {ANSWER_LIMIT:g} s')
+            raise LinkError(
+                f"node '{self._name}' did not answer message {self._sent} on "
+                f'{publisher.topic_name} within {ANSWER_LIMIT:g} s'
+            )
         if self._counts.estimates > estimates_before:
             self.delays.append(time.monotonic() - sent)
         if self.counts.messages > self._sent:
-            raise LinkError(f"something else publishes to the node '{self._name}': it took "
-                            f'{self.counts.messages} messages and {self._sent} were sent')
+            raise LinkError(
+                f"something else publishes to the node '{self._name}': it took "
+                f'{self.counts.messages} messages and {self._sent} were sent'
+            )
 
     def _answered(self, message: PointCloud2) -> None:
         columns = decode_table(message)
@@ -147,11 +166,13 @@ class LockStep:
 
     def _caught_up(self) -> bool:
         return self.counts.messages >= self._sent and (
-            self._recorder is None or len(self._recorder) >= self.counts.estimates)
+            self._recorder is None or len(self._recorder) >= self.counts.estimates
+        )
 
     def _recorded(self) -> bool:
         return self._recorder is None or bool(
-            self._link.node.count_publishers(f'{self._name}/estimate'))
+            self._link.node.count_publishers(f'{self._name}/estimate')
+        )
 
     def _lost(self) -> str | None:
         if sentence := self._trouble():
@@ -162,9 +183,14 @@ class LockStep:
 
     def _heard(self, publishers: list[Publisher]) -> set[str]:
         """Topics among those of `publishers` that the node itself subscribes to."""
-        return {p.topic_name for p in publishers if any(
-            _full_name(info) == self._name
-            for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name))}
+        return {
+            p.topic_name
+            for p in publishers
+            if any(
+                _full_name(info) == self._name
+                for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name)
+            )
+        }
 
     def _silence(self, publishers: list[Publisher], heard: set[str]) -> str:
         """Say why no topic of the bag reaches the node."""
@@ -172,17 +198,20 @@ class LockStep:
             for info in self._link.node.get_subscriptions_info_by_topic(publisher.topic_name):
                 wanted, offered = info.topic_type, _type_name(publisher)
                 if _full_name(info) == self._name and wanted != offered:
-                    return (f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
-                            f'bag holds {offered}; change the type parameter of the node')
+                    return (
+                        f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
+                        f'bag holds {offered}; change the type parameter of the node'
+                    )
         if heard:
             return f"node '{self._name}' does not take what is published on {', '.join(heard)}"
         names = ', '.join(p.topic_name for p in publishers) or 'no topics'
-        return (f"node '{self._name}' listens to none of the topics of the bag ({names}); "
-                'remap them')
+        return (
+            f"node '{self._name}' listens to none of the topics of the bag ({names}); remap them"
+        )
 
 
 def _full_name(info: Any) -> str:
-    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def _type_name(publisher: Publisher) -> str:

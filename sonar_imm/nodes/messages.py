@@ -19,8 +19,18 @@ from typing import Any
 
 import numpy as np
 
-_CODES = {'float': 'f', 'double': 'd', 'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H',
-          'int32': 'i', 'uint32': 'I', 'int64': 'q', 'uint64': 'Q'}
+_CODES = {
+    'float': 'f',
+    'double': 'd',
+    'int8': 'b',
+    'uint8': 'B',
+    'int16': 'h',
+    'uint16': 'H',
+    'int32': 'i',
+    'uint32': 'I',
+    'int64': 'q',
+    'uint64': 'Q',
+}
 
 
 @functools.cache
@@ -56,7 +66,7 @@ def _casts(cls: Any) -> dict[str, Callable[[Any], Any]]:
 def _cast(kind: str) -> Callable[[Any], Any]:
     """Choose the function that turns a value into what a field declared as `kind` must hold."""
     if kind.startswith('sequence<'):
-        element = kind[len('sequence<'):-1].split(',')[0]
+        element = kind[len('sequence<') : -1].split(',')[0]
         return functools.partial(_bulk, _CODES[element]) if element in _CODES else list
     if kind.endswith(']'):
         element, _, size = kind[:-1].partition('[')

@@ -36,8 +36,7 @@ class ObstacleNode(TrackerNode):
     def advertise_displays(self) -> None:
         self._obstacles = self.advertise('geometry_msgs/msg/PoseArray', '~/obstacles')
         self._markers = self.advertise('visualization_msgs/msg/MarkerArray', '~/markers')
-        self._probabilities = self.advertise('sensor_msgs/msg/JointState',
-                                             '~/model_probabilities')
+        self._probabilities = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
 
     def show(self, newest: Estimate) -> None:
         self._frame_id = newest.frame_id

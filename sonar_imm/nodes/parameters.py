@@ -26,17 +26,25 @@ from ..parameters import Config, ConfigError, did_you_mean, ParameterSpec
 C = TypeVar('C', bound=Config)
 
 _TYPES = {
-    'bool': Parameter.Type.BOOL, 'int': Parameter.Type.INTEGER, 'float': Parameter.Type.DOUBLE,
-    'str': Parameter.Type.STRING, 'float[]': Parameter.Type.DOUBLE_ARRAY,
-    'int[]': Parameter.Type.INTEGER_ARRAY, 'str[]': Parameter.Type.STRING_ARRAY,
+    'bool': Parameter.Type.BOOL,
+    'int': Parameter.Type.INTEGER,
+    'float': Parameter.Type.DOUBLE,
+    'str': Parameter.Type.STRING,
+    'float[]': Parameter.Type.DOUBLE_ARRAY,
+    'int[]': Parameter.Type.INTEGER_ARRAY,
+    'str[]': Parameter.Type.STRING_ARRAY,
 }
 
 
 class NodeParameters:
     """The parameters of one node, spread over several `Config` classes."""
 
-    def __init__(self, node: Node, config_types: Iterable[type[Config]],
-                 choices: Iterable[ParameterSpec] = ()):
+    def __init__(
+        self,
+        node: Node,
+        config_types: Iterable[type[Config]],
+        choices: Iterable[ParameterSpec] = (),
+    ):
         """Read the overrides, check them, declare.
 
         `choices` are further read-only parameters that no class knows. Raises `ConfigError` with
@@ -46,12 +54,16 @@ class NodeParameters:
         self._types = tuple(config_types)
         self._choices = {spec.name: spec for spec in choices}
         # Where two classes share a parameter, the first one, the tracker's, describes it.
-        self._specs = {spec.name: spec for config_type in reversed(self._types)
-                       for spec in config_type.specs()} | self._choices
+        self._specs = {
+            spec.name: spec
+            for config_type in reversed(self._types)
+            for spec in config_type.specs()
+        } | self._choices
         values = self._start_values()
         self._configs = self._build(values)
-        self._chosen = {name: values.get(name, spec.default)
-                        for name, spec in self._choices.items()}
+        self._chosen = {
+            name: values.get(name, spec.default) for name, spec in self._choices.items()
+        }
         for spec in self._specs.values():
             self._declare(spec)
         node.add_on_set_parameters_callback(self._check)
@@ -66,10 +78,12 @@ class NodeParameters:
 
     def on_change(self, apply: Callable[[], None]) -> None:
         """Call `apply` after a change made from outside has been taken over."""
+
         def take_over(changed: list[Parameter]) -> None:
             if ours := self._ours(changed):
                 self._configs = self._build(self._values() | _plain_values(ours))
                 apply()
+
         self._node.add_post_set_parameters_callback(take_over)
 
     def warn_of_unknown(self) -> None:
@@ -79,16 +93,21 @@ class NodeParameters:
         """
         for name in _overrides(self._node):
             if not self._node.has_parameter(name):
-                self._node.get_logger().warning(f"parameter '{name}' is not known and has no "
-                                                f'effect{did_you_mean(name, self._specs)}')
+                self._node.get_logger().warning(
+                    f"parameter '{name}' is not known and has no "
+                    f'effect{did_you_mean(name, self._specs)}'
+                )
 
     def _start_values(self) -> dict[str, Any]:
         given = self._ours(_overrides(self._node).values())
         problems = [trouble for p in given if (trouble := _type_problem(self._specs[p.name], p))]
         if not problems:
             values = _plain_values(given)
-            problems = [trouble for name, value in values.items()
-                        if (trouble := self._specs[name].problem(value))]
+            problems = [
+                trouble
+                for name, value in values.items()
+                if (trouble := self._specs[name].problem(value))
+            ]
         if problems:
             raise ConfigError(*problems)
         return values
@@ -106,14 +125,21 @@ class NodeParameters:
         return built
 
     def _values(self) -> dict[str, Any]:
-        return {name: value for config in self._configs.values()
-                for name, value in config.as_dict().items()}
+        return {
+            name: value
+            for config in self._configs.values()
+            for name, value in config.as_dict().items()
+        }
 
     def _declare(self, spec: ParameterSpec) -> None:
         value = (self._values() | self._chosen)[spec.name]
         # rclpy takes an empty list for an array of bytes: declare its type, without a value.
-        self._node.declare_parameter(spec.name, _TYPES[spec.kind] if value == [] else value,
-                                     descriptor(spec), ignore_override=True)
+        self._node.declare_parameter(
+            spec.name,
+            _TYPES[spec.kind] if value == [] else value,
+            descriptor(spec),
+            ignore_override=True,
+        )
 
     def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [p for p in parameters if p.name in self._specs]
@@ -132,7 +158,8 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     made = ParameterDescriptor(
         description=spec.description + (f' [{spec.unit}]' if spec.unit else ''),
         additional_constraints=', '.join(spec.choices) or spec.range_text(),
-        read_only=spec.read_only)
+        read_only=spec.read_only,
+    )
     if spec.low is None and spec.high is None:
         return made
     if spec.kind == 'float':
@@ -140,7 +167,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
         high = sys.float_info.max if spec.high is None else float(spec.high)
         made.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     if spec.kind == 'int':
-        low = -2**63 if spec.low is None else int(spec.low)
+        low = -(2**63) if spec.low is None else int(spec.low)
         high = 2**63 - 1 if spec.high is None else int(spec.high)
         made.integer_range = [IntegerRange(from_value=low, to_value=high)]
     return made
@@ -161,15 +188,21 @@ def _type_problem(spec: ParameterSpec, given: Parameter) -> str | None:
         return None
     pair = (given.type_, wanted)
     if pair == (Parameter.Type.INTEGER, Parameter.Type.DOUBLE):
-        return (f"parameter '{spec.name}' is a double: write {float(given.value)!r} "
-                f'instead of {given.value}')
+        return (
+            f"parameter '{spec.name}' is a double: write {float(given.value)!r} "
+            f'instead of {given.value}'
+        )
     if pair == (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY):
-        return (f"parameter '{spec.name}' is a list of doubles: write "
-                f'{[float(v) for v in given.value]} instead of {list(given.value)}')
+        return (
+            f"parameter '{spec.name}' is a list of doubles: write "
+            f'{[float(v) for v in given.value]} instead of {list(given.value)}'
+        )
     if given.type_ == Parameter.Type.NOT_SET:
         return f"parameter '{spec.name}' is given without a value"
-    return (f"parameter '{spec.name}' must be of type {wanted.name.lower()}, "
-            f'got {given.type_.name.lower()} {_plain(given.value)!r}')
+    return (
+        f"parameter '{spec.name}' must be of type {wanted.name.lower()}, "
+        f'got {given.type_.name.lower()} {_plain(given.value)!r}'
+    )
 
 
 def _is_empty_list(spec: ParameterSpec, given: Parameter) -> bool:

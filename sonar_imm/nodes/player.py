@@ -74,8 +74,13 @@ class PlayResult:
     delays: tuple[float, ...] = ()
 
 
-def play(path: Path | str, options: PlayOptions, *, domain_id: int | None = None,
-         progress: Callable[[int], None] = lambda count: None) -> PlayResult:
+def play(
+    path: Path | str,
+    options: PlayOptions,
+    *,
+    domain_id: int | None = None,
+    progress: Callable[[int], None] = lambda count: None,
+) -> PlayResult:
     """Publish the bag at `path`; ends with it, or never with ``loop``.
 
     `progress` is called with the number of messages just published. Raises `BagError` for a bag
@@ -91,8 +96,9 @@ def play(path: Path | str, options: PlayOptions, *, domain_id: int | None = None
 class Player:
     """One playing of one open bag over one link."""
 
-    def __init__(self, bag: BagReader, link: Link, options: PlayOptions,
-                 lockstep: LockStep | None = None):
+    def __init__(
+        self, bag: BagReader, link: Link, options: PlayOptions, lockstep: LockStep | None = None
+    ):
         """Advertise the topics. `lockstep` replaces the one that `options` would make."""
         self._bag = bag
         self._link = link
@@ -107,8 +113,11 @@ class Player:
         self._pause = Pause(link, options.start_paused)
         self._published = 0
 
-    def run(self, progress: Callable[[int], None] = lambda count: None,
-            start_limit: float = MATCH_LIMIT) -> None:
+    def run(
+        self,
+        progress: Callable[[int], None] = lambda count: None,
+        start_limit: float = MATCH_LIMIT,
+    ) -> None:
         """Play to the end, once or for ever; a node to step with has `start_limit` s to come."""
         stepped = self._meet(start_limit)
         self._link.wait_for(lambda: False, self._options.delay)
@@ -120,16 +129,20 @@ class Player:
 
     def result(self) -> PlayResult:
         """Sum up."""
-        return PlayResult(self._published, (*self._problems, *self._bag.problems),
-                          tuple(self._lockstep.delays) if self._lockstep else ())
+        return PlayResult(
+            self._published,
+            (*self._problems, *self._bag.problems),
+            tuple(self._lockstep.delays) if self._lockstep else (),
+        )
 
     def _advertise(self) -> dict[str, Publisher]:
         """Make a publisher for each topic to play: {recorded name: publisher}."""
         recorded = {topic.name: topic.type_name for topic in self._bag.topics}
         for name in (*self._options.topics, *self._options.remap):
             if name not in recorded:
-                raise ConfigError(f"{self._bag.path} has no topic '{name}'"
-                                  f'{did_you_mean(name, recorded)}')
+                raise ConfigError(
+                    f"{self._bag.path} has no topic '{name}'{did_you_mean(name, recorded)}"
+                )
         # Reliable, which every listener accepts; in lock-step nothing may be dropped at all.
         qos = lockstep_qos() if self._options.lockstep else output_qos(_DEPTH)
         publishers = {}
@@ -142,7 +155,8 @@ class Player:
                 self._problems.append(f'topic {name} is not published: {error}')
                 continue
             publishers[name] = self._link.node.create_publisher(
-                cls, self._options.remap.get(name, name), qos)
+                cls, self._options.remap.get(name, name), qos
+            )
         if not publishers:
             raise BagError(f'{self._bag.path} has nothing to publish')
         return publishers
@@ -156,11 +170,13 @@ class Player:
         publishers = self._publishers.values()
         if self._lockstep:
             return self._lockstep.connect(publishers, limit)
-        if not self._link.wait_for(lambda: any(p.get_subscription_count() for p in publishers),
-                                   _FIRST_LISTENER):
+        if not self._link.wait_for(
+            lambda: any(p.get_subscription_count() for p in publishers), _FIRST_LISTENER
+        ):
             self._problems.append('nobody was listening when playing began')
-        self._link.wait_for(lambda: all(p.get_subscription_count() for p in publishers),
-                            _OTHER_LISTENERS)
+        self._link.wait_for(
+            lambda: all(p.get_subscription_count() for p in publishers), _OTHER_LISTENERS
+        )
         return set()
 
     def _play_once(self, stepped: set[str], progress: Callable[[int], None]) -> None:
@@ -244,8 +260,9 @@ class Ticker:
             return
         self._next = time.monotonic() + self._period
         seconds, nanoseconds = divmod(now_ns, _NANO)
-        self._publisher.publish(Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds,
-                                                 nanosec=nanoseconds)))
+        self._publisher.publish(
+            Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds))
+        )
 
 
 class Pause:

@@ -29,20 +29,26 @@ from rclpy.subscription import Subscription
 
 def input_qos(depth: int) -> QoSProfile:
     """Best effort, the last `depth` messages: what a listener to a sensor should ask for."""
-    return QoSProfile(reliability=ReliabilityPolicy.BEST_EFFORT,
-                      history=HistoryPolicy.KEEP_LAST, depth=depth)
+    return QoSProfile(
+        reliability=ReliabilityPolicy.BEST_EFFORT, history=HistoryPolicy.KEEP_LAST, depth=depth
+    )
 
 
 def output_qos(depth: int = 10) -> QoSProfile:
     """Reliable, the last `depth` messages."""
-    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE,
-                      history=HistoryPolicy.KEEP_LAST, depth=depth)
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth
+    )
 
 
 def latched_qos() -> QoSProfile:
     """Reliable, and the last message waits for listeners that come later."""
-    return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST,
-                      durability=DurabilityPolicy.TRANSIENT_LOCAL, depth=1)
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE,
+        history=HistoryPolicy.KEEP_LAST,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        depth=1,
+    )
 
 
 def lockstep_qos() -> QoSProfile:
@@ -62,35 +68,49 @@ class Endpoints:
         self.lost: Counter[str] = Counter()
         self.incompatible: dict[str, str] = {}
 
-    def subscribe(self, message_type: type, topic: str, callback: Callable[[Any], None],
-                  qos: QoSProfile) -> Subscription:
+    def subscribe(
+        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+    ) -> Subscription:
         """Subscribe, counting what is lost and naming peers that cannot be heard."""
         events = SubscriptionEventCallbacks(
             incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be heard'),
-            message_lost=lambda event: self._lost(topic, event))
+            message_lost=lambda event: self._lost(topic, event),
+        )
         return self._node.create_subscription(
-            message_type, topic, callback, qos, event_callbacks=events,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+            message_type,
+            topic,
+            callback,
+            qos,
+            event_callbacks=events,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
     def advertise(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         """Offer a topic, naming listeners that cannot be reached."""
         events = PublisherEventCallbacks(
-            incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be reached'))
+            incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be reached')
+        )
         return self._node.create_publisher(
-            message_type, topic, qos, event_callbacks=events,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+            message_type,
+            topic,
+            qos,
+            event_callbacks=events,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
     def _mismatch(self, topic: str, event: Any, effect: str) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind)
         if topic not in self.incompatible:
             self._node.get_logger().warning(
                 f"a peer on '{topic}' {effect}: its {policy} quality of service does not fit; "
-                'change it there, or here with the qos_overrides parameters')
+                'change it there, or here with the qos_overrides parameters'
+            )
         self.incompatible[topic] = policy
 
     def _lost(self, topic: str, event: Any) -> None:
         if topic not in self.lost:
             self._node.get_logger().warning(
                 f"messages on '{topic}' are lost before the node can read them: raise queue_depth "
-                'or slow the sender down (said once, counted in /diagnostics)')
+                'or slow the sender down (said once, counted in /diagnostics)'
+            )
         self.lost[topic] = event.total_count

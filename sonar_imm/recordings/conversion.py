@@ -8,8 +8,7 @@ from typing import Any, TypeVar
 
 from attrs import define, Factory
 
-from sonar_imm.measurements import Rejection
-
+from ..measurements import Rejection
 from .csv_table import BadRow, CsvTable, Row
 from .sources import BagError
 from .writer import BagWriter
@@ -56,8 +55,14 @@ class ConversionReport:
                 self.bad_row(table.path, f'line {row.line}', error)
 
 
-def write_bag(out: str | Path, records: Iterable[Record], report: ConversionReport, *,
-              source: str, storage: str = 'mcap') -> ConversionReport:
+def write_bag(
+    out: str | Path,
+    records: Iterable[Record],
+    report: ConversionReport,
+    *,
+    source: str,
+    storage: str = 'mcap',
+) -> ConversionReport:
     """Write `records` in time order into a new bag at `out`; log time = stamp.
 
     Raises `BagError` when there is nothing to write or the bag cannot be made.

@@ -18,15 +18,24 @@ from typing import Any, TextIO
 
 from attrs import field, frozen
 
-from sonar_imm.parameters import did_you_mean
-
+from ..parameters import did_you_mean
 from .sources import BagError
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 ALIASES: dict[str, tuple[str, ...]] = {
-    'stamp': ('stamp', 'time', 'timestamp', 't', 'datetime', 'date_time', 'utc',
-              'utc_time', 'epoch', 'unix_time'),
+    'stamp': (
+        'stamp',
+        'time',
+        'timestamp',
+        't',
+        'datetime',
+        'date_time',
+        'utc',
+        'utc_time',
+        'epoch',
+        'unix_time',
+    ),
     'x': ('x', 'east', 'easting', 'px', 'pos_x', 'position_x', 'utm_e', 'utm_x', 'e'),
     'y': ('y', 'north', 'northing', 'py', 'pos_y', 'position_y', 'utm_n', 'utm_y', 'n'),
     'z': ('z', 'up', 'pz', 'pos_z', 'position_z'),
@@ -44,8 +53,17 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'vy': ('vy', 'v_north', 'vn', 'vel_y', 'velocity_y'),
     'id': ('id', 'track_id', 'target', 'target_id', 'tag', 'diver', 'name'),
     'ping': ('ping', 'ping_id', 'ping_number'),
-    'receiver': ('receiver', 'rx', 'rx_id', 'receiver_id', 'hydro', 'hydrophone', 'station',
-                 'name', 'id'),
+    'receiver': (
+        'receiver',
+        'rx',
+        'rx_id',
+        'receiver_id',
+        'hydro',
+        'hydrophone',
+        'station',
+        'name',
+        'id',
+    ),
     'transmitter': ('transmitter', 'tx', 'tx_id', 'transmitter_id', 'source', 'name', 'id'),
     'arrival': ('arrival', 'arrival_time', 'time_of_arrival', 'detection_time'),
     'toa': ('toa', 'travel_time', 'delay', 'tof', 'time_of_flight'),
@@ -83,12 +101,15 @@ class CsvOptions:
 
     def __attrs_post_init__(self) -> None:
         if self.time_unit not in ('', *TIME_UNITS):
-            raise BagError(f"the time unit must be one of {', '.join(TIME_UNITS)}, "
-                           f"got '{self.time_unit}'")
+            raise BagError(
+                f"the time unit must be one of {', '.join(TIME_UNITS)}, got '{self.time_unit}'"
+            )
         for name in self.columns:
             if name not in ALIASES:
-                raise BagError(f"there is no quantity '{name}' to map a column to"
-                               f'{did_you_mean(name, ALIASES)}')
+                raise BagError(
+                    f"there is no quantity '{name}' to map a column to"
+                    f'{did_you_mean(name, ALIASES)}'
+                )
 
 
 @frozen
@@ -131,8 +152,10 @@ class Row:
             value = Decimal(text if self.table.delimiter == ',' else text.replace(',', '.'))
             nanoseconds = value * self.table.time_scale(name)
             if not abs(nanoseconds) < 2**63:
-                raise BadRow(f"{self.table.header(name)} is '{text[:40]}', beyond the year 2262; "
-                             'is the time unit right?')
+                raise BadRow(
+                    f"{self.table.header(name)} is '{text[:40]}', beyond the year 2262; "
+                    'is the time unit right?'
+                )
             return round(nanoseconds)
         except ArithmeticError:
             raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time") from None
@@ -143,8 +166,10 @@ class Row:
         stamp = _iso_ns(*parts.groups()) if parts else self.seconds_ns(name)
         stamp += self.table.options.time_offset_ns
         if not 0 < stamp < 2**31 * 10**9:
-            raise BadRow(f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
-                         'can hold; a time offset and the time unit can mend that')
+            raise BadRow(
+                f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
+                'can hold; a time offset and the time unit can mend that'
+            )
         return stamp
 
 
@@ -191,9 +216,11 @@ class CsvTable:
     def require(self, *names: str) -> None:
         """Raise `BagError` naming the quantities without a column and what the file has."""
         if missing := [name for name in names if name not in self.index]:
-            raise BagError(f'{self.path} has no column for {" and ".join(missing)}; it has '
-                           f'{", ".join(self._headers)}; say which column holds '
-                           f'{"it" if len(missing) == 1 else "them"}')
+            raise BagError(
+                f'{self.path} has no column for {" and ".join(missing)}; it has '
+                f'{", ".join(self._headers)}; say which column holds '
+                f'{"it" if len(missing) == 1 else "them"}'
+            )
 
     def header(self, name: str) -> str:
         """What the file calls a quantity."""
@@ -218,8 +245,9 @@ class CsvTable:
         by_hand = {}
         for name, header in self.options.columns.items():
             if header not in self._headers:
-                raise BagError(f"{self.path} has no column '{header}'"
-                               f'{did_you_mean(header, self._headers)}')
+                raise BagError(
+                    f"{self.path} has no column '{header}'{did_you_mean(header, self._headers)}"
+                )
             by_hand[name] = self._headers.index(header)
         found = dict(by_hand)
         plain = [_plain(header) for header in self._headers]

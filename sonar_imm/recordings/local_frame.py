@@ -42,6 +42,7 @@ class LocalFrame:
 
     def _from_geodetic(self, row: Row) -> tuple[float, float, float]:
         from pymap3d import geodetic2enu  # only needed for latitudes
+
         latitude, longitude = row.number('latitude'), row.number('longitude')
         if abs(latitude) > 90.0 or abs(longitude) > 360.0:
             raise BadRow(f'latitude {latitude:g}, longitude {longitude:g} is no place on Earth')

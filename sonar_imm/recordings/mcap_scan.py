@@ -77,7 +77,7 @@ class McapScan:
                 self._file.seek(start)
                 data = self._file.read(length)
             else:
-                data = self._chunk(self._block[i])[start:start + length]
+                data = self._chunk(self._block[i])[start : start + length]
             yield self._channel[i], self._log[i], data
 
     def close(self) -> None:
@@ -121,7 +121,7 @@ class McapScan:
             if at + length > len(records):
                 return
             if code in (_SCHEMA, _CHANNEL, _MESSAGE):
-                self._take(code, records[at:at + length], position, at)
+                self._take(code, records[at : at + length], position, at)
             at += length
 
     def _read_chunk(self, position: int) -> bytes:
@@ -132,7 +132,7 @@ class McapScan:
         try:
             _, _, size, checksum = _CHUNK_HEAD.unpack_from(content)
             compression, at = _text(content, _CHUNK_HEAD.size)
-            packed = content[at + 8:]
+            packed = content[at + 8 :]
             records = _unpack(packed, compression)
         except (struct.error, UnicodeDecodeError, KeyError, RuntimeError, zstd.ZstdError):
             self._lose(f'has a damaged chunk at byte {position}')
@@ -155,13 +155,13 @@ class McapScan:
                     self._length.append(len(content) - _MESSAGE_HEAD.size)
                     self.counts[channel] += 1
                 return
-            number, = struct.unpack_from('<H', content)
+            (number,) = struct.unpack_from('<H', content)
             if code == _SCHEMA:
                 name, at = _text(content, 2)
                 encoding, at = _text(content, at)
                 self._schemas[number] = (name, _text(content, at)[0], encoding)
             else:
-                schema, = struct.unpack_from('<H', content, 2)
+                (schema,) = struct.unpack_from('<H', content, 2)
                 topic = _text(content, 4)[0]
                 self.channels[number] = Channel(topic, *self._schemas.get(schema, ('', '', '')))
         except (struct.error, UnicodeDecodeError):
@@ -185,7 +185,7 @@ def _unpack(packed: bytes, compression: str) -> bytes:
 
 def _text(content: bytes, at: int) -> tuple[str, int]:
     """Read a length-prefixed text: (text, position after it)."""
-    length, = struct.unpack_from('<I', content, at)
+    (length,) = struct.unpack_from('<I', content, at)
     if at + 4 + length > len(content):
         raise struct.error('text beyond the record')
-    return content[at + 4:at + 4 + length].decode(), at + 4 + length
+    return content[at + 4 : at + 4 + length].decode(), at + 4 + length

@@ -7,14 +7,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from msg_adapters.inputs import INPUTS, InputTopic
-from sonar_imm.measurements import Rejection
-from sonar_imm.parameters import did_you_mean
 
+from ..measurements import Rejection
+from ..parameters import did_you_mean
 from .reader import BagReader
 from .sources import BagError, TopicInfo
 
-DOUBTS = {'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
-          'no_frame': 'have no frame_id'}
+DOUBTS = {
+    'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
+    'no_frame': 'have no frame_id',
+}
 
 
 class Heard(NamedTuple):
@@ -25,8 +27,9 @@ class Heard(NamedTuple):
     log_ns: int
 
 
-def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None = None
-                   ) -> dict[str, InputTopic]:
+def fitting_topics(
+    bag: BagReader, system: str, topics: Mapping[str, str] | None = None
+) -> dict[str, InputTopic]:
     """Say which topics of `bag` feed the tracker `system`: input by topic name.
 
     A topic fits when its type can be read and its last name component is the input's name; topics
@@ -36,22 +39,35 @@ def fitting_topics(bag: BagReader, system: str, topics: Mapping[str, str] | None
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
-    fitting = {topic.name: entry for topic in bag.topics for entry in INPUTS[system]
-               if _can_read(topic, entry) and topic.name.split('/')[-1] == entry.name
-               and 'truth' not in topic.name.split('/')[:-1]}
+    fitting = {
+        topic.name: entry
+        for topic in bag.topics
+        for entry in INPUTS[system]
+        if _can_read(topic, entry)
+        and topic.name.split('/')[-1] == entry.name
+        and 'truth' not in topic.name.split('/')[:-1]
+    }
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
     for entry in INPUTS[system]:
         names = [name for name, its in fitting.items() if its is entry]
         if entry.one_topic and len(names) > 1:
-            raise BagError(f'several topics fit {entry.name}: {", ".join(names)}; say which one '
-                           f'is meant, e.g. --topic {entry.name}={names[0]}')
+            raise BagError(
+                f'several topics fit {entry.name}: {", ".join(names)}; say which one '
+                f'is meant, e.g. --topic {entry.name}={names[0]}'
+            )
     return fitting
 
 
-def measurements_of(bag: BagReader, system: str, topics: Mapping[str, str] | None = None, *,
-                    world_frame: str = 'enu', order: str = 'recorded',
-                    settings: Mapping[str, Any] | None = None) -> Iterator[Heard]:
+def measurements_of(
+    bag: BagReader,
+    system: str,
+    topics: Mapping[str, str] | None = None,
+    *,
+    world_frame: str = 'enu',
+    order: str = 'recorded',
+    settings: Mapping[str, Any] | None = None,
+) -> Iterator[Heard]:
     """Yield what the tracker `system` hears in an open recording, in replay order.
 
     `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
@@ -60,8 +76,11 @@ def measurements_of(bag: BagReader, system: str, topics: Mapping[str, str] | Non
     counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
     """
     chosen = fitting_topics(bag, system, topics)
-    readers = {(name, type_name): entry.reader(type_name, world_frame, settings or {})
-               for name, entry in chosen.items() for type_name in entry.readers}
+    readers = {
+        (name, type_name): entry.reader(type_name, world_frame, settings or {})
+        for name, entry in chosen.items()
+        for type_name in entry.readers
+    }
     doubts: Counter[tuple[str, str]] = Counter()
     for item in bag.messages(list(chosen), order=order):
         entry = chosen[item.topic]
@@ -84,15 +103,19 @@ def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
     """Check one entry of a topic map."""
     entries = {entry.name: entry for entry in INPUTS[system]}
     if wanted not in entries:
-        raise BagError(f"the {system} tracker has no input '{wanted}'"
-                       f'{did_you_mean(wanted, entries)}; it has {", ".join(entries)}')
+        raise BagError(
+            f"the {system} tracker has no input '{wanted}'"
+            f'{did_you_mean(wanted, entries)}; it has {", ".join(entries)}'
+        )
     found = [topic for topic in bag.topics if topic.name == name]
     if not found:
         names = sorted({topic.name for topic in bag.topics})
         raise BagError(f"{bag.path} has no topic '{name}'{did_you_mean(name, names)}")
     if not any(_can_read(topic, entries[wanted]) for topic in found):
-        raise BagError(f'{name} is of type {found[0].type_name}; the input {wanted} takes '
-                       f'{", ".join(entries[wanted].readers)}')
+        raise BagError(
+            f'{name} is of type {found[0].type_name}; the input {wanted} takes '
+            f'{", ".join(entries[wanted].readers)}'
+        )
     return entries[wanted]
 
 
@@ -106,9 +129,14 @@ def _nothing_fits(bag: BagReader, system: str) -> str:
     if not bag.topics:
         return f'{bag.path} is empty: it has no topics'
     there = ', '.join(f'{topic.name} ({topic.type_name})' for topic in bag.topics)
-    maybe = [f'{topic.name} as {entry.name}' for topic in bag.topics for entry in INPUTS[system]
-             if _can_read(topic, entry) and not entry.companion
-             and 'truth' not in topic.name.split('/')]
+    maybe = [
+        f'{topic.name} as {entry.name}'
+        for topic in bag.topics
+        for entry in INPUTS[system]
+        if _can_read(topic, entry) and not entry.companion and 'truth' not in topic.name.split('/')
+    ]
     hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''
-    return (f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
-            f'there are {there}{hint}')
+    return (
+        f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
+        f'there are {there}{hint}'
+    )

@@ -11,12 +11,26 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-_DTYPES = {'bool': np.bool_, 'octet': np.uint8, 'byte': np.uint8, 'char': np.uint8,
-           'int8': np.int8, 'uint8': np.uint8, 'int16': np.int16, 'uint16': np.uint16,
-           'int32': np.int32, 'uint32': np.uint32, 'int64': np.int64, 'uint64': np.uint64,
-           'float32': np.float32, 'float64': np.float64}
-_SCALARS = {name: bool if name == 'bool' else float if name.startswith('float') else int
-            for name in _DTYPES}
+_DTYPES = {
+    'bool': np.bool_,
+    'octet': np.uint8,
+    'byte': np.uint8,
+    'char': np.uint8,
+    'int8': np.int8,
+    'uint8': np.uint8,
+    'int16': np.int16,
+    'uint16': np.uint16,
+    'int32': np.int32,
+    'uint32': np.uint32,
+    'int64': np.int64,
+    'uint64': np.uint64,
+    'float32': np.float32,
+    'float64': np.float64,
+}
+_SCALARS = {
+    name: bool if name == 'bool' else float if name.startswith('float') else int
+    for name in _DTYPES
+}
 
 
 @cache
@@ -35,8 +49,12 @@ def ros_message(type_name: str, /, **fields: Any) -> Any:
     message_class, kinds = _layout(type_name)
     if unknown := fields.keys() - kinds.keys():
         raise TypeError(f'{type_name} has no field {", ".join(sorted(unknown))}')
-    return message_class(*(_cast(kind, fields[name]) if name in fields else _default(kind)
-                           for name, kind in kinds.items()))
+    return message_class(
+        *(
+            _cast(kind, fields[name]) if name in fields else _default(kind)
+            for name, kind in kinds.items()
+        )
+    )
 
 
 @cache
@@ -54,7 +72,7 @@ def decode_cdr(types: Typestore, type_name: str, raw: bytes) -> Any:
     """
     for spare in (0, 4, 8, 12):
         try:
-            return types.deserialize_cdr(raw[:len(raw) - spare], type_name)
+            return types.deserialize_cdr(raw[: len(raw) - spare], type_name)
         except SerdeError as error:
             if 'size mismatch' not in str(error):
                 raise

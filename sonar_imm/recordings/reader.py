@@ -20,8 +20,8 @@ from typing import Any
 from attrs import evolve, frozen
 
 from msg_adapters.headers import stamp_ns
-from sonar_imm.measurements import Rejection
 
+from ..measurements import Rejection
 from .sources import BagError, one_line, open_sources, RawMessage, Source, TopicInfo
 
 __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
@@ -66,9 +66,12 @@ class BagReader:
         except OSError as error:
             raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
         self.topics = _merged(self._sources)
-        problems += [f'topic {topic.name} is of type {topic.type_name or "(none)"}, whose '
-                     'definition is neither in the bag nor known'
-                     for topic in self.topics if not topic.decodable]
+        problems += [
+            f'topic {topic.name} is of type {topic.type_name or "(none)"}, whose '
+            'definition is neither in the bag nor known'
+            for topic in self.topics
+            if not topic.decodable
+        ]
         try:
             for sentence in problems:
                 self.add_problem(sentence)
@@ -90,7 +93,9 @@ class BagReader:
         """Sentences about what is wrong, those about messages counted by topic."""
         return self._sentences + [
             f'topic {topic}: {count} message{"s" if count > 1 else ""} could not be decoded '
-            f'(the first: {reason})' for topic, (count, reason) in self._undecoded.items()]
+            f'(the first: {reason})'
+            for topic, (count, reason) in self._undecoded.items()
+        ]
 
     def add_problem(self, sentence: str) -> None:
         """Note what is wrong; raises `BagError` when strict."""
@@ -101,11 +106,19 @@ class BagReader:
     @property
     def custom_data(self) -> dict[str, str]:
         """Notes of the program that wrote the bag, empty when there are none."""
-        return {key: value for source in self._sources
-                for key, value in getattr(source, 'custom_data', {}).items()}
+        return {
+            key: value
+            for source in self._sources
+            for key, value in getattr(source, 'custom_data', {}).items()
+        }
 
-    def messages(self, topics: Collection[str] | None = None, *, order: str = 'recorded',
-                 decode: bool = True) -> Iterator[BagMessage]:
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        order: str = 'recorded',
+        decode: bool = True,
+    ) -> Iterator[BagMessage]:
         """Yield the messages of `topics` (all when None).
 
         What cannot be decoded is skipped and counted in `problems`. Raises `BagError` for it when
@@ -132,8 +145,9 @@ class BagReader:
                     continue
             yield BagMessage(item.topic, item.type_name, item.log_ns, index, message, item.raw)
 
-    def _guarded(self, source: Source, topics: Collection[str] | None
-                 ) -> Iterator[tuple[Source, RawMessage]]:
+    def _guarded(
+        self, source: Source, topics: Collection[str] | None
+    ) -> Iterator[tuple[Source, RawMessage]]:
         """Read one source up to its end or its first damage."""
         try:
             for item in source.messages(topics):
@@ -141,8 +155,10 @@ class BagReader:
         except GeneratorExit:
             raise
         except Exception as error:  # rosbags raises nearly anything on damaged files
-            self.add_problem(f'{self.path} is damaged: {one_line(error)}; the messages after the '
-                             'damage are lost')
+            self.add_problem(
+                f'{self.path} is damaged: {one_line(error)}; the messages after the '
+                'damage are lost'
+            )
 
     def _cannot_decode(self, item: RawMessage, index: int, error: Exception) -> None:
         reason = f'message {index}, {one_line(error)}'
@@ -159,9 +175,15 @@ def _merged(sources: list[Source]) -> list[TopicInfo]:
         for topic in source.topics():
             key = (topic.name, topic.type_name)
             known = joined.get(key)
-            joined[key] = topic if known is None else evolve(
-                known, count=known.count + topic.count,
-                decodable=known.decodable and topic.decodable)
+            joined[key] = (
+                topic
+                if known is None
+                else evolve(
+                    known,
+                    count=known.count + topic.count,
+                    decodable=known.decodable and topic.decodable,
+                )
+            )
     return [joined[key] for key in sorted(joined)]
 
 

@@ -82,8 +82,9 @@ class RosbagsSource:
         self._reader = AnyReader([place], default_typestore=typestore())
         self._reader.open()
         # rosbags ignores its default types as soon as the bag defines a single one
-        _add_known_types(self._reader.typestore, [link.msgtype for link in
-                                                  self._reader.connections])
+        _add_known_types(
+            self._reader.typestore, [link.msgtype for link in self._reader.connections]
+        )
 
     @property
     def custom_data(self) -> dict[str, str]:
@@ -96,18 +97,27 @@ class RosbagsSource:
         """True for MCAP without chunks: rosbags refuses it when log times are not sorted."""
         storage = getattr(self._reader.readers[0], 'storage', None)
         files = getattr(storage, 'storages', [storage])
-        return any(hasattr(file, 'chunks') and not file.chunks and file.metadata.message_count
-                   for file in files)
+        return any(
+            hasattr(file, 'chunks') and not file.chunks and file.metadata.message_count
+            for file in files
+        )
 
     def topics(self) -> list[TopicInfo]:
-        return [TopicInfo(link.topic, link.msgtype, link.msgcount,
-                          link.msgtype in self._reader.typestore.fielddefs,
-                          tuple(getattr(link.ext, 'offered_qos_profiles', ())))
-                for link in self._reader.connections]
+        return [
+            TopicInfo(
+                link.topic,
+                link.msgtype,
+                link.msgcount,
+                link.msgtype in self._reader.typestore.fielddefs,
+                tuple(getattr(link.ext, 'offered_qos_profiles', ())),
+            )
+            for link in self._reader.connections
+        ]
 
     def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
-        chosen = [link for link in self._reader.connections
-                  if topics is None or link.topic in topics]
+        chosen = [
+            link for link in self._reader.connections if topics is None or link.topic in topics
+        ]
         if chosen:
             for link, log_ns, raw in self._reader.messages(connections=chosen):
                 yield RawMessage(link.topic, link.msgtype, log_ns, _unpacked(raw))
@@ -133,17 +143,27 @@ class ScanSource:
                 self._types.register(get_types_from_idl(channel.definition))
             elif channel.definition:
                 self._types.register(get_types_from_msg(channel.definition, channel.type_name))
-        _add_known_types(self._types, [channel.type_name
-                                       for channel in self._scan.channels.values()])
+        _add_known_types(
+            self._types, [channel.type_name for channel in self._scan.channels.values()]
+        )
 
     def topics(self) -> list[TopicInfo]:
-        return [TopicInfo(channel.topic, channel.type_name, self._scan.counts[number],
-                          channel.type_name in self._types.fielddefs)
-                for number, channel in self._scan.channels.items()]
+        return [
+            TopicInfo(
+                channel.topic,
+                channel.type_name,
+                self._scan.counts[number],
+                channel.type_name in self._types.fielddefs,
+            )
+            for number, channel in self._scan.channels.items()
+        ]
 
     def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
-        chosen = {number: channel for number, channel in self._scan.channels.items()
-                  if topics is None or channel.topic in topics}
+        chosen = {
+            number: channel
+            for number, channel in self._scan.channels.items()
+            if topics is None or channel.topic in topics
+        }
         for number, log_ns, raw in self._scan.messages(chosen):
             yield RawMessage(chosen[number].topic, chosen[number].type_name, log_ns, raw)
 
@@ -166,8 +186,10 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
         if path.name == 'metadata.yaml':
             return open_sources(path.parent)
         if path.suffix not in SUFFIXES:
-            raise BagError(f'{path} is no recording: the file names of recordings end in '
-                           f'{", ".join(SUFFIXES)}{_packed_hint([path])}')
+            raise BagError(
+                f'{path} is no recording: the file names of recordings end in '
+                f'{", ".join(SUFFIXES)}{_packed_hint([path])}'
+            )
         return _open_files([path], [])
     return _open_directory(path)
 
@@ -179,17 +201,22 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
         try:
             source = RosbagsSource(path)
         except Exception as error:  # see the module docstring
-            problems.append(f'{path}: the bag as a whole cannot be read ({one_line(error)}), '
-                            'its files are read one by one')
+            problems.append(
+                f'{path}: the bag as a whole cannot be read ({one_line(error)}), '
+                'its files are read one by one'
+            )
         else:
             if not source.unordered:
                 return [source], _leftovers(path)
             source.close()
     files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
     if not files:
-        raise BagError(problems[0] if problems else
-                       f'{path} is no recording: it holds neither metadata.yaml nor a file that '
-                       f'ends in {", ".join(SUFFIXES)}{_packed_hint(path.iterdir())}')
+        raise BagError(
+            problems[0]
+            if problems
+            else f'{path} is no recording: it holds neither metadata.yaml nor a file that '
+            f'ends in {", ".join(SUFFIXES)}{_packed_hint(path.iterdir())}'
+        )
     if not problems and not (path / 'metadata.yaml').exists():
         problems.append(f'{path} has no metadata.yaml, its files are read one by one')
     return _open_files(files, problems)
@@ -238,9 +265,13 @@ def _unpacked(raw: bytes) -> bytes:
 def _leftovers(path: Path) -> list[str]:
     """Sentences about write-ahead logs that a crashed recorder left: SQLite rows nobody reads."""
     logs = path.glob('*.db3-wal') if path.is_dir() else [path.with_name(path.name + '-wal')]
-    return [f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
-            f"the messages in it are not read (sqlite3 {log.name[:-4]} 'pragma wal_checkpoint' "
-            'merges them)' for log in logs if log.exists() and log.stat().st_size]
+    return [
+        f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
+        f"the messages in it are not read (sqlite3 {log.name[:-4]} 'pragma wal_checkpoint' "
+        'merges them)'
+        for log in logs
+        if log.exists() and log.stat().st_size
+    ]
 
 
 def _advice(file: Path) -> str:

@@ -24,8 +24,17 @@ __all__ = ['BagWriter', 'ros_message', 'STORAGES']
 
 STORAGES = ('mcap', 'sqlite3')
 
-_RELIABLE = Qos(QosHistory.KEEP_LAST, 10, QosReliability.RELIABLE, QosDurability.VOLATILE,
-                QosTime(0, 0), QosTime(0, 0), QosLiveliness.SYSTEM_DEFAULT, QosTime(0, 0), False)
+_RELIABLE = Qos(
+    QosHistory.KEEP_LAST,
+    10,
+    QosReliability.RELIABLE,
+    QosDurability.VOLATILE,
+    QosTime(0, 0),
+    QosTime(0, 0),
+    QosLiveliness.SYSTEM_DEFAULT,
+    QosTime(0, 0),
+    False,
+)
 
 
 class BagWriter:
@@ -36,16 +45,22 @@ class BagWriter:
     Raises `BagError` when the bag cannot be made.
     """
 
-    def __init__(self, path: str | Path, *, storage: str = 'mcap',
-                 custom_data: Mapping[str, str] | None = None):
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        storage: str = 'mcap',
+        custom_data: Mapping[str, str] | None = None,
+    ):
         if storage not in STORAGES:
             raise ValueError(f"storage must be one of {', '.join(STORAGES)}, got '{storage}'")
         self.path = Path(path)
         self.count = 0
         self._links: dict[tuple[str, str], Connection] = {}
         try:
-            self._writer = Writer(self.path, version=8,
-                                  storage_plugin=StoragePlugin[storage.upper()])
+            self._writer = Writer(
+                self.path, version=8, storage_plugin=StoragePlugin[storage.upper()]
+            )
             for key, note in sorted((custom_data or {}).items()):
                 self._writer.set_custom_data(key, str(note))
             self._writer.open()
@@ -75,8 +90,9 @@ class BagWriter:
             raise ValueError(f'a recording cannot hold the log time {log_ns} ns')
         link = self._links.get((topic, type_name))
         if link is None:
-            link = self._writer.add_connection(topic, type_name, typestore=typestore(),
-                                               offered_qos_profiles=[_RELIABLE])
+            link = self._writer.add_connection(
+                topic, type_name, typestore=typestore(), offered_qos_profiles=[_RELIABLE]
+            )
             self._links[topic, type_name] = link
         self._writer.write(link, log_ns, raw)
         self.count += 1

@@ -1,4 +1,4 @@
-"""The trackers: one file a system. `SYSTEMS` says what exists; importing it does not load a
+"""The trackers: one folder per system. `SYSTEMS` says what exists; importing it does not load a
 tracker."""
 
 from __future__ import annotations
@@ -86,29 +86,29 @@ class System:
 SYSTEMS = {
     'bathymetry': System(
         'bathymetry',
-        'sonar_imm.trackers.bathymetry',
+        'sonar_imm.trackers.bathymetry.tracker',
         'BathymetryConfig',
         'BathymetryTracker',
         'sea floor from side-scan array snapshots, IMM particle filter along each ping',
     ),
     'diver': System(
         'diver',
-        'sonar_imm.trackers.diver',
+        'sonar_imm.trackers.diver.tracker',
         'DiverConfig',
         'DiverTracker',
         'divers from multistatic fixes or raw arrival times, 16-direction IMM',
-        smoother='sonar_imm.trackers.diver_smoothing.SmoothingDiverTracker',
+        smoother='sonar_imm.trackers.diver.smoothing.SmoothingDiverTracker',
     ),
     'fathometer': System(
         'fathometer',
-        'sonar_imm.trackers.fathometer',
+        'sonar_imm.trackers.fathometer.tracker',
         'FathometerConfig',
         'FathometerTracker',
         'sub-bottom reflectors from array noise or traces, multiple-model particle filter',
     ),
     'obstacle': System(
         'obstacle',
-        'sonar_imm.trackers.obstacle',
+        'sonar_imm.trackers.obstacle.tracker',
         'ObstacleConfig',
         'ObstacleTracker',
         'obstacles ahead of a vehicle with their height, from a forward-looking sonar and '

@@ -8,8 +8,15 @@ from sonar_imm.acoustics import multistatic
 from sonar_imm.acoustics.arrival_fit import ArrivalFit, minimise
 
 Z = -6.0
-RX = np.array([[80.0, 5.0, -2.0], [-30.0, 70.0, -3.0], [60.0, 90.0, -1.0], [-70.0, -20.0, -4.0],
-               [10.0, -60.0, -2.0]])
+RX = np.array(
+    [
+        [80.0, 5.0, -2.0],
+        [-30.0, 70.0, -3.0],
+        [60.0, 90.0, -1.0],
+        [-70.0, -20.0, -4.0],
+        [10.0, -60.0, -2.0],
+    ]
+)
 TRUTH = np.array([22.0, 31.0])
 
 
@@ -17,12 +24,19 @@ def problem(active, offset=0.0, bearings=2):
     active = np.array(active)
     tx = np.where(active[:, None], [5.0, -12.0, -3.0], RX)
     path = multistatic.pseudo_range(TRUTH, RX, Z, 0.0) + np.where(
-        active, multistatic.pseudo_range(TRUTH, tx, Z), offset)
+        active, multistatic.pseudo_range(TRUTH, tx, Z), offset
+    )
     seen = multistatic.bearing(TRUTH, RX[:bearings])
-    return ArrivalFit(tx=tx, rx=RX, active=active, bearing_rx=RX[:bearings],
-                      observed=np.concatenate([path, seen]),
-                      weight=np.linspace(1.0, 3.0, len(RX) + bearings), target_z=Z,
-                      max_range=1000.0)
+    return ArrivalFit(
+        tx=tx,
+        rx=RX,
+        active=active,
+        bearing_rx=RX[:bearings],
+        observed=np.concatenate([path, seen]),
+        weight=np.linspace(1.0, 3.0, len(RX) + bearings),
+        target_z=Z,
+        max_range=1000.0,
+    )
 
 
 KINDS = {'active': [True] * 5, 'passive': [False] * 5, 'mixed': [True, False, True, False, False]}
@@ -41,8 +55,10 @@ def test_jacobian_equals_finite_differences_also_with_rows_left_out(kind):
     weight = fit.weight * [1, 1, 0, 1, 1, 0, 1]
     at, h = np.array([[10.0, -15.0]]), 1e-5
     _, jacobian = fit.residuals(at, weight)
-    numeric = [(fit.residuals(at - h * e, weight)[0] - fit.residuals(at + h * e, weight)[0])
-               / (2 * h) for e in np.eye(2)]
+    numeric = [
+        (fit.residuals(at - h * e, weight)[0] - fit.residuals(at + h * e, weight)[0]) / (2 * h)
+        for e in np.eye(2)
+    ]
     assert_allclose(jacobian[0], np.stack(numeric, axis=-1)[0], atol=1e-6)
 
 
@@ -87,9 +103,16 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
     rx = np.column_stack([rng.uniform(-100, 100, (n, 2)), rng.uniform(-9, -1, n)])
     truth = rng.uniform(-150, 150, 2)
     noise = sigma * np.random.default_rng(seed).standard_normal(n)
-    fit = ArrivalFit(tx=rx, rx=rx, active=np.zeros(n, bool), bearing_rx=np.empty((0, 3)),
-                     observed=multistatic.pseudo_range(truth, rx, -5.0) + noise,
-                     weight=np.full(n, 0.15**-2), target_z=-5.0, max_range=1e4)
+    fit = ArrivalFit(
+        tx=rx,
+        rx=rx,
+        active=np.zeros(n, bool),
+        bearing_rx=np.empty((0, 3)),
+        observed=multistatic.pseudo_range(truth, rx, -5.0) + noise,
+        weight=np.full(n, 0.15**-2),
+        target_z=-5.0,
+        max_range=1e4,
+    )
     found = minimise(fit, fit.starts(fit.weight), fit.weight).distinct()
     begun = minimise(fit, truth[None], fit.weight)
     assert found.cost[0] <= 1.001 * begun.cost[0] + 1e-3

@@ -36,9 +36,17 @@ def test_echoes_are_found_once_each_and_strongest_first():
     assert cfar_peaks(image, false_alarm=1e-8).tolist() == [[120, 50], [5, 30], [40, 10]]
 
 
-@pytest.mark.parametrize('image', [np.zeros((50, 5)), np.full((50, 5), 7.0), np.empty((0, 5)),
-                                   np.full((50, 5), np.nan), np.full((50, 5), np.inf),
-                                   np.ones((1, 1))])
+@pytest.mark.parametrize(
+    'image',
+    [
+        np.zeros((50, 5)),
+        np.full((50, 5), 7.0),
+        np.empty((0, 5)),
+        np.full((50, 5), np.nan),
+        np.full((50, 5), np.inf),
+        np.ones((1, 1)),
+    ],
+)
 def test_nothing_is_found_where_nothing_is(image):
     assert cfar_peaks(image).shape == (0, 2)
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics import array, interference, laplace, law_kernels
+from sonar_imm.acoustics import array, interference, laplace, likelihood_kernels
 
 STAVES, SPACING = 8, 0.5
 STEP = array.phase_step(SPACING)
@@ -34,14 +34,14 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, law):
     u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
     out = np.empty(len(u))
     for n in range(3):
-        law_kernels.log_likelihoods(
+        likelihood_kernels.log_likelihoods(
             u,
             SPACING,
             -signal * form.beam[n],
             form.base[n],
             form.spread[n],
             signal,
-            law_kernels.law_table(STAVES, law),
+            likelihood_kernels.law_table(STAVES, law),
             np.empty((4, len(u))),
             out,
         )

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import kve
 
-from sonar_imm.acoustics import array, laplace, law_kernels
+from sonar_imm.acoustics import array, laplace, likelihood_kernels
 
 STEP = array.phase_step(0.5)
 
@@ -108,7 +108,9 @@ def test_the_form_is_that_of_the_covariance(staves):
 def test_the_table_is_the_law(staves, law):
     q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
     out = np.empty(len(q))
-    law_kernels.log_densities(q.copy(), np.empty(len(q)), law_kernels.law_table(staves, law), out)
+    likelihood_kernels.log_densities(
+        q.copy(), np.empty(len(q)), likelihood_kernels.law_table(staves, law), out
+    )
     if law == 'gaussian':
         assert np.allclose(out, -q, rtol=1e-12)
         return
@@ -120,13 +122,13 @@ def test_the_table_is_the_law(staves, law):
 
 
 def test_what_the_table_does_not_reach_is_held_at_its_end():
-    table, out = law_kernels.law_table(8), np.empty(5)
+    table, out = likelihood_kernels.law_table(8), np.empty(5)
     q = np.array([0.0, -1.0, 1e-30, np.nan, 1e300])
-    law_kernels.log_densities(q.copy(), np.empty(5), table, out)
+    likelihood_kernels.log_densities(q.copy(), np.empty(5), table, out)
     assert (out[:4] == out[0]).all() and np.isfinite(out).all() and out[4] < -1e7
     for staves, law in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
         with pytest.raises(ValueError):
-            law_kernels.law_table(staves, law)
+            likelihood_kernels.law_table(staves, law)
     assert not table.flags.writeable
 
 
@@ -137,14 +139,14 @@ def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, law):
     u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
     y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
     out = np.empty(len(u))
-    law_kernels.log_likelihoods(
+    likelihood_kernels.log_likelihoods(
         u,
         spacing,
         laplace.form_coefficients(y, signal, noise),
         0.0,
         np.empty(0, complex),
         0.0,
-        law_kernels.law_table(staves, law),
+        likelihood_kernels.law_table(staves, law),
         np.empty((4, len(u))),
         out,
     )

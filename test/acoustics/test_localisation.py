@@ -12,8 +12,18 @@ from sonar_imm.acoustics.localisation import Limits, Localisation, localise, Ref
 
 SOUND_SPEED, Z, SIGMA = 1500.0, -5.0, 1e-4
 TX = np.array([5.0, -10.0, -2.0])
-RX = np.array([[100.0, 10.0, -2.0], [-20.0, 90.0, -3.0], [70.0, 95.0, -1.0], [-60.0, 20.0, -3.0],
-               [20.0, -70.0, -2.0], [110.0, 60.0, -4.0], [-70.0, 80.0, -1.0], [40.0, 40.0, -2.0]])
+RX = np.array(
+    [
+        [100.0, 10.0, -2.0],
+        [-20.0, 90.0, -3.0],
+        [70.0, 95.0, -1.0],
+        [-60.0, 20.0, -3.0],
+        [20.0, -70.0, -2.0],
+        [110.0, 60.0, -4.0],
+        [-70.0, 80.0, -1.0],
+        [40.0, 40.0, -2.0],
+    ]
+)
 TRUTH = np.array([31.0, 42.0])
 
 
@@ -22,16 +32,29 @@ def active(n, truth=TRUTH, tx=TX, rx=RX, sigma=0.0, seed=0, **more):
     transmitters = np.tile(tx, (n, 1))
     noise = sigma * np.random.default_rng(seed).standard_normal(n)
     toa = multistatic.range_sum(truth, transmitters, rx[:n], Z) / SOUND_SPEED + noise
-    return dict(rx=rx[:n], toa=toa, var_toa=np.full(n, SIGMA**2), tx=transmitters, target_z=Z,
-                sound_speed=SOUND_SPEED, **more)
+    return dict(
+        rx=rx[:n],
+        toa=toa,
+        var_toa=np.full(n, SIGMA**2),
+        tx=transmitters,
+        target_z=Z,
+        sound_speed=SOUND_SPEED,
+        **more,
+    )
 
 
 def passive(n, truth=TRUTH, rx=RX, sigma=0.0, seed=0, emission=1e9, **more):
     """Arguments of `localise` for n receivers of a tag that emits at an unknown time."""
     noise = sigma * np.random.default_rng(seed).standard_normal(n)
     toa = multistatic.pseudo_range(truth, rx[:n], Z) / SOUND_SPEED + noise + emission
-    return dict(rx=rx[:n], toa=toa, var_toa=np.full(n, SIGMA**2), target_z=Z,
-                sound_speed=SOUND_SPEED, **more)
+    return dict(
+        rx=rx[:n],
+        toa=toa,
+        var_toa=np.full(n, SIGMA**2),
+        target_z=Z,
+        sound_speed=SOUND_SPEED,
+        **more,
+    )
 
 
 def distance2(fix, truth):
@@ -53,20 +76,32 @@ def test_errors_are_what_the_covariance_and_the_bound_say(kind):
             scene = active(n, sigma=SIGMA, seed=seed)
         if kind == 'bearings':
             noise = sigma_bearing * np.random.default_rng(10_000 + seed).standard_normal(n)
-            scene.update(bearing=multistatic.bearing(TRUTH, RX[:n]) + noise,
-                         var_bearing=np.full(n, sigma_bearing**2))
+            scene.update(
+                bearing=multistatic.bearing(TRUTH, RX[:n]) + noise,
+                var_bearing=np.full(n, sigma_bearing**2),
+            )
         fix = localise(**scene, limits=Limits(min_p_value=1e-9))
         assert isinstance(fix, Localisation) and not fix.ambiguous and fix.used.all()
         fixes.append(fix)
         gaps.append(fix.position - TRUTH)
-    bound = multistatic.crlb(TRUTH, None if kind == 'passive' else np.tile(TX, (n, 1)), RX[:n],
-                             np.full(n, SIGMA**2), target_z=Z, sound_speed=SOUND_SPEED,
-                             var_bearing=sigma_bearing**2 if kind == 'bearings' else None)
+    bound = multistatic.crlb(
+        TRUTH,
+        None if kind == 'passive' else np.tile(TX, (n, 1)),
+        RX[:n],
+        np.full(n, SIGMA**2),
+        target_z=Z,
+        sound_speed=SOUND_SPEED,
+        var_bearing=sigma_bearing**2 if kind == 'bearings' else None,
+    )
     low, high = chi2.ppf([0.025, 0.975], 2 * runs) / runs
     assert low < np.mean([distance2(fix, TRUTH) for fix in fixes]) < high
     assert low < np.mean([gap @ np.linalg.solve(bound, gap) for gap in gaps]) < high
-    assert_allclose(np.mean([fix.covariance for fix in fixes], axis=0), bound, rtol=0.02,
-                    atol=1e-3 * np.trace(bound))
+    assert_allclose(
+        np.mean([fix.covariance for fix in fixes], axis=0),
+        bound,
+        rtol=0.02,
+        atol=1e-3 * np.trace(bound),
+    )
     assert kstest([fix.p_value for fix in fixes], 'uniform').pvalue > 0.01
     dof = {'active': 4, 'passive': 3, 'bearings': 10}[kind]
     assert {fix.dof for fix in fixes} == {dof}
@@ -85,6 +120,7 @@ def test_emission_time_of_a_tag():
 
 def test_passive_fix_minimises_the_augmented_sum_of_squares():
     from scipy.optimize import least_squares
+
     scene = passive(5, sigma=SIGMA, seed=3, emission=2.0)
 
     def residuals(x):
@@ -102,8 +138,13 @@ def test_passive_fix_minimises_the_augmented_sum_of_squares():
 
 
 @settings(max_examples=40, derandomize=True, deadline=None)
-@given(angle=st.floats(-4.0, 4.0), east=st.floats(-1e4, 1e4), north=st.floats(-1e4, 1e4),
-       order=st.permutations(range(5)), tag=st.booleans())
+@given(
+    angle=st.floats(-4.0, 4.0),
+    east=st.floats(-1e4, 1e4),
+    north=st.floats(-1e4, 1e4),
+    order=st.permutations(range(5)),
+    tag=st.booleans(),
+)
 def test_fix_turns_and_moves_with_the_scene(angle, east, north, order, tag):
     more = dict(sigma=SIGMA, seed=8)
     scene = passive(5, emission=4.0, **more) if tag else active(5, **more)
@@ -125,9 +166,14 @@ def test_two_transmitters_and_a_mixture_of_active_and_passive_rows():
     fix = localise(RX[:4], toa, np.full(4, SIGMA**2), tx=tx, target_z=Z)
     assert_allclose(fix.position, TRUTH, atol=1e-3)
     tag = passive(4, emission=0.3)
-    rx, toa, tx = (np.concatenate(pair) for pair in (
-        (RX[:2], RX[2:6]), (toa[:2], multistatic.pseudo_range(TRUTH, RX[2:6], Z) / 1500.0 + 0.3),
-        (tx[:2], np.full((4, 3), np.nan))))
+    rx, toa, tx = (
+        np.concatenate(pair)
+        for pair in (
+            (RX[:2], RX[2:6]),
+            (toa[:2], multistatic.pseudo_range(TRUTH, RX[2:6], Z) / 1500.0 + 0.3),
+            (tx[:2], np.full((4, 3), np.nan)),
+        )
+    )
     fix = localise(rx, toa, np.full(6, SIGMA**2), tx=tx, target_z=tag['target_z'])
     assert_allclose(fix.position, TRUTH, atol=1e-3)
     assert fix.dof == 3 and fix.emission_time == pytest.approx(0.3, abs=1e-6)
@@ -225,8 +271,9 @@ def test_receivers_in_a_line_leave_left_and_right_open():
 def test_target_between_transmitter_and_receivers_in_line_is_refused():
     rx = np.array([[100.0, 0.0, Z], [140.0, 0.0, Z], [170.0, 0.0, Z]])
     for seed in range(50):
-        scene = active(3, np.array([40.0, 0.0]), tx=np.array([0.0, 0.0, Z]), rx=rx, sigma=SIGMA,
-                       seed=seed)
+        scene = active(
+            3, np.array([40.0, 0.0]), tx=np.array([0.0, 0.0, Z]), rx=rx, sigma=SIGMA, seed=seed
+        )
         refusal = localise(**scene)
         assert isinstance(refusal, Refusal)
         assert refusal.reason in ('singular_geometry', 'diverged')
@@ -262,9 +309,17 @@ def test_limits():
 # -- reflections ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('make, n, late', [
-    (active, 4, [2]), (active, 6, [0]), (active, 8, [1, 4]), (active, 8, [0, 2, 5]),
-    (passive, 6, [3]), (passive, 8, [0, 6])])
+@pytest.mark.parametrize(
+    'make, n, late',
+    [
+        (active, 4, [2]),
+        (active, 6, [0]),
+        (active, 8, [1, 4]),
+        (active, 8, [0, 2, 5]),
+        (passive, 6, [3]),
+        (passive, 8, [0, 6]),
+    ],
+)
 def test_late_reflections_are_left_out(make, n, late):
     for seed in range(8):
         scene = make(n, sigma=SIGMA, seed=seed)
@@ -331,8 +386,12 @@ def test_too_few(scene):
 
 def test_rows_that_are_not_measured_are_not_used():
     scene = active(6, sigma=SIGMA, seed=4)
-    good = localise(**{name: value[:4] if name in ('rx', 'tx', 'toa', 'var_toa') else value
-                       for name, value in scene.items()})
+    good = localise(
+        **{
+            name: value[:4] if name in ('rx', 'tx', 'toa', 'var_toa') else value
+            for name, value in scene.items()
+        }
+    )
     scene['toa'][4], scene['var_toa'][5] = np.nan, 0.0
     fix = localise(**scene)
     assert_array_equal(fix.used, [True] * 4 + [False] * 2)
@@ -348,32 +407,60 @@ def test_a_transmitter_at_infinity_is_not_used(place):
     assert fix.emission_time is None and distance2(fix, TRUTH) < 25.0
 
 
-@pytest.mark.parametrize('change', [
-    {'toa': np.zeros(3)}, {'tx': np.zeros((3, 3))}, {'rx': np.zeros((4, 2))},
-    {'bearing': np.zeros(5)}, {'rx': np.full((4, 3), np.nan)}, {'var_toa': 1e-8}])
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'toa': np.zeros(3)},
+        {'tx': np.zeros((3, 3))},
+        {'rx': np.zeros((4, 2))},
+        {'bearing': np.zeros(5)},
+        {'rx': np.full((4, 3), np.nan)},
+        {'var_toa': 1e-8},
+    ],
+)
 def test_arrays_that_do_not_fit_raise(change):
     with pytest.raises(ValueError, match='receiver|every arrival'):
         localise(**{**active(4), **change})
 
 
-ANY = st.one_of(st.floats(), st.sampled_from([0.0, 1e-320, 1e308, -1e308, 1e-9, 0.05, np.nan]),
-                st.floats(0.0, 0.2))
+ANY = st.one_of(
+    st.floats(),
+    st.sampled_from([0.0, 1e-320, 1e308, -1e308, 1e-9, 0.05, np.nan]),
+    st.floats(0.0, 0.2),
+)
 
 
 @settings(max_examples=150, derandomize=True, deadline=None)
-@given(st.integers(0, 6).flatmap(lambda n: st.tuples(
-    *(st.lists(ANY, min_size=n, max_size=n) for _ in range(4)),
-    st.lists(st.floats(-1e8, 1e8), min_size=6 * n, max_size=6 * n), st.booleans())))
+@given(
+    st.integers(0, 6).flatmap(
+        lambda n: st.tuples(
+            *(st.lists(ANY, min_size=n, max_size=n) for _ in range(4)),
+            st.lists(st.floats(-1e8, 1e8), min_size=6 * n, max_size=6 * n),
+            st.booleans(),
+        )
+    )
+)
 def test_no_input_raises_or_gives_nan(data):
     toa, var_toa, bearing, var_bearing, places, tag = data
     n = len(toa)
     places = np.reshape(places, (2, n, 3))
     places[1, :1] *= 1e300
-    result = localise(places[0], toa, var_toa, tx=None if tag else places[1], bearing=bearing,
-                      var_bearing=var_bearing)
+    result = localise(
+        places[0],
+        toa,
+        var_toa,
+        tx=None if tag else places[1],
+        bearing=bearing,
+        var_bearing=var_bearing,
+    )
     if isinstance(result, Refusal):
-        assert result.reason in ('too_few', 'singular_geometry', 'poor_fit', 'diverged',
-                                 'out_of_range')
+        assert result.reason in (
+            'too_few',
+            'singular_geometry',
+            'poor_fit',
+            'diverged',
+            'out_of_range',
+        )
     else:
         assert np.isfinite(result.position).all() and np.isfinite(result.cost)
         assert np.linalg.eigvalsh(result.covariance)[0] > 0.0

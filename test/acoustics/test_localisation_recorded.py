@@ -17,8 +17,10 @@ ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data')) / 'yaps_ssu1'
 SIGMA_TOA, SOUND_SPEED, TAG_Z = 0.9e-3, 1545.0, -1.0
 
-pytestmark = pytest.mark.skipif(not (DATA / 'arrivals.csv').exists(), reason=(
-    'the recording yaps_ssu1 is not here: set SONAR_IMM_DATA to the folder that holds it'))
+pytestmark = pytest.mark.skipif(
+    not (DATA / 'arrivals.csv').exists(),
+    reason=('the recording yaps_ssu1 is not here: set SONAR_IMM_DATA to the folder that holds it'),
+)
 
 
 def table(name):
@@ -29,9 +31,16 @@ def table(name):
 def results():
     arrivals, receivers = table('arrivals.csv'), table('receivers.csv')
     places = np.column_stack([receivers[:, 1:3], -receivers[:, 3]])
-    return [localise(places[rows[:, 1].astype(int)], rows[:, 2],
-                     np.full(len(rows), SIGMA_TOA**2), target_z=TAG_Z, sound_speed=SOUND_SPEED)
-            for rows in (arrivals[arrivals[:, 0] == ping] for ping in np.unique(arrivals[:, 0]))]
+    return [
+        localise(
+            places[rows[:, 1].astype(int)],
+            rows[:, 2],
+            np.full(len(rows), SIGMA_TOA**2),
+            target_z=TAG_Z,
+            sound_speed=SOUND_SPEED,
+        )
+        for rows in (arrivals[arrivals[:, 0] == ping] for ping in np.unique(arrivals[:, 0]))
+    ]
 
 
 @pytest.fixture(scope='module')
@@ -68,7 +77,7 @@ def test_error_against_gps_is_as_small_as_that_of_the_reference_fixes(fixes):
     assert np.median(ours) < 1.02 * np.median(theirs)
     assert np.sqrt(np.mean(ours**2)) < 1.02 * np.sqrt(np.mean(theirs**2))
     # The tag follows the GPS receiver some seconds later.
-    assert np.sqrt(np.mean(gps_errors(stamps, positions, lag=3.4)**2)) < 3.0
+    assert np.sqrt(np.mean(gps_errors(stamps, positions, lag=3.4) ** 2)) < 3.0
 
 
 def test_fixes_agree_with_the_reference_fixes(fixes):

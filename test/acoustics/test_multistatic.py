@@ -16,8 +16,13 @@ quick = settings(max_examples=60, derandomize=True, deadline=None)
 
 def slope(function, position, step=1e-4):
     """Central differences (n, 2) of function(position) -> (n,)."""
-    return np.stack([(function(position + step * e) - function(position - step * e)) / (2 * step)
-                     for e in np.eye(2)], axis=-1)
+    return np.stack(
+        [
+            (function(position + step * e) - function(position - step * e)) / (2 * step)
+            for e in np.eye(2)
+        ],
+        axis=-1,
+    )
 
 
 def turned(points, angle, shift):
@@ -41,15 +46,23 @@ def test_jacobians_equal_finite_differences(position, tx, rx, z):
     away = [np.hypot(*(position - point[:2])) for point in (tx, rx)]
     assume(min(away) > 0.5)
     tx, rx = tx[None], rx[None]
-    assert_allclose(multistatic.range_sum_jacobian(position, tx, rx, z),
-                    slope(lambda p: multistatic.range_sum(p, tx, rx, z), position), atol=1e-6)
-    assert_allclose(multistatic.pseudo_range_jacobian(position, rx, z),
-                    slope(lambda p: multistatic.pseudo_range(p, rx, z, 7.0), position), atol=1e-6)
+    assert_allclose(
+        multistatic.range_sum_jacobian(position, tx, rx, z),
+        slope(lambda p: multistatic.range_sum(p, tx, rx, z), position),
+        atol=1e-6,
+    )
+    assert_allclose(
+        multistatic.pseudo_range_jacobian(position, rx, z),
+        slope(lambda p: multistatic.pseudo_range(p, rx, z, 7.0), position),
+        atol=1e-6,
+    )
     around = multistatic.bearing(position, rx)
     assert_allclose(
         multistatic.bearing_jacobian(position, rx),
         slope(lambda p: multistatic.wrap_angle(multistatic.bearing(p, rx) - around), position),
-        rtol=1e-6, atol=1e-7)
+        rtol=1e-6,
+        atol=1e-7,
+    )
 
 
 @quick
@@ -58,13 +71,18 @@ def test_models_turn_and_move_with_the_scene(position, tx, rx, angle, shift):
     assume(np.hypot(*(position - rx[:2])) > 0.1)
     tx, rx = tx[None], rx[None]
     moved = [turned(each, angle, shift) for each in (position, tx, rx)]
-    assert_allclose(multistatic.range_sum(*moved, -5.0),
-                    multistatic.range_sum(position, tx, rx, -5.0), rtol=1e-9)
+    assert_allclose(
+        multistatic.range_sum(*moved, -5.0),
+        multistatic.range_sum(position, tx, rx, -5.0),
+        rtol=1e-9,
+    )
     gain = multistatic.bearing(moved[0], moved[2]) - multistatic.bearing(position, rx)
     assert_allclose(multistatic.wrap_angle(gain - angle), 0.0, atol=1e-9)
-    assert_allclose(multistatic.range_sum_jacobian(*moved, -5.0),
-                    turned(multistatic.range_sum_jacobian(position, tx, rx, -5.0), angle, 0.0),
-                    atol=1e-6)
+    assert_allclose(
+        multistatic.range_sum_jacobian(*moved, -5.0),
+        turned(multistatic.range_sum_jacobian(position, tx, rx, -5.0), angle, 0.0),
+        atol=1e-6,
+    )
 
 
 def test_hand_worked_values():
@@ -75,33 +93,44 @@ def test_hand_worked_values():
     assert_allclose(multistatic.bearing(position, rx), [-np.pi / 2])
     assert_allclose(multistatic.bearing_jacobian(position, rx), [[0.25, 0.0]])
     assert_allclose(multistatic.range_sum(position, tx, rx, 4.0), [5.0 + np.sqrt(32.0)])
-    assert_allclose(multistatic.wrap_angle([3.5 * np.pi, -0.1, np.pi + 1e-3]),
-                    [-0.5 * np.pi, -0.1, -np.pi + 1e-3])
+    assert_allclose(
+        multistatic.wrap_angle([3.5 * np.pi, -0.1, np.pi + 1e-3]),
+        [-0.5 * np.pi, -0.1, -np.pi + 1e-3],
+    )
 
 
 def test_leading_axes():
     tx, rx, _, _ = scene(5, seed=1)
     position = np.random.default_rng(2).uniform(-50, 50, (4, 3, 2))
-    for value, shape in ((multistatic.range_sum(position, tx, rx, -3.0), (4, 3, 5)),
-                         (multistatic.range_sum_jacobian(position, tx, rx, -3.0), (4, 3, 5, 2)),
-                         (multistatic.bearing(position, rx), (4, 3, 5)),
-                         (multistatic.bearing_jacobian(position, rx), (4, 3, 5, 2)),
-                         (multistatic.pseudo_range(position, rx, -3.0, np.ones((4, 3))),
-                          (4, 3, 5)),
-                         (multistatic.crlb(position, tx, rx, np.full(5, 1e-8), target_z=-3.0,
-                                           sound_speed=1500.0), (4, 3, 2, 2))):
+    for value, shape in (
+        (multistatic.range_sum(position, tx, rx, -3.0), (4, 3, 5)),
+        (multistatic.range_sum_jacobian(position, tx, rx, -3.0), (4, 3, 5, 2)),
+        (multistatic.bearing(position, rx), (4, 3, 5)),
+        (multistatic.bearing_jacobian(position, rx), (4, 3, 5, 2)),
+        (multistatic.pseudo_range(position, rx, -3.0, np.ones((4, 3))), (4, 3, 5)),
+        (
+            multistatic.crlb(
+                position, tx, rx, np.full(5, 1e-8), target_z=-3.0, sound_speed=1500.0
+            ),
+            (4, 3, 2, 2),
+        ),
+    ):
         assert value.shape == shape
         assert np.isfinite(value).all()
-    assert_allclose(multistatic.range_sum(position, tx, rx, -3.0)[2, 1],
-                    multistatic.range_sum(position[2, 1], tx, rx, -3.0))
+    assert_allclose(
+        multistatic.range_sum(position, tx, rx, -3.0)[2, 1],
+        multistatic.range_sum(position[2, 1], tx, rx, -3.0),
+    )
 
 
 @pytest.mark.parametrize('distance', [0.0, 1e-300, 1e-160, 1e-9])
 def test_coincident_points_give_no_information_and_no_nan(distance):
     point = np.array([[10.0, 20.0, -5.0]])
     position = point[0, :2] + [distance, 0.0]
-    for jacobian in (multistatic.range_sum_jacobian(position, point, point, -5.0),
-                     multistatic.bearing_jacobian(position, point)):
+    for jacobian in (
+        multistatic.range_sum_jacobian(position, point, point, -5.0),
+        multistatic.bearing_jacobian(position, point),
+    ):
         assert np.isfinite(jacobian).all() and np.abs(jacobian).max() <= 2.0
     assert_allclose(multistatic.range_sum(position, point, point, -5.0), 0.0, atol=1e-8)
     assert multistatic.bearing(point[0, :2], point)[0] == 0.0
@@ -126,11 +155,13 @@ def test_differences_keep_the_information_of_a_free_offset(n):
     assert measurement.z.shape == (n - 1,) and jacobian.shape == (n - 1, 2)
     assert_allclose(measurement.R, np.eye(n - 1))
     noise = np.diag(SOUND_SPEED**2 * variance)
-    assert_allclose(measurement.projection @ noise @ measurement.projection.T, np.eye(n - 1),
-                    atol=1e-12)
+    assert_allclose(
+        measurement.projection @ noise @ measurement.projection.T, np.eye(n - 1), atol=1e-12
+    )
     assert_allclose(measurement.projection @ np.ones(n), 0.0, atol=1e-12)
-    augmented = np.column_stack([multistatic.pseudo_range_jacobian(position, rx, -4.0),
-                                 np.ones(n)])
+    augmented = np.column_stack(
+        [multistatic.pseudo_range_jacobian(position, rx, -4.0), np.ones(n)]
+    )
     full = augmented.T @ np.linalg.inv(noise) @ augmented
     schur = full[:2, :2] - np.outer(full[:2, 2], full[2, :2]) / full[2, 2]
     assert_allclose(jacobian.T @ jacobian, schur, atol=1e-9 * np.abs(full).max())
@@ -149,16 +180,22 @@ def test_update_equals_the_augmented_filter_and_every_choice_of_reference():
     toa = toa + np.sqrt(variance) * rng.standard_normal(n)
     x, P = truth + [2.0, -1.0], np.array([[9.0, 2.0], [2.0, 4.0]])
     measurement = multistatic.difference_measurement(toa, variance, SOUND_SPEED)
-    mean, covariance = ekf_update(x, P, measurement.z - measurement.predict(x, rx, -4.0),
-                                  measurement.jacobian(x, rx, -4.0), measurement.R)
+    mean, covariance = ekf_update(
+        x,
+        P,
+        measurement.z - measurement.predict(x, rx, -4.0),
+        measurement.jacobian(x, rx, -4.0),
+        measurement.R,
+    )
 
     R = np.diag(SOUND_SPEED**2 * variance)
     H = multistatic.pseudo_range_jacobian(x, rx, -4.0)
     innovation = SOUND_SPEED * (toa - 1234.0) - multistatic.pseudo_range(x, rx, -4.0)
     prior = np.zeros((3, 3))
     prior[:2, :2], prior[2, 2] = P, 1e10
-    wide, wide_covariance = ekf_update(np.append(x, 0.0), prior, innovation,
-                                       np.column_stack([H, np.ones(n)]), R)
+    wide, wide_covariance = ekf_update(
+        np.append(x, 0.0), prior, innovation, np.column_stack([H, np.ones(n)]), R
+    )
     assert_allclose(mean, wide[:2], atol=1e-5)
     assert_allclose(covariance, wide_covariance[:2, :2], rtol=1e-4, atol=1e-6)
 
@@ -178,9 +215,18 @@ def test_differences_are_the_same_for_times_since_1970():
     assert_allclose(late.z, near.z, atol=1e-2 * 0.5)
 
 
-@pytest.mark.parametrize('toa, variance', [
-    ([1.0], [1.0]), ([1.0, 2.0], [1.0]), ([1.0, np.nan], [1.0, 1.0]), ([1.0, 2.0], [1.0, 0.0]),
-    ([1.0, 2.0], [1.0, -1.0]), ([[1.0, 2.0]], [[1.0, 1.0]]), ([1.0, 2.0], [np.inf, 1.0])])
+@pytest.mark.parametrize(
+    'toa, variance',
+    [
+        ([1.0], [1.0]),
+        ([1.0, 2.0], [1.0]),
+        ([1.0, np.nan], [1.0, 1.0]),
+        ([1.0, 2.0], [1.0, 0.0]),
+        ([1.0, 2.0], [1.0, -1.0]),
+        ([[1.0, 2.0]], [[1.0, 1.0]]),
+        ([1.0, 2.0], [np.inf, 1.0]),
+    ],
+)
 def test_differences_refuse_what_they_cannot_use(toa, variance):
     with pytest.raises(ValueError, match='arrival times'):
         multistatic.difference_measurement(toa, variance, SOUND_SPEED)
@@ -190,14 +236,17 @@ def test_emission_time_and_its_variance_are_those_of_the_joint_estimate():
     n = 6
     _, rx, truth, variance = scene(n, seed=21)
     toa = multistatic.pseudo_range(truth, rx, -4.0) / SOUND_SPEED + 77.25
-    time, _ = multistatic.emission_time(toa, variance, rx, truth, target_z=-4.0,
-                                        sound_speed=SOUND_SPEED)
+    time, _ = multistatic.emission_time(
+        toa, variance, rx, truth, target_z=-4.0, sound_speed=SOUND_SPEED
+    )
     assert time == pytest.approx(77.25, abs=1e-12)
-    augmented = np.column_stack([
-        multistatic.pseudo_range_jacobian(truth, rx, -4.0) / SOUND_SPEED, np.ones(n)])
+    augmented = np.column_stack(
+        [multistatic.pseudo_range_jacobian(truth, rx, -4.0) / SOUND_SPEED, np.ones(n)]
+    )
     joint = np.linalg.inv(augmented.T @ np.diag(1.0 / variance) @ augmented)
-    _, stated = multistatic.emission_time(toa, variance, rx, truth, target_z=-4.0,
-                                          sound_speed=SOUND_SPEED, covariance=joint[:2, :2])
+    _, stated = multistatic.emission_time(
+        toa, variance, rx, truth, target_z=-4.0, sound_speed=SOUND_SPEED, covariance=joint[:2, :2]
+    )
     assert stated == pytest.approx(joint[2, 2], rel=1e-9)
 
 
@@ -216,8 +265,10 @@ def numeric_bound(position, tx, rx, var_toa, z, speed_std, var_bearing):
 
     at = np.append(position, [0.0, 0.0])
     steps = np.array([1e-3, 1e-3, 1e-6, 1e-2])
-    rows = np.stack([(times(at + h * e) - times(at - h * e)) / (2 * h)
-                     for h, e in zip(steps, np.eye(4))], axis=-1)
+    rows = np.stack(
+        [(times(at + h * e) - times(at - h * e)) / (2 * h) for h, e in zip(steps, np.eye(4))],
+        axis=-1,
+    )
     information = rows.T @ (rows / var_toa[:, None])
     if var_bearing is not None:
         across = slope(lambda p: multistatic.bearing(p, rx), position)
@@ -235,20 +286,39 @@ def test_bound_equals_the_inverse_of_the_whole_information(kind, speed_std, bear
     tx, rx, position, variance = scene(6, seed=31)
     tx[{'active': slice(0), 'passive': slice(None), 'mixed': slice(3)}[kind]] = np.nan
     var_bearing = np.full(6, 1e-3) if bearings else None
-    bound = multistatic.crlb(position, tx, rx, variance, target_z=-4.0, sound_speed=SOUND_SPEED,
-                             sound_speed_std=speed_std, var_bearing=var_bearing)
+    bound = multistatic.crlb(
+        position,
+        tx,
+        rx,
+        variance,
+        target_z=-4.0,
+        sound_speed=SOUND_SPEED,
+        sound_speed_std=speed_std,
+        var_bearing=var_bearing,
+    )
     expected = numeric_bound(position, tx, rx, variance, -4.0, speed_std, var_bearing)
     assert_allclose(bound, expected, rtol=1e-5)
     if kind == 'passive':
-        assert_allclose(bound, multistatic.crlb(
-            position, None, rx, variance, target_z=-4.0, sound_speed=SOUND_SPEED,
-            sound_speed_std=speed_std, var_bearing=var_bearing))
+        assert_allclose(
+            bound,
+            multistatic.crlb(
+                position,
+                None,
+                rx,
+                variance,
+                target_z=-4.0,
+                sound_speed=SOUND_SPEED,
+                sound_speed_std=speed_std,
+                var_bearing=var_bearing,
+            ),
+        )
 
 
 def test_passive_bound_equals_the_information_of_the_differences():
     _, rx, position, variance = scene(6, seed=41)
     H = multistatic.difference_measurement(np.zeros(6), variance, SOUND_SPEED).jacobian(
-        position, rx, -4.0)
+        position, rx, -4.0
+    )
     bound = multistatic.crlb(position, None, rx, variance, target_z=-4.0, sound_speed=SOUND_SPEED)
     assert_allclose(bound, np.linalg.inv(H.T @ H), rtol=1e-9)
 
@@ -257,8 +327,9 @@ def test_bound_is_infinite_where_the_position_is_not_fixed():
     tx, rx = np.array([[-50.0, 0, 0], [-50.0, 0, 0]]), np.array([[50.0, 0, 0], [80.0, 0, 0]])
     one = multistatic.crlb([0.0, 30.0], tx[:1], rx[:1], [1e-8], target_z=0.0, sound_speed=1500.0)
     line = multistatic.crlb([0.0, 0.0], tx, rx, [1e-8, 1e-8], target_z=0.0, sound_speed=1500.0)
-    unmeasured = multistatic.crlb([0.0, 30.0], tx, rx, [np.nan, np.inf], target_z=0.0,
-                                  sound_speed=1500.0)
+    unmeasured = multistatic.crlb(
+        [0.0, 30.0], tx, rx, [np.nan, np.inf], target_z=0.0, sound_speed=1500.0
+    )
     for bound in (one, line, unmeasured):
         assert_allclose(bound, np.diag([np.inf, np.inf]))
 
@@ -268,5 +339,7 @@ def test_unmeasured_rows_change_nothing():
     blank = np.where(np.arange(5) == 2, np.nan, variance)
     kept = np.arange(5) != 2
     common = dict(target_z=-4.0, sound_speed=1500.0)
-    assert_allclose(multistatic.crlb(position, tx, rx, blank, **common),
-                    multistatic.crlb(position, tx[kept], rx[kept], variance[kept], **common))
+    assert_allclose(
+        multistatic.crlb(position, tx, rx, blank, **common),
+        multistatic.crlb(position, tx[kept], rx[kept], variance[kept], **common),
+    )

@@ -19,8 +19,10 @@ def rotation(angle):
 def measured(truth, runs, seed):
     """Noisy ranges and bearings (runs,) of one true position."""
     rng = np.random.default_rng(seed)
-    return (np.hypot(*truth) + SIGMA_RANGE * rng.standard_normal(runs),
-            np.arctan2(truth[1], truth[0]) + SIGMA_BEARING * rng.standard_normal(runs))
+    return (
+        np.hypot(*truth) + SIGMA_RANGE * rng.standard_normal(runs),
+        np.arctan2(truth[1], truth[0]) + SIGMA_BEARING * rng.standard_normal(runs),
+    )
 
 
 def nees(truth, positions, covariances):
@@ -49,8 +51,8 @@ def test_covariance_equals_the_printed_equations():
     r, b, vr, vb = 200.0, -0.7, 0.01, 0.09
     lam = np.exp(-vb / 2)
     position, covariance = unbiased_polar_to_cartesian(r, b, vr, vb)
-    xx = (r**2 + vr) / 2 * (1 + lam**4 * np.cos(2 * b)) - lam**2 * r**2 * np.cos(b)**2
-    yy = (r**2 + vr) / 2 * (1 - lam**4 * np.cos(2 * b)) - lam**2 * r**2 * np.sin(b)**2
+    xx = (r**2 + vr) / 2 * (1 + lam**4 * np.cos(2 * b)) - lam**2 * r**2 * np.cos(b) ** 2
+    yy = (r**2 + vr) / 2 * (1 - lam**4 * np.cos(2 * b)) - lam**2 * r**2 * np.sin(b) ** 2
     xy = (r**2 + vr) / 2 * lam**4 * np.sin(2 * b) - lam**2 * r**2 * np.sin(b) * np.cos(b)
     assert_allclose(covariance, [[xx, xy], [xy, yy]], rtol=1e-10)
     assert_allclose(position, lam * r * np.array([np.cos(b), np.sin(b)]), rtol=1e-14)
@@ -75,16 +77,21 @@ def test_fusing_many_measurements_does_not_drift_from_the_truth():
     for convert in (unbiased_polar_to_cartesian, linearised_polar_to_cartesian):
         positions, covariances = convert(r, b, SIGMA_RANGE**2, SIGMA_BEARING**2)
         information = np.linalg.inv(covariances)
-        fused = np.linalg.solve(information.sum(axis=0),
-                                (information @ positions[..., None]).sum(axis=0)[:, 0])
+        fused = np.linalg.solve(
+            information.sum(axis=0), (information @ positions[..., None]).sum(axis=0)[:, 0]
+        )
         radial.append(abs(fused[0] - truth[0]))
     assert radial[0] < 0.01
     assert radial[1] > 0.05
 
 
 @settings(max_examples=100, derandomize=True, deadline=None)
-@given(r=st.floats(0.0, 1e5), b=st.floats(-10.0, 10.0), sr=st.floats(1e-3, 100.0),
-       sb=st.floats(1e-5, 2.0))
+@given(
+    r=st.floats(0.0, 1e5),
+    b=st.floats(-10.0, 10.0),
+    sr=st.floats(1e-3, 100.0),
+    sb=st.floats(1e-5, 2.0),
+)
 def test_covariance_is_positive_definite_and_turns_with_the_scene(r, b, sr, sb):
     position, covariance = unbiased_polar_to_cartesian(r, 0.0, sr**2, sb**2)
     turn = rotation(b)

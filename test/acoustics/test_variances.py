@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics import variances
-from sonar_imm.simulation.bathymetry import scenario, simulate, snr
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate, snr
 
 
 @pytest.fixture(scope='module')

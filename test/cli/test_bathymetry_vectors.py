@@ -20,24 +20,47 @@ def tracked(name, tmp_path, **more):
     with np.load(VECTORS / f'{name}.npz') as archive:
         case = dict(archive)
     noise = np.full(len(case['r']), float(case['sn2']))
-    snapshot = Snapshot(stamp_ns=10**9, range=case['r'], iq=case['Y'], noise_variance=noise,
-                        signal_variance=case['rho'] * noise)
+    snapshot = Snapshot(
+        stamp_ns=10**9,
+        range=case['r'],
+        iq=case['Y'],
+        noise_variance=noise,
+        signal_variance=case['rho'] * noise,
+    )
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('/snapshot', write_snapshot(snapshot, ros_message), 10**9)
     values = {
-        'sonar_height': float(case['H']), 'tilt_deg': float(np.degrees(case['tilt'])),
+        'sonar_height': float(case['H']),
+        'tilt_deg': float(np.degrees(case['tilt'])),
         'element_spacing_wavelengths': float(case['dlam']),
         'transition_matrix': case['Pi'].ravel().tolist(),
-        'initial_probabilities': case['mu0'].tolist(), 'initial_std': float(case['sd0']),
-        'particles_per_model': 3000, 'shadow_gate': False, **more}
+        'initial_probabilities': case['mu0'].tolist(),
+        'initial_std': float(case['sd0']),
+        'particles_per_model': 3000,
+        'shadow_gate': False,
+        **more,
+    }
     if name.startswith('set_iii'):
-        values |= {'model_set': 'angle_two_rw', 'initial_mean': float(case['th0']),
-                   'sigmas_deg': [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()]}
+        values |= {
+            'model_set': 'angle_two_rw',
+            'initial_mean': float(case['th0']),
+            'sigmas_deg': [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()],
+        }
     else:
         values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}
     (tmp_path / 'params.yaml').write_text(json.dumps({'/**': {'ros__parameters': values}}))
-    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'out'), '--params',
-                 str(tmp_path / 'params.yaml')]) == 0
+    assert (
+        main(
+            [
+                'track',
+                str(tmp_path / 'bag'),
+                str(tmp_path / 'out'),
+                '--params',
+                str(tmp_path / 'params.yaml'),
+            ]
+        )
+        == 0
+    )
     with open(tmp_path / 'out' / 'estimate.csv', newline='') as file:
         rows = list(csv.DictReader(file))
     return case, {key: np.array([float(row[key]) for row in rows]) for key in rows[0]}

@@ -17,8 +17,14 @@ ROOT = Path(__file__).resolve().parents[2]
 def run(*arguments, **options):
     """The command as a process of its own."""
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
-    return subprocess.run([sys.executable, '-m', 'sonar_imm.cli', *arguments], text=True,
-                          capture_output=True, env=environment, timeout=120, **options)
+    return subprocess.run(
+        [sys.executable, '-m', 'sonar_imm.cli', *arguments],
+        text=True,
+        capture_output=True,
+        env=environment,
+        timeout=120,
+        **options,
+    )
 
 
 @pytest.mark.parametrize('arguments', [[], ['--help'], ['-h']])
@@ -49,33 +55,40 @@ def test_version(capsys):
 
 
 def test_help_loads_no_heavy_module():
-    code = ("import sys; from sonar_imm.cli import main; main(['--help']); "
-            "print([name for name in ('numpy', 'scipy', 'rosbags', 'numba', 'plotly', 'rclpy', "
-            "'rich') if name in sys.modules])")
+    code = (
+        "import sys; from sonar_imm.cli import main; main(['--help']); "
+        "print([name for name in ('numpy', 'scipy', 'rosbags', 'numba', 'plotly', 'rclpy', "
+        "'rich') if name in sys.modules])"
+    )
     done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True, cwd=ROOT)
     assert done.stdout.splitlines()[-1] == '[]'
 
 
-@pytest.mark.parametrize('arguments, words', [
-    (['trakc'], "there is no command 'trakc' (did you mean 'track'?)"),
-    (['--bad'], '--bad'),
-    (['track'], "Missing argument 'BAG'"),
-    (['track', 'nowhere.bag', 'out'], 'nowhere.bag does not exist'),
-    (['info', 'nowhere.bag'], 'nowhere.bag does not exist'),
-    (['evaluate', 'nowhere'], 'holds no finished run'),
-    (['track', 'b', 'o', '--set', 'speed_mean'], "'speed_mean' is not of the form NAME=VALUE"),
-    (['track', 'b', 'o', '--topic', 'fix'], "'fix' is not of the form INPUT=TOPIC"),
-    (['track', 'b', 'o', '--system', 'divers'], "'divers'"),
-    (['simulate', 'diver'], "Missing argument 'OUT_BAG'"),
-    (['simulate', 'diver', 'b', '--scenario', 'tabel1'], "did you mean 'table1'?"),
-    (['simulate', 'diver', 'b', '--set', 'speed=fast'], "'speed' must be a number, got 'fast'"),
-    (['convert', 'fixes', 'nowhere.csv', 'b'], 'nowhere.csv'),
-    (['convert', 'fixes', 'a', 'b', '--origin', '5'], "'5' is not of the form LAT,LON"),
-    (['convert', 'fixes', 'a', 'b', '--time-offset', 'x'], 'not a number of seconds'),
-    (['check', 'dvier'], "'dvier'"),
-])
-def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_path,
-                                                  monkeypatch):
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['trakc'], "there is no command 'trakc' (did you mean 'track'?)"),
+        (['--bad'], '--bad'),
+        (['track'], "Missing argument 'BAG'"),
+        (['track', 'nowhere.bag', 'out'], 'nowhere.bag does not exist'),
+        (['info', 'nowhere.bag'], 'nowhere.bag does not exist'),
+        (['evaluate', 'nowhere'], 'holds no finished run'),
+        (['track', 'b', 'o', '--set', 'speed_mean'], "'speed_mean' is not of the form NAME=VALUE"),
+        (['track', 'b', 'o', '--topic', 'fix'], "'fix' is not of the form INPUT=TOPIC"),
+        (['track', 'b', 'o', '--system', 'divers'], "'divers'"),
+        (['simulate', 'diver'], "Missing argument 'OUT_BAG'"),
+        (['simulate', 'diver', 'b', '--scenario', 'tabel1'], "did you mean 'table1'?"),
+        (
+            ['simulate', 'diver', 'b', '--set', 'speed=fast'],
+            "'speed' must be a number, got 'fast'",
+        ),
+        (['convert', 'fixes', 'nowhere.csv', 'b'], 'nowhere.csv'),
+        (['convert', 'fixes', 'a', 'b', '--origin', '5'], "'5' is not of the form LAT,LON"),
+        (['convert', 'fixes', 'a', 'b', '--time-offset', 'x'], 'not a number of seconds'),
+        (['check', 'dvier'], "'dvier'"),
+    ],
+)
+def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     printed = capsys.readouterr()
@@ -89,9 +102,12 @@ def test_a_bug_is_not_hidden(monkeypatch):
 
     def broken(*arguments, **options):
         raise RuntimeError('a bug')
+
     monkeypatch.setattr(info, 'progress', broken)
-    monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__',
-                        lambda self: (_ for _ in ()).throw(RuntimeError('a bug')))
+    monkeypatch.setattr(
+        'sonar_imm.recordings.reader.BagReader.__enter__',
+        lambda self: (_ for _ in ()).throw(RuntimeError('a bug')),
+    )
     with pytest.raises(RuntimeError, match='a bug'):
         main(['info', 'x.bag'])
 
@@ -99,6 +115,7 @@ def test_a_bug_is_not_hidden(monkeypatch):
 def test_a_package_that_is_not_there_is_named(monkeypatch, capsys):
     def absent(self):
         raise ModuleNotFoundError("No module named 'rclpy'", name='rclpy')
+
     monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__', absent)
     assert main(['info', 'x.bag']) == 2
     assert 'sonar_imm[ros]' in capsys.readouterr().err
@@ -107,6 +124,7 @@ def test_a_package_that_is_not_there_is_named(monkeypatch, capsys):
 def test_ctrl_c_is_clean(monkeypatch, capsys):
     def interrupted(self):
         raise KeyboardInterrupt
+
     monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__', interrupted)
     assert main(['info', 'x.bag']) == 130
     assert 'Traceback' not in capsys.readouterr().err
@@ -114,9 +132,12 @@ def test_ctrl_c_is_clean(monkeypatch, capsys):
 
 @pytest.mark.skipif(sys.platform == 'win32', reason='pipes end otherwise there')
 def test_a_reader_that_goes_away_is_no_trouble():
-    process = subprocess.Popen([sys.executable, '-m', 'sonar_imm.cli', 'simulate', 'diver',
-                                '--list'], env=dict(os.environ, PYTHONPATH=str(ROOT)),
-                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'sonar_imm.cli', 'simulate', 'diver', '--list'],
+        env=dict(os.environ, PYTHONPATH=str(ROOT)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
     process.stdout.close()
     assert process.wait(60) == 141
     assert b'Traceback' not in process.stderr.read()

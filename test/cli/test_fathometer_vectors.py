@@ -16,7 +16,7 @@ from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagReader
 from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.simulation.fathometer import scenario, simulate
+from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'

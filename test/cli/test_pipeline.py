@@ -3,7 +3,7 @@
 import csv
 import json
 
-from dive_bags import write_dive
+from helpers.dive_bags import write_dive
 import pytest
 
 from sonar_imm.cli import main
@@ -12,10 +12,12 @@ from sonar_imm.cli import main
 @pytest.fixture
 def call(capsys):
     """Run a command that has to succeed and give its JSON."""
+
     def call(*arguments):
         capsys.readouterr()
         assert main([*map(str, arguments), '--json']) == 0
         return json.loads(capsys.readouterr().out)
+
     return call
 
 
@@ -25,8 +27,11 @@ def dive(tmp_path):
 
 
 def contents(folder):
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob('*')
-            if path.is_file() and path.name != 'run.json'}
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in folder.rglob('*')
+        if path.is_file() and path.name != 'run.json'
+    }
 
 
 def test_track_twice_writes_the_same_bytes(call, dive, tmp_path):
@@ -89,22 +94,38 @@ def test_a_run_is_not_overwritten_by_accident(call, dive, tmp_path, capsys):
 
 def test_parameters_come_from_file_and_command(call, dive, tmp_path):
     params = tmp_path / 'diver.yaml'
-    params.write_text('/**:\n  ros__parameters:\n    model_set: cv_cv\n    confirm_hits: 2\n'
-                      '    use_sim_time: true\n')
-    run = call('track', dive, tmp_path / 'out', '--params', params, '--set', 'confirm_hits=1',
-               '--set', 'acceleration_noise=0.1, 1.5', '--set', 'hover=false')
+    params.write_text(
+        '/**:\n  ros__parameters:\n    model_set: cv_cv\n    confirm_hits: 2\n'
+        '    use_sim_time: true\n'
+    )
+    run = call(
+        'track',
+        dive,
+        tmp_path / 'out',
+        '--params',
+        params,
+        '--set',
+        'confirm_hits=1',
+        '--set',
+        'acceleration_noise=0.1, 1.5',
+        '--set',
+        'hover=false',
+    )
     parameters = run['parameters']
     assert parameters['model_set'] == 'cv_cv' and parameters['confirm_hits'] == 1
     assert parameters['acceleration_noise'] == [0.1, 1.5] and parameters['hover'] is False
 
 
-@pytest.mark.parametrize('text, words', [
-    ('/**:\n  ros__parameters:\n    model_sett: cv', "did you mean 'model_set'?"),
-    ('model_set: vc', 'must be one of'),
-    ('{', 'not a YAML file'),
-    ('- 1', 'must hold a mapping'),
-    (b'\xff\xfe', 'is not a text file'),
-])
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('/**:\n  ros__parameters:\n    model_sett: cv', "did you mean 'model_set'?"),
+        ('model_set: vc', 'must be one of'),
+        ('{', 'not a YAML file'),
+        ('- 1', 'must hold a mapping'),
+        (b'\xff\xfe', 'is not a text file'),
+    ],
+)
 def test_bad_parameter_files_are_one_sentence(dive, tmp_path, capsys, text, words):
     params = tmp_path / 'diver.yaml'
     params.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -115,6 +136,7 @@ def test_bad_parameter_files_are_one_sentence(dive, tmp_path, capsys, text, word
 
 def test_the_shipped_parameter_file_is_understood(call, dive, tmp_path):
     from sonar_imm.resources import shared_file
+
     run = call('track', dive, tmp_path / 'out', '--params', shared_file('config/diver.yaml'))
     assert run['estimates'] == 118
 
@@ -135,16 +157,28 @@ def test_smoothing_is_recorded_in_the_run(call, dive, tmp_path):
 def test_simulate_gives_the_same_bag_for_the_same_seed(call, tmp_path):
     for folder in ('a', 'b'):
         (tmp_path / folder).mkdir()
-        result = call('simulate', 'diver', tmp_path / folder / 'bag', '--seed', '5', '--scenario',
-                      'several', '--set', 'divers=2', '--set', 'duration=20')
+        result = call(
+            'simulate',
+            'diver',
+            tmp_path / folder / 'bag',
+            '--seed',
+            '5',
+            '--scenario',
+            'several',
+            '--set',
+            'divers=2',
+            '--set',
+            'duration=20',
+        )
     assert result['targets'] == 2 and result['messages']['/fix'] > 20
     assert contents(tmp_path / 'a') == contents(tmp_path / 'b')
 
 
 def test_convert_tells_what_it_left_out(call, tmp_path, capsys):
     table = tmp_path / 'usbl.csv'
-    table.write_text('when,easting,northing,std\n1700000000,1,2,0.5\n1700000001,x,2,0.5\n'
-                     '1700000002,1,3,0.5\n')
+    table.write_text(
+        'when,easting,northing,std\n1700000000,1,2,0.5\n1700000001,x,2,0.5\n1700000002,1,3,0.5\n'
+    )
     arguments = ['convert', 'fixes', str(table), '--column', 'stamp=when', '--time-offset', '0.5']
     result = call(*arguments, tmp_path / 'bag')
     assert result['messages'] == {'/fix': 2} and result['bad_rows'] == 1
@@ -164,6 +198,7 @@ def test_convert_does_not_replace_a_bag(call, tmp_path, capsys):
 
 def test_info_on_what_no_tracker_knows_exits_with_1(tmp_path, capsys):
     from sonar_imm.recordings.writer import BagWriter, ros_message
+
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('/note', ros_message('std_msgs/msg/String', data='hello'), 10**9)
     assert main(['info', str(tmp_path / 'bag')]) == 1

@@ -1,7 +1,7 @@
 """What is said of a recording."""
 
-from dive_bags import write_dive
-from dive_scenes import SECOND, START_NS
+from helpers.dive_bags import write_dive
+from helpers.dive_scenes import SECOND, START_NS
 import numpy as np
 import pytest
 
@@ -52,11 +52,14 @@ def test_a_topic_of_another_name_still_suits(tmp_path):
     assert result['systems'] == {'diver': {'fix': ['/usbl/pose']}}
 
 
-@pytest.mark.parametrize('seconds, words', [
-    ([0, 1, 2, 1.5, 3], '1 stamps older than the one before, by up to 0.5 s'),
-    ([0, 1, 2, 3, 40, 41], '1 gaps in the stamps, the longest 37 s against 1 s'),
-    ([None, None, 1], '2 messages without a usable stamp'),
-])
+@pytest.mark.parametrize(
+    'seconds, words',
+    [
+        ([0, 1, 2, 1.5, 3], '1 stamps older than the one before, by up to 0.5 s'),
+        ([0, 1, 2, 3, 40, 41], '1 gaps in the stamps, the longest 37 s against 1 s'),
+        ([None, None, 1], '2 messages without a usable stamp'),
+    ],
+)
 def test_odd_stamps_are_told(tmp_path, seconds, words):
     _, topics = found(write_fixes(tmp_path / 'bag', seconds))
     assert any(words in problem for problem in topics['/fix']['problems'])
@@ -71,10 +74,18 @@ def test_several_fixes_of_one_stamp_are_a_scan(tmp_path, capsys):
 
 
 def test_two_pings_of_one_stamp_are_a_problem(tmp_path):
-    ping = Arrivals(stamp_ns=START_NS, frame_id='map', tx_id=[0, 0, 0], rx_id=[1, 2, 3],
-                    tx=np.zeros((3, 3)), rx=np.diag([40.0, 50.0, 60.0]), toa=[0.05, 0.06, 0.07],
-                    var_toa=np.full(3, np.nan), bearing=np.full(3, np.nan),
-                    var_bearing=np.full(3, np.nan))
+    ping = Arrivals(
+        stamp_ns=START_NS,
+        frame_id='map',
+        tx_id=[0, 0, 0],
+        rx_id=[1, 2, 3],
+        tx=np.zeros((3, 3)),
+        rx=np.diag([40.0, 50.0, 60.0]),
+        toa=[0.05, 0.06, 0.07],
+        var_toa=np.full(3, np.nan),
+        bearing=np.full(3, np.nan),
+        var_bearing=np.full(3, np.nan),
+    )
     with BagWriter(tmp_path / 'bag') as bag:
         for k in range(2):
             bag.write('/arrivals', write_arrivals(ping, ros_message), START_NS + k)

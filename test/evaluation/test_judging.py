@@ -1,9 +1,9 @@
 """Every system has what the commands need of it, and judges its own runs."""
 
-from dive_bags import write_dive
+from helpers.dive_bags import write_dive
 import pytest
 
-from sonar_imm.evaluation.benching import BENCHES, benches_of
+from sonar_imm.evaluation.benches import BENCHES, benches_of
 from sonar_imm.evaluation.judging import judge, JudgeOptions, JUDGES, Limit
 from sonar_imm.evaluation.run_folder import read_measurements, read_truth, RunFolder
 from sonar_imm.measurements import Fix
@@ -15,8 +15,17 @@ def folder_of(tmp_path, estimates=(), **run):
     folder = RunFolder(tmp_path / 'run')
     folder.prepare()
     folder.write_estimates(estimates, 'diver')
-    folder.write_json('run.json', {'system': 'diver', 'bag': str(tmp_path / 'dive'), 'counts': {},
-                                   'topics': {'/fix': 'fix'}, 'parameters': {}, **run})
+    folder.write_json(
+        'run.json',
+        {
+            'system': 'diver',
+            'bag': str(tmp_path / 'dive'),
+            'counts': {},
+            'topics': {'/fix': 'fix'},
+            'parameters': {},
+            **run,
+        },
+    )
     return folder
 
 
@@ -41,7 +50,8 @@ def test_a_limit_is_met_or_missed():
 
 
 def test_without_truth_there_is_no_accuracy_but_a_page(tmp_path):
-    from dive_scenes import single_run
+    from helpers.dive_scenes import single_run
+
     judgement = judge(folder_of(tmp_path, single_run(count=30)[0]))
     assert judgement.accuracy(None) is None
     assert 'no truth' in judgement.summary and judgement.metrics['truth_lag_s'] == 0.0
@@ -49,7 +59,8 @@ def test_without_truth_there_is_no_accuracy_but_a_page(tmp_path):
 
 
 def test_truth_of_another_bag_is_scored(tmp_path):
-    from dive_scenes import single_run
+    from helpers.dive_scenes import single_run
+
     truth = write_dive(tmp_path / 'truth')
     options = JudgeOptions(truth_bag=truth, lag=0.5, gap=5.0, cutoff=3.0)
     judgement = judge(folder_of(tmp_path, single_run(count=100)[0]), options)
@@ -62,9 +73,11 @@ def test_truth_of_another_bag_is_scored(tmp_path):
 
 def test_estimates_of_something_else_are_one_sentence(tmp_path):
     import attrs
-    from dive_scenes import single_run
-    whales = [attrs.evolve(one, state_names=('a', 'b', 'c', 'd')) for one in
-              single_run(count=3)[0]]
+    from helpers.dive_scenes import single_run
+
+    whales = [
+        attrs.evolve(one, state_names=('a', 'b', 'c', 'd')) for one in single_run(count=3)[0]
+    ]
     with pytest.raises(BagError, match="no column 'px'"):
         judge(folder_of(tmp_path, whales))
 

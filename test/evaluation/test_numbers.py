@@ -15,15 +15,16 @@ from sonar_imm.evaluation.numbers import (
 )
 
 
-@pytest.mark.parametrize('coverage, words', [(0.6, 'more sure'), (0.95, 'can be believed'),
-                                             (1.0, 'more careful')])
+@pytest.mark.parametrize(
+    'coverage, words', [(0.6, 'more sure'), (0.95, 'can be believed'), (1.0, 'more careful')]
+)
 def test_belief_is_put_in_words(coverage, words):
     assert words in belief_sentence(coverage)
 
 
 def test_lines_name_the_unit_and_are_left_out_without_errors():
     summary = error_summary(np.radians([3.0, 4.0]), unit='rad')
-    (title, value), = error_line('angle error', summary, 'rad')
+    ((title, value),) = error_line('angle error', summary, 'rad')
     assert title == 'angle error, RMSE / median / 95 %'
     assert value == '0.062 / 0.061 / 0.069 rad'
     assert error_line('angle error', error_summary(np.empty(0)), 'm') == []

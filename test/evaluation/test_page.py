@@ -15,7 +15,7 @@ def kinds(sizes):
         parts.append(Part('', 'run', '', (), (Section('figure', 'text', figure),)))
     html = render('title', parts, footer='')
     # Templates of figures name every kind of trace: look at the ones with a name.
-    return re.findall(r'"name":"n\d+"[^{]*?"type":"(\w+)"', html[html.index('<body>'):])
+    return re.findall(r'"name":"n\d+"[^{]*?"type":"(\w+)"', html[html.index('<body>') :])
 
 
 def test_only_the_largest_figures_use_the_graphics_card():

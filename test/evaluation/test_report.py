@@ -2,7 +2,7 @@
 
 from html.parser import HTMLParser
 
-from dive_scenes import single_run
+from helpers.dive_scenes import single_run
 
 from sonar_imm.evaluation.diver.scoring import score
 from sonar_imm.evaluation.diver.sections import diver_part, Material
@@ -12,18 +12,24 @@ from sonar_imm.evaluation.judging import Check
 from sonar_imm.evaluation.page import Card, Section
 from sonar_imm.evaluation.report import report_html, run_part
 
-RUN = {'system': 'diver', 'bag': '/data/my <dive>.bag', 'topics': {'/fix': 'fix'},
-       'parameters': {'model_set': 'heading_speed', 'speed_mean': 0.75},
-       'counts': {'used': 60}, 'versions': {'sonar_imm': '0.1.0'},
-       'refused': {'nan': {'count': 3, 'example': '/fix: not <b>finite</b>'}}}
+RUN = {
+    'system': 'diver',
+    'bag': '/data/my <dive>.bag',
+    'topics': {'/fix': 'fix'},
+    'parameters': {'model_set': 'heading_speed', 'speed_mean': 0.75},
+    'counts': {'used': 60},
+    'versions': {'sonar_imm': '0.1.0'},
+    'refused': {'nan': {'count': 3, 'example': '/fix: not <b>finite</b>'}},
+}
 
 
 def material(truth=True, count=60, **changes):
     estimates, true_rows, _ = single_run(count=count)
     series = series_of(estimates)
     known = Truth.from_series(series_of(true_rows)) if truth else None
-    return Material(run={**RUN, **changes}, metrics=score(series, known), series=series,
-                       truth=known)
+    return Material(
+        run={**RUN, **changes}, metrics=score(series, known), series=series, truth=known
+    )
 
 
 def html(*materials):
@@ -54,8 +60,13 @@ def test_the_page_is_whole_and_loads_nothing():
     text = html(material())
     page = Page(text)
     assert page.loads == []
-    assert page.headings[:5] == ['my <dive>.bag', 'Map', 'Error, and the error it predicted',
-                                 'Which motion model held', 'Surprise of each measurement (NIS)']
+    assert page.headings[:5] == [
+        'my <dive>.bag',
+        'Map',
+        'Error, and the error it predicted',
+        'Which motion model held',
+        'Surprise of each measurement (NIS)',
+    ]
     assert 'Refused input' in page.headings
     assert 'not &lt;b&gt;finite' in text and 'not <b>finite' not in text
 
@@ -90,9 +101,14 @@ def test_checks_against_the_live_node_come_first():
 
 
 def test_runs_of_several_systems_share_a_page():
-    other = run_part({**RUN, 'system': 'whale', 'bag': 'whale.bag'}, {'size': {'rmse_m': 2.0}}, [],
-                     summary='A whale.', cards=[Card('30 m', 'Length')],
-                     sections=[Section('Whale', 'Seen from the side.')])
+    other = run_part(
+        {**RUN, 'system': 'whale', 'bag': 'whale.bag'},
+        {'size': {'rmse_m': 2.0}},
+        [],
+        summary='A whale.',
+        cards=[Card('30 m', 'Length')],
+        sections=[Section('Whale', 'Seen from the side.')],
+    )
     text = report_html([diver_part(material()), other])
     page = Page(text)
     assert page.headings.index('whale.bag') < page.headings.index('Whale')

@@ -3,7 +3,7 @@
 import csv
 import json
 
-from dive_scenes import single_run, START_NS
+from helpers.dive_scenes import single_run, START_NS
 import numpy as np
 import pytest
 
@@ -44,8 +44,9 @@ def test_the_same_estimates_make_the_same_bytes(tmp_path):
         folder = RunFolder(tmp_path / name)
         folder.prepare()
         folder.write_estimates(ESTIMATES, 'diver')
-        contents.append({path.name: path.read_bytes() for path in folder.path.rglob('*')
-                         if path.is_file()})
+        contents.append(
+            {path.name: path.read_bytes() for path in folder.path.rglob('*') if path.is_file()}
+        )
     assert contents[0] == contents[1] and len(contents[0]) == 3
 
 
@@ -69,9 +70,18 @@ def test_a_file_is_no_folder(tmp_path):
         RunFolder(tmp_path / 'file').prepare()
 
 
-@pytest.mark.parametrize('text', ['', '{', '[]', '{"system": "diver"}', '3',
-                                  '{"system": "whale", "bag": "", "topics": {}, "parameters": 0}',
-                                  '{"system": [], "bag": "", "topics": {}, "parameters": 0}'])
+@pytest.mark.parametrize(
+    'text',
+    [
+        '',
+        '{',
+        '[]',
+        '{"system": "diver"}',
+        '3',
+        '{"system": "whale", "bag": "", "topics": {}, "parameters": 0}',
+        '{"system": [], "bag": "", "topics": {}, "parameters": 0}',
+    ],
+)
 def test_a_broken_run_json_is_one_sentence(folder, text):
     (folder.path / 'run.json').write_text(text)
     with pytest.raises(BagError, match='cannot be understood'):
@@ -84,8 +94,9 @@ def test_an_unfinished_run_is_told(tmp_path):
 
 
 def test_json_never_holds_nan():
-    text = json.dumps(finite({'a': [float('nan'), 1.0, (float('inf'),)], 'b': {'c': 'x'}}),
-                      allow_nan=False)
+    text = json.dumps(
+        finite({'a': [float('nan'), 1.0, (float('inf'),)], 'b': {'c': 'x'}}), allow_nan=False
+    )
     assert json.loads(text) == {'a': [None, 1.0, [None]], 'b': {'c': 'x'}}
 
 

@@ -1,7 +1,7 @@
 """Offline runs: the last word on each stamp, refusals, order, smoothing."""
 
-from dive_bags import write_dive
-from dive_scenes import estimate_at, SECOND, START_NS
+from helpers.dive_bags import write_dive
+from helpers.dive_scenes import estimate_at, SECOND, START_NS
 import numpy as np
 import pytest
 
@@ -97,12 +97,14 @@ def test_topics_can_be_named(tmp_path):
 
 
 def test_the_smoother_is_nearer_to_the_truth(tmp_path):
-    from dive_scenes import legs
+    from helpers.dive_scenes import legs
+
     errors = {}
     for smooth in (False, True):
         with BagReader(write_dive(tmp_path / f'dive{smooth}')) as bag:
-            estimates = list(OfflineRun(bag, DIVER, CONFIG, InputOptions(smooth=smooth))
-                             .estimates())
+            estimates = list(
+                OfflineRun(bag, DIVER, CONFIG, InputOptions(smooth=smooth)).estimates()
+            )
         rows = [one for one in estimates if len(one)]
         times = np.array([(one.stamp_ns - START_NS) / SECOND for one in rows])
         place = np.array([one.state[0, :2] for one in rows])

@@ -11,15 +11,17 @@ from sonar_imm.recordings.messages import ros_message
 
 def columns(rows=3, **changes):
     base = {name: np.arange(rows, dtype=np.float64) + 1.0 for name in REQUIRED}
-    base.update(tx_id=np.zeros(rows, np.uint16), rx_id=np.arange(rows, dtype=np.uint16),
-                toa=np.linspace(0.1, 0.2, rows))
+    base.update(
+        tx_id=np.zeros(rows, np.uint16),
+        rx_id=np.arange(rows, dtype=np.uint16),
+        toa=np.linspace(0.1, 0.2, rows),
+    )
     base.update(changes)
     return {name: column for name, column in base.items() if column is not None}
 
 
 def message(stamp_ns=10**18, frame_id='map', **changes):
-    return encode_table(columns(**changes), stamp_ns=stamp_ns, frame_id=frame_id,
-                        make=ros_message)
+    return encode_table(columns(**changes), stamp_ns=stamp_ns, frame_id=frame_id, make=ros_message)
 
 
 def reason(**changes):
@@ -43,17 +45,22 @@ def test_a_missing_required_column_is_named():
 
 
 def test_bad_rows_are_dropped_one_by_one():
-    arrivals = read_arrivals(message(
-        rows=7, toa=np.array([0.1, np.nan, 0.3, 0.4, 1e9, -0.1, 0.7]),
-        rx_y=np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0]),
-        tx_x=np.array([0.0, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0])))
+    arrivals = read_arrivals(
+        message(
+            rows=7,
+            toa=np.array([0.1, np.nan, 0.3, 0.4, 1e9, -0.1, 0.7]),
+            rx_y=np.array([0.0, 0.0, np.inf, 0.0, 0.0, 0.0, 0.0]),
+            tx_x=np.array([0.0, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0]),
+        )
+    )
     assert arrivals.rx_id.tolist() == [0, 6]
 
 
 def test_without_any_transmitter_the_target_emits():
     nowhere = np.full(3, np.nan)
-    arrivals = read_arrivals(message(tx_x=nowhere, tx_y=nowhere, tx_z=nowhere,
-                                     toa=np.array([0.0, -0.01, 0.2])))
+    arrivals = read_arrivals(
+        message(tx_x=nowhere, tx_y=nowhere, tx_z=nowhere, toa=np.array([0.0, -0.01, 0.2]))
+    )
     assert arrivals.passive and len(arrivals) == 3
 
 
@@ -70,14 +77,21 @@ def test_bearings_are_wrapped_and_degrees_are_refused():
     assert reason(bearing=np.array([0.1, 45.0, 0.1])) == 'out_of_range'
 
 
-@pytest.mark.parametrize('code, changes', [
-    ('empty', {'rows': 0}), ('nan', {'toa': np.full(3, np.nan)}),
-    ('nan', {'tx_x': np.array([1.0, np.nan, 2.0]), 'rx_x': np.array([np.nan, 0.0, np.nan])}),
-    ('out_of_range', {'rx_id': np.array([0.0, 0.5, 2.0])}),
-    ('out_of_range', {'tx_id': np.array([0, -1, 2], np.int32)}),
-    ('out_of_range', {'tx_id': np.array([0, 65536, 2], np.int32)}),
-    ('bad_field', {'toa': np.zeros((3, 2))}), ('bad_stamp', {'stamp_ns': 0}),
-    ('frame_ned', {'frame_id': 'map_ned'}), ('too_large', {'rows': 10_001})])
+@pytest.mark.parametrize(
+    'code, changes',
+    [
+        ('empty', {'rows': 0}),
+        ('nan', {'toa': np.full(3, np.nan)}),
+        ('nan', {'tx_x': np.array([1.0, np.nan, 2.0]), 'rx_x': np.array([np.nan, 0.0, np.nan])}),
+        ('out_of_range', {'rx_id': np.array([0.0, 0.5, 2.0])}),
+        ('out_of_range', {'tx_id': np.array([0, -1, 2], np.int32)}),
+        ('out_of_range', {'tx_id': np.array([0, 65536, 2], np.int32)}),
+        ('bad_field', {'toa': np.zeros((3, 2))}),
+        ('bad_stamp', {'stamp_ns': 0}),
+        ('frame_ned', {'frame_id': 'map_ned'}),
+        ('too_large', {'rows': 10_001}),
+    ],
+)
 def test_what_cannot_be_used_is_refused_with_its_reason(code, changes):
     assert reason(**changes) == code
 
@@ -85,33 +99,64 @@ def test_what_cannot_be_used_is_refused_with_its_reason(code, changes):
 @pytest.mark.parametrize('bearing', [np.full(2, np.nan), np.array([0.3, np.nan])])
 def test_writing_and_reading_gives_the_same_arrivals(bearing):
     nowhere = np.full((2, 3), np.nan)
-    arrivals = Arrivals(stamp_ns=10**18 + 1, tx_id=[0, 0], rx_id=[3, 65535], tx=nowhere,
-                        rx=[[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]], toa=[0.0, 0.1],
-                        var_toa=np.float32([1e-6, np.nan]), bearing=bearing,
-                        var_bearing=np.float32(bearing * 0.1), frame_id='map')
+    arrivals = Arrivals(
+        stamp_ns=10**18 + 1,
+        tx_id=[0, 0],
+        rx_id=[3, 65535],
+        tx=nowhere,
+        rx=[[1 / 3, 2.0, -1.0], [4.0, 5.0, 6.0]],
+        toa=[0.0, 0.1],
+        var_toa=np.float32([1e-6, np.nan]),
+        bearing=bearing,
+        var_bearing=np.float32(bearing * 0.1),
+        frame_id='map',
+    )
     again = read_arrivals(write_arrivals(arrivals, ros_message))
     assert again.stamp_ns == arrivals.stamp_ns and again.frame_id == 'map'
     for name in ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing'):
         assert np.array_equal(getattr(again, name), getattr(arrivals, name), equal_nan=True), name
 
 
-NASTY = np.array([0.1, 0.2, 0.5, 1.0, 3.0, 0.0, -1.0, 1e-30, 1e9, 1e30, -1e30, 45.0, 7e4, np.nan,
-                  np.inf, -np.inf])
+NASTY = np.array(
+    [
+        0.1,
+        0.2,
+        0.5,
+        1.0,
+        3.0,
+        0.0,
+        -1.0,
+        1e-30,
+        1e9,
+        1e30,
+        -1e30,
+        45.0,
+        7e4,
+        np.nan,
+        np.inf,
+        -np.inf,
+    ]
+)
 ALL = (*REQUIRED, 'var_toa', 'bearing', 'var_bearing')
 
 
-@given(rows=st.integers(0, 3), nasty=st.sets(st.sampled_from(ALL), max_size=4),
-       gone=st.sampled_from((None,) * 5 + REQUIRED), values=st.binary(min_size=36, max_size=36),
-       stamp_ns=st.integers(-10**18, 2 * 10**18), cut=st.sampled_from((0, 0, 0, 1, 40)))
+@given(
+    rows=st.integers(0, 3),
+    nasty=st.sets(st.sampled_from(ALL), max_size=4),
+    gone=st.sampled_from((None,) * 5 + REQUIRED),
+    values=st.binary(min_size=36, max_size=36),
+    stamp_ns=st.integers(-(10**18), 2 * 10**18),
+    cut=st.sampled_from((0, 0, 0, 1, 40)),
+)
 @settings(max_examples=3_000, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_arrivals_are_refused_or_finite(rows, nasty, gone, values, stamp_ns, cut):
     table = columns(rows=rows)
     drawn = NASTY[np.frombuffer(values, np.uint8) % len(NASTY)].astype(np.float32)
     for i, name in enumerate(sorted(nasty)):
-        table[name] = drawn[3 * i:3 * i + rows]
+        table[name] = drawn[3 * i : 3 * i + rows]
     table.pop(gone, None)
     cloud = encode_table(table, stamp_ns=stamp_ns, frame_id='map', make=ros_message)
-    cloud.data = cloud.data[:len(cloud.data) - cut]
+    cloud.data = cloud.data[: len(cloud.data) - cut]
     try:
         arrivals = read_arrivals(cloud)
     except Rejection as rejection:

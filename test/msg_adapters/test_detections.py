@@ -1,9 +1,9 @@
 """Detections from every message that carries them; the sign of the bearing above all."""
 
+from helpers import marine
 from hypothesis import given, HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-import marine
 import numpy as np
 import pytest
 
@@ -42,12 +42,24 @@ def reason(read, message, **options):
 
 
 def test_writing_and_reading_gives_the_same_detections():
-    detections = Detections(stamp_ns=1_700_000_000_123_456_789, frame_id='sonar',
-                            range=[10.0, 1 / 3], bearing=[PORT, STARBOARD],
-                            var_range=[0.25, np.nan], intensity=[3.0, 4.0])
+    detections = Detections(
+        stamp_ns=1_700_000_000_123_456_789,
+        frame_id='sonar',
+        range=[10.0, 1 / 3],
+        bearing=[PORT, STARBOARD],
+        var_range=[0.25, np.nan],
+        intensity=[3.0, 4.0],
+    )
     message = write_detections(detections, ros_message)
     assert [field.name for field in message.fields] == [
-        'x', 'y', 'z', 'range', 'bearing', 'var_range', 'intensity']
+        'x',
+        'y',
+        'z',
+        'range',
+        'bearing',
+        'var_range',
+        'intensity',
+    ]
     again = read_detections(message)
     assert again.stamp_ns == detections.stamp_ns and again.frame_id == 'sonar'
     for name in ('range', 'bearing', 'var_range', 'intensity'):
@@ -61,9 +73,14 @@ def test_port_is_drawn_on_the_left():
     assert x > 9.0 and y == pytest.approx(10.0 * np.sin(PORT))
 
 
-@pytest.mark.parametrize('message', [
-    write_detections(Detections(stamp_ns=7, range=[], bearing=[]), ros_message),
-    table(), table(range=np.empty(0), bearing=np.empty(0))])
+@pytest.mark.parametrize(
+    'message',
+    [
+        write_detections(Detections(stamp_ns=7, range=[], bearing=[]), ros_message),
+        table(),
+        table(range=np.empty(0), bearing=np.empty(0)),
+    ],
+)
 def test_an_empty_cloud_is_a_ping_without_detections(message):
     message.header = header()
     ping = read_detections(message)
@@ -77,21 +94,30 @@ def test_a_cloud_of_points_is_read_by_x_y_z():
 
 
 def test_rows_that_are_no_echo_are_dropped_and_their_columns_with_them():
-    ping = read_detections(table(
-        range=[np.nan, np.inf, -np.inf, 0.0, -3.0, 1e30, 5.0, 6.0],
-        bearing=[0.1] * 6 + [np.nan, PORT], var_range=np.arange(1.0, 9.0),
-        var_bearing=[1.0] * 7 + [-1.0]))
+    ping = read_detections(
+        table(
+            range=[np.nan, np.inf, -np.inf, 0.0, -3.0, 1e30, 5.0, 6.0],
+            bearing=[0.1] * 6 + [np.nan, PORT],
+            var_range=np.arange(1.0, 9.0),
+            var_bearing=[1.0] * 7 + [-1.0],
+        )
+    )
     assert ping.range.tolist() == [6.0] and ping.bearing.tolist() == [PORT]
     assert ping.var_range.tolist() == [8.0] and np.isnan(ping.var_bearing).all()
 
 
-@pytest.mark.parametrize('message, code', [
-    (table(range=[1.0]), 'missing_column'), (table(bearing=[1.0]), 'missing_column'),
-    (table(x=[1.0], y=[1.0]), 'missing_column'),
-    (table(range=[1.0], bearing=[30.0]), 'out_of_range'),
-    (table(range=np.ones((1, 2)), bearing=[0.0]), 'bad_field'),
-    (table(range=np.ones(10_001), bearing=np.zeros(10_001)), 'too_large'),
-    (ros_message('sensor_msgs/msg/PointCloud2'), 'bad_stamp')])
+@pytest.mark.parametrize(
+    'message, code',
+    [
+        (table(range=[1.0]), 'missing_column'),
+        (table(bearing=[1.0]), 'missing_column'),
+        (table(x=[1.0], y=[1.0]), 'missing_column'),
+        (table(range=[1.0], bearing=[30.0]), 'out_of_range'),
+        (table(range=np.ones((1, 2)), bearing=[0.0]), 'bad_field'),
+        (table(range=np.ones(10_001), bearing=np.zeros(10_001)), 'too_large'),
+        (ros_message('sensor_msgs/msg/PointCloud2'), 'bad_stamp'),
+    ],
+)
 def test_a_table_that_cannot_be_used_is_refused_with_its_reason(message, code):
     assert reason(read_detections, message) == code
 
@@ -100,9 +126,16 @@ def test_a_table_that_cannot_be_used_is_refused_with_its_reason(message, code):
 
 
 def scan(ranges, intensities=()):
-    return ros_message('sensor_msgs/msg/LaserScan', header=header(), angle_min=-0.2,
-                       angle_increment=0.1, range_min=1.0, range_max=50.0, ranges=ranges,
-                       intensities=intensities)
+    return ros_message(
+        'sensor_msgs/msg/LaserScan',
+        header=header(),
+        angle_min=-0.2,
+        angle_increment=0.1,
+        range_min=1.0,
+        range_max=50.0,
+        ranges=ranges,
+        intensities=intensities,
+    )
 
 
 def test_a_laser_scan_counts_to_port_and_keeps_what_lies_inside_its_limits():
@@ -115,11 +148,16 @@ def test_a_laser_scan_counts_to_port_and_keeps_what_lies_inside_its_limits():
 
 
 def test_a_pose_array_is_read_by_its_places():
-    poses = [ros_message('geometry_msgs/msg/Pose',
-                         position=ros_message('geometry_msgs/msg/Point', x=x, y=y, z=z))
-             for x, y, z in [(4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0)]]
-    ping = read_pose_array(ros_message('geometry_msgs/msg/PoseArray', header=header(),
-                                       poses=poses))
+    poses = [
+        ros_message(
+            'geometry_msgs/msg/Pose',
+            position=ros_message('geometry_msgs/msg/Point', x=x, y=y, z=z),
+        )
+        for x, y, z in [(4.0, 3.0, 0.0), (np.nan, 0.0, 0.0), (0.0, 0.0, 0.0)]
+    ]
+    ping = read_pose_array(
+        ros_message('geometry_msgs/msg/PoseArray', header=header(), poses=poses)
+    )
     assert ping.range.tolist() == [5.0] and ping.bearing == pytest.approx([np.arctan2(3, 4)])
     assert len(read_pose_array(ros_message('geometry_msgs/msg/PoseArray', header=header()))) == 0
 
@@ -139,8 +177,12 @@ def beams(axes):
 @pytest.mark.parametrize('told', ['right', 'auto'])
 def test_both_beam_axes_give_port_as_positive(axes, told):
     message = marine.sent(marine.sonar_ranges(beams(axes), [20.0, 30.0]))
-    ping = read_sonar_ranges(message, beam_axes=axes if told == 'right' else 'auto',
-                             world_frame='enu', sound_speed=1400.0)
+    ping = read_sonar_ranges(
+        message,
+        beam_axes=axes if told == 'right' else 'auto',
+        world_frame='enu',
+        sound_speed=1400.0,
+    )
     assert ping.bearing == pytest.approx([PORT, STARBOARD], abs=1e-6)
     assert ping.range.tolist() == [20.0, 30.0]
 
@@ -155,8 +197,9 @@ def test_the_wrong_axes_are_not_mended_in_silence():
 
 def test_bad_flags_and_ranges_are_dropped():
     axes = np.repeat(beams('marine')[:1], 5, axis=0)
-    message = marine.sonar_ranges(axes, [5.0, np.inf, 7.0, np.nan, 9.0], flags=[0, 0, 2, 0, 0],
-                                  intensities=[3.0])
+    message = marine.sonar_ranges(
+        axes, [5.0, np.inf, 7.0, np.nan, 9.0], flags=[0, 0, 2, 0, 0], intensities=[3.0]
+    )
     ping = read_sonar_ranges(message)
     assert ping.range.tolist() == [5.0, 9.0] and ping.intensity.tolist() == [3.0, 3.0]
     assert reason(read_sonar_ranges, marine.sonar_ranges(axes, [5.0])) == 'bad_shape'
@@ -165,8 +208,9 @@ def test_bad_flags_and_ranges_are_dropped():
 
 
 def test_two_way_times_become_ranges_and_starboard_angles_negative_bearings():
-    message = marine.sent(marine.sonar_detections([0.04, 0.02], [-PORT, -STARBOARD],
-                                                  sound_speed=1480.0))
+    message = marine.sent(
+        marine.sonar_detections([0.04, 0.02], [-PORT, -STARBOARD], sound_speed=1480.0)
+    )
     ping = read_sonar_detections(message, sound_speed=1500.0)
     assert ping.range == pytest.approx([29.6, 14.8], rel=1e-6)
     assert ping.bearing == pytest.approx([PORT, STARBOARD])
@@ -174,8 +218,9 @@ def test_two_way_times_become_ranges_and_starboard_angles_negative_bearings():
 
 @pytest.mark.parametrize('stated', [0.0, np.nan, 1.5])
 def test_a_speed_of_sound_that_is_none_gives_way_to_the_parameter(stated):
-    ping = read_sonar_detections(marine.sonar_detections([0.02], [0.0], sound_speed=stated),
-                                 sound_speed=1450.0)
+    ping = read_sonar_detections(
+        marine.sonar_detections([0.02], [0.0], sound_speed=stated), sound_speed=1450.0
+    )
     assert ping.range == pytest.approx([14.5])
 
 
@@ -195,11 +240,12 @@ numbers = arrays(np.float32, st.integers(0, 6), elements=st.sampled_from(NASTY).
 def test_anything_gives_sound_detections_or_a_rejection(a, b, c, flags):
     rows = np.column_stack([np.resize(one, 4) if len(one) else np.zeros(4) for one in (a, b, c)])
     for read, message in [
-            (read_detections, table(x=rows[:, 0], range=rows[:, 1], bearing=rows[:, 2])),
-            (read_detections, table(x=rows[:, 0], y=rows[:, 1], z=rows[:, 2])),
-            (read_laser_scan, scan(a, b)),
-            (read_sonar_ranges, marine.sonar_ranges(rows, a, flags, b)),
-            (read_sonar_detections, marine.sonar_detections(a, b, flags, c))]:
+        (read_detections, table(x=rows[:, 0], range=rows[:, 1], bearing=rows[:, 2])),
+        (read_detections, table(x=rows[:, 0], y=rows[:, 1], z=rows[:, 2])),
+        (read_laser_scan, scan(a, b)),
+        (read_sonar_ranges, marine.sonar_ranges(rows, a, flags, b)),
+        (read_sonar_detections, marine.sonar_detections(a, b, flags, c)),
+    ]:
         message.header = header()
         try:
             ping = read(message)

@@ -23,13 +23,21 @@ def estimate(rows=2, seed=1):
     probabilities = rng.random((rows, 3))
     state = rng.standard_normal((rows, 4)) * 1e5
     xyz = np.column_stack([state[:, :2], np.full(rows, -4.0)]).astype(np.float32)
-    return Estimate(stamp_ns=1700000000123456789, frame_id='map', xyz=xyz, state_names=STATES,
-                    state=state, covariance=root @ root.transpose(0, 2, 1),
-                    model_names=('heading_000', 'heading_022', 'hover'),
-                    probabilities=probabilities / probabilities.sum(axis=1, keepdims=True),
-                    extras={'track_id': np.arange(7, 7 + rows, dtype=np.uint32),
-                            'track_state': np.ones(rows, np.uint8),
-                            'nis': np.full(rows, np.nan)})
+    return Estimate(
+        stamp_ns=1700000000123456789,
+        frame_id='map',
+        xyz=xyz,
+        state_names=STATES,
+        state=state,
+        covariance=root @ root.transpose(0, 2, 1),
+        model_names=('heading_000', 'heading_022', 'hover'),
+        probabilities=probabilities / probabilities.sum(axis=1, keepdims=True),
+        extras={
+            'track_id': np.arange(7, 7 + rows, dtype=np.uint32),
+            'track_state': np.ones(rows, np.uint8),
+            'nis': np.full(rows, np.nan),
+        },
+    )
 
 
 def through_cdr(message):
@@ -51,9 +59,30 @@ def test_an_estimate_reads_back_bit_for_bit(rows):
 def test_the_columns_are_those_of_the_contract():
     message = write_estimate(estimate(), ros_message)
     assert [field.name for field in message.fields] == [
-        'x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px', 'cov_px_py', 'cov_px_vx', 'cov_px_vy',
-        'cov_py_py', 'cov_py_vx', 'cov_py_vy', 'cov_vx_vx', 'cov_vx_vy', 'cov_vy_vy',
-        'prob_heading_000', 'prob_heading_022', 'prob_hover', 'track_id', 'track_state', 'nis']
+        'x',
+        'y',
+        'z',
+        'px',
+        'py',
+        'vx',
+        'vy',
+        'cov_px_px',
+        'cov_px_py',
+        'cov_px_vx',
+        'cov_px_vy',
+        'cov_py_py',
+        'cov_py_vx',
+        'cov_py_vy',
+        'cov_vx_vx',
+        'cov_vx_vy',
+        'cov_vy_vy',
+        'prob_heading_000',
+        'prob_heading_022',
+        'prob_hover',
+        'track_id',
+        'track_state',
+        'nis',
+    ]
     assert [field.datatype for field in message.fields] == [7] * 3 + [8] * 17 + [6, 2, 8]
 
 
@@ -68,10 +97,24 @@ def test_a_table_without_a_column_is_refused(gone):
 
 
 def test_truth_comes_back_as_extras():
-    message = write_truth([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [[0.1, 0.2], [np.nan, np.nan]],
-                          [3, 9], stamp_ns=5, frame_id='map', make=ros_message)
-    assert [field.name for field in message.fields] == ['x', 'y', 'z', 'px', 'py', 'vx', 'vy',
-                                                        'track_id']
+    message = write_truth(
+        [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]],
+        [[0.1, 0.2], [np.nan, np.nan]],
+        [3, 9],
+        stamp_ns=5,
+        frame_id='map',
+        make=ros_message,
+    )
+    assert [field.name for field in message.fields] == [
+        'x',
+        'y',
+        'z',
+        'px',
+        'py',
+        'vx',
+        'vy',
+        'track_id',
+    ]
     truth = read_estimate(message)
     assert truth.extras['py'].tolist() == [2.0, 5.0]
     assert truth.extras['track_id'].tolist() == [3, 9]
@@ -88,8 +131,10 @@ def test_odometry_shows_one_diver_with_velocity_in_the_world():
     assert [twist.twist.linear.x, twist.twist.linear.y] == first.state[1, 2:].tolist()
     quaternion = pose.pose.orientation
     assert (quaternion.x, quaternion.y, quaternion.z, quaternion.w) == (0.0, 0.0, 0.0, 1.0)
-    for got, block in ((pose.covariance, first.covariance[1, :2, :2]),
-                       (twist.covariance, first.covariance[1, 2:, 2:])):
+    for got, block in (
+        (pose.covariance, first.covariance[1, :2, :2]),
+        (twist.covariance, first.covariance[1, 2:, 2:]),
+    ):
         matrix = got.reshape(6, 6)
         assert (matrix[:2, :2] == block).all()
         assert (matrix[2:, 2:] == np.eye(4) * UNKNOWN_VARIANCE).all()

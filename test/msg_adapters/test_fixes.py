@@ -43,15 +43,24 @@ def test_a_pose_and_a_point_are_read():
     assert fix.stamp_ns == 100_000_000_005 and fix.frame_id == 'map'
     assert fix.position.tolist() == [1.0, 2.0, 3.0]
     assert fix.covariance.tolist() == [[4.0, 0.5], [0.5, 9.0]]
-    point = ros_message('geometry_msgs/msg/PointStamped', header=header(),
-                        point=ros_message('geometry_msgs/msg/Point', x=7.0, y=8.0))
+    point = ros_message(
+        'geometry_msgs/msg/PointStamped',
+        header=header(),
+        point=ros_message('geometry_msgs/msg/Point', x=7.0, y=8.0),
+    )
     assert read_fix(point).position.tolist() == [7.0, 8.0, 0.0]
     assert read_fix(point).covariance is None and doubt_fix(point) is None
 
 
-@pytest.mark.parametrize('covariance, doubt', [
-    (block(0.0, 0.0, 0.0, 0.0), 'zero_covariance'), (block(-1.0, 0.0, 0.0, 4.0), None),
-    (block(4.0, 0.0, 0.0, -1.0), None), (-np.eye(6), None)])
+@pytest.mark.parametrize(
+    'covariance, doubt',
+    [
+        (block(0.0, 0.0, 0.0, 0.0), 'zero_covariance'),
+        (block(-1.0, 0.0, 0.0, 4.0), None),
+        (block(4.0, 0.0, 0.0, -1.0), None),
+        (-np.eye(6), None),
+    ],
+)
 def test_zero_and_negative_covariances_are_unknown_and_only_zero_is_doubted(covariance, doubt):
     assert read_fix(pose(covariance)).covariance is None
     assert doubt_fix(pose(covariance)) == doubt
@@ -64,16 +73,24 @@ def test_what_is_not_used_may_be_nonsense():
     assert fix.covariance.tolist() == [[4.0, 0.0], [0.0, 9.0]] and fix.position[2] == 0.0
 
 
-@pytest.mark.parametrize('message, code', [
-    (pose(block(4.0, 1.0, 2.0, 9.0)), 'bad_covariance'),
-    (pose(block(1.0, 2.0, 2.0, 1.0)), 'bad_covariance'),
-    (pose(block(math.nan, 0.0, 0.0, 1.0)), 'nan'),
-    (pose(block(1.0, math.inf, math.inf, 1.0)), 'nan'),
-    (pose(block(1e-300, 0.0, 0.0, 1e-300)), 'out_of_range'),
-    (pose(block(1e300, 0.0, 0.0, 1e308)), 'out_of_range'),
-    (pose(x=math.nan), 'nan'), (pose(y=math.inf), 'nan'), (pose(x=1e9), 'out_of_range'),
-    (pose(sec=0, nanosec=0), 'bad_stamp'), (pose(sec=-5), 'bad_stamp'),
-    (pose(nanosec=2**32 - 1), 'bad_stamp'), (pose(frame_id='odom_ned'), 'frame_ned')])
+@pytest.mark.parametrize(
+    'message, code',
+    [
+        (pose(block(4.0, 1.0, 2.0, 9.0)), 'bad_covariance'),
+        (pose(block(1.0, 2.0, 2.0, 1.0)), 'bad_covariance'),
+        (pose(block(math.nan, 0.0, 0.0, 1.0)), 'nan'),
+        (pose(block(1.0, math.inf, math.inf, 1.0)), 'nan'),
+        (pose(block(1e-300, 0.0, 0.0, 1e-300)), 'out_of_range'),
+        (pose(block(1e300, 0.0, 0.0, 1e308)), 'out_of_range'),
+        (pose(x=math.nan), 'nan'),
+        (pose(y=math.inf), 'nan'),
+        (pose(x=1e9), 'out_of_range'),
+        (pose(sec=0, nanosec=0), 'bad_stamp'),
+        (pose(sec=-5), 'bad_stamp'),
+        (pose(nanosec=2**32 - 1), 'bad_stamp'),
+        (pose(frame_id='odom_ned'), 'frame_ned'),
+    ],
+)
 def test_what_cannot_be_used_is_refused_with_its_reason(message, code):
     assert reason(message) == code
 
@@ -86,29 +103,58 @@ def test_a_covariance_of_another_size_is_refused():
 
 @pytest.mark.parametrize('covariance', [None, [[4.0, 0.1], [0.1, 9.0]]])
 def test_writing_and_reading_gives_the_same_fix(covariance):
-    fix = Fix(stamp_ns=1700000000123456789, position=(1 / 3, -2e5, 0.5), covariance=covariance,
-              frame_id='map')
+    fix = Fix(
+        stamp_ns=1700000000123456789,
+        position=(1 / 3, -2e5, 0.5),
+        covariance=covariance,
+        frame_id='map',
+    )
     message = write_fix(fix, ros_message)
     again = read_fix(message)
     assert again.stamp_ns == fix.stamp_ns and again.frame_id == 'map'
     assert (again.position == fix.position).all() and doubt_fix(message) is None
-    assert (again.covariance is None) if covariance is None else (
-        again.covariance == fix.covariance).all()
+    assert (
+        (again.covariance is None)
+        if covariance is None
+        else (again.covariance == fix.covariance).all()
+    )
 
 
-NASTY = (1.0, 2.0, 4.0, 0.5, 0.0, -0.0, -1.0, 1e-300, 1e-12, 1e9, 1e300, 1e-160, math.nan,
-         math.inf, -math.inf, 1 / 3, 100.0)
+NASTY = (
+    1.0,
+    2.0,
+    4.0,
+    0.5,
+    0.0,
+    -0.0,
+    -1.0,
+    1e-300,
+    1e-12,
+    1e9,
+    1e300,
+    1e-160,
+    math.nan,
+    math.inf,
+    -math.inf,
+    1 / 3,
+    100.0,
+)
 
 
-@given(values=st.binary(min_size=7, max_size=7), symmetric=st.booleans(),
-       sec=st.sampled_from((1, 0, -1, 1700000000, 2**31 - 1, -2**31)),
-       nanosec=st.sampled_from((0, 5, 999999999, 10**9, 2**32 - 1)),
-       frame_id=st.sampled_from(['map', '', 'x_ned']), world=st.sampled_from(['enu', 'ned']))
+@given(
+    values=st.binary(min_size=7, max_size=7),
+    symmetric=st.booleans(),
+    sec=st.sampled_from((1, 0, -1, 1700000000, 2**31 - 1, -(2**31))),
+    nanosec=st.sampled_from((0, 5, 999999999, 10**9, 2**32 - 1)),
+    frame_id=st.sampled_from(['map', '', 'x_ned']),
+    world=st.sampled_from(['enu', 'ned']),
+)
 @settings(max_examples=3_000, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_fixes_are_refused_or_finite(values, symmetric, sec, nanosec, frame_id, world):
     x, y, z, a, b, c, d = (NASTY[value % len(NASTY)] for value in values)
-    message = pose(block(a, b, b if symmetric else c, d), x, y, z, sec=sec, nanosec=nanosec,
-                   frame_id=frame_id)
+    message = pose(
+        block(a, b, b if symmetric else c, d), x, y, z, sec=sec, nanosec=nanosec, frame_id=frame_id
+    )
     try:
         fix = read_fix(message, world_frame=world)
     except Rejection as rejection:

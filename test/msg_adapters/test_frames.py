@@ -50,9 +50,10 @@ def test_what_sensors_on_board_say_is_in_frames_of_their_own():
     place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
     for measurement in (echo, height, place, echo, height, place):
         guard.check(measurement)
-    for other in (Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
-                  Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1],
-                             frame_id='map')):
+    for other in (
+        Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
+        Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='map'),
+    ):
         with pytest.raises(Rejection) as caught:
             guard.check(other)
         assert caught.value.reason == 'frame'

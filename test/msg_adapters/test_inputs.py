@@ -10,6 +10,7 @@ def test_every_tracker_has_inputs_whose_readers_say_no_politely():
     import pytest
 
     from sonar_imm.measurements import Rejection
+
     assert set(INPUTS) == set(SYSTEMS)
     for topics in INPUTS.values():
         for topic in topics:
@@ -24,6 +25,8 @@ def test_every_tracker_has_inputs_whose_readers_say_no_politely():
 
 
 def test_the_adapters_load_neither_rclpy_nor_rosbags():
-    code = ('import sys, msg_adapters.inputs, msg_adapters.estimates; '
-            'sys.exit(any(name in sys.modules for name in ("rclpy", "rosbags")))')
+    code = (
+        'import sys, msg_adapters.inputs, msg_adapters.estimates; '
+        'sys.exit(any(name in sys.modules for name in ("rclpy", "rosbags")))'
+    )
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0

@@ -1,6 +1,6 @@
 """Poses and altitudes of a vehicle."""
 
-import marine
+from helpers import marine
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -20,11 +20,18 @@ TURNED = Rotation.from_euler('ZYX', [0.7, -0.2, 0.4])
 
 
 def navigation(**values):
-    return Navigation(**{
-        'stamp_ns': 1_700_000_000_123_456_789, 'position': [1 / 3, -2e5, -20.0],
-        'orientation': TURNED.as_quat(), 'velocity': [1.5, 0.1, -0.2],
-        'turn_rate': [0.01, 0.02, 0.03], 'frame_id': 'odom', 'child_frame_id': 'base_link',
-        **values})
+    return Navigation(
+        **{
+            'stamp_ns': 1_700_000_000_123_456_789,
+            'position': [1 / 3, -2e5, -20.0],
+            'orientation': TURNED.as_quat(),
+            'velocity': [1.5, 0.1, -0.2],
+            'turn_rate': [0.01, 0.02, 0.03],
+            'frame_id': 'odom',
+            'child_frame_id': 'base_link',
+            **values,
+        }
+    )
 
 
 def odometry(**values):
@@ -71,11 +78,16 @@ def test_a_ned_frame_is_taken_only_when_it_is_expected():
     assert read_navigation(message, world_frame='ned').position[2] == -20.0
 
 
-@pytest.mark.parametrize('change, code', [
-    ({'orientation': [0.0, 0.0, 0.0, 0.0]}, 'bad_orientation'),
-    ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'bad_orientation'),
-    ({'orientation': [0.0, np.nan, 0.0, 1.0]}, 'nan'), ({'position': [0, 0, np.inf]}, 'nan'),
-    ({'position': [0.0, 2e8, 0.0]}, 'out_of_range')])
+@pytest.mark.parametrize(
+    'change, code',
+    [
+        ({'orientation': [0.0, 0.0, 0.0, 0.0]}, 'bad_orientation'),
+        ({'orientation': [0.0, 0.0, 0.0, 2.0]}, 'bad_orientation'),
+        ({'orientation': [0.0, np.nan, 0.0, 1.0]}, 'nan'),
+        ({'position': [0, 0, np.inf]}, 'nan'),
+        ({'position': [0.0, 2e8, 0.0]}, 'out_of_range'),
+    ],
+)
 def test_a_pose_that_cannot_be_used_is_refused(change, code):
     message = odometry()
     for name, values in change.items():
@@ -101,9 +113,16 @@ def test_an_altitude_is_written_and_read():
         assert np.array_equal(again.variance, variance, equal_nan=True)
 
 
-@pytest.mark.parametrize('height, code', [
-    (np.inf, 'nan'), (-np.inf, 'nan'), (np.nan, 'nan'), (60.0, 'out_of_range'),
-    (0.2, 'out_of_range')])
+@pytest.mark.parametrize(
+    'height, code',
+    [
+        (np.inf, 'nan'),
+        (-np.inf, 'nan'),
+        (np.nan, 'nan'),
+        (60.0, 'out_of_range'),
+        (0.2, 'out_of_range'),
+    ],
+)
 def test_an_altitude_out_of_limits_is_refused(height, code):
     message = write_range(Altitude(stamp_ns=12, altitude=15.5), ros_message)
     message.min_range, message.max_range, message.range = 0.5, 50.0, height

@@ -12,9 +12,14 @@ ROOT = str(Path(sonar_imm.__file__).parent.parent)
 
 
 def import_with(*path):
-    return subprocess.run([sys.executable, '-c', 'import sonar_imm'], capture_output=True,
-                          text=True, cwd='/', check=False,
-                          env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)})
+    return subprocess.run(
+        [sys.executable, '-c', 'import sonar_imm'],
+        capture_output=True,
+        text=True,
+        cwd='/',
+        check=False,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)},
+    )
 
 
 def test_our_own_adapters_are_ours():
@@ -23,8 +28,15 @@ def test_our_own_adapters_are_ours():
     assert import_with(ROOT).returncode == 0
 
 
-@pytest.mark.parametrize('content', ['', "__owner__ = 'someone'\n__version__ = '9'\n",
-                                     "__owner__ = 'sonar_imm'\n__version__ = '0.0.0'\n", None])
+@pytest.mark.parametrize(
+    'content',
+    [
+        '',
+        "__owner__ = 'someone'\n__version__ = '9'\n",
+        "__owner__ = 'sonar_imm'\n__version__ = '0.0.0'\n",
+        None,
+    ],
+)
 def test_foreign_adapters_are_refused_and_both_places_named(tmp_path, content):
     foreign = tmp_path / 'msg_adapters'
     foreign.mkdir()

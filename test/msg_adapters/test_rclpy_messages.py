@@ -43,28 +43,51 @@ def make_rclpy(type_name, /, **fields):
 
 
 def fix():
-    return Fix(stamp_ns=1700000000123456789, position=(1 / 3, 2.0, 3.0),
-               covariance=[[4.0, 0.5], [0.5, 9.0]], frame_id='map')
+    return Fix(
+        stamp_ns=1700000000123456789,
+        position=(1 / 3, 2.0, 3.0),
+        covariance=[[4.0, 0.5], [0.5, 9.0]],
+        frame_id='map',
+    )
 
 
 def arrivals():
-    return Arrivals(stamp_ns=10**18, tx_id=[1, 1], rx_id=[2, 3], tx=np.ones((2, 3)),
-                    rx=np.zeros((2, 3)), toa=[0.1, 1 / 3], var_toa=np.float32([1e-6, np.nan]),
-                    bearing=[0.3, -0.4], var_bearing=np.float32([0.01, 0.02]), frame_id='map')
+    return Arrivals(
+        stamp_ns=10**18,
+        tx_id=[1, 1],
+        rx_id=[2, 3],
+        tx=np.ones((2, 3)),
+        rx=np.zeros((2, 3)),
+        toa=[0.1, 1 / 3],
+        var_toa=np.float32([1e-6, np.nan]),
+        bearing=[0.3, -0.4],
+        var_bearing=np.float32([0.01, 0.02]),
+        frame_id='map',
+    )
 
 
 def estimate():
-    return Estimate(stamp_ns=10**18, frame_id='map', xyz=np.zeros((1, 3), np.float32),
-                    state_names=('px', 'py', 'vx', 'vy'), state=np.array([[1 / 3, 2.0, 0.3, 0.4]]),
-                    covariance=np.eye(4)[None] * 0.1, model_names=('a', 'b'),
-                    probabilities=np.array([[0.25, 0.75]]),
-                    extras={'track_id': np.array([4], np.uint32)})
+    return Estimate(
+        stamp_ns=10**18,
+        frame_id='map',
+        xyz=np.zeros((1, 3), np.float32),
+        state_names=('px', 'py', 'vx', 'vy'),
+        state=np.array([[1 / 3, 2.0, 0.3, 0.4]]),
+        covariance=np.eye(4)[None] * 0.1,
+        model_names=('a', 'b'),
+        probabilities=np.array([[0.25, 0.75]]),
+        extras={'track_id': np.array([4], np.uint32)},
+    )
 
 
 def messages(make):
-    return [write_fix(fix(), make), write_arrivals(arrivals(), make),
-            write_estimate(estimate(), make), write_odometry(estimate(), 0, make),
-            write_model_probabilities(estimate(), 0, make)]
+    return [
+        write_fix(fix(), make),
+        write_arrivals(arrivals(), make),
+        write_estimate(estimate(), make),
+        write_odometry(estimate(), 0, make),
+        write_model_probabilities(estimate(), 0, make),
+    ]
 
 
 def test_rclpy_reads_what_rosbags_writes_and_the_other_way():
@@ -74,7 +97,8 @@ def test_rclpy_reads_what_rosbags_writes_and_the_other_way():
         back = decode_cdr(typestore(), name, rclpy_serialization.serialize_message(theirs))
         # bytes may differ in alignment padding, so both are written by the same serializer
         assert bytes(typestore().serialize_cdr(back, name)) == bytes(
-            typestore().serialize_cdr(ours, name))
+            typestore().serialize_cdr(ours, name)
+        )
 
 
 def test_live_and_recorded_messages_give_the_same_measurement():

@@ -1,6 +1,6 @@
 """Images of both kinds in both orders, and the echoes in them."""
 
-import marine
+from helpers import marine
 import numpy as np
 import pytest
 
@@ -22,26 +22,42 @@ def picture():
 
 def data(image, order, dtype='u1', big=False, beams=None):
     samples = (image if order == 'range_major' else image.T).astype(('>' if big else '<') + dtype)
-    return marine.make('SonarImageData', is_bigendian=big, dtype=DTYPES.index(dtype),
-                       beam_count=len(BEARINGS) if beams is None else beams,
-                       data=np.frombuffer(samples.tobytes(), np.uint8))
+    return marine.make(
+        'SonarImageData',
+        is_bigendian=big,
+        dtype=DTYPES.index(dtype),
+        beam_count=len(BEARINGS) if beams is None else beams,
+        data=np.frombuffer(samples.tobytes(), np.uint8),
+    )
 
 
 def projected(order='range_major', axes='rep103', **change):
     port, ahead, none = np.sin(BEARINGS), np.cos(BEARINGS), np.zeros(len(BEARINGS))
     beams = np.column_stack([ahead, port, none] if axes == 'rep103' else [none, -port, ahead])
-    return marine.make('ProjectedSonarImage', header=marine.header(),
-                       ping_info=marine.ping_info(), beam_directions=marine.vectors(beams),
-                       ranges=marine.floats(RANGES), image=data(picture(), order, **change))
+    return marine.make(
+        'ProjectedSonarImage',
+        header=marine.header(),
+        ping_info=marine.ping_info(),
+        beam_directions=marine.vectors(beams),
+        ranges=marine.floats(RANGES),
+        image=data(picture(), order, **change),
+    )
 
 
 def raw(sample0=8, rate=3000.0, sound_speed=1500.0):
     """c / (2 rate) = 0.25 m a sample: sample0 = 8 begins at 2 m."""
-    return marine.make('RawSonarImage', header=marine.header(),
-                       ping_info=marine.ping_info(sound_speed), sample_rate=rate,
-                       samples_per_beam=len(RANGES), sample0=sample0, tx_delays=marine.floats([]),
-                       tx_angles=marine.floats([]), rx_angles=marine.floats(-BEARINGS),
-                       image=data(picture(), 'range_major'))
+    return marine.make(
+        'RawSonarImage',
+        header=marine.header(),
+        ping_info=marine.ping_info(sound_speed),
+        sample_rate=rate,
+        samples_per_beam=len(RANGES),
+        sample0=sample0,
+        tx_delays=marine.floats([]),
+        tx_angles=marine.floats([]),
+        rx_angles=marine.floats(-BEARINGS),
+        image=data(picture(), 'range_major'),
+    )
 
 
 def config(**values):
@@ -58,8 +74,9 @@ def reason(message, **values):
 @pytest.mark.parametrize('axes', ['rep103', 'marine'])
 @pytest.mark.parametrize('dtype, big', [('u1', False), ('u2', True), ('f4', False), ('f8', True)])
 def test_echoes_are_found_where_they_are(order, axes, dtype, big):
-    found = detect(marine.sent(projected(order, axes, dtype=dtype, big=big)),
-                   config(image_order=order))
+    found = detect(
+        marine.sent(projected(order, axes, dtype=dtype, big=big)), config(image_order=order)
+    )
     assert found.stamp_ns == 100_000_000_005 and found.frame_id == 'sonar'
     assert found.range == pytest.approx([RANGES[40], RANGES[90]])
     assert found.bearing == pytest.approx([BEARINGS[5], BEARINGS[33]], abs=1e-6)
@@ -86,9 +103,15 @@ def test_the_wrong_order_is_not_mended_in_silence():
     assert mixed.amplitude[40, 5] != 200.0
 
 
-@pytest.mark.parametrize('message, code', [
-    (projected(beams=40), 'bad_shape'), (projected(beams=0), 'bad_shape'),
-    (raw(rate=0.0), 'out_of_range'), (raw(rate=np.nan), 'out_of_range')])
+@pytest.mark.parametrize(
+    'message, code',
+    [
+        (projected(beams=40), 'bad_shape'),
+        (projected(beams=0), 'bad_shape'),
+        (raw(rate=0.0), 'out_of_range'),
+        (raw(rate=np.nan), 'out_of_range'),
+    ],
+)
 def test_an_image_that_does_not_fit_is_refused(message, code):
     assert reason(message) == code
 

@@ -18,10 +18,17 @@ FORMATS = list(table.DATATYPES.values())
 def cloud(fields, data, *, height=1, width=1, point_step, row_step=None, big=False):
     """A PointCloud2 of plain attributes; fields are (name, offset, datatype, count)."""
     return SimpleNamespace(
-        height=height, width=width, point_step=point_step, is_bigendian=big, data=data,
+        height=height,
+        width=width,
+        point_step=point_step,
+        is_bigendian=big,
+        data=data,
         row_step=width * point_step if row_step is None else row_step,
-        fields=[SimpleNamespace(name=name, offset=offset, datatype=datatype, count=count)
-                for name, offset, datatype, count in fields])
+        fields=[
+            SimpleNamespace(name=name, offset=offset, datatype=datatype, count=count)
+            for name, offset, datatype, count in fields
+        ],
+    )
 
 
 def encode(columns):
@@ -41,10 +48,13 @@ class TestDecode:
             packed = np.zeros(3, [(code, order + code) for code in FORMATS])
             for code in FORMATS:
                 packed[code] = [1, 2, 120]
-            fields = [(code, packed.dtype.fields[code][1], number, 1)
-                      for number, code in table.DATATYPES.items()]
-            message = cloud(fields, packed.tobytes(), width=3, point_step=packed.itemsize,
-                            big=order == '>')
+            fields = [
+                (code, packed.dtype.fields[code][1], number, 1)
+                for number, code in table.DATATYPES.items()
+            ]
+            message = cloud(
+                fields, packed.tobytes(), width=3, point_step=packed.itemsize, big=order == '>'
+            )
             for code, column in decode_table(message).items():
                 assert column.dtype == np.dtype(code) and column.dtype.isnative
                 assert column.tolist() == [1, 2, 120]
@@ -56,10 +66,16 @@ class TestDecode:
         for r in range(2):
             for c in range(3):
                 at = r * row + c * step
-                data[at + 1:at + 5] = np.array([10 * r + c, 7], '<i2').tobytes()
-                data[at + 7:at + 11] = np.array([r - c], '<f4').tobytes()
-        message = cloud([('v', 1, 3, 2), ('f', 7, 7, 1)], bytes(data), height=2, width=3,
-                        point_step=step, row_step=row)
+                data[at + 1 : at + 5] = np.array([10 * r + c, 7], '<i2').tobytes()
+                data[at + 7 : at + 11] = np.array([r - c], '<f4').tobytes()
+        message = cloud(
+            [('v', 1, 3, 2), ('f', 7, 7, 1)],
+            bytes(data),
+            height=2,
+            width=3,
+            point_step=step,
+            row_step=row,
+        )
         columns = decode_table(message)
         assert columns['v'].tolist() == [[0, 7], [1, 7], [2, 7], [10, 7], [11, 7], [12, 7]]
         assert columns['f'].tolist() == [0, -1, -2, 1, 0, -1]
@@ -70,42 +86,60 @@ class TestDecode:
         assert columns['word'].tolist() == [0x04030201]
         assert columns['bytes'].tolist() == [[1, 2, 3, 4]]
 
-    @pytest.mark.parametrize('kind', [bytes, lambda data: array('B', data),
-                                      lambda data: np.frombuffer(data, np.uint8)])
+    @pytest.mark.parametrize(
+        'kind', [bytes, lambda data: array('B', data), lambda data: np.frombuffer(data, np.uint8)]
+    )
     def test_every_kind_of_payload_and_the_columns_are_fresh(self, kind):
-        columns = decode_table(cloud([('a', 0, 8, 1)], kind(np.float64(2.5).tobytes()),
-                                     point_step=8))
+        columns = decode_table(
+            cloud([('a', 0, 8, 1)], kind(np.float64(2.5).tobytes()), point_step=8)
+        )
         columns['a'][0] = 3.0
         assert columns['a'][0] == 3.0
 
     def test_an_empty_cloud_has_typed_empty_columns(self):
         for height, width, step in ((1, 0, 8), (0, 5, 8), (0, 0, 8)):
-            columns = decode_table(cloud([('a', 0, 8, 1), ('b', 0, 1, 3)], b'', height=height,
-                                         width=width, point_step=step,
-                                         row_step=width * step))
+            columns = decode_table(
+                cloud(
+                    [('a', 0, 8, 1), ('b', 0, 1, 3)],
+                    b'',
+                    height=height,
+                    width=width,
+                    point_step=step,
+                    row_step=width * step,
+                )
+            )
             assert columns['a'].shape == (0,) and columns['a'].dtype == np.float64
             assert columns['b'].shape == (0, 3)
         assert decode_table(cloud([], b'', width=0, point_step=0)) == {}
 
-    @pytest.mark.parametrize('code, message', [
-        ('short_data', cloud([('a', 0, 8, 1)], bytes(15), width=2, point_step=8)),
-        ('short_data', cloud([('a', 0, 2, 1)], bytes(15), height=2, width=1, point_step=1,
-                             row_step=8)),
-        ('bad_layout', cloud([('a', 0, 8, 1)], bytes(16), width=2, point_step=8, row_step=8)),
-        ('bad_layout', cloud([], b'', width=2, point_step=0)),
-        ('bad_layout', cloud([('a', 0, 2, 1)], [1, 2], point_step=1)),
-        ('bad_field', cloud([('a', 1, 8, 1)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('a', 0, 7, 3)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('a', 0, 7, 2**32 - 1)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('a', 0, 7, 0)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('a', 0, 0, 1)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('a', 0, 9, 1)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('', 0, 7, 1)], bytes(8), point_step=8)),
-        ('bad_field', cloud([('a', 0, 7, 1), ('a', 4, 7, 1)], bytes(8), point_step=8)),
-        ('too_large', cloud([(str(i), 0, 1, 1) for i in range(1025)], b'\0', point_step=1)),
-        ('too_large', cloud([(str(i), 0, 2, 2**20) for i in range(1000)], bytes(2**20),
-                            point_step=2**20)),
-    ])
+    @pytest.mark.parametrize(
+        'code, message',
+        [
+            ('short_data', cloud([('a', 0, 8, 1)], bytes(15), width=2, point_step=8)),
+            (
+                'short_data',
+                cloud([('a', 0, 2, 1)], bytes(15), height=2, width=1, point_step=1, row_step=8),
+            ),
+            ('bad_layout', cloud([('a', 0, 8, 1)], bytes(16), width=2, point_step=8, row_step=8)),
+            ('bad_layout', cloud([], b'', width=2, point_step=0)),
+            ('bad_layout', cloud([('a', 0, 2, 1)], [1, 2], point_step=1)),
+            ('bad_field', cloud([('a', 1, 8, 1)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('a', 0, 7, 3)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('a', 0, 7, 2**32 - 1)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('a', 0, 7, 0)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('a', 0, 0, 1)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('a', 0, 9, 1)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('', 0, 7, 1)], bytes(8), point_step=8)),
+            ('bad_field', cloud([('a', 0, 7, 1), ('a', 4, 7, 1)], bytes(8), point_step=8)),
+            ('too_large', cloud([(str(i), 0, 1, 1) for i in range(1025)], b'\0', point_step=1)),
+            (
+                'too_large',
+                cloud(
+                    [(str(i), 0, 2, 2**20) for i in range(1000)], bytes(2**20), point_step=2**20
+                ),
+            ),
+        ],
+    )
     def test_what_does_not_fit_is_refused_by_name(self, code, message):
         assert reason(message) == code
 
@@ -116,8 +150,15 @@ class TestDecode:
 
 class TestEncode:
     def test_x_y_z_come_first_and_nothing_is_padded(self):
-        message = encode({'id': np.array([1], np.uint8), 'z': np.float32([3]),
-                          'iq': np.float32([[1, 2]]), 'x': np.float32([1]), 'y': np.float32([2])})
+        message = encode(
+            {
+                'id': np.array([1], np.uint8),
+                'z': np.float32([3]),
+                'iq': np.float32([[1, 2]]),
+                'x': np.float32([1]),
+                'y': np.float32([2]),
+            }
+        )
         assert [field.name for field in message.fields] == ['x', 'y', 'z', 'id', 'iq']
         assert [field.offset for field in message.fields] == [0, 4, 8, 12, 13]
         assert message.point_step == 21 and message.row_step == 21 and len(message.data) == 21
@@ -130,9 +171,16 @@ class TestEncode:
     def test_booleans_become_bytes(self):
         assert decode_table(encode({'a': np.array([True, False])}))['a'].tolist() == [1, 0]
 
-    @pytest.mark.parametrize('columns', [{'a': np.zeros(2, np.int64)}, {'a': np.array(['x'])},
-                                         {'a': np.zeros(2), 'b': np.zeros(3)},
-                                         {'a': np.zeros((2, 2, 2))}, {'a': np.zeros((2, 0))}])
+    @pytest.mark.parametrize(
+        'columns',
+        [
+            {'a': np.zeros(2, np.int64)},
+            {'a': np.array(['x'])},
+            {'a': np.zeros(2), 'b': np.zeros(3)},
+            {'a': np.zeros((2, 2, 2))},
+            {'a': np.zeros((2, 0))},
+        ],
+    )
     def test_what_no_cloud_can_hold_is_a_programming_error(self, columns):
         with pytest.raises(ValueError, match='column'):
             encode(columns)
@@ -141,14 +189,18 @@ class TestEncode:
     @settings(max_examples=100, deadline=None)
     def test_round_trip_through_cdr_is_bit_exact(self, data):
         rows = data.draw(st.integers(0, 5))
-        names = data.draw(st.lists(st.text(min_size=1, max_size=5, alphabet='xyzabc_0'),
-                                   unique=True, max_size=6))
+        names = data.draw(
+            st.lists(st.text(min_size=1, max_size=5, alphabet='xyzabc_0'), unique=True, max_size=6)
+        )
         columns = {}
         for name in names:
             dtype = np.dtype(data.draw(st.sampled_from(FORMATS)))
             count = data.draw(st.integers(1, 3))
-            raw = data.draw(st.binary(min_size=rows * count * dtype.itemsize,
-                                      max_size=rows * count * dtype.itemsize))
+            raw = data.draw(
+                st.binary(
+                    min_size=rows * count * dtype.itemsize, max_size=rows * count * dtype.itemsize
+                )
+            )
             shape = (rows,) if count == 1 else (rows, count)
             columns[name] = np.frombuffer(raw, dtype).reshape(shape)
         message = encode(columns)
@@ -164,15 +216,29 @@ class TestEncode:
 SIZES = (0, 1, 1, 1, 2, 3, 4, 4, 5, 7, 8, 8, 12, 16, 24, 2**31 - 1, 2**32 - 1)
 
 
-@given(sizes=st.binary(min_size=20, max_size=20), count=st.integers(0, 4),
-       data=st.binary(max_size=200), packed=st.booleans(), big=st.booleans())
+@given(
+    sizes=st.binary(min_size=20, max_size=20),
+    count=st.integers(0, 4),
+    data=st.binary(max_size=200),
+    packed=st.booleans(),
+    big=st.booleans(),
+)
 @settings(max_examples=4_000, deadline=None, suppress_health_check=list(HealthCheck))
 def test_hostile_layouts_are_refused_or_read_within_their_bytes(sizes, count, data, packed, big):
     height, width, point_step, row_step, *rest = (SIZES[size % len(SIZES)] for size in sizes)
-    fields = [('xyab'[rest[4 * i] % 4], rest[4 * i + 1], sizes[4 * i + 6] % 10, rest[4 * i + 3])
-              for i in range(count)]
-    message = cloud(fields, data, height=height, width=width, point_step=point_step,
-                    row_step=None if packed else row_step, big=big)
+    fields = [
+        ('xyab'[rest[4 * i] % 4], rest[4 * i + 1], sizes[4 * i + 6] % 10, rest[4 * i + 3])
+        for i in range(count)
+    ]
+    message = cloud(
+        fields,
+        data,
+        height=height,
+        width=width,
+        point_step=point_step,
+        row_step=None if packed else row_step,
+        big=big,
+    )
     try:
         columns = decode_table(message)
     except Rejection as rejection:
@@ -185,11 +251,15 @@ def test_hostile_layouts_are_refused_or_read_within_their_bytes(sizes, count, da
         assert len(column) == rows
         if rows:  # an independent, slow reading of the last element
             dtype = np.dtype(table.DATATYPES[field.datatype]).newbyteorder(
-                '>' if message.is_bigendian else '<')
-            at = ((message.height - 1) * message.row_step
-                  + (message.width - 1) * message.point_step
-                  + field.offset + (field.count - 1) * dtype.itemsize)
-            raw = message.data[at:at + dtype.itemsize]
+                '>' if message.is_bigendian else '<'
+            )
+            at = (
+                (message.height - 1) * message.row_step
+                + (message.width - 1) * message.point_step
+                + field.offset
+                + (field.count - 1) * dtype.itemsize
+            )
+            raw = message.data[at : at + dtype.itemsize]
             assert len(raw) == dtype.itemsize
             last = np.frombuffer(raw, dtype)[0]
             got = column.reshape(rows, math.prod(column.shape[1:]))[-1, -1]

@@ -3,9 +3,9 @@
 import contextlib
 import time
 
+from helpers import walker
 import pytest
 import rclpy
-import walker
 
 
 @pytest.fixture(name='walker')
@@ -19,12 +19,16 @@ class Bench:
 
     def __init__(self, args=()):
         self.context = rclpy.Context()
-        rclpy.init(args=['bench', '--ros-args', *args] if args else None, context=self.context,
-                   signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        rclpy.init(
+            args=['bench', '--ros-args', *args] if args else None,
+            context=self.context,
+            signal_handler_options=rclpy.signals.SignalHandlerOptions.NO,
+        )
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.nodes = []
-        self.peer = self.add(rclpy.node.Node('peer', context=self.context,
-                                             use_global_arguments=False))
+        self.peer = self.add(
+            rclpy.node.Node('peer', context=self.context, use_global_arguments=False)
+        )
 
     def add(self, node):
         self.nodes.append(node)
@@ -62,8 +66,10 @@ class Bench:
 def make_bench():
     """Make benches, each with ROS arguments as on a command line; all are closed at the end."""
     with contextlib.ExitStack() as stack:
+
         def make(*args):
             bench = Bench(args)
             stack.callback(bench.close)
             return bench
+
         yield make

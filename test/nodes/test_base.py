@@ -24,8 +24,15 @@ pytestmark = pytest.mark.usefixtures('walker')
 
 
 def a_fix(seconds, x=1.0, y=2.0, frame_id='map'):
-    return write_fix(Fix(stamp_ns=round(seconds * SECOND), position=(x, y, 0.0),
-                         covariance=np.diag([4.0, 9.0]), frame_id=frame_id), make)
+    return write_fix(
+        Fix(
+            stamp_ns=round(seconds * SECOND),
+            position=(x, y, 0.0),
+            covariance=np.diag([4.0, 9.0]),
+            frame_id=frame_id,
+        ),
+        make,
+    )
 
 
 def a_point(seconds, x=1.0, y=2.0):
@@ -209,9 +216,14 @@ def test_inputs_can_be_remapped(make_bench):
 
 
 def test_qos_overrides_reach_the_endpoints(make_bench):
-    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable',
-                       '-p', 'qos_overrides./fix.subscription.history:=keep_all',
-                       '-p', 'qos_overrides./walker/estimate.publisher.depth:=3')
+    bench = make_bench(
+        '-p',
+        'qos_overrides./fix.subscription.reliability:=reliable',
+        '-p',
+        'qos_overrides./fix.subscription.history:=keep_all',
+        '-p',
+        'qos_overrides./walker/estimate.publisher.depth:=3',
+    )
     node = bench.add(TrackerNode('walker', context=bench.context))
     inputs = {s.topic_name: s.qos_profile for s in node.subscriptions}
     outputs = {p.topic_name: p.qos_profile for p in node.publishers}
@@ -239,7 +251,8 @@ def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):
     def tick(seconds):
         clock.publish(Clock(clock=a_fix(seconds).header.stamp))
         rig.bench.spin_until(
-            lambda: rig.node.get_clock().now().nanoseconds == round(seconds * SECOND))
+            lambda: rig.node.get_clock().now().nanoseconds == round(seconds * SECOND)
+        )
 
     rig.send(a_fix(100.0, 1.0, 2.0))
     tick(100.0)

@@ -12,7 +12,7 @@ from msg_adapters.table import encode_table
 from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos
-from sonar_imm.simulation.bathymetry import scenario, simulate
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 
 SHORT = {'pings': 3, 'last_range': 24.0}
 
@@ -28,8 +28,12 @@ class Rig:
         self.node = bench.add(BathymetryNode(context=bench.context))
         self.tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
         self.publisher = bench.peer.create_publisher(PointCloud2, '/snapshot', lockstep_qos())
-        bench.spin_until(lambda: self.publisher.get_subscription_count()
-                         and self.node.count_subscribers('/bathymetry/estimate'))
+        bench.spin_until(
+            lambda: (
+                self.publisher.get_subscription_count()
+                and self.node.count_subscribers('/bathymetry/estimate')
+            )
+        )
 
     def send(self, *messages):
         received = self.node._meter.received
@@ -69,7 +73,7 @@ def test_a_ping_becomes_the_floor_under_it(rig):
 
 
 def test_hostile_snapshots_are_named_and_counted_and_the_node_lives(rig):
-    good, = pings(pings=1)[0]
+    (good,) = pings(pings=1)[0]
     one_bin = table(1)
     huge = table(1_000_000, iq=np.ones((1_000_000, 4), np.float32))
     backward = table(40, range=np.linspace(24.0, 17.0, 40, dtype=np.float32))
@@ -78,30 +82,40 @@ def test_hostile_snapshots_are_named_and_counted_and_the_node_lives(rig):
     nan = table(40, iq=np.full((40, 8), np.nan, np.float32))
     silent = table(40, iq=np.zeros((40, 8), np.float32))
     empty = table(0)
-    no_column = encode_table({'range': np.ones(4, np.float32)}, stamp_ns=10**9, frame_id='sonar',
-                             make=make)
+    no_column = encode_table(
+        {'range': np.ones(4, np.float32)}, stamp_ns=10**9, frame_id='sonar', make=make
+    )
     changing = table(40, sound_speed=np.linspace(1400, 1500, 40, dtype=np.float32))
     cut = write_snapshot(good, make)
     cut.data = bytes(cut.data)[:-100]
     rig.send(one_bin, huge, backward, odd, no_staves, nan, silent, empty, no_column, changing, cut)
     refused = rig.node._meter.refused
     assert refused.total() == 11 and not rig.tables and not rig.node._errors
-    assert {'too_short', 'too_large', 'bad_range', 'bad_field', 'nan', 'silent',
-            'missing_column', 'not_constant'} <= set(refused)
+    assert {
+        'too_short',
+        'too_large',
+        'bad_range',
+        'bad_field',
+        'nan',
+        'silent',
+        'missing_column',
+        'not_constant',
+    } <= set(refused)
     rig.send(write_snapshot(good, make))
     assert len(read_estimate(rig.tables[0])) == len(good)
 
 
 def test_pings_of_changing_sizes_and_some_bad_bins_are_used(rig):
     sizes = []
-    for number, values in enumerate(({'staves': 8}, {'staves': 2}, {'staves': 16},
-                                     {'last_range': 18.0}, {'first_range': 10.0})):
+    for number, values in enumerate(
+        ({'staves': 8}, {'staves': 2}, {'staves': 16}, {'last_range': 18.0}, {'first_range': 10.0})
+    ):
         one = pings(pings=1, **values)[0][0]
         message = write_snapshot(one, make)
         message.header.stamp.sec = 100 + number
         raw = np.frombuffer(bytes(message.data), np.uint8).copy().reshape(len(one), -1)
         iq = next(field.offset for field in message.fields if field.name == 'iq')
-        raw[5, iq:iq + 4] = np.array([np.nan], np.float32).view(np.uint8)
+        raw[5, iq : iq + 4] = np.array([np.nan], np.float32).view(np.uint8)
         message.data = raw.tobytes()
         rig.send(message)
         sizes.append(len(one))
@@ -139,8 +153,12 @@ def test_two_sides_are_two_nodes(make_bench):
     node = bench.add(BathymetryNode(context=bench.context, namespace='port'))
     tables = bench.listen(PointCloud2, '/port/bathymetry/estimate', lockstep_qos())
     publisher = bench.peer.create_publisher(PointCloud2, '/port/snapshot', lockstep_qos())
-    bench.spin_until(lambda: publisher.get_subscription_count()
-                     and node.count_subscribers('/port/bathymetry/estimate'))
+    bench.spin_until(
+        lambda: (
+            publisher.get_subscription_count()
+            and node.count_subscribers('/port/bathymetry/estimate')
+        )
+    )
     publisher.publish(write_snapshot(pings(pings=1)[0][0], make))
     bench.spin_until(lambda: tables)
     assert (read_estimate(tables[0]).xyz[20:, 1] > 0.0).all()

@@ -19,8 +19,15 @@ class Desk:
         self.reporter = Reporter('diver', {'fix': '/fix', 'arrivals': '/arrivals'}, self.meter)
 
     def report(self, now, **changes):
-        state = {'enabled': True, 'stale_after': 5.0, 'counts': Counter(used=3),
-                 'health': {'NIS': 1.5}, 'lost': {}, 'incompatible': {}, **changes}
+        state = {
+            'enabled': True,
+            'stale_after': 5.0,
+            'counts': Counter(used=3),
+            'health': {'NIS': 1.5},
+            'lost': {},
+            'incompatible': {},
+            **changes,
+        }
         message = self.reporter.report(Time(sec=9), now, **state)
         assert message.header.stamp.sec == 9
         self.input, self.tracker = message.status
@@ -125,12 +132,15 @@ def test_internal_errors_and_disabling_show(desk):
 
 
 def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker):
-    bench = make_bench('-p', 'diagnostics_period:=0.05', '-r', '__ns:=/auv1',
-                       '-p', 'use_sim_time:=true')  # no /clock at all: still it reports
+    bench = make_bench(
+        '-p', 'diagnostics_period:=0.05', '-r', '__ns:=/auv1', '-p', 'use_sim_time:=true'
+    )  # no /clock at all: still it reports
     heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     bench.add(TrackerNode('walker', context=bench.context))
     bench.spin_until(lambda: len(heard) >= 3)
-    assert [status.name for status in heard[-1].status] == ['auv1/walker: input',
-                                                            'auv1/walker: tracker']
+    assert [status.name for status in heard[-1].status] == [
+        'auv1/walker: input',
+        'auv1/walker: tracker',
+    ]
     values = {pair.key: pair.value for pair in heard[-1].status[0].values}
     assert values['fix topic'] == '/auv1/fix'

@@ -20,20 +20,32 @@ def rig(make_bench):
     node = bench.add(DiverNode(context=bench.context))
     odometry = bench.listen(Odometry, '/diver/odometry')
     probabilities = bench.listen(JointState, '/diver/model_probabilities')
-    bench.spin_until(lambda: node.count_subscribers('/diver/odometry')
-                     and node.count_subscribers('/diver/model_probabilities'))
+    bench.spin_until(
+        lambda: (
+            node.count_subscribers('/diver/odometry')
+            and node.count_subscribers('/diver/model_probabilities')
+        )
+    )
     return bench, node, odometry, probabilities
 
 
 def an_estimate(ids, states):
     rows = len(ids)
     return Estimate(
-        stamp_ns=5 * 10**9, frame_id='map', xyz=np.zeros((rows, 3), np.float32),
-        state_names=('px', 'py', 'vx', 'vy'), state=np.arange(4.0 * rows).reshape(rows, 4),
-        covariance=np.tile(np.eye(4), (rows, 1, 1)), model_names=('heading_000', 'hover'),
+        stamp_ns=5 * 10**9,
+        frame_id='map',
+        xyz=np.zeros((rows, 3), np.float32),
+        state_names=('px', 'py', 'vx', 'vy'),
+        state=np.arange(4.0 * rows).reshape(rows, 4),
+        covariance=np.tile(np.eye(4), (rows, 1, 1)),
+        model_names=('heading_000', 'hover'),
         probabilities=np.array([[0.25 + 0.01 * i, 0.75 - 0.01 * i] for i in ids]).reshape(-1, 2),
-        extras={'track_id': np.array(ids, np.uint32), 'track_state': np.array(states, np.uint8),
-                'nis': np.full(rows, np.nan)})
+        extras={
+            'track_id': np.array(ids, np.uint32),
+            'track_state': np.array(states, np.uint8),
+            'nis': np.full(rows, np.nan),
+        },
+    )
 
 
 def test_confirmed_divers_are_shown_and_the_oldest_gives_the_probabilities(rig):
@@ -60,12 +72,21 @@ def test_nothing_is_shown_of_tentative_tracks_and_of_none(rig):
 def test_a_diver_is_tracked_from_fixes(rig):
     bench, node, odometry, probabilities = rig
     publisher = bench.peer.create_publisher(
-        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10)
+        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10
+    )
     bench.spin_until(publisher.get_subscription_count)
     for second in range(1, 31):
-        publisher.publish(write_fix(Fix(
-            stamp_ns=second * 10**9, position=(1.0 * second, 0.0, 0.0),
-            covariance=0.01 * np.eye(2), frame_id='map'), make))
+        publisher.publish(
+            write_fix(
+                Fix(
+                    stamp_ns=second * 10**9,
+                    position=(1.0 * second, 0.0, 0.0),
+                    covariance=0.01 * np.eye(2),
+                    frame_id='map',
+                ),
+                make,
+            )
+        )
         bench.spin_until(lambda want=second: node._meter.received['fix'] == want)
     bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 30)
     assert odometry[-1].pose.pose.position.x == pytest.approx(30.0, abs=0.5)
@@ -77,12 +98,21 @@ def test_a_diver_is_tracked_from_fixes(rig):
 def test_a_bag_that_starts_over_is_tracked_again_without_a_clock(rig):
     bench, node, odometry, _ = rig
     publisher = bench.peer.create_publisher(
-        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10)
+        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', 10
+    )
     bench.spin_until(publisher.get_subscription_count)
     for count, second in enumerate((*range(1, 41), *range(1, 21)), start=1):
-        publisher.publish(write_fix(Fix(
-            stamp_ns=second * 10**9, position=(0.0, 2.0 * second, 0.0),
-            covariance=0.01 * np.eye(2), frame_id='map'), make))
+        publisher.publish(
+            write_fix(
+                Fix(
+                    stamp_ns=second * 10**9,
+                    position=(0.0, 2.0 * second, 0.0),
+                    covariance=0.01 * np.eye(2),
+                    frame_id='map',
+                ),
+                make,
+            )
+        )
         bench.spin_until(lambda want=count: node._meter.received['fix'] == want)
     bench.spin_until(lambda: odometry and odometry[-1].header.stamp.sec == 20)
     assert odometry[-1].pose.pose.position.y == pytest.approx(40.0, abs=0.5)
@@ -92,7 +122,8 @@ def test_a_storm_of_garbage_is_answered_and_leaves_no_garbage_behind(rig):
     bench, node, _, _ = rig
     tables = bench.listen(PointCloud2, '/diver/estimate', lockstep_qos())
     publisher = bench.peer.create_publisher(
-        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', lockstep_qos())
+        message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), '/fix', lockstep_qos()
+    )
     bench.spin_until(publisher.get_subscription_count)
     rng = np.random.default_rng(7)
     odd = np.array([np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 5e-324, 1e-30, 1e30, 1.7e308])

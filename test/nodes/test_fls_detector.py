@@ -1,6 +1,6 @@
 """The detector node on images as a driver would send them."""
 
-import marine
+from helpers import marine
 import numpy as np
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -16,12 +16,21 @@ def image(spoilt=False):
     samples[30, 2] = 250
     bearing = np.radians(np.linspace(20.0, -20.0, 9))
     return marine.make(
-        'ProjectedSonarImage', header=marine.header(), ping_info=marine.ping_info(),
-        beam_directions=marine.vectors(np.column_stack(
-            [np.cos(bearing), np.sin(bearing), np.zeros(9)])),
+        'ProjectedSonarImage',
+        header=marine.header(),
+        ping_info=marine.ping_info(),
+        beam_directions=marine.vectors(
+            np.column_stack([np.cos(bearing), np.sin(bearing), np.zeros(9)])
+        ),
         ranges=marine.floats(np.arange(1.0, 51.0)),
-        image=marine.make('SonarImageData', is_bigendian=False, dtype=0, beam_count=9,
-                          data=samples.ravel()[:449 if spoilt else 450]))
+        image=marine.make(
+            'SonarImageData',
+            is_bigendian=False,
+            dtype=0,
+            beam_count=9,
+            data=samples.ravel()[: 449 if spoilt else 450],
+        ),
+    )
 
 
 def test_without_the_message_package_the_node_says_what_is_missing(make_bench):
@@ -34,8 +43,11 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench, monkeypatch):
     # The package is not installed here: any installed type subscribes, images are handed over.
     bench = make_bench()
     known = fls_detector.message_class
-    monkeypatch.setattr(fls_detector, 'message_class', lambda name: known(
-        'sensor_msgs/msg/Image' if name.startswith('marine') else name))
+    monkeypatch.setattr(
+        fls_detector,
+        'message_class',
+        lambda name: known('sensor_msgs/msg/Image' if name.startswith('marine') else name),
+    )
     node = bench.add(FlsDetectorNode(context=bench.context))
     heard = bench.listen(PointCloud2, '/detections')
     bench.spin_until(lambda: node.count_subscribers('/detections'))

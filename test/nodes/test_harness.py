@@ -35,8 +35,9 @@ def test_reserved_domains_differ_and_come_free_again():
 
 def test_an_input_recorded_with_two_types_cannot_be_played_to_one_node(tmp_path):
     fix = write_fix(Fix(stamp_ns=10**9, position=(1.0, 2.0, 0.0), frame_id='map'), ros_message)
-    point = ros_message('geometry_msgs/msg/PointStamped', header=fix.header,
-                        point=fix.pose.pose.position)
+    point = ros_message(
+        'geometry_msgs/msg/PointStamped', header=fix.header, point=fix.pose.pose.position
+    )
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write('/usbl/fix', fix, 10**9)
         writer.write('/gps/fix', point, 10**9)

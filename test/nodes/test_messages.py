@@ -23,23 +23,28 @@ def test_a_square_covariance_is_flattened_and_its_size_checked():
         make('geometry_msgs/msg/PoseWithCovariance', covariance=[0.0] * 35)
 
 
-@pytest.mark.parametrize('data', [b'\x01\x02', bytearray(b'\x01\x02'), [1, 2],
-                                  np.array([1, 9, 2, 9], np.uint8)[::2]])
+@pytest.mark.parametrize(
+    'data', [b'\x01\x02', bytearray(b'\x01\x02'), [1, 2], np.array([1, 9, 2, 9], np.uint8)[::2]]
+)
 def test_bulk_bytes_take_any_form(data):
     made = make('sensor_msgs/msg/PointCloud2', data=data)
     assert made.data == array.array('B', [1, 2])
 
 
 def test_bulk_doubles_from_float32_and_strings_from_a_tuple():
-    made = make('sensor_msgs/msg/JointState', name=('a', 'b'),
-                position=np.array([0.25, 0.5], np.float32))
+    made = make(
+        'sensor_msgs/msg/JointState', name=('a', 'b'), position=np.array([0.25, 0.5], np.float32)
+    )
     assert made.name == ['a', 'b']
     assert made.position == array.array('d', [0.25, 0.5])
 
 
 def test_nested_messages_and_defaults():
-    header = make('std_msgs/msg/Header', frame_id='map',
-                  stamp=make('builtin_interfaces/msg/Time', sec=3, nanosec=4))
+    header = make(
+        'std_msgs/msg/Header',
+        frame_id='map',
+        stamp=make('builtin_interfaces/msg/Time', sec=3, nanosec=4),
+    )
     made = make('geometry_msgs/msg/PointStamped', header=header)
     assert made.header.stamp.sec == 3
     assert made.point.x == 0.0

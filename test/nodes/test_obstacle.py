@@ -18,12 +18,14 @@ from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle import scenario, simulate
-from sonar_imm.trackers.obstacle import ObstacleConfig, ObstacleTracker
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
-WRITERS = {Detections: ('/detections', 'sensor_msgs/msg/PointCloud2', write_detections),
-           Navigation: ('/nav', 'nav_msgs/msg/Odometry', write_navigation),
-           Altitude: ('/altitude', 'sensor_msgs/msg/Range', write_range)}
+WRITERS = {
+    Detections: ('/detections', 'sensor_msgs/msg/PointCloud2', write_detections),
+    Navigation: ('/nav', 'nav_msgs/msg/Odometry', write_navigation),
+    Altitude: ('/altitude', 'sensor_msgs/msg/Range', write_range),
+}
 
 
 class Rig:
@@ -36,12 +38,15 @@ class Rig:
         self.tables = bench.listen(PointCloud2, '/obstacle/estimate', lockstep_qos())
         self.publishers = {
             kind: bench.peer.create_publisher(message_class(type_name), topic, lockstep_qos())
-            for kind, (topic, type_name, _) in WRITERS.items()}
+            for kind, (topic, type_name, _) in WRITERS.items()
+        }
         displays = ('obstacles', 'markers', 'model_probabilities', 'estimate')
-        bench.spin_until(lambda: all(p.get_subscription_count()
-                                     for p in self.publishers.values())
-                         and all(self.node.count_subscribers(f'/obstacle/{name}')
-                                 for name in displays))
+        bench.spin_until(
+            lambda: (
+                all(p.get_subscription_count() for p in self.publishers.values())
+                and all(self.node.count_subscribers(f'/obstacle/{name}') for name in displays)
+            )
+        )
         self.sent = 0
 
     def send(self, measurement):
@@ -61,14 +66,21 @@ def rig(make_bench):
 def an_estimate(ids, states, above=0.02):
     rows = len(ids)
     return Estimate(
-        stamp_ns=5 * 10**9, frame_id='odom',
+        stamp_ns=5 * 10**9,
+        frame_id='odom',
         xyz=np.tile(np.float32([40.0, 5.0, -23.0]), (rows, 1)),
         state_names=('range', 'bearing', 'vertical_offset'),
-        state=np.tile([40.0, 0.1, 3.0], (rows, 1)), covariance=np.tile(np.eye(3), (rows, 1, 1)),
-        model_names=('above', 'below'), probabilities=np.tile([above, 1.0 - above], (rows, 1)),
-        extras={'track_id': np.array(ids, np.uint32), 'track_state': np.array(states, np.uint8),
-                'vertical_offset_lo': np.full(rows, 1.0),
-                'vertical_offset_hi': np.full(rows, 4.5)})
+        state=np.tile([40.0, 0.1, 3.0], (rows, 1)),
+        covariance=np.tile(np.eye(3), (rows, 1, 1)),
+        model_names=('above', 'below'),
+        probabilities=np.tile([above, 1.0 - above], (rows, 1)),
+        extras={
+            'track_id': np.array(ids, np.uint32),
+            'track_state': np.array(states, np.uint8),
+            'vertical_offset_lo': np.full(rows, 1.0),
+            'vertical_offset_hi': np.full(rows, 4.5),
+        },
+    )
 
 
 def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
@@ -80,15 +92,19 @@ def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
     assert bar.scale.z == 3.5 and bar.pose.position.z == -22.75
     assert ball.type == Marker.SPHERE and ball.pose.position.z == -23.0
     assert label.type == Marker.TEXT_VIEW_FACING and label.text == '7: 40 m ahead, +3.0 m down'
-    assert all(marker.lifetime.sec > 0 and marker.header.frame_id == 'odom'
-               for marker in (bar, ball, label))
+    assert all(
+        marker.lifetime.sec > 0 and marker.header.frame_id == 'odom'
+        for marker in (bar, ball, label)
+    )
     deep = write_markers(an_estimate([7], [1]), [0], make, down=True).markers[0]
     assert deep.pose.position.z == -23.25 and band(one, 0, down=True) == (-25.0, -21.5)
 
 
 def test_colours_tell_above_from_below_from_unknown():
-    colours = [write_markers(an_estimate([1], [1], above), [0], make).markers[0].color
-               for above in (0.02, 0.5, 0.98)]
+    colours = [
+        write_markers(an_estimate([1], [1], above), [0], make).markers[0].color
+        for above in (0.02, 0.5, 0.98)
+    ]
     assert colours[0].b > colours[0].r and colours[2].r > colours[2].b
     assert colours[1].r == colours[1].b
 
@@ -112,11 +128,14 @@ def test_reset_deletes_all_markers(rig):
 
 
 def test_the_node_says_what_the_tracker_says(rig):
-    received = [one.measurement for one in
-                simulate(scenario('late', {'last_range': 60.0}), 3).measurements]
+    received = [
+        one.measurement for one in simulate(scenario('late', {'last_range': 60.0}), 3).measurements
+    ]
     # A Range holds the altitude as a float32.
-    received = [evolve(one, altitude=float(np.float32(one.altitude)))
-                if isinstance(one, Altitude) else one for one in received]
+    received = [
+        evolve(one, altitude=float(np.float32(one.altitude))) if isinstance(one, Altitude) else one
+        for one in received
+    ]
     tracker = ObstacleTracker(ObstacleConfig())
     wanted = [one for each in received for one in tracker.process(each)]
     for each in received:
@@ -146,9 +165,16 @@ def test_a_storm_of_garbage_is_answered_and_leaves_no_garbage_behind(rig):
             setattr(place.pose.pose.orientation, axis, float(value))
         height = make('sensor_msgs/msg/Range', range=rng.choice(odd), max_range=100.0)
         n = int(rng.integers(0, 8))
-        ping = write_detections(Detections(
-            stamp_ns=1, range=rng.choice(odd, n), bearing=rng.normal(size=n),
-            var_range=rng.choice(odd, n), frame_id='sonar'), make)
+        ping = write_detections(
+            Detections(
+                stamp_ns=1,
+                range=rng.choice(odd, n),
+                bearing=rng.normal(size=n),
+                var_range=rng.choice(odd, n),
+                frame_id='sonar',
+            ),
+            make,
+        )
         for kind, message in ((Navigation, place), (Altitude, height), (Detections, ping)):
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
             rig.publish(kind, message)

@@ -4,8 +4,8 @@ import pytest
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
+from sonar_imm.node_config import NodeConfig
 from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.config import NodeConfig
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers import SYSTEMS
 
@@ -15,9 +15,11 @@ pytestmark = pytest.mark.usefixtures('walker')
 @pytest.fixture
 def start(make_bench):
     """Start the walker's node with parameters as on the command line."""
+
     def start(*parameters):
         bench = make_bench(*(word for p in parameters for word in ('-p', p)))
         return bench.add(TrackerNode('walker', context=bench.context))
+
     return start
 
 
@@ -35,7 +37,9 @@ def test_defaults_and_descriptors(start):
     made = node.describe_parameter('sound_speed')
     assert made.description == 'speed of sound [m/s]'
     assert (made.floating_point_range[0].from_value, made.floating_point_range[0].to_value) == (
-        1300.0, 1700.0)
+        1300.0,
+        1700.0,
+    )
     assert made.additional_constraints == 'between 1300 and 1700'
     assert not made.read_only
     assert node.describe_parameter('steps').read_only
@@ -48,7 +52,11 @@ def test_start_values_reach_the_tracker(start):
     node = start('sound_speed:=1400.5', 'steps:=5', 'weights:=[0.5, 1.0]', 'mood:=hasty')
     config = node.tracker.config
     assert (config.sound_speed, config.steps, config.weights, config.mood) == (
-        1400.5, 5, (0.5, 1.0), 'hasty')
+        1400.5,
+        5,
+        (0.5, 1.0),
+        'hasty',
+    )
     assert list(node.get_parameter('weights').value) == [0.5, 1.0]
 
 
@@ -56,22 +64,31 @@ def test_an_empty_list_empties_a_list(start):
     assert start('offsets:=[]').tracker.config.offsets == ()
 
 
-@pytest.mark.parametrize('parameter, sentence', [
-    ('sound_speed:=1500', "parameter 'sound_speed' is a double: write 1500.0 instead of 1500"),
-    ('offsets:=[1, 2]',
-     "parameter 'offsets' is a list of doubles: write [1.0, 2.0] instead of [1, 2]"),
-    ('sound_speed:=15.0', "parameter 'sound_speed' must be between 1300 and 1700, got 15.0 m/s"),
-    ('sound_speed:=.nan', "parameter 'sound_speed' must be finite, got nan"),
-    ('sound_speed:=fast',
-     "parameter 'sound_speed' must be of type double, got string 'fast'"),
-    ('steps:=2.5', "parameter 'steps' must be of type integer, got double 2.5"),
-    ('weights:=[0.5, 7.0]', "parameter 'weights' must be between 0 and 1, got 7.0"),
-    ('mood:=hastey',
-     "parameter 'mood' must be one of calm, hasty, got 'hastey' (did you mean 'hasty'?)"),
-    ('steps:=[]', "parameter 'steps' is given without a value"),
-    ('fast_share:=0.5', 'fast_share and slow_share must sum to 1'),
-    ('queue_depth:=0', "parameter 'queue_depth' must be between 1 and 100000, got 0"),
-])
+@pytest.mark.parametrize(
+    'parameter, sentence',
+    [
+        ('sound_speed:=1500', "parameter 'sound_speed' is a double: write 1500.0 instead of 1500"),
+        (
+            'offsets:=[1, 2]',
+            "parameter 'offsets' is a list of doubles: write [1.0, 2.0] instead of [1, 2]",
+        ),
+        (
+            'sound_speed:=15.0',
+            "parameter 'sound_speed' must be between 1300 and 1700, got 15.0 m/s",
+        ),
+        ('sound_speed:=.nan', "parameter 'sound_speed' must be finite, got nan"),
+        ('sound_speed:=fast', "parameter 'sound_speed' must be of type double, got string 'fast'"),
+        ('steps:=2.5', "parameter 'steps' must be of type integer, got double 2.5"),
+        ('weights:=[0.5, 7.0]', "parameter 'weights' must be between 0 and 1, got 7.0"),
+        (
+            'mood:=hastey',
+            "parameter 'mood' must be one of calm, hasty, got 'hastey' (did you mean 'hasty'?)",
+        ),
+        ('steps:=[]', "parameter 'steps' is given without a value"),
+        ('fast_share:=0.5', 'fast_share and slow_share must sum to 1'),
+        ('queue_depth:=0', "parameter 'queue_depth' must be between 1 and 100000, got 0"),
+    ],
+)
 def test_bad_start_values_are_explained(start, parameter, sentence):
     problems = refusal(start, parameter)
     assert problems == (sentence,)
@@ -85,8 +102,9 @@ def test_misspelt_names_are_warned_of_with_a_suggestion(start, capfd):
     start('sound_sped:=1500.0', 'qos_overrides./fix.subscription.depth:=7')
     warnings = [line for line in capfd.readouterr().err.splitlines() if '[WARN]' in line]
     assert len(warnings) == 1
-    assert "'sound_sped' is not known and has no effect (did you mean 'sound_speed'?)" \
-        in warnings[0]
+    assert (
+        "'sound_sped' is not known and has no effect (did you mean 'sound_speed'?)" in warnings[0]
+    )
 
 
 def test_changes_while_running(start):
@@ -97,11 +115,18 @@ def test_changes_while_running(start):
     assert node._settings[NodeConfig].stale_after == 3.0
 
 
-@pytest.mark.parametrize('name, value, word', [
-    ('sound_speed', 1500, 'DOUBLE'), ('sound_speed', 9.0, ''), ('sound_speed', float('nan'), ''),
-    ('steps', 4, 'read-only'), ('weights', [0.5, 7.0], 'between 0 and 1'),
-    ('mood', 'sad', 'one of calm, hasty'), ('fast_share', 0.5, 'sum to 1'),
-])
+@pytest.mark.parametrize(
+    'name, value, word',
+    [
+        ('sound_speed', 1500, 'DOUBLE'),
+        ('sound_speed', 9.0, ''),
+        ('sound_speed', float('nan'), ''),
+        ('steps', 4, 'read-only'),
+        ('weights', [0.5, 7.0], 'between 0 and 1'),
+        ('mood', 'sad', 'one of calm, hasty'),
+        ('fast_share', 0.5, 'sum to 1'),
+    ],
+)
 def test_bad_changes_are_refused_and_change_nothing(start, name, value, word):
     node = start()
     before = node.tracker.config
@@ -118,10 +143,13 @@ def test_changes_that_only_fit_together(start):
     assert node.tracker.config.fast_share == 0.5
 
 
-@pytest.mark.parametrize('override', [
-    'qos_overrides./fix.subscription.reliability:=often',
-    'qos_overrides./fix.subscription.depth:=deep',
-])
+@pytest.mark.parametrize(
+    'override',
+    [
+        'qos_overrides./fix.subscription.reliability:=often',
+        'qos_overrides./fix.subscription.depth:=deep',
+    ],
+)
 def test_bad_qos_overrides_are_explained(start, override):
     assert refusal(start, override)
 
@@ -132,4 +160,8 @@ def test_what_node_and_tracker_both_take_is_one_parameter(system):
     for spec in NodeConfig.specs():
         if (twin := own.get(spec.name)) is not None:
             assert (twin.kind, twin.default, twin.choices, twin.read_only) == (
-                spec.kind, spec.default, spec.choices, spec.read_only)
+                spec.kind,
+                spec.default,
+                spec.choices,
+                spec.read_only,
+            )

@@ -45,8 +45,15 @@ def bag(tmp_path):
     path = tmp_path / 'bag'
     with BagWriter(path) as writer:
         for k in range(COUNT):
-            message = write_fix(Fix(stamp_ns=START + k * STEP, position=(float(k), 0.0, 0.0),
-                                    covariance=np.eye(2), frame_id='map'), ros_message)
+            message = write_fix(
+                Fix(
+                    stamp_ns=START + k * STEP,
+                    position=(float(k), 0.0, 0.0),
+                    covariance=np.eye(2),
+                    frame_id='map',
+                ),
+                ros_message,
+            )
             if k == 3:
                 message.pose.pose.position.x = float('nan')
             writer.write('/fix', message, START + k * STEP)
@@ -86,8 +93,11 @@ def test_a_bag_is_played_in_order_with_its_stamps(bag, link, domain):
 
 def test_topics_remapping_and_offset(bag, link, domain):
     ear = Ear(link, PoseWithCovarianceStamped, '/usbl')
-    result = play(bag, PlayOptions(topics=('/fix',), remap={'/fix': '/usbl'}, start_offset=0.1),
-                  domain_id=domain)
+    result = play(
+        bag,
+        PlayOptions(topics=('/fix',), remap={'/fix': '/usbl'}, start_offset=0.1),
+        domain_id=domain,
+    )
     assert result.published == COUNT - 10
     assert ear.positions(COUNT - 10) == list(range(10, COUNT))
 
@@ -139,16 +149,23 @@ def test_a_loop_starts_over_with_the_recorded_stamps(bag, link, domain):
             raise Enough
 
     with pytest.raises(Enough):
-        play(bag, PlayOptions(loop=True, topics=('/fix',), rate=10.0), domain_id=domain,
-             progress=progress)
-    assert ear.positions(COUNT + 4)[COUNT:COUNT + 3] == [0.0, 1.0, 2.0]
+        play(
+            bag,
+            PlayOptions(loop=True, topics=('/fix',), rate=10.0),
+            domain_id=domain,
+            progress=progress,
+        )
+    assert ear.positions(COUNT + 4)[COUNT : COUNT + 3] == [0.0, 1.0, 2.0]
 
 
 def test_a_paused_player_waits_for_resume(bag, link, domain):
     ear = Ear(link, PoseWithCovarianceStamped, '/fix')
     results = []
-    thread = threading.Thread(target=lambda: results.append(
-        play(bag, PlayOptions(start_paused=True, rate=10.0), domain_id=domain)))
+    thread = threading.Thread(
+        target=lambda: results.append(
+            play(bag, PlayOptions(start_paused=True, rate=10.0), domain_id=domain)
+        )
+    )
     thread.start()
     client = link.node.create_client(Trigger, f'/{NAME}/resume')
     assert link.wait_for(client.service_is_ready, 15.0)
@@ -160,15 +177,18 @@ def test_a_paused_player_waits_for_resume(bag, link, domain):
     assert len(ear.positions(COUNT)) == COUNT
 
 
-@pytest.mark.parametrize('options, sentence', [
-    ({'topics': ('/fxi',)}, r"has no topic '/fxi' \(did you mean '/fix'\?\)"),
-    ({'remap': {'/fxi': '/x'}}, "has no topic '/fxi'"),
-    ({'rate': 0.0}, 'the rate must be positive, got 0'),
-    ({'rate': float('nan')}, 'the rate must be positive, got nan'),
-    ({'start_offset': float('nan')}, 'the start_offset must not be negative, got nan'),
-    ({'delay': -1.0}, 'the delay must not be negative, got -1'),
-    ({'clock': -1.0}, 'the clock must be positive, got -1'),
-])
+@pytest.mark.parametrize(
+    'options, sentence',
+    [
+        ({'topics': ('/fxi',)}, r"has no topic '/fxi' \(did you mean '/fix'\?\)"),
+        ({'remap': {'/fxi': '/x'}}, "has no topic '/fxi'"),
+        ({'rate': 0.0}, 'the rate must be positive, got 0'),
+        ({'rate': float('nan')}, 'the rate must be positive, got nan'),
+        ({'start_offset': float('nan')}, 'the start_offset must not be negative, got nan'),
+        ({'delay': -1.0}, 'the delay must not be negative, got -1'),
+        ({'clock': -1.0}, 'the clock must be positive, got -1'),
+    ],
+)
 def test_what_cannot_be_played_is_said(bag, domain, options, sentence):
     with pytest.raises(ConfigError, match=sentence):
         play(bag, PlayOptions(**options), domain_id=domain)
@@ -186,8 +206,9 @@ class Live:
 
     def __init__(self, domain_id, *arguments):
         self.link = Link(f'beside_{len(arguments)}', domain_id=domain_id)
-        self.node = TrackerNode('walker', context=self.link.context,
-                                cli_args=['--ros-args', *arguments])
+        self.node = TrackerNode(
+            'walker', context=self.link.context, cli_args=['--ros-args', *arguments]
+        )
         self.executor = SingleThreadedExecutor(context=self.link.context)
         self.executor.add_node(self.node)
         self.thread = threading.Thread(target=self.executor.spin)
@@ -200,8 +221,12 @@ class Live:
         self.link.__exit__()
 
 
-RELIABLE = ('-p', 'qos_overrides./fix.subscription.reliability:=reliable',
-            '-p', 'qos_overrides./fix.subscription.history:=keep_all')
+RELIABLE = (
+    '-p',
+    'qos_overrides./fix.subscription.reliability:=reliable',
+    '-p',
+    'qos_overrides./fix.subscription.history:=keep_all',
+)
 
 
 @pytest.fixture
@@ -212,6 +237,7 @@ def start(walker, domain):
     def start(*parameters):
         started.append(Live(domain, *parameters))
         return started[-1]
+
     yield start
     for live in started:
         live.end()
@@ -228,6 +254,7 @@ def stepping(bag, link):
             step = LockStep(link, '/walker', recorder=recorder)
             chosen = PlayOptions(lockstep='/walker', **options)
             return Player(reader, link, chosen, step), recorder, step
+
         yield stepping
 
 
@@ -240,7 +267,8 @@ def test_lockstep_gets_the_estimate_of_every_message(link, start, stepping):
     assert len(player.result().delays) == COUNT - 1
     used = [float(k) for k in range(COUNT) if k != 3]
     assert [e.state[0, 0] for e in recorder.estimates()] == [
-        pytest.approx(np.mean(used[:k + 1])) for k in range(COUNT - 1)]
+        pytest.approx(np.mean(used[: k + 1])) for k in range(COUNT - 1)
+    ]
 
 
 def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping):
@@ -253,8 +281,9 @@ def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping
     assert len(recorder) == 0
 
 
-def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(bag, start, domain,
-                                                                    monkeypatch):
+def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(
+    bag, start, domain, monkeypatch
+):
     start(*RELIABLE)
     result = play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
     assert len(result.delays) == COUNT - 1
@@ -324,6 +353,7 @@ def test_recorded_estimates_read_back(link, start, stepping):
 def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import get_typestore, Stores
+
     types = get_typestore(Stores.ROS1_NOETIC)
     make_of = types.types
     with Writer(tmp_path / 'old.bag') as writer:
@@ -339,4 +369,7 @@ def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
     assert play(tmp_path / 'old.bag', PlayOptions(rate=100.0), domain_id=domain).published == 3
     assert link.wait_for(lambda: len(ear.heard) == 3, 10.0)
     assert [(m.header.stamp.sec, m.header.frame_id, m.point.x) for m in ear.heard] == [
-        (100, 'map', 0.0), (101, 'map', 1.0), (102, 'map', 2.0)]
+        (100, 'map', 0.0),
+        (101, 'map', 1.0),
+        (102, 'map', 2.0),
+    ]

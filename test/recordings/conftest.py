@@ -24,19 +24,32 @@ def real_data():
 @pytest.fixture
 def fix_message():
     """Make the message of the i-th fix, one a second."""
+
     def make(i, **changes):
-        return write_fix(Fix(**{'stamp_ns': START + i * 10**9, 'position': (i, 2.0, 0.0),
-                                'covariance': [[4.0, 0.5], [0.5, 9.0]], 'frame_id': 'map',
-                                **changes}), ros_message)
+        return write_fix(
+            Fix(
+                **{
+                    'stamp_ns': START + i * 10**9,
+                    'position': (i, 2.0, 0.0),
+                    'covariance': [[4.0, 0.5], [0.5, 9.0]],
+                    'frame_id': 'map',
+                    **changes,
+                }
+            ),
+            ros_message,
+        )
+
     return make
 
 
 @pytest.fixture
 def write_fixes(tmp_path, fix_message):
     """Write a bag of n fixes and give its path."""
+
     def write(n=50, name='bag', **options):
         with BagWriter(tmp_path / name, **options) as bag:
             for i in range(n):
                 bag.write('/fix', fix_message(i), START + i * 10**9)
         return tmp_path / name
+
     return write

@@ -12,12 +12,21 @@ def table(tmp_path):
         path = tmp_path / 'a.csv'
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         return CsvTable(path, CsvOptions(**options))
+
     return make
 
 
-@pytest.mark.parametrize('header', [
-    'stamp,x,y', 'Time [s];East (m);North (m)', 'timestamp\teasting\tnorthing', 'T  X  Y',
-    '\ufefftime_s | east_m | north_m', '"Unix Time","UTM_E","UTM_N"'])
+@pytest.mark.parametrize(
+    'header',
+    [
+        'stamp,x,y',
+        'Time [s];East (m);North (m)',
+        'timestamp\teasting\tnorthing',
+        'T  X  Y',
+        '\ufefftime_s | east_m | north_m',
+        '"Unix Time","UTM_E","UTM_N"',
+    ],
+)
 def test_usual_names_and_delimiters_are_recognised(table, header):
     found = table(header + '\n')
     assert [found.index.get(name) for name in ('stamp', 'x', 'y')] == [0, 1, 2]
@@ -28,9 +37,14 @@ def test_columns_mapped_by_hand_win(table):
     assert next(iter(found)).number('x') == 2.0
 
 
-@pytest.mark.parametrize('options, words', [
-    ({'columns': {'x': 'eest'}}, "no column 'eest' (did you mean 'east'?)"),
-    ({'columns': {'xx': 'east'}}, "no quantity 'xx'"), ({'time_unit': 'min'}, 's, ms, us, ns')])
+@pytest.mark.parametrize(
+    'options, words',
+    [
+        ({'columns': {'x': 'eest'}}, "no column 'eest' (did you mean 'east'?)"),
+        ({'columns': {'xx': 'east'}}, "no quantity 'xx'"),
+        ({'time_unit': 'min'}, 's, ms, us, ns'),
+    ],
+)
 def test_wrong_options_are_explained(table, options, words):
     with pytest.raises(BagError) as caught:
         table('time,east\n', **options)
@@ -42,50 +56,69 @@ def test_a_missing_column_is_named_with_what_is_there(table):
         table('time,foo\n').require('stamp', 'x', 'y')
 
 
-@pytest.mark.parametrize('header, cell, stamp', [
-    ('stamp_s', '1568052068.920238', 1568052068920238000),
-    ('time', '1568052068.920238123', 1568052068920238123),
-    ('time_ms', '1568052068920.5', 1568052068920500000),
-    ('time_us', '1568052068920238', 1568052068920238000),
-    ('time_ns', '1568052068920238123', 1568052068920238123),
-    ('time [ms]', '1568052068920', 1568052068920000000),
-    ('time', '1.568052068e9', 1568052068000000000),
-    ('time', '2019-09-09T18:01:08.920238123Z', 1568052068920238123),
-    ('time', '2019-09-09 18:01:08', 1568052068000000000),
-    ('time', '2019-09-09T20:01:08,5+02:00', 1568052068500000000),
-    ('time', '2019-09-09T14:01:08-0400', 1568052068000000000)])
+@pytest.mark.parametrize(
+    'header, cell, stamp',
+    [
+        ('stamp_s', '1568052068.920238', 1568052068920238000),
+        ('time', '1568052068.920238123', 1568052068920238123),
+        ('time_ms', '1568052068920.5', 1568052068920500000),
+        ('time_us', '1568052068920238', 1568052068920238000),
+        ('time_ns', '1568052068920238123', 1568052068920238123),
+        ('time [ms]', '1568052068920', 1568052068920000000),
+        ('time', '1.568052068e9', 1568052068000000000),
+        ('time', '2019-09-09T18:01:08.920238123Z', 1568052068920238123),
+        ('time', '2019-09-09 18:01:08', 1568052068000000000),
+        ('time', '2019-09-09T20:01:08,5+02:00', 1568052068500000000),
+        ('time', '2019-09-09T14:01:08-0400', 1568052068000000000),
+    ],
+)
 def test_times_are_exact_in_every_unit(table, header, cell, stamp):
-    row, = table(f'{header};x\n{cell};1\n')
+    (row,) = table(f'{header};x\n{cell};1\n')
     assert row.stamp_ns() == stamp
 
 
 def test_a_stated_unit_and_an_offset_are_used(table):
-    row, = table('time,x\n1500,1\n', time_unit='ms', time_offset_ns=10**18)
+    (row,) = table('time,x\n1500,1\n', time_unit='ms', time_offset_ns=10**18)
     assert row.stamp_ns() == 10**18 + 1_500_000_000
 
 
-@pytest.mark.parametrize('cell, words', [
-    ('', 'not a time'), ('noon', "'noon', not a time"), ('0', 'time unit'), ('-5', 'time unit'),
-    ('1568052068920238123', 'time unit'), ('1e400', 'time unit'), ('nan', 'not a time'),
-    ('inf', 'time unit'), ('2019-13-45T00:00:00', 'month'), ('1e9999999999', '')])
+@pytest.mark.parametrize(
+    'cell, words',
+    [
+        ('', 'not a time'),
+        ('noon', "'noon', not a time"),
+        ('0', 'time unit'),
+        ('-5', 'time unit'),
+        ('1568052068920238123', 'time unit'),
+        ('1e400', 'time unit'),
+        ('nan', 'not a time'),
+        ('inf', 'time unit'),
+        ('2019-13-45T00:00:00', 'month'),
+        ('1e9999999999', ''),
+    ],
+)
 def test_bad_times_are_bad_rows(table, cell, words):
-    row, = table(f'time,x\n{cell},1\n')
+    (row,) = table(f'time,x\n{cell},1\n')
     with pytest.raises(BadRow) as caught:
         row.stamp_ns()
     assert words in str(caught.value)
 
 
 def test_numbers(table):
-    row, = table('x,y,z,vx\n1.5, abc ,,inf\n')
+    (row,) = table('x,y,z,vx\n1.5, abc ,,inf\n')
     assert row.number('x') == 1.5 and row.optional('z') != row.optional('z')
-    for name, words in (('y', "y is 'abc', not a number"), ('z', 'z is empty'),
-                        ('vx', 'infinite'), ('depth', 'depth is empty')):
+    for name, words in (
+        ('y', "y is 'abc', not a number"),
+        ('z', 'z is empty'),
+        ('vx', 'infinite'),
+        ('depth', 'depth is empty'),
+    ):
         with pytest.raises(BadRow, match=words):
             row.number(name)
 
 
 def test_a_decimal_comma_is_read_between_semicolons(table):
-    row, = table('time;x\n1,5;2,25\n', time_offset_ns=1)
+    (row,) = table('time;x\n1,5;2,25\n', time_offset_ns=1)
     assert row.number('x') == 2.25 and row.stamp_ns() == 1_500_000_001
 
 

@@ -23,8 +23,9 @@ def write(path, mode, n=40):
     with writer:
         links = [writer.add_connection(name, TEXT, typestore=typestore()) for name in ('/a', '/b')]
         for i in range(n):
-            raw = bytes(typestore().serialize_cdr(
-                ros_message(TEXT, data=rng.bytes(30_000).hex()), TEXT))
+            raw = bytes(
+                typestore().serialize_cdr(ros_message(TEXT, data=rng.bytes(30_000).hex()), TEXT)
+            )
             log_ns = 1000 + (i * 7) % 5
             writer.write(links[i % 3 == 0], log_ns, raw)
             expected.append((log_ns, raw))
@@ -59,22 +60,22 @@ def test_a_cut_keeps_whole_messages_of_the_last_chunk(recording, tmp_path):
     while data[position] != mcap_scan._DATA_END:
         if data[position] == mcap_scan._CHUNK:
             chunks.append(position)
-        position += 9 + int.from_bytes(data[position + 1:position + 9], 'little')
+        position += 9 + int.from_bytes(data[position + 1 : position + 9], 'little')
     assert len(chunks) > 1
     cut = tmp_path / 'cut.mcap'
-    cut.write_bytes(data[:chunks[1] - 1])
+    cut.write_bytes(data[: chunks[1] - 1])
     scan = McapScan(cut)
     first_chunk = sum(scan.counts.values())
     scan.close()
     assert 0 < first_chunk < 40
     end = [*chunks, position][2]
-    cut.write_bytes(data[:(chunks[1] + 3 * end) // 4])
+    cut.write_bytes(data[: (chunks[1] + 3 * end) // 4])
     scan = McapScan(cut)
     found = messages(scan)
     scan.close()
     assert scan.lost.startswith('is cut off')
     assert len(found) > first_chunk
-    kept = expected[:len(found)]
+    kept = expected[: len(found)]
     assert found == sorted(kept, key=lambda item: item[0])
 
 
@@ -82,8 +83,8 @@ def test_a_damaged_chunk_costs_only_itself(recording, tmp_path):
     file, expected = recording
     data = bytearray(file.read_bytes())
     at = data.index(b'\x06', len(mcap_scan.MAGIC) + 30)
-    data[at + 9 + 28:at + 9 + 32] = b'\x04\x00\x00\x00'
-    data[at + 9 + 32:at + 9 + 36] = b'zstf'  # a compression nobody knows
+    data[at + 9 + 28 : at + 9 + 32] = b'\x04\x00\x00\x00'
+    data[at + 9 + 32 : at + 9 + 36] = b'zstf'  # a compression nobody knows
     broken = tmp_path / 'broken.mcap'
     broken.write_bytes(data)
     scan = McapScan(broken)
@@ -95,7 +96,7 @@ def test_zeros_after_a_power_loss_end_the_walk(recording, tmp_path):
     file, expected = recording
     data = file.read_bytes()
     broken = tmp_path / 'zeros.mcap'
-    broken.write_bytes(data[:len(data) // 2] + bytes(len(data) // 2))
+    broken.write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))
     scan = McapScan(broken)
     assert 0 <= len(messages(scan)) < len(expected) and scan.lost
     scan.close()
@@ -111,9 +112,9 @@ def test_what_is_no_mcap_is_refused(tmp_path):
 @settings(max_examples=150, deadline=None)
 def test_no_damage_raises_or_invents_messages(small, cut, place, junk):
     data, folder = small
-    damaged = bytearray(data[:int(len(data) * cut)])
+    damaged = bytearray(data[: int(len(data) * cut)])
     at = int(len(damaged) * place)
-    damaged[at:at + len(junk)] = junk
+    damaged[at : at + len(junk)] = junk
     file = folder / 'damaged.mcap'
     file.write_bytes(damaged)
     try:

@@ -13,10 +13,21 @@ POINT = 'geometry_msgs/msg/PointStamped'
 
 
 def ping():
-    return write_arrivals(Arrivals(
-        stamp_ns=10**18, tx_id=[0], rx_id=[1], tx=[[0.0, 0.0, 0.0]], rx=[[1.0, 0.0, 0.0]],
-        toa=[0.1], var_toa=[np.nan], bearing=[np.nan], var_bearing=[np.nan], frame_id='map'),
-        ros_message)
+    return write_arrivals(
+        Arrivals(
+            stamp_ns=10**18,
+            tx_id=[0],
+            rx_id=[1],
+            tx=[[0.0, 0.0, 0.0]],
+            rx=[[1.0, 0.0, 0.0]],
+            toa=[0.1],
+            var_toa=[np.nan],
+            bearing=[np.nan],
+            var_bearing=[np.nan],
+            frame_id='map',
+        ),
+        ros_message,
+    )
 
 
 @pytest.fixture
@@ -34,8 +45,11 @@ def mixed(tmp_path, fix_message):
         bag.write('/arrivals', ping(), 5)
         bag.write('/truth/fix', fix_message(9), 6)
         bag.write('/pose', fix_message(5), 7)
-        bag.write('/truth/estimate', write_truth([[1, 2]], [[0, 0]], [1], stamp_ns=5, frame_id='m',
-                                                 make=ros_message), 8)
+        bag.write(
+            '/truth/estimate',
+            write_truth([[1, 2]], [[0, 0]], [1], stamp_ns=5, frame_id='m', make=ros_message),
+            8,
+        )
         bag.write('/other/fix', ros_message('std_msgs/msg/String', data='no fix'), 9)
     return tmp_path / 'bag'
 
@@ -44,21 +58,28 @@ def test_inputs_are_found_by_type_and_last_name(mixed):
     with BagReader(mixed) as bag:
         fitting = fitting_topics(bag, 'diver')
         assert {name: entry.name for name, entry in fitting.items()} == {
-            '/usbl/fix': 'fix', '/arrivals': 'arrivals'}
+            '/usbl/fix': 'fix',
+            '/arrivals': 'arrivals',
+        }
 
 
 def test_measurements_and_rejections_come_in_recorded_order(mixed):
     with BagReader(mixed) as bag:
         heard = list(measurements_of(bag, 'diver'))
         assert [(item.topic, item.log_ns) for item in heard] == [
-            ('/usbl/fix', 1), ('/usbl/fix', 2), ('/usbl/fix', 3), ('/usbl/fix', 4),
-            ('/arrivals', 5)]
+            ('/usbl/fix', 1),
+            ('/usbl/fix', 2),
+            ('/usbl/fix', 3),
+            ('/usbl/fix', 4),
+            ('/arrivals', 5),
+        ]
         kinds = [type(item.measurement) for item in heard]
         assert kinds == [Fix, Fix, Rejection, Fix, Arrivals]
         assert heard[2].measurement.reason == 'bad_covariance'
         assert heard[1].measurement.covariance is None and heard[3].measurement.covariance is None
-        assert bag.problems == ['topic /usbl/fix: 1 messages have a covariance of zeros, which is '
-                                'taken as unknown']
+        assert bag.problems == [
+            'topic /usbl/fix: 1 messages have a covariance of zeros, which is taken as unknown'
+        ]
 
 
 def test_a_topic_map_chooses(mixed):
@@ -67,9 +88,14 @@ def test_a_topic_map_chooses(mixed):
         assert len(heard) == 1 and heard[0].measurement.position.tolist() == [2.0, 5.0, 0.0]
 
 
-@pytest.mark.parametrize('topics, words', [
-    ({'/pose': 'fixx'}, ["no input 'fixx'", "'fix'"]), ({'/posee': 'fix'}, ["'/pose'"]),
-    ({'/other/fix': 'fix'}, ['std_msgs/msg/String', POINT])])
+@pytest.mark.parametrize(
+    'topics, words',
+    [
+        ({'/pose': 'fixx'}, ["no input 'fixx'", "'fix'"]),
+        ({'/posee': 'fix'}, ["'/pose'"]),
+        ({'/other/fix': 'fix'}, ['std_msgs/msg/String', POINT]),
+    ],
+)
 def test_a_wrong_topic_map_is_explained(mixed, topics, words):
     with BagReader(mixed) as bag, pytest.raises(BagError) as caught:
         list(measurements_of(bag, 'diver', topics))

@@ -15,8 +15,9 @@ def test_every_common_message_can_be_made_empty_and_survives_cdr():
 
 
 def test_fields_are_cast_strictly():
-    message = ros_message('sensor_msgs/msg/JointState', name=('a',), position=[1, 2],
-                          velocity=np.float32([0.5]))
+    message = ros_message(
+        'sensor_msgs/msg/JointState', name=('a',), position=[1, 2], velocity=np.float32([0.5])
+    )
     assert message.position.dtype == np.float64 and message.velocity.dtype == np.float64
     cloud = ros_message('sensor_msgs/msg/PointCloud2', data=b'\x01\x02', height=np.int64(3))
     assert cloud.data.tolist() == [1, 2] and type(cloud.height) is int

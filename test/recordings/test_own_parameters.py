@@ -7,8 +7,8 @@ import pytest
 from sonar_imm.cli import main
 from sonar_imm.parameters import parameters_from_yaml
 from sonar_imm.recordings.own_parameters import own_parameters, unusual, write_own_parameters
-from sonar_imm.simulation.fathometer import scenario as fathometer_scenario
-from sonar_imm.simulation.obstacle import scenario as obstacle_scenario
+from sonar_imm.simulation.fathometer.simulator import scenario as fathometer_scenario
+from sonar_imm.simulation.obstacle.simulator import scenario as obstacle_scenario
 from sonar_imm.trackers import SYSTEMS
 
 
@@ -42,8 +42,20 @@ def test_the_file_is_one_of_ros(tmp_path):
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     bag = tmp_path_factory.mktemp('own') / 'scene'
-    assert main(['simulate', 'obstacle', str(bag), '--set', 'sonar_lever=2,0,-0.3',
-                 '--set', 'last_range=80']) == 0
+    assert (
+        main(
+            [
+                'simulate',
+                'obstacle',
+                str(bag),
+                '--set',
+                'sonar_lever=2,0,-0.3',
+                '--set',
+                'last_range=80',
+            ]
+        )
+        == 0
+    )
     return bag
 
 
@@ -73,7 +85,24 @@ def test_a_spoilt_file_is_one_sentence(bag, tmp_path, capsys):
 
 
 def test_a_sweep_knows_the_instruments_of_its_scene(tmp_path):
-    assert main(['sweep', 'obstacle', '--runs', '1', '--workers', '1', '--set', 'last_range=80',
-                 '--set', 'sonar_lever=2,0,-0.3', '--out', str(tmp_path)]) == 0
+    assert (
+        main(
+            [
+                'sweep',
+                'obstacle',
+                '--runs',
+                '1',
+                '--workers',
+                '1',
+                '--set',
+                'last_range=80',
+                '--set',
+                'sonar_lever=2,0,-0.3',
+                '--out',
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
     told = json.loads((tmp_path / 'sweep.json').read_text())['parameters']
     assert told['sonar_lever'] == [2.0, 0.0, -0.3]

@@ -13,8 +13,12 @@ from sonar_imm.recordings.writer import BagWriter
 
 FIX = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CUSTOM = 'my_msgs/msg/Custom'
-KINDS = [(plugin, mode) for plugin in StoragePlugin for mode in CompressionMode
-         if (plugin, mode) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)]
+KINDS = [
+    (plugin, mode)
+    for plugin in StoragePlugin
+    for mode in CompressionMode
+    if (plugin, mode) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)
+]
 
 
 def storage_file(path):
@@ -28,7 +32,7 @@ def read(path, **options):
 
 def cut(path, share):
     data = path.read_bytes()
-    path.write_bytes(data[:int(len(data) * share)])
+    path.write_bytes(data[: int(len(data) * share)])
 
 
 class TestWhole:
@@ -62,8 +66,9 @@ class TestWhole:
         assert len(items) == 50 and len(problems) == 1 and 'no metadata.yaml' in problems[0]
 
     @pytest.mark.parametrize('plugin', list(StoragePlugin))
-    def test_compressed_messages_without_the_metadata_that_tell_of_it(self, tmp_path, fix_message,
-                                                                      plugin):
+    def test_compressed_messages_without_the_metadata_that_tell_of_it(
+        self, tmp_path, fix_message, plugin
+    ):
         writer = Writer(tmp_path / 'bag', version=8, storage_plugin=plugin)
         writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
         with writer:
@@ -103,7 +108,11 @@ class TestWhole:
             shutil.copy(tmp_path / f's_{number}' / f's_{number}.mcap', split)
         items, _ = read(split)
         assert [(item.log_ns, item.message.pose.pose.position.x) for item in items] == [
-            (30, 2), (40, 10), (50, 2), (50, 10)]
+            (30, 2),
+            (40, 10),
+            (50, 2),
+            (50, 10),
+        ]
         with BagReader(split) as bag:
             assert [(topic.name, topic.count) for topic in bag.topics] == [('/fix', 4)]
 
@@ -151,7 +160,7 @@ class TestDamage:
         for target in (path, file):
             items, problems = read(target)
             assert 50 * share * 0.7 < len(items) <= 50
-            assert [item.raw for item in items] == [item.raw for item in whole[:len(items)]]
+            assert [item.raw for item in items] == [item.raw for item in whole[: len(items)]]
             assert f'{len(items)} messages' in problems[-1] and 'recovered' in problems[-1]
             with pytest.raises(BagError), BagReader(target, strict=True):
                 pass
@@ -167,7 +176,7 @@ class TestDamage:
     def test_the_end_of_a_db3_that_is_missing_is_a_problem(self, write_fixes):
         path = write_fixes(500, storage='sqlite3')
         data = storage_file(path).read_bytes()
-        storage_file(path).write_bytes(data[:len(data) - 1000])
+        storage_file(path).write_bytes(data[: len(data) - 1000])
         items, problems = read(path)
         assert 0 < len(items) < 500 and 'damaged' in problems[0] and 'lost' in problems[0]
         with pytest.raises(BagError, match='damaged'):
@@ -220,10 +229,21 @@ class TestDamage:
         items, problems = read(path)
         assert len(items) == 50 and len(problems) == 1 and '\n' not in problems[0]
 
-    @pytest.mark.parametrize('name, content', [
-        ('no', None), ('x.mcap', b''), ('x.mcap', b'nonsense'), ('x.db3', b'nonsense' * 100),
-        ('x.bag', b'nonsense'), ('x.txt', b''), ('x.mcap.zstd', b''), ('dir', 'dir'),
-        ('x.mcap', b'\x89MCAP0\r\n'), ('x.bag', b'')])
+    @pytest.mark.parametrize(
+        'name, content',
+        [
+            ('no', None),
+            ('x.mcap', b''),
+            ('x.mcap', b'nonsense'),
+            ('x.db3', b'nonsense' * 100),
+            ('x.bag', b'nonsense'),
+            ('x.txt', b''),
+            ('x.mcap.zstd', b''),
+            ('dir', 'dir'),
+            ('x.mcap', b'\x89MCAP0\r\n'),
+            ('x.bag', b''),
+        ],
+    )
     def test_what_is_no_recording_is_one_sentence(self, tmp_path, name, content):
         path = tmp_path / name
         if content == 'dir':
@@ -264,7 +284,9 @@ class TestTypes:
         self.add_custom(tmp_path / 'bag', definition=False)
         with BagReader(tmp_path / 'bag') as bag:
             assert [(topic.name, topic.decodable) for topic in bag.topics] == [
-                ('/custom', False), ('/text', True)]
+                ('/custom', False),
+                ('/text', True),
+            ]
             assert CUSTOM in bag.problems[0]
             assert [item.message.data for item in bag.messages(['/text'])] == ['hello']
             assert [item.topic for item in bag.messages()] == ['/text']

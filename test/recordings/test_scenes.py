@@ -24,12 +24,18 @@ def logged(path):
 
 
 def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
-    scene = Scene((Received(START_NS + 9, fix(1)), Received(START_NS + 4, fix(3))), (TrueTrack(
-        7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2))),))
+    scene = Scene(
+        (Received(START_NS + 9, fix(1)), Received(START_NS + 4, fix(3))),
+        (TrueTrack(7, START_NS + np.array([2, 6]), np.zeros((2, 3)), np.ones((2, 2))),),
+    )
     report = scenes.write_scene(scene, tmp_path / 'bag', provenance={})
     assert report.messages == {'/fix': 2, '/truth/estimate': 2}
-    assert logged(tmp_path / 'bag') == [('/truth/estimate', 2), ('/fix', 4),
-                                        ('/truth/estimate', 6), ('/fix', 9)]
+    assert logged(tmp_path / 'bag') == [
+        ('/truth/estimate', 2),
+        ('/fix', 4),
+        ('/truth/estimate', 6),
+        ('/fix', 9),
+    ]
 
 
 def test_another_system_adds_a_writer_of_its_truth(tmp_path, monkeypatch):
@@ -38,9 +44,18 @@ def test_another_system_adds_a_writer_of_its_truth(tmp_path, monkeypatch):
         stamp_ns: int
 
     def buoy_records(buoy, frame_id):
-        yield (buoy.stamp_ns, '/truth/buoy', write_truth(
-            [[0.0, 0.0]], [[0.0, 0.0]], [1], stamp_ns=buoy.stamp_ns, frame_id=frame_id,
-            make=ros_message))
+        yield (
+            buoy.stamp_ns,
+            '/truth/buoy',
+            write_truth(
+                [[0.0, 0.0]],
+                [[0.0, 0.0]],
+                [1],
+                stamp_ns=buoy.stamp_ns,
+                frame_id=frame_id,
+                make=ros_message,
+            ),
+        )
 
     scene = Scene((Received(START_NS + 1, fix(0)),), (Buoy(START_NS + 2),))
     with pytest.raises(KeyError):

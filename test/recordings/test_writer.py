@@ -29,7 +29,7 @@ def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
     text = (path / 'metadata.yaml').read_text()
     assert 'version: 8' in text
     with BagReader(path) as bag:
-        profile, = bag.topics[0].offered_qos
+        (profile,) = bag.topics[0].offered_qos
         assert profile.reliability.name == 'RELIABLE' and profile.depth == 10
 
 

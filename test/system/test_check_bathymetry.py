@@ -14,8 +14,26 @@ pytestmark = pytest.mark.system
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp('bags') / 'floor'
-    assert main(['simulate', 'bathymetry', str(path), '--seed', '3', '--scenario', 'shadow',
-                 '--set', 'pings=3', '--set', 'last_range=45', '--set', 'shadows=30,33']) == 0
+    assert (
+        main(
+            [
+                'simulate',
+                'bathymetry',
+                str(path),
+                '--seed',
+                '3',
+                '--scenario',
+                'shadow',
+                '--set',
+                'pings=3',
+                '--set',
+                'last_range=45',
+                '--set',
+                'shadows=30,33',
+            ]
+        )
+        == 0
+    )
     return path
 
 
@@ -23,9 +41,23 @@ def bag(tmp_path_factory):
 def test_live_lockstep_equals_offline(bag, tmp_path, capsys, parameters):
     params = tmp_path / 'my.yaml'
     params.write_text(json.dumps({'/**': {'ros__parameters': {'seed': 7, **parameters}}}))
-    assert main(['check', 'bathymetry', '--bag', str(bag), '--params', str(params), '--out',
-                 str(tmp_path), '--json']) == 0
-    outcome, = json.loads(capsys.readouterr().out)
+    assert (
+        main(
+            [
+                'check',
+                'bathymetry',
+                '--bag',
+                str(bag),
+                '--params',
+                str(params),
+                '--out',
+                str(tmp_path),
+                '--json',
+            ]
+        )
+        == 0
+    )
+    (outcome,) = json.loads(capsys.readouterr().out)
     assert outcome['good'] and len(outcome['checks']) == 4
     offline, live = tmp_path / 'floor' / 'offline', tmp_path / 'floor' / 'live'
     assert (offline / 'estimate.csv').read_bytes() == (live / 'estimate.csv').read_bytes()

@@ -14,15 +14,33 @@ pytestmark = pytest.mark.system
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp('bags') / 'dive'
-    assert main(['simulate', 'diver', str(path), '--seed', '3', '--scenario', 'irregular',
-                 '--set', 'duration=40']) == 0
+    assert (
+        main(
+            [
+                'simulate',
+                'diver',
+                str(path),
+                '--seed',
+                '3',
+                '--scenario',
+                'irregular',
+                '--set',
+                'duration=40',
+            ]
+        )
+        == 0
+    )
     return path
 
 
 def test_live_lockstep_equals_offline(bag, tmp_path, capsys):
-    assert main(['check', 'diver', '--bag', str(bag), '--limit', '3', '--out', str(tmp_path),
-                 '--json']) == 0
-    outcome, = json.loads(capsys.readouterr().out)
+    assert (
+        main(
+            ['check', 'diver', '--bag', str(bag), '--limit', '3', '--out', str(tmp_path), '--json']
+        )
+        == 0
+    )
+    (outcome,) = json.loads(capsys.readouterr().out)
     assert outcome['good'] and len(outcome['checks']) == 4
     assert outcome['latency_ms']['p50'] > 0.0
     offline, live = tmp_path / 'dive' / 'offline', tmp_path / 'dive' / 'live'
@@ -32,11 +50,39 @@ def test_live_lockstep_equals_offline(bag, tmp_path, capsys):
 
 def test_inputs_that_interleave_and_come_late_give_equal_bytes_too(tmp_path, capsys):
     bag = tmp_path / 'approach'
-    assert main(['simulate', 'obstacle', str(bag), '--scenario', 'late',
-                 '--set', 'last_range=45', '--set', 'clutter=2']) == 0
-    assert main(['check', 'obstacle', '--bag', str(bag), '--limit', '8', '--out', str(tmp_path),
-                 '--json']) == 0
-    outcome, = json.loads(capsys.readouterr().out.partition('\n')[2])
+    assert (
+        main(
+            [
+                'simulate',
+                'obstacle',
+                str(bag),
+                '--scenario',
+                'late',
+                '--set',
+                'last_range=45',
+                '--set',
+                'clutter=2',
+            ]
+        )
+        == 0
+    )
+    assert (
+        main(
+            [
+                'check',
+                'obstacle',
+                '--bag',
+                str(bag),
+                '--limit',
+                '8',
+                '--out',
+                str(tmp_path),
+                '--json',
+            ]
+        )
+        == 0
+    )
+    (outcome,) = json.loads(capsys.readouterr().out.partition('\n')[2])
     assert outcome['good'] and len(outcome['checks']) == 4
 
 
@@ -49,6 +95,7 @@ def test_a_limit_that_is_not_reached_exits_with_1(bag, capsys):
 
 def test_lockstep_with_nobody_is_one_line_and_exit_code_1(bag, capsys, monkeypatch):
     from sonar_imm.nodes import player
+
     monkeypatch.setattr(player, 'MATCH_LIMIT', 0.5)
     assert main(['play', str(bag), '--lockstep', '/nobody']) == 1
     error = capsys.readouterr().err

@@ -30,9 +30,7 @@ def test_a_limit_that_cannot_be_met_fails(tmp_path, capsys):
     assert [check['good'] for check in outcome['checks']] == [True, True, True, False]
 
 
-def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out(
-    tmp_path, capsys
-):
+def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out(tmp_path, capsys):
     from sonar_imm.resources import share_folder
 
     bag = share_folder() / 'bags' / 'fathometer_array'

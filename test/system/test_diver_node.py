@@ -39,8 +39,12 @@ def bag(tmp_path_factory):
                 stamp = START + (k - late) * SECOND + (late > 0) * SECOND // 3
                 place = np.array([-40.0 + 0.7 * k + 30.0 * diver, 40.0 - 0.5 * k, 0.0])
                 place[:2] += rng.normal(scale=0.3, size=2) + (k % 23 == 22) * 500.0
-                message = write_fix(Fix(stamp_ns=stamp, position=place, frame_id='map',
-                                        covariance=0.09 * np.eye(2)), ros_message)
+                message = write_fix(
+                    Fix(
+                        stamp_ns=stamp, position=place, frame_id='map', covariance=0.09 * np.eye(2)
+                    ),
+                    ros_message,
+                )
                 if k % 17 == 16:
                     message.pose.pose.position.y = float('inf')
                 if k == 60:
@@ -94,8 +98,10 @@ def test_live_lockstep_equals_offline_byte_for_byte(bag):
 
 def test_the_parameter_file_reaches_the_live_node(bag, tmp_path):
     file = tmp_path / 'diver.yaml'
-    file.write_text('/**:\n  ros__parameters:\n    model_set: cv_cv\n    max_tracks: 3\n'
-                    '    transition_matrix: []\n')
+    file.write_text(
+        '/**:\n  ros__parameters:\n    model_set: cv_cv\n    max_tracks: 3\n'
+        '    transition_matrix: []\n'
+    )
     result = run_lockstep(bag, 'diver', params_file=file)
     assert_same_tables(result.estimates, offline(bag, model_set='cv_cv', max_tracks=3))
 
@@ -103,22 +109,30 @@ def test_the_parameter_file_reaches_the_live_node(bag, tmp_path):
 def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
     file = tmp_path / 'diver.yaml'
     file.write_text('/**:\n  ros__parameters:\n    sound_speed: 1500\n')
-    with pytest.raises(LinkError, match=r"exit code 2: diver: parameter 'sound_speed' is a "
-                                        r'double: write 1500\.0 instead of 1500'):
+    with pytest.raises(
+        LinkError,
+        match=r"exit code 2: diver: parameter 'sound_speed' is a "
+        r'double: write 1500\.0 instead of 1500',
+    ):
         run_lockstep(bag, 'diver', params_file=file)
 
 
-@pytest.mark.parametrize('arguments, sentence', [
-    (('-p', 'sound_speed:=1500'), 'write 1500.0 instead of 1500'),
-    (('-p', 'sound_speed:=15.0'), 'must be between 1300 and 1700'),
-    (('-p', 'confirm_hits:=9'), 'confirm_hits (9) cannot exceed confirm_window'),
-    (('-p', 'qos_overrides./fix.subscription.reliability:=often'), 'often'),
-    (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
-    (('--no-such-flag',), '--no-such-flag'),
-])
+@pytest.mark.parametrize(
+    'arguments, sentence',
+    [
+        (('-p', 'sound_speed:=1500'), 'write 1500.0 instead of 1500'),
+        (('-p', 'sound_speed:=15.0'), 'must be between 1300 and 1700'),
+        (('-p', 'confirm_hits:=9'), 'confirm_hits (9) cannot exceed confirm_window'),
+        (('-p', 'qos_overrides./fix.subscription.reliability:=often'), 'often'),
+        (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
+        (('--no-such-flag',), '--no-such-flag'),
+    ],
+)
 def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence):
-    with reserved_domain_id() as domain, \
-            NodeProcess('diver', domain_id=domain, arguments=arguments) as node:
+    with (
+        reserved_domain_id() as domain,
+        NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
+    ):
         assert node.process.wait(30.0) == 2
         lines = [line for line in node.log().splitlines() if '[rcl]' not in line]
     assert len(lines) == 1
@@ -152,16 +166,20 @@ def test_sigterm_ends_the_diver_node_cleanly():
 @pytest.mark.parametrize('how', [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_a_node_cleanly_twenty_times(how, monkeypatch):
     # the light tracker of the node tests starts fast; `run` is the same
-    monkeypatch.setenv('PYTHONPATH', str(Path(__file__).parents[1] / 'nodes'))
+    monkeypatch.setenv('PYTHONPATH', str(Path(__file__).parents[1]))
     for _ in range(5):
         with reserved_domain_id() as domain:
-            nodes = [NodeProcess('walker', domain_id=domain, module='walker') for _ in range(4)]
+            nodes = [
+                NodeProcess('walker', domain_id=domain, module='helpers.walker') for _ in range(4)
+            ]
             wait_until_ready(nodes)
             assert_clean_end(nodes, how)
 
 
 def test_modules_of_the_nodes_load_neither_scipy_nor_numba():
-    code = ('import sys, sonar_imm.nodes.diver; '
-            'print([m for m in ("numba", "scipy", "rosbags", "plotly") if m in sys.modules])')
+    code = (
+        'import sys, sonar_imm.nodes.diver; '
+        'print([m for m in ("numba", "scipy", "rosbags", "plotly") if m in sys.modules])'
+    )
     said = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == '[]'

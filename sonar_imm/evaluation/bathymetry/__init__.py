@@ -1,7 +1,7 @@
 """How runs of the bathymetry tracker are judged: a floor along each ping against the true floor.
 
 `profiles` lays estimate and truth of each ping side by side, `scoring` says how far apart they
-are. `words`, `sections` and `figures` tell it; `bench` measures the filter beside its `peers`.
+are. `summary`, `sections` and `figures` tell it; `bench` measures the filter beside its `peers`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_truth, RunFolder
 from .profiles import profiles_of, Swath
 from .scoring import score
-from .words import lines, summary_sentence
+from .summary import lines, summary_sentence
 
 if TYPE_CHECKING:
     from ..page import Part

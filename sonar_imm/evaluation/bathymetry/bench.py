@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from ...measurements import Snapshot
-from ...simulation.bathymetry import scenario, simulate
-from ...trackers.bathymetry import BathymetryTracker
-from ..benching import Bench
+from ...simulation.bathymetry.simulator import scenario, simulate
+from ...trackers.bathymetry.tracker import BathymetryTracker
+from ..benches import Bench
 from .peers import config, cut, numpy_filter, stone_soup_filter
 
 PEER_BINS = 400

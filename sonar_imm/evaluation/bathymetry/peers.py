@@ -17,7 +17,7 @@ from scipy.special import kve
 
 from ...acoustics.laplace import autocorrelation
 from ...measurements import FloatArray, Snapshot
-from ...trackers.bathymetry import BathymetryConfig
+from ...trackers.bathymetry.tracker import BathymetryConfig
 
 CHAIN = np.array([[0.98, 0.02], [0.02, 0.98]])
 SIGMAS = (0.01, 1.0)

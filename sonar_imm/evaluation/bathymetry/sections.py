@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...measurements import Snapshot
-from ...trackers.bathymetry_config import BathymetryConfig
-from ...trackers.bathymetry_law import spacing_of
+from ...trackers.bathymetry.config import BathymetryConfig
+from ...trackers.bathymetry.likelihood import spacing_of
 from ..judging import Check
 from ..page import Card, Part, Section
 from ..report import run_part
 from ..run_folder import read_measurements
 from . import figures
 from .profiles import Profile, Swath
-from .words import percent, summary_sentence
+from .summary import percent, summary_sentence
 
 
 def bathymetry_part(

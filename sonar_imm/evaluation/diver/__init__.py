@@ -1,7 +1,7 @@
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
 `series` lays estimates end to end, `truth` says where the divers were, `matching` which track is
-whose, `scoring` how far off. `words`, `sections` and `figures` tell it; `bench` measures the
+whose, `scoring` how far off. `summary`, `sections` and `figures` tell it; `bench` measures the
 filter.
 """
 
@@ -19,8 +19,8 @@ from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_measurements, read_truth, RunFolder
 from .scoring import fix_series, score
 from .series import Series, series_of
+from .summary import lines, summary_sentence
 from .truth import Truth
-from .words import lines, summary_sentence
 
 if TYPE_CHECKING:
     from ..page import Part
@@ -44,9 +44,12 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     metrics = score(series, truth, fixes=raw, cutoff=cutoff)
     metrics['truth_lag_s'] = options.lag
     return Judgement(
-        metrics=metrics, summary=summary_sentence(metrics), lines=tuple(lines(metrics)),
+        metrics=metrics,
+        summary=summary_sentence(metrics),
+        lines=tuple(lines(metrics)),
         part=functools.partial(_part, run, metrics, series, truth, raw),
-        accuracy=functools.partial(_accuracy, metrics))
+        accuracy=functools.partial(_accuracy, metrics),
+    )
 
 
 def _series(estimates: Iterable[Estimate], where: Path) -> Series:
@@ -64,12 +67,20 @@ def _truth(run: Mapping[str, Any], options: JudgeOptions) -> Truth | None:
     return Truth.from_series(series, max_gap=options.gap).shifted(options.lag)
 
 
-def _part(run: Mapping[str, Any], metrics: Mapping[str, Any], series: Series,
-          truth: Truth | None, fixes: Series | None, checks: Sequence[Check]) -> Part:
+def _part(
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    series: Series,
+    truth: Truth | None,
+    fixes: Series | None,
+    checks: Sequence[Check],
+) -> Part:
     # plotly, which only a report needs, takes a second to load.
     from .sections import diver_part, Material
-    return diver_part(Material(run=run, metrics=metrics, series=series, truth=truth, fixes=fixes),
-                      checks)
+
+    return diver_part(
+        Material(run=run, metrics=metrics, series=series, truth=truth, fixes=fixes), checks
+    )
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
@@ -77,5 +88,6 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
     if not position.get('n'):
         return None
     raw = metrics.get('raw_fix', {}).get('rmse_m')
-    return LIMIT.check(position['rmse_m'], at_most=at_most,
-                       remark=f' (raw fixes {raw:.2f} m)' if raw else '')
+    return LIMIT.check(
+        position['rmse_m'], at_most=at_most, remark=f' (raw fixes {raw:.2f} m)' if raw else ''
+    )

@@ -17,7 +17,7 @@ import numpy as np
 from ...estimation import imm, imm_kernels
 from ...estimation.association import assign, association_cost, gate_threshold
 from ...measurements import FloatArray
-from ..benching import Bench
+from ..benches import Bench
 
 MODELS, STATES, STEP = 16, 4, 1.0
 RATIO_WANTED = 100.0
@@ -66,8 +66,9 @@ def run_kernel(p: Problem) -> FloatArray:
     H, R, transition = np.tile(p.H, (MODELS, 1, 1)), p.R[None], p.transition[None]
     means = np.empty((len(p.z), STATES))
     for k in range(len(p.z)):
-        x, P, mu, mean, *_ = imm_kernels.linear_cycle(x, P, mu, transition, p.F, p.Q, B,
-                                                      p.z[k:k + 1], H, R, E)
+        x, P, mu, mean, *_ = imm_kernels.linear_cycle(
+            x, P, mu, transition, p.F, p.Q, B, p.z[k : k + 1], H, R, E
+        )
         means[k] = mean[0]
     return means
 
@@ -75,6 +76,7 @@ def run_kernel(p: Problem) -> FloatArray:
 def run_filterpy(p: Problem) -> FloatArray:
     """(K, 4) estimates by FilterPy. Raises ModuleNotFoundError when it is not installed."""
     from filterpy.kalman import IMMEstimator, KalmanFilter
+
     filters = []
     for F, Q in zip(p.F, p.Q):
         one = KalmanFilter(dim_x=STATES, dim_z=2)
@@ -95,15 +97,26 @@ def bench_step(rounds: int = 7, steps: int = 150) -> dict[str, Any]:
     p = problem(steps)
     ours, theirs = run_kernel(p), run_filterpy(p)
     agreement = float(np.abs(ours - theirs).max())
-    pairs = np.array([[_seconds(run_kernel, p), _seconds(run_filterpy, p)]
-                      for _ in range(rounds)]) / steps * 1e6
+    pairs = (
+        np.array([[_seconds(run_kernel, p), _seconds(run_filterpy, p)] for _ in range(rounds)])
+        / steps
+        * 1e6
+    )
     ratio = pairs[:, 1] / pairs[:, 0]
-    return {'models': MODELS, 'states': STATES, 'measurements': 2, 'steps': steps,
-            'rounds': rounds, 'ours_us': float(np.median(pairs[:, 0])),
-            'filterpy_us': float(np.median(pairs[:, 1])), 'ratio': float(np.median(ratio)),
-            'ratio_lowest': float(ratio.min()), 'ratio_wanted': RATIO_WANTED,
-            'largest_difference_m': agreement,
-            'good': bool(np.median(ratio) >= RATIO_WANTED and agreement < 1e-9)}
+    return {
+        'models': MODELS,
+        'states': STATES,
+        'measurements': 2,
+        'steps': steps,
+        'rounds': rounds,
+        'ours_us': float(np.median(pairs[:, 0])),
+        'filterpy_us': float(np.median(pairs[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'ratio_lowest': float(ratio.min()),
+        'ratio_wanted': RATIO_WANTED,
+        'largest_difference_m': agreement,
+        'good': bool(np.median(ratio) >= RATIO_WANTED and agreement < 1e-9),
+    }
 
 
 def bench_scan(targets: int = 1000, scans: int = 20) -> dict[str, Any]:
@@ -123,21 +136,29 @@ def bench_scan(targets: int = 1000, scans: int = 20) -> dict[str, Any]:
         times.append(1e3 * (time.perf_counter() - begin))
         hits.append(hit / targets)
     median = float(np.median(times[1:]))
-    return {'targets': targets, 'scans': scans, 'median_ms': median,
-            'worst_ms': float(np.max(times[1:])), 'assigned': float(np.mean(hits)),
-            'wanted_ms': SCAN_WANTED_MS, 'good': median <= SCAN_WANTED_MS}
+    return {
+        'targets': targets,
+        'scans': scans,
+        'median_ms': median,
+        'worst_ms': float(np.max(times[1:])),
+        'assigned': float(np.mean(hits)),
+        'wanted_ms': SCAN_WANTED_MS,
+        'good': median <= SCAN_WANTED_MS,
+    }
 
 
-def _scan(p: Problem, x: FloatArray, P: FloatArray, mu: FloatArray, z: FloatArray
-          ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+def _scan(
+    p: Problem, x: FloatArray, P: FloatArray, mu: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
     """One scan of many targets, and how many of them were hit."""
     targets = len(x)
     H = np.tile(p.H, (1, MODELS, 1, 1))
     x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
     x, P = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
     expected = np.ascontiguousarray(x[:, :, :2])
-    fit = imm_kernels.gate(expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)),
-                           gate_threshold(0.999, 2))
+    fit = imm_kernels.gate(
+        expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2)
+    )
     target, detection = imm.pairs_inside(fit)
     cost = association_cost(fit[target, detection], 0.95, 1e-4)
     chosen = assign(target, detection, cost, targets, len(z))
@@ -155,17 +176,21 @@ def _seconds(function: Callable[[Problem], Any], p: Problem) -> float:
 
 
 def _step_sentence(step: Mapping[str, Any]) -> str:
-    return (f'IMM step, {step["models"]} models, {step["states"]} states, {step["measurements"]} '
-            f'measurements: {step["ours_us"]:.1f} us, FilterPy {step["filterpy_us"]:.0f} us: '
-            f'{step["ratio"]:.0f} times as fast (wanted {step["ratio_wanted"]:.0f}; lowest of '
-            f'{step["rounds"]} paired rounds {step["ratio_lowest"]:.0f}); the estimates agree to '
-            f'{step["largest_difference_m"]:.0e} m')
+    return (
+        f'IMM step, {step["models"]} models, {step["states"]} states, {step["measurements"]} '
+        f'measurements: {step["ours_us"]:.1f} us, FilterPy {step["filterpy_us"]:.0f} us: '
+        f'{step["ratio"]:.0f} times as fast (wanted {step["ratio_wanted"]:.0f}; lowest of '
+        f'{step["rounds"]} paired rounds {step["ratio_lowest"]:.0f}); the estimates agree to '
+        f'{step["largest_difference_m"]:.0e} m'
+    )
 
 
 def _scan_sentence(scan: Mapping[str, Any]) -> str:
-    return (f'scan of {scan["targets"]} targets with gating and assignment: median '
-            f'{scan["median_ms"]:.1f} ms (wanted {scan["wanted_ms"]:.0f}), worst of '
-            f'{scan["scans"]} {scan["worst_ms"]:.1f} ms')
+    return (
+        f'scan of {scan["targets"]} targets with gating and assignment: median '
+        f'{scan["median_ms"]:.1f} ms (wanted {scan["wanted_ms"]:.0f}), worst of '
+        f'{scan["scans"]} {scan["worst_ms"]:.1f} ms'
+    )
 
 
 BENCHES = (

@@ -62,7 +62,7 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
     scans: list[int] = []
     for scan in np.flatnonzero(known & (ends > starts)):
         there = np.flatnonzero(present[:, scan])
-        offset = series.state[starts[scan]:ends[scan], None, :2] - states[None, there, scan, :2]
+        offset = series.state[starts[scan] : ends[scan], None, :2] - states[None, there, scan, :2]
         for row, column in assign(np.hypot(offset[..., 0], offset[..., 1]), limit):
             rows.append(starts[scan] + row)
             targets.append(there[column])
@@ -70,16 +70,26 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
             followed_by[there[column], scan] = series.track_id[starts[scan] + row]
     row, target, at = (np.array(values, np.int64) for values in (rows, targets, scans))
     scan_ns = series.scan_ns[known]
-    return Matching(series=series, row=row, target=target, truth=states[target, at],
-                    scan_ns=scan_ns, present=present[:, known], followed_by=followed_by[:, known],
-                    scored=np.isin(series.stamp_ns, scan_ns))
+    return Matching(
+        series=series,
+        row=row,
+        target=target,
+        truth=states[target, at],
+        scan_ns=scan_ns,
+        present=present[:, known],
+        followed_by=followed_by[:, known],
+        scored=np.isin(series.stamp_ns, scan_ns),
+    )
 
 
 def assign(distance: FloatArray, limit: float) -> list[tuple[int, int]]:
     """Pairs (row, column) of least total cost; those not nearer than `limit` are left apart."""
     cost = np.where(np.isfinite(distance), np.minimum(distance, limit), 1e12)
-    return [(int(row), int(column)) for row, column in zip(*linear_sum_assignment(cost))
-            if distance[row, column] < limit]
+    return [
+        (int(row), int(column))
+        for row, column in zip(*linear_sum_assignment(cost))
+        if distance[row, column] < limit
+    ]
 
 
 def _one_to_one(series: Series, truth: Truth) -> bool:
@@ -104,11 +114,13 @@ def track_summary(matching: Matching) -> dict[str, float]:
         'tracks': len(scored_ids),
         'false_tracks': int(np.count_nonzero(2 * hits < lifetimes)),
         'identity_switches': identity_switches(matching.followed_by.T),
-        'fragmentations': sum(_interruptions(one[there]) for one, there
-                              in zip(found, matching.present)),
+        'fragmentations': sum(
+            _interruptions(one[there]) for one, there in zip(found, matching.present)
+        ),
         'completeness': float(found.sum() / present) if present else float('nan'),
-        'false_rows_per_scan': float((matching.scored.sum() - len(matching.row))
-                                     / max(1, len(matching.scan_ns))),
+        'false_rows_per_scan': float(
+            (matching.scored.sum() - len(matching.row)) / max(1, len(matching.scan_ns))
+        ),
     }
 
 

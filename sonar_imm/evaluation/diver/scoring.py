@@ -31,8 +31,13 @@ COVERAGE_LEVELS = (0.5, 0.9, 0.95)
 LAG_RANGE = 30.0
 
 
-def score(series: Series, truth: Truth | None = None, *, fixes: Series | None = None,
-          cutoff: float = 10.0) -> dict[str, Any]:
+def score(
+    series: Series,
+    truth: Truth | None = None,
+    *,
+    fixes: Series | None = None,
+    cutoff: float = 10.0,
+) -> dict[str, Any]:
     """All metrics of a run. Without `truth` only what needs none: NIS, models, counts.
 
     fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is off target.
@@ -41,11 +46,14 @@ def score(series: Series, truth: Truth | None = None, *, fixes: Series | None = 
     hits = confirmed.hits()
     span = (series.scan_ns[-1] - series.scan_ns[0]) / SECOND if len(series.scan_ns) else 0.0
     metrics: dict[str, Any] = {
-        'stamps': len(series.scan_ns), 'span_s': float(span), 'rows_confirmed': len(confirmed),
+        'stamps': len(series.scan_ns),
+        'span_s': float(span),
+        'rows_confirmed': len(confirmed),
         'rows_tentative': len(series) - len(confirmed),
         'tracks_confirmed': len(np.unique(confirmed.track_id)),
         'consistency': {'nis': nis_summary(hits.nis, hits.nis_dof)},
-        'models': model_summary(confirmed)}
+        'models': model_summary(confirmed),
+    }
     if truth is None or not len(truth):
         return metrics
     matching = match(confirmed, truth, cutoff=cutoff)
@@ -73,10 +81,18 @@ def fix_series(fixes: Iterable[Fix]) -> Series:
         state[row, :2] = fix.position[:2]
         if fix.covariance is not None:
             covariance[row, :2, :2] = fix.covariance
-    return Series(scan_ns=np.unique(stamp_ns), stamp_ns=stamp_ns, track_id=np.zeros(n, np.int64),
-                  track_state=np.ones(n, np.int64), state=state, covariance=covariance,
-                  model_names=(), probabilities=np.empty((n, 0)), nis=np.full(n, np.nan),
-                  nis_dof=np.full(n, np.nan))
+    return Series(
+        scan_ns=np.unique(stamp_ns),
+        stamp_ns=stamp_ns,
+        track_id=np.zeros(n, np.int64),
+        track_state=np.ones(n, np.int64),
+        state=state,
+        covariance=covariance,
+        model_names=(),
+        probabilities=np.empty((n, 0)),
+        nis=np.full(n, np.nan),
+        nis_dof=np.full(n, np.nan),
+    )
 
 
 def truth_consistency(matching: Matching) -> dict[str, Any]:
@@ -86,9 +102,14 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
     state = usable_nees(error, covariance)
     result: dict[str, Any] = {
         'nees_position': chi2_summary(position, 2),
-        'coverage': {f'{100 * level:g}': float(np.mean(position <= chi2.ppf(level, 2)))
-                     if len(position) else float('nan') for level in COVERAGE_LEVELS},
-        'singular_position_covariances': len(error) - len(position)}
+        'coverage': {
+            f'{100 * level:g}': float(np.mean(position <= chi2.ppf(level, 2)))
+            if len(position)
+            else float('nan')
+            for level in COVERAGE_LEVELS
+        },
+        'singular_position_covariances': len(error) - len(position),
+    }
     if known := int(np.isfinite(error).all(axis=1).sum()):
         result['nees_state'] = chi2_summary(state, 4)
         result['singular_state_covariances'] = known - len(state)
@@ -106,11 +127,14 @@ def model_summary(series: Series) -> dict[str, Any]:
         changes += int(np.count_nonzero(np.diff(leader[rows])))
         duration += float(np.ptp(series.stamp_ns[rows])) / SECOND
     return {
-        'mean_probability': dict(zip(series.model_names,
-                                     series.probabilities.mean(axis=0).tolist())),
-        'leads': {name: float(np.mean(leader == index))
-                  for index, name in enumerate(series.model_names)},
-        'leader_changes_per_minute': 60.0 * changes / duration if duration > 0 else float('nan')}
+        'mean_probability': dict(
+            zip(series.model_names, series.probabilities.mean(axis=0).tolist())
+        ),
+        'leads': {
+            name: float(np.mean(leader == index)) for index, name in enumerate(series.model_names)
+        },
+        'leader_changes_per_minute': 60.0 * changes / duration if duration > 0 else float('nan'),
+    }
 
 
 def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, float]:
@@ -125,9 +149,11 @@ def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, 
     if not parts:
         return {}
     half = 0.5 * cutoff**2
-    return {'mean_m': float(np.mean([part.distance for part in parts])),
-            'missed_per_scan': float(np.mean([part.missed for part in parts])) / half,
-            'false_per_scan': float(np.mean([part.false for part in parts])) / half}
+    return {
+        'mean_m': float(np.mean([part.distance for part in parts])),
+        'missed_per_scan': float(np.mean([part.missed for part in parts])) / half,
+        'false_per_scan': float(np.mean([part.false for part in parts])) / half,
+    }
 
 
 def best_lag(matching: Matching, truth: Truth) -> dict[str, float]:
@@ -150,5 +176,8 @@ def best_lag(matching: Matching, truth: Truth) -> dict[str, float]:
     coarse = grid[int(np.nanargmin([rmse(lag) for lag in grid]))]
     step = grid[1] - grid[0]
     fine = minimize_scalar(rmse, bounds=(coarse - step, coarse + step), method='bounded')
-    return {'best_s': float(fine.x), 'rmse_at_best_m': float(fine.fun),
-            'rmse_at_zero_m': rmse(0.0)}
+    return {
+        'best_s': float(fine.x),
+        'rmse_at_best_m': float(fine.fun),
+        'rmse_at_zero_m': rmse(0.0),
+    }

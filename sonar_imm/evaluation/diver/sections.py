@@ -16,8 +16,8 @@ from ..report import run_part
 from . import figures
 from .matching import match
 from .series import Series
+from .summary import summary_sentence
 from .truth import Truth
-from .words import summary_sentence
 
 
 @frozen(eq=False, kw_only=True)
@@ -33,51 +33,84 @@ class Material:
 
 def diver_part(material: Material, checks: Sequence[Check] = ()) -> Part:
     """The whole part of one run, `checks` first."""
-    return run_part(material.run, material.metrics, checks,
-                    summary=summary_sentence(material.metrics), cards=_cards(material.metrics),
-                    sections=_sections(material))
+    return run_part(
+        material.run,
+        material.metrics,
+        checks,
+        summary=summary_sentence(material.metrics),
+        cards=_cards(material.metrics),
+        sections=_sections(material),
+    )
 
 
 def _cards(metrics: Mapping[str, Any]) -> list[Card]:
     position, raw = metrics.get('position', {}), metrics.get('raw_fix', {})
     cards = []
     if position.get('n'):
-        cards.append(Card(f'{position["rmse_m"]:.2f} m', 'Position error, RMS',
-                          f'median {position["median_m"]:.2f} m, 95 % {position["p95_m"]:.2f} m'))
+        cards.append(
+            Card(
+                f'{position["rmse_m"]:.2f} m',
+                'Position error, RMS',
+                f'median {position["median_m"]:.2f} m, 95 % {position["p95_m"]:.2f} m',
+            )
+        )
         if raw.get('n'):
             cards.append(Card(f'{raw["rmse_m"]:.2f} m', 'Raw fixes, RMS', f'{raw["n"]} fixes'))
         if metrics['velocity']['n']:
             cards.append(Card(f'{metrics["velocity"]["rmse_mps"]:.2f} m/s', 'Velocity error, RMS'))
         consistency = metrics['consistency']
-        cards.append(Card(f'{100 * consistency["coverage"]["95"]:.0f} %',
-                          'Truth inside the 95 % ellipse', '95 % would be perfect'))
-        cards.append(Card(f'{consistency["nees_position"]["mean"]:.2f}', 'NEES of the position',
-                          bounds_remark(consistency['nees_position'])))
+        cards.append(
+            Card(
+                f'{100 * consistency["coverage"]["95"]:.0f} %',
+                'Truth inside the 95 % ellipse',
+                '95 % would be perfect',
+            )
+        )
+        cards.append(
+            Card(
+                f'{consistency["nees_position"]["mean"]:.2f}',
+                'NEES of the position',
+                bounds_remark(consistency['nees_position']),
+            )
+        )
         if metrics['tracks']['true_targets'] > 1 or metrics['tracks']['tracks'] > 1:
             cards.append(_tracks_card(metrics['tracks']))
     nis = metrics['consistency']['nis']
     if nis['n']:
         cards.append(Card(f'{nis["mean"]:.2f}', 'NIS of the hits', bounds_remark(nis)))
     if not position.get('n'):
-        cards.insert(0, Card(str(metrics['tracks_confirmed']), 'Confirmed tracks',
-                             f'{metrics["stamps"]} stamps in {metrics["span_s"]:.0f} s'))
+        cards.insert(
+            0,
+            Card(
+                str(metrics['tracks_confirmed']),
+                'Confirmed tracks',
+                f'{metrics["stamps"]} stamps in {metrics["span_s"]:.0f} s',
+            ),
+        )
     return cards
 
 
 def _tracks_card(tracks: Mapping[str, Any]) -> Card:
-    return Card(f'{tracks["tracks"]} / {tracks["true_targets"]}', 'Tracks / true targets',
-                f'{tracks["identity_switches"]} identity switches, '
-                f'{tracks["false_tracks"]} false, '
-                f'{100 * tracks["completeness"]:.0f} % complete')
+    return Card(
+        f'{tracks["tracks"]} / {tracks["true_targets"]}',
+        'Tracks / true targets',
+        f'{tracks["identity_switches"]} identity switches, '
+        f'{tracks["false_tracks"]} false, '
+        f'{100 * tracks["completeness"]:.0f} % complete',
+    )
 
 
 def _sections(material: Material) -> list[Section]:
     series = material.series.confirmed()
     track_id = series.longest_track()
-    sections = [Section(
-        'Map', 'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: the ellipses that '
-        'should hold the target 95 times in a hundred.',
-        figures.map_figure(series, material.truth, material.fixes))]
+    sections = [
+        Section(
+            'Map',
+            'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: the ellipses that '
+            'should hold the target 95 times in a hundred.',
+            figures.map_figure(series, material.truth, material.fixes),
+        )
+    ]
     if track_id is not None:
         sections += _track_sections(material, series, track_id)
     return sections
@@ -89,28 +122,47 @@ def _track_sections(material: Material, series: Series, track_id: int) -> list[S
     sections = []
     if material.truth is not None and material.metrics.get('position', {}).get('n'):
         matching = match(series, material.truth, cutoff=material.metrics['cutoff_m'])
-        sections.append(Section(
-            'Error, and the error it predicted', 'A tracker that knows its limits keeps its error '
-            f'inside the band 95 % of the time.{which}', figures.error_figure(matching, track_id)))
+        sections.append(
+            Section(
+                'Error, and the error it predicted',
+                'A tracker that knows its limits keeps its error '
+                f'inside the band 95 % of the time.{which}',
+                figures.error_figure(matching, track_id),
+            )
+        )
     else:
-        sections.append(Section('Stated uncertainty', f'One sigma on each axis.{which}',
-                                figures.sigma_figure(series, track_id)))
+        sections.append(
+            Section(
+                'Stated uncertainty',
+                f'One sigma on each axis.{which}',
+                figures.sigma_figure(series, track_id),
+            )
+        )
     if series.model_names:
         course = _true_course(material, series, track_id)
-        sections.append(Section(
-            'Which motion model held', 'Dark: the model is probable. Headings are counter-'
-            f'clockwise from +x.{which}', figures.models_figure(series, track_id, course)))
+        sections.append(
+            Section(
+                'Which motion model held',
+                f'Dark: the model is probable. Headings are counter-clockwise from +x.{which}',
+                figures.models_figure(series, track_id, course),
+            )
+        )
     hits = series.hits()
     if len(hits):
-        sections.append(Section(
-            'Surprise of each measurement (NIS)', 'How far each measurement fell from where it '
-            'was expected, in units of the stated uncertainty. Amber: where the mean should stay.',
-            nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, hits.nis_dof)))
+        sections.append(
+            Section(
+                'Surprise of each measurement (NIS)',
+                'How far each measurement fell from where it was expected, in units of the stated '
+                'uncertainty. Amber: where the mean should stay.',
+                nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, hits.nis_dof),
+            )
+        )
     return sections
 
 
-def _true_course(material: Material, series: Series,
-                 track_id: int) -> tuple[np.ndarray, np.ndarray] | None:
+def _true_course(
+    material: Material, series: Series, track_id: int
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Seconds and degrees of the true course of the target a track followed; None if unknown."""
     relative = material.run.get('parameters', {}).get('model_set') == 'relative_headings'
     if material.truth is None or relative or 'position' not in material.metrics:
@@ -122,5 +174,7 @@ def _true_course(material: Material, series: Series,
     stamps = series.stamp_ns[matching.row[rows]][moving]
     if not len(stamps):
         return None
-    return (seconds(stamps, series.scan_ns),
-            np.degrees(np.arctan2(velocity[moving, 1], velocity[moving, 0])))
+    return (
+        seconds(stamps, series.scan_ns),
+        np.degrees(np.arctan2(velocity[moving, 1], velocity[moving, 0])),
+    )

@@ -47,8 +47,11 @@ class Series:
 
     def pick(self, rows: NDArray) -> Series:
         """The same run with some of its rows (a mask or indices); `scan_ns` is kept."""
-        return Series(scan_ns=self.scan_ns, model_names=self.model_names,
-                      **{name: getattr(self, name)[rows] for name in _ROW_FIELDS})
+        return Series(
+            scan_ns=self.scan_ns,
+            model_names=self.model_names,
+            **{name: getattr(self, name)[rows] for name in _ROW_FIELDS},
+        )
 
     def confirmed(self) -> Series:
         """Without the rows of tentative tracks."""
@@ -64,8 +67,16 @@ class Series:
         return int(ids[np.argmax(counts)]) if len(ids) else None
 
 
-_ROW_FIELDS = ('stamp_ns', 'track_id', 'track_state', 'state', 'covariance', 'probabilities',
-               'nis', 'nis_dof')
+_ROW_FIELDS = (
+    'stamp_ns',
+    'track_id',
+    'track_state',
+    'state',
+    'covariance',
+    'probabilities',
+    'nis',
+    'nis_dof',
+)
 
 
 def series_of(estimates: Iterable[Estimate]) -> Series:
@@ -89,7 +100,9 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
         covariance=_stack([_covariance(estimate) for estimate in filled], (4, 4)),
         model_names=models,
         probabilities=_stack([_probabilities(estimate) for estimate in filled], (len(models),)),
-        nis=_extra(filled, 'nis', np.nan), nis_dof=_extra(filled, 'nis_dof', np.nan))
+        nis=_extra(filled, 'nis', np.nan),
+        nis_dof=_extra(filled, 'nis_dof', np.nan),
+    )
 
 
 def _states(estimate: Estimate) -> FloatArray:
@@ -106,8 +119,9 @@ def _covariance(estimate: Estimate) -> FloatArray:
     full = np.full((len(estimate.xyz), 4, 4), np.nan)
     own = [index for index, name in enumerate(estimate.state_names) if name in STATES]
     ours = [STATES.index(estimate.state_names[index]) for index in own]
-    full[:, np.array(ours, int)[:, None], np.array(ours, int)] = \
-        estimate.covariance[:, np.array(own, int)[:, None], np.array(own, int)]
+    full[:, np.array(ours, int)[:, None], np.array(ours, int)] = estimate.covariance[
+        :, np.array(own, int)[:, None], np.array(own, int)
+    ]
     return full
 
 
@@ -116,8 +130,9 @@ def _probabilities(estimate: Estimate) -> FloatArray:
 
 
 def _extra(estimates: list[Estimate], name: str, default: float) -> FloatArray:
-    columns = [estimate.extras.get(name, np.full(len(estimate.xyz), default))
-               for estimate in estimates]
+    columns = [
+        estimate.extras.get(name, np.full(len(estimate.xyz), default)) for estimate in estimates
+    ]
     return _stack([np.asarray(column, float) for column in columns], ())
 
 

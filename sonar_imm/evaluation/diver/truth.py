@@ -69,11 +69,16 @@ class Truth:
     def shifted(self, lag: float) -> Truth:
         """The same truth told `lag` seconds earlier: an estimate at t meets truth of t + lag."""
         shift = round(lag * SECOND)
-        return Truth(tuple(TruthPath(path.track_id, path.stamp_ns - shift, path.state)
-                           for path in self.paths), self.max_gap)
+        return Truth(
+            tuple(
+                TruthPath(path.track_id, path.stamp_ns - shift, path.state) for path in self.paths
+            ),
+            self.max_gap,
+        )
 
     def at(self, stamp_ns: IntArray) -> NDArray[np.float64]:
         """(paths, m, 4) states at `stamp_ns`, NaN where unknown."""
         empty = np.empty((0, len(stamp_ns), 4))
         return np.concatenate(
-            [empty, *[path.at(stamp_ns, max_gap=self.max_gap)[None] for path in self.paths]])
+            [empty, *[path.at(stamp_ns, max_gap=self.max_gap)[None] for path in self.paths]]
+        )

@@ -1,7 +1,7 @@
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
 `records` lays estimates and truth side by side, `scoring` compares them: how many there are, where
-they are, how strong. `words`, `sections` and `figures` tell it; `bench` measures the filter.
+they are, how strong. `summary`, `sections` and `figures` tell it; `bench` measures the filter.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_truth, RunFolder
 from .records import Record, records_of
 from .scoring import CUTOFF, score
-from .words import lines, summary_sentence
+from .summary import lines, summary_sentence
 
 if TYPE_CHECKING:
     from ..page import Part

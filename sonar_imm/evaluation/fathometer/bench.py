@@ -15,8 +15,8 @@ import numpy as np
 
 from ...acoustics.pulse import band_pulse
 from ...measurements import FloatArray, Trace
-from ...trackers.fathometer import FathometerConfig, FathometerTracker
-from ..benching import Bench
+from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from ..benches import Bench
 
 REFLECTORS, PARTICLES = 8, 20_000
 RECORD_WANTED_MS = 40.0

@@ -13,7 +13,7 @@ from attrs import evolve, frozen
 import numpy as np
 
 from ...measurements import Trace
-from ...trackers.fathometer import FathometerConfig, FathometerTracker
+from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from .figures import Image
 from .records import Record, records_of
 from .scoring import pair

@@ -8,7 +8,7 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from ...trackers.fathometer import FathometerConfig, FathometerTracker
+from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from ..judging import Check
 from ..page import Card, Part, Section
 from ..report import run_part
@@ -17,7 +17,7 @@ from . import figures
 from .fixed_order import fixed_orders
 from .records import Record
 from .scoring import pair
-from .words import summary_sentence
+from .summary import summary_sentence
 
 
 def fathometer_part(

@@ -1,7 +1,7 @@
 """How runs of the obstacle tracker are judged: heights and bands against what was really there.
 
 `series` lays estimates end to end and says which track is which obstacle, `scoring` how far off
-and how honest, `looking_back` what the paper's deferred estimate would have said. `words`,
+and how honest, `deferred` what the paper's deferred estimate would have said. `summary`,
 `sections` and `figures` tell it; `bench` measures the tracker.
 """
 
@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING, TypeVar
 
 from ...recordings.sources import BagError
-from ...trackers.obstacle_config import ObstacleConfig
+from ...trackers.obstacle.config import ObstacleConfig
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_measurements, read_truth, RunFolder
-from .looking_back import look_back
+from .deferred import look_back
 from .scoring import score
 from .series import Matching, series_of, truth_of
-from .words import lines, summary_sentence
+from .summary import lines, summary_sentence
 
 if TYPE_CHECKING:
     from ..page import Part
@@ -39,8 +39,13 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     run = folder.read_run()
     series = _understood(lambda: series_of(folder.read_estimates()), folder.path)
     tables = read_truth(run, options.truth_bag)
-    truth = None if tables is None else _understood(
-        lambda: truth_of(tables, options.lag), options.truth_bag or Path(run['bag']))
+    truth = (
+        None
+        if tables is None
+        else _understood(
+            lambda: truth_of(tables, options.lag), options.truth_bag or Path(run['bag'])
+        )
+    )
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics, found = score(series, truth, cutoff=cutoff, gap=options.gap)
     metrics['truth_lag_s'] = options.lag
@@ -53,13 +58,28 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     def part(checks: Sequence[Check]) -> Part:
         # plotly, which only a report needs, takes a second to load.
         from .sections import Material, obstacle_part
-        return obstacle_part(Material(run=run, metrics=metrics, series=series, truth=truth,
-                                      found=found, back=back, received=received,
-                                      gap=options.gap), checks)
 
-    return Judgement(metrics=metrics, summary=summary_sentence(metrics),
-                     lines=tuple(lines(metrics)), part=part,
-                     accuracy=functools.partial(_accuracy, metrics))
+        return obstacle_part(
+            Material(
+                run=run,
+                metrics=metrics,
+                series=series,
+                truth=truth,
+                found=found,
+                back=back,
+                received=received,
+                gap=options.gap,
+            ),
+            checks,
+        )
+
+    return Judgement(
+        metrics=metrics,
+        summary=summary_sentence(metrics),
+        lines=tuple(lines(metrics)),
+        part=part,
+        accuracy=functools.partial(_accuracy, metrics),
+    )
 
 
 def _understood(read: Callable[[], T], where: Path) -> T:
@@ -82,8 +102,14 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
         return None
     near = metrics['vertical_offset_near']
     if not near['n']:
-        return Check(f'{LIMIT.meaning} against truth', 'no obstacle was followed to 50 m',
-                     'at least one', good=False)
-    return LIMIT.check(near['rmse_m'], at_most=at_most,
-                       remark=f' (band holds {100 * metrics["consistency"]["band_coverage"]:.0f}'
-                              ' % of the truth)')
+        return Check(
+            f'{LIMIT.meaning} against truth',
+            'no obstacle was followed to 50 m',
+            'at least one',
+            good=False,
+        )
+    return LIMIT.check(
+        near['rmse_m'],
+        at_most=at_most,
+        remark=f' (band holds {100 * metrics["consistency"]["band_coverage"]:.0f} % of the truth)',
+    )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...measurements import Altitude, Detections, Navigation
-from ...trackers.obstacle import ObstacleTracker
-from ...trackers.obstacle_config import ObstacleConfig
-from ..benching import Bench
+from ...trackers.obstacle.config import ObstacleConfig
+from ...trackers.obstacle.tracker import ObstacleTracker
+from ..benches import Bench
 
 OBSTACLES = 20
 WANTED_MS = 2.0
@@ -26,10 +26,15 @@ def bench_ping(rounds: int = 7, pings: int = 40, obstacles: int = OBSTACLES) -> 
         times += spent
         tracked.append(followed)
     median = float(np.median(times))
-    return {'obstacles': obstacles, 'pings': len(times), 'median_ms': median,
-            'p99_ms': float(np.percentile(times, 99.0)), 'tracked': float(np.mean(tracked)),
-            'wanted_ms': WANTED_MS,
-            'good': median <= WANTED_MS and float(np.mean(tracked)) == obstacles}
+    return {
+        'obstacles': obstacles,
+        'pings': len(times),
+        'median_ms': median,
+        'p99_ms': float(np.percentile(times, 99.0)),
+        'tracked': float(np.mean(tracked)),
+        'wanted_ms': WANTED_MS,
+        'good': median <= WANTED_MS and float(np.mean(tracked)) == obstacles,
+    }
 
 
 def _approach(pings: int, obstacles: int) -> tuple[list[float], int]:
@@ -47,12 +52,18 @@ def _approach(pings: int, obstacles: int) -> tuple[list[float], int]:
         stamp = (ping + 1) * STEP_NS
         east = 1.5 * stamp * 1e-9
         tracker.process(Altitude(stamp_ns=stamp, altitude=15.0))
-        tracker.process(Navigation(stamp_ns=stamp, position=(east, 0.0, -20.0),
-                                   orientation=(0.0, 0.0, 0.0, 1.0)))
+        tracker.process(
+            Navigation(
+                stamp_ns=stamp, position=(east, 0.0, -20.0), orientation=(0.0, 0.0, 0.0, 1.0)
+            )
+        )
         away = np.column_stack([ahead - east, aside, -down])
         noise = rng.normal(size=(obstacles, 2)) * (0.1, np.radians(0.2))
-        echoes = Detections(stamp_ns=stamp, range=np.linalg.norm(away, axis=1) + noise[:, 0],
-                            bearing=np.arctan2(away[:, 1], away[:, 0]) + noise[:, 1])
+        echoes = Detections(
+            stamp_ns=stamp,
+            range=np.linalg.norm(away, axis=1) + noise[:, 0],
+            bearing=np.arctan2(away[:, 1], away[:, 0]) + noise[:, 1],
+        )
         begin = time.perf_counter()
         estimate = tracker.process(echoes)[-1]
         if ping >= 10:
@@ -62,9 +73,11 @@ def _approach(pings: int, obstacles: int) -> tuple[list[float], int]:
 
 
 def _sentence(result: Mapping[str, Any]) -> str:
-    return (f'{result["obstacles"]} obstacles a ping, association included: '
-            f'{result["median_ms"]:.2f} ms, p99 {result["p99_ms"]:.2f} ms '
-            f'(wanted {result["wanted_ms"]:.0f}), {result["tracked"]:.0f} of them tracked')
+    return (
+        f'{result["obstacles"]} obstacles a ping, association included: '
+        f'{result["median_ms"]:.2f} ms, p99 {result["p99_ms"]:.2f} ms '
+        f'(wanted {result["wanted_ms"]:.0f}), {result["tracked"]:.0f} of them tracked'
+    )
 
 
 BENCHES = (Bench('ping', bench_ping, _sentence),)

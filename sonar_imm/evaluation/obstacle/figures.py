@@ -8,9 +8,9 @@ import numpy as np
 import plotly.graph_objects as go
 
 from ...measurements import Detections, FloatArray
-from ...trackers.obstacle_deferred import Deferred
+from ...trackers.obstacle.deferred import Deferred
 from ..plotting import AMBER, COLOURS, GREY, INK, MOST_POINTS, styled, thin, transparent
-from .looking_back import LookingBack
+from .deferred import LookingBack
 from .series import level, Matching, Series, TruePath
 
 
@@ -22,40 +22,77 @@ def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> go
         colour, name = COLOURS[order % len(COLOURS)], f'track {track_id}'
         near = track.state[:, 0]
         figure.add_scatter(
-            x=np.concatenate([near, near[::-1]]), y=np.concatenate([track.low, track.high[::-1]]),
-            fill='toself', fillcolor=transparent(colour, 0.15), mode='lines', hoverinfo='skip',
-            line={'color': transparent(colour, 0.4), 'width': 0.5}, legendgroup=name,
-            showlegend=False)
-        figure.add_scatter(x=near, y=track.state[:, 2], mode='lines', name=name, legendgroup=name,
-                           line={'color': colour, 'width': 2})
+            x=np.concatenate([near, near[::-1]]),
+            y=np.concatenate([track.low, track.high[::-1]]),
+            fill='toself',
+            fillcolor=transparent(colour, 0.15),
+            mode='lines',
+            hoverinfo='skip',
+            line={'color': transparent(colour, 0.4), 'width': 0.5},
+            legendgroup=name,
+            showlegend=False,
+        )
+        figure.add_scatter(
+            x=near,
+            y=track.state[:, 2],
+            mode='lines',
+            name=name,
+            legendgroup=name,
+            line={'color': colour, 'width': 2},
+        )
         if track_id in truths:
             seen = truths[track_id].at(track.stamp_ns, gap)
-            figure.add_scatter(x=seen[:, 0], y=seen[:, 2], mode='lines', legendgroup=name,
-                               showlegend=False, line={'color': INK, 'width': 1.5, 'dash': 'dot'})
+            figure.add_scatter(
+                x=seen[:, 0],
+                y=seen[:, 2],
+                mode='lines',
+                legendgroup=name,
+                showlegend=False,
+                line={'color': INK, 'width': 1.5, 'dash': 'dot'},
+            )
     figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
     figure.update_yaxes(title='below the sonar [m]', autorange='reversed')
     return styled(figure, height=440)
 
 
-def image_figure(series: Series, pings: Sequence[Detections], truths: Sequence[TruePath],
-                 sign: float) -> go.Figure:
+def image_figure(
+    series: Series, pings: Sequence[Detections], truths: Sequence[TruePath], sign: float
+) -> go.Figure:
     """Tracks and echoes in the image of the sonar: ahead is up. `sign` turns bearings to port."""
     figure = go.Figure()
     if pings:
-        echoes = np.concatenate([np.column_stack([ping.range, sign * ping.bearing])
-                                 for ping in pings])
+        echoes = np.concatenate(
+            [np.column_stack([ping.range, sign * ping.bearing]) for ping in pings]
+        )
         shown = level(echoes[thin(len(echoes), MOST_POINTS)])
-        figure.add_scattergl(x=-shown[:, 1], y=shown[:, 0], mode='markers', name='detections',
-                             hoverinfo='skip', marker={'size': 3, 'color': GREY})
+        figure.add_scattergl(
+            x=-shown[:, 1],
+            y=shown[:, 0],
+            mode='markers',
+            name='detections',
+            hoverinfo='skip',
+            marker={'size': 3, 'color': GREY},
+        )
     for path in truths:
         flat = level(path.seen[path.in_beam])
-        figure.add_scatter(x=-flat[:, 1], y=flat[:, 0], mode='lines', name='truth',
-                           legendgroup='truth', showlegend=path is truths[0],
-                           line={'color': INK, 'width': 1.5, 'dash': 'dot'})
+        figure.add_scatter(
+            x=-flat[:, 1],
+            y=flat[:, 0],
+            mode='lines',
+            name='truth',
+            legendgroup='truth',
+            showlegend=path is truths[0],
+            line={'color': INK, 'width': 1.5, 'dash': 'dot'},
+        )
     for order, track_id in enumerate(np.unique(series.track_id).tolist()):
         flat = level(series.state[series.track_id == track_id])
-        figure.add_scatter(x=-flat[:, 1], y=flat[:, 0], mode='lines', name=f'track {track_id}',
-                           line={'color': COLOURS[order % len(COLOURS)], 'width': 2})
+        figure.add_scatter(
+            x=-flat[:, 1],
+            y=flat[:, 0],
+            mode='lines',
+            name=f'track {track_id}',
+            line={'color': COLOURS[order % len(COLOURS)], 'width': 2},
+        )
     figure.update_xaxes(title='to starboard [m]')
     figure.update_yaxes(title='ahead [m]', scaleanchor='x', scaleratio=1, rangemode='tozero')
     return styled(figure, height=620)
@@ -64,32 +101,57 @@ def image_figure(series: Series, pings: Sequence[Detections], truths: Sequence[T
 def rmsd_figure(back: LookingBack) -> go.Figure:
     """The paper's Figure 3: RMSD against the assumed offset, or the height above the floor."""
     figure = go.Figure()
-    for curve, name, colour in ((back.plain, 'RMSD, as the paper', COLOURS[0]),
-                                (back.refit, 'first echo and scale refitted', COLOURS[2])):
+    for curve, name, colour in (
+        (back.plain, 'RMSD, as the paper', COLOURS[0]),
+        (back.refit, 'first echo and scale refitted', COLOURS[2]),
+    ):
         _add_curve(figure, curve, name, colour, back.altitude)
-    figure.add_vrect(x0=back.band[0], x1=back.band[1], fillcolor=AMBER, opacity=0.25, line_width=0,
-                     annotation_text='90 % band, online')
+    figure.add_vrect(
+        x0=back.band[0],
+        x1=back.band[1],
+        fillcolor=AMBER,
+        opacity=0.25,
+        line_width=0,
+        annotation_text='90 % band, online',
+    )
     for value, name, dash, side in (
-            (back.online, 'online', 'dash', 'right'), (back.truth, 'truth', 'dot', 'left'),
-            (back.altitude, 'sea floor', 'dashdot', 'right')):
+        (back.online, 'online', 'dash', 'right'),
+        (back.truth, 'truth', 'dot', 'left'),
+        (back.altitude, 'sea floor', 'dashdot', 'right'),
+    ):
         if np.isfinite(value):
-            figure.add_vline(x=value, line={'color': INK, 'width': 1.5, 'dash': dash},
-                             annotation_text=name, annotation_position=f'bottom {side}')
+            figure.add_vline(
+                x=value,
+                line={'color': INK, 'width': 1.5, 'dash': dash},
+                annotation_text=name,
+                annotation_position=f'bottom {side}',
+            )
     figure.update_xaxes(title='vertical offset at the first echo, below the sonar [m]')
     figure.update_yaxes(title='RMSD [pixels of range and bearing]', type='log')
     return styled(figure, height=440)
 
 
-def _add_curve(figure: go.Figure, curve: Deferred, name: str, colour: str, altitude: float
-               ) -> None:
+def _add_curve(
+    figure: go.Figure, curve: Deferred, name: str, colour: str, altitude: float
+) -> None:
     figure.add_scatter(
-        x=curve.offset, y=curve.rmsd, mode='lines', name=name, line={'color': colour, 'width': 2},
+        x=curve.offset,
+        y=curve.rmsd,
+        mode='lines',
+        name=name,
+        line={'color': colour, 'width': 2},
         customdata=altitude - curve.offset,
-        hovertemplate='%{x:.2f} m below, %{customdata:.2f} m above the floor: %{y:.2f}')
+        hovertemplate='%{x:.2f} m below, %{customdata:.2f} m above the floor: %{y:.2f}',
+    )
     if np.isfinite(curve.best):
-        figure.add_scatter(x=[curve.best], y=[curve.least], mode='markers', showlegend=False,
-                           marker={'color': colour, 'size': 10, 'symbol': 'diamond'},
-                           hovertemplate='least: %{x:.2f} m')
+        figure.add_scatter(
+            x=[curve.best],
+            y=[curve.least],
+            mode='markers',
+            showlegend=False,
+            marker={'color': colour, 'size': 10, 'symbol': 'diamond'},
+            hovertemplate='least: %{x:.2f} m',
+        )
 
 
 def above_figure(series: Series) -> go.Figure:
@@ -97,9 +159,13 @@ def above_figure(series: Series) -> go.Figure:
     figure = go.Figure()
     for order, track_id in enumerate(np.unique(series.track_id).tolist()):
         rows = series.track_id == track_id
-        figure.add_scatter(x=series.state[rows, 0], y=series.above[rows], mode='lines',
-                           name=f'track {track_id}',
-                           line={'color': COLOURS[order % len(COLOURS)], 'width': 2})
+        figure.add_scatter(
+            x=series.state[rows, 0],
+            y=series.above[rows],
+            mode='lines',
+            name=f'track {track_id}',
+            line={'color': COLOURS[order % len(COLOURS)], 'width': 2},
+        )
     figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
     figure.update_yaxes(title='P(above)', range=[-0.02, 1.02])
     return styled(figure, height=280)
@@ -110,11 +176,21 @@ def error_figure(found: Matching) -> go.Figure:
     error = found.error[:, 2]
     sigma: FloatArray = np.sqrt(found.series.covariance[found.row, 2, 2])
     figure = go.Figure()
-    figure.add_hrect(y0=-1.645, y1=1.645, fillcolor=AMBER, opacity=0.2, line_width=0,
-                     annotation_text='9 in 10 should lie here')
-    figure.add_scattergl(x=found.truth[:, 0], y=error / sigma, mode='markers',
-                         name='error / stated sigma',
-                         marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6})
+    figure.add_hrect(
+        y0=-1.645,
+        y1=1.645,
+        fillcolor=AMBER,
+        opacity=0.2,
+        line_width=0,
+        annotation_text='9 in 10 should lie here',
+    )
+    figure.add_scattergl(
+        x=found.truth[:, 0],
+        y=error / sigma,
+        mode='markers',
+        name='error / stated sigma',
+        marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6},
+    )
     figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
     figure.update_yaxes(title='offset error / sigma')
     return styled(figure, height=320)

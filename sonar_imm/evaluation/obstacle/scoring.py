@@ -25,34 +25,42 @@ NEAR = 50.0
 BINS = (0.0, 0.1, 0.3, 0.7, 0.9, 1.0)
 
 
-def score(series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, gap: float
-          ) -> tuple[dict[str, Any], Matching | None]:
+def score(
+    series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, gap: float
+) -> tuple[dict[str, Any], Matching | None]:
     """All metrics of a run and the matching they rest on; without truth only what needs none."""
     pings = series.ping_ns
     nis = series.nis[np.isfinite(series.nis)]
     metrics: dict[str, Any] = {
-        'pings': len(pings), 'span_s': float(np.ptp(pings)) / SECOND if len(pings) else 0.0,
-        'tracks_confirmed': len(np.unique(series.track_id)), 'rows_confirmed': len(series),
-        'consistency': {'nis': chi2_summary(nis, 2)}}
+        'pings': len(pings),
+        'span_s': float(np.ptp(pings)) / SECOND if len(pings) else 0.0,
+        'tracks_confirmed': len(np.unique(series.track_id)),
+        'rows_confirmed': len(series),
+        'consistency': {'nis': chi2_summary(nis, 2)},
+    }
     if not truth:
         return metrics, None
     found = match(series, truth, cutoff=cutoff, gap=gap)
     error = found.error
     near = found.truth[:, 0] <= NEAR
     metrics |= {
-        'cutoff_m': float(cutoff), 'scored_rows': len(found.row),
+        'cutoff_m': float(cutoff),
+        'scored_rows': len(found.row),
         'range': error_summary(np.abs(error[:, 0])),
         'bearing': error_summary(np.degrees(np.abs(error[:, 1])), unit='deg'),
         'vertical_offset': error_summary(np.abs(error[:, 2])),
         'vertical_offset_near': error_summary(np.abs(error[near, 2])),
         'above': above_calibration(found),
         'gospa': gospa_summary(found, cutoff),
-        'tracks': {'true_obstacles': len(truth),
-                   'found_obstacles': len(np.unique(found.target)),
-                   'tracks': metrics['tracks_confirmed'],
-                   'false_tracks': metrics['tracks_confirmed']
-                   - len(np.unique(series.track_id[found.row])),
-                   'identity_switches': identity_switches(followed_by(found, len(truth)))}}
+        'tracks': {
+            'true_obstacles': len(truth),
+            'found_obstacles': len(np.unique(found.target)),
+            'tracks': metrics['tracks_confirmed'],
+            'false_tracks': metrics['tracks_confirmed']
+            - len(np.unique(series.track_id[found.row])),
+            'identity_switches': identity_switches(followed_by(found, len(truth))),
+        },
+    }
     metrics['consistency'] |= truth_consistency(found)
     return metrics, found
 
@@ -62,9 +70,11 @@ def truth_consistency(found: Matching) -> dict[str, Any]:
     error, covariance = found.error, found.series.covariance[found.row]
     offset = usable_nees(error[:, 2:], covariance[:, 2:, 2:])
     low, high = found.series.low[found.row], found.series.high[found.row]
-    return {'nees_offset': chi2_summary(offset, 1),
-            'nees_state': chi2_summary(usable_nees(error, covariance), 3),
-            'band_coverage': interval_coverage(found.truth[:, 2], low, high)}
+    return {
+        'nees_offset': chi2_summary(offset, 1),
+        'nees_state': chi2_summary(usable_nees(error, covariance), 3),
+        'band_coverage': interval_coverage(found.truth[:, 2], low, high),
+    }
 
 
 def followed_by(found: Matching, obstacles: int) -> NDArray[np.int64]:
@@ -82,10 +92,15 @@ def above_calibration(found: Matching) -> dict[str, Any]:
     if not len(stated):
         return {}
     which = np.clip(np.searchsorted(BINS, stated, side='right') - 1, 0, len(BINS) - 2)
-    table = {f'{BINS[k]:g} to {BINS[k + 1]:g}': {
-        'n': int((which == k).sum()), 'stated': float(stated[which == k].mean()),
-        'came_true': float(true[which == k].mean())}
-        for k in range(len(BINS) - 1) if (which == k).any()}
+    table = {
+        f'{BINS[k]:g} to {BINS[k + 1]:g}': {
+            'n': int((which == k).sum()),
+            'stated': float(stated[which == k].mean()),
+            'came_true': float(true[which == k].mean()),
+        }
+        for k in range(len(BINS) - 1)
+        if (which == k).any()
+    }
     return {'brier': float(np.mean((stated - true) ** 2)), 'bins': table}
 
 
@@ -95,5 +110,8 @@ def gospa_summary(found: Matching, cutoff: float) -> dict[str, float]:
         return {}
     half = 0.5 * cutoff**2
     distance, _, missed, false = found.gospa.mean(axis=0)
-    return {'mean_m': float(distance), 'missed_per_ping': float(missed / half),
-            'false_per_ping': float(false / half)}
+    return {
+        'mean_m': float(distance),
+        'missed_per_ping': float(missed / half),
+        'false_per_ping': float(false / half),
+    }

@@ -15,9 +15,9 @@ from ..page import Card, Part, Section, table
 from ..plotting import nis_figure, seconds
 from ..report import run_part
 from . import figures
-from .looking_back import LookingBack
+from .deferred import LookingBack
 from .series import Matching, Series, TruePath
-from .words import summary_sentence
+from .summary import summary_sentence
 
 
 @frozen(eq=False, kw_only=True)
@@ -36,31 +36,66 @@ class Material:
 
 def obstacle_part(material: Material, checks: Sequence[Check] = ()) -> Part:
     """The whole part of one run, `checks` first."""
-    return run_part(material.run, material.metrics, checks,
-                    summary=summary_sentence(material.metrics), cards=_cards(material.metrics),
-                    sections=_sections(material))
+    return run_part(
+        material.run,
+        material.metrics,
+        checks,
+        summary=summary_sentence(material.metrics),
+        cards=_cards(material.metrics),
+        sections=_sections(material),
+    )
 
 
 def _cards(metrics: Mapping[str, Any]) -> list[Card]:
     cards, consistency = [], metrics['consistency']
     near = metrics.get('vertical_offset_near', {})
     if near.get('n'):
-        cards.append(Card(f'{near["rmse_m"]:.2f} m', 'Height error within 50 m, RMS',
-                          f'median {near["median_m"]:.2f} m, 95 % {near["p95_m"]:.2f} m'))
+        cards.append(
+            Card(
+                f'{near["rmse_m"]:.2f} m',
+                'Height error within 50 m, RMS',
+                f'median {near["median_m"]:.2f} m, 95 % {near["p95_m"]:.2f} m',
+            )
+        )
     if metrics.get('range', {}).get('n'):
-        cards.append(Card(f'{100 * consistency["band_coverage"]:.0f} %',
-                          'Truth inside the 90 % band', '90 % would be perfect'))
-        cards.append(Card(f'{consistency["nees_offset"]["mean"]:.2f}', 'NEES of the offset',
-                          bounds_remark(consistency['nees_offset'])))
-        cards.append(Card(f'{metrics["gospa"]["mean_m"]:.2f} m', 'GOSPA',
-                          f'{metrics["gospa"]["missed_per_ping"]:.2f} missed, '
-                          f'{metrics["gospa"]["false_per_ping"]:.2f} false a ping'))
+        cards.append(
+            Card(
+                f'{100 * consistency["band_coverage"]:.0f} %',
+                'Truth inside the 90 % band',
+                '90 % would be perfect',
+            )
+        )
+        cards.append(
+            Card(
+                f'{consistency["nees_offset"]["mean"]:.2f}',
+                'NEES of the offset',
+                bounds_remark(consistency['nees_offset']),
+            )
+        )
+        cards.append(
+            Card(
+                f'{metrics["gospa"]["mean_m"]:.2f} m',
+                'GOSPA',
+                f'{metrics["gospa"]["missed_per_ping"]:.2f} missed, '
+                f'{metrics["gospa"]["false_per_ping"]:.2f} false a ping',
+            )
+        )
     else:
-        cards.append(Card(str(metrics['tracks_confirmed']), 'Confirmed obstacles',
-                          f'{metrics["pings"]} pings in {metrics["span_s"]:.0f} s'))
+        cards.append(
+            Card(
+                str(metrics['tracks_confirmed']),
+                'Confirmed obstacles',
+                f'{metrics["pings"]} pings in {metrics["span_s"]:.0f} s',
+            )
+        )
     if consistency['nis']['n']:
-        cards.append(Card(f'{consistency["nis"]["mean"]:.2f}', 'NIS of the hits',
-                          bounds_remark(consistency['nis'])))
+        cards.append(
+            Card(
+                f'{consistency["nis"]["mean"]:.2f}',
+                'NIS of the hits',
+                bounds_remark(consistency['nis']),
+            )
+        )
     return cards
 
 
@@ -70,38 +105,68 @@ def _sections(material: Material) -> list[Section]:
     sign = -1.0 if parameters.get('bearing_positive') == 'starboard' else 1.0
     pings = [one for one in material.received if isinstance(one, Detections) and len(one)]
     sections = [
-        Section('Height over range', 'How far each obstacle lies below the sonar, as it comes '
-                'nearer from left to right. Shaded: the 90 % band. Dotted: truth.',
-                figures.offset_figure(series, _truths(material), material.gap)),
-        Section('Above or below', 'On a level path nothing tells above from below, and the '
-                'probability has to stay at one half; rolling decides it.',
-                figures.above_figure(series)),
-        Section('Seen by the sonar', 'Tracks among the detections of all pings. Dotted: truth, '
-                'while the beam holds it.',
-                figures.image_figure(series, pings, material.truth or (), sign))]
+        Section(
+            'Height over range',
+            'How far each obstacle lies below the sonar, as it comes '
+            'nearer from left to right. Shaded: the 90 % band. Dotted: truth.',
+            figures.offset_figure(series, _truths(material), material.gap),
+        ),
+        Section(
+            'Above or below',
+            'On a level path nothing tells above from below, and the '
+            'probability has to stay at one half; rolling decides it.',
+            figures.above_figure(series),
+        ),
+        Section(
+            'Seen by the sonar',
+            'Tracks among the detections of all pings. Dotted: truth, while the beam holds it.',
+            figures.image_figure(series, pings, material.truth or (), sign),
+        ),
+    ]
     if material.back is not None:
-        sections.append(Section(
-            f'Looking back: RMSD of track {material.back.track_id}', 'The deferred estimate of '
-            'the paper: how badly each assumed offset explains all echoes. Diamonds: the least '
-            'RMSD.', figures.rmsd_figure(material.back)))
+        sections.append(
+            Section(
+                f'Looking back: RMSD of track {material.back.track_id}',
+                'The deferred estimate of the paper: how badly each assumed offset explains all '
+                'echoes. Diamonds: the least RMSD.',
+                figures.rmsd_figure(material.back),
+            )
+        )
     if found is not None and len(found.row):
-        sections.append(Section('Error, and the error it predicted', 'Errors of the vertical '
-                                'offset in units of the stated standard deviation.',
-                                figures.error_figure(found)))
+        sections.append(
+            Section(
+                'Error, and the error it predicted',
+                'Errors of the vertical offset in units of the stated standard deviation.',
+                figures.error_figure(found),
+            )
+        )
         bins = material.metrics['above']['bins']
-        sections.append(Section(
-            'Do probabilities come true?', 'Of all the times the tracker said an obstacle is '
-            'above, by how sure it was. Pings of one approach are not independent.',
-            html=table(('P(above)', 'pings', 'stated', 'was above'),
-                       [(name, one['n'], one['stated'], one['came_true'])
-                        for name, one in bins.items()])))
+        sections.append(
+            Section(
+                'Do probabilities come true?',
+                'Of all the times the tracker said an obstacle is '
+                'above, by how sure it was. Pings of one approach are not independent.',
+                html=table(
+                    ('P(above)', 'pings', 'stated', 'was above'),
+                    [
+                        (name, one['n'], one['stated'], one['came_true'])
+                        for name, one in bins.items()
+                    ],
+                ),
+            )
+        )
     hits = series.pick(np.isfinite(series.nis))
     if len(hits):
-        sections.append(Section(
-            'Surprise of each detection (NIS)', 'How far each detection fell from where it was '
-            'expected. It says nothing of the height: a sonar mounted the wrong way round has a '
-            'perfect NIS.',
-            nis_figure(seconds(hits.stamp_ns, series.ping_ns), hits.nis, np.full(len(hits), 2.0))))
+        sections.append(
+            Section(
+                'Surprise of each detection (NIS)',
+                'How far each detection fell from where it was expected. It says nothing of the '
+                'height: a sonar mounted the wrong way round has a perfect NIS.',
+                nis_figure(
+                    seconds(hits.stamp_ns, series.ping_ns), hits.nis, np.full(len(hits), 2.0)
+                ),
+            )
+        )
     return sections
 
 
@@ -109,5 +174,7 @@ def _truths(material: Material) -> dict[int, TruePath]:
     found, truth = material.found, material.truth
     if found is None or not truth:
         return {}
-    return {track: truth[target] for track, target in
-            zip(found.series.track_id[found.row].tolist(), found.target.tolist())}
+    return {
+        track: truth[target]
+        for track, target in zip(found.series.track_id[found.row].tolist(), found.target.tolist())
+    }

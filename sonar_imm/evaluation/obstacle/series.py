@@ -74,13 +74,19 @@ class TruePath:
         fraction = (stamp_ns - start) / np.maximum(end - start, 1)
         known = (fraction >= 0.0) & (fraction <= 1.0) & (end - start <= gap * SECOND)
         between = self.seen[after - 1] + fraction[:, None] * (
-            self.seen[after] - self.seen[after - 1])
+            self.seen[after] - self.seen[after - 1]
+        )
         return np.where(known[:, None], between, np.nan)
 
     def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
         """True (m,) where it ought to be tracked: seen for a while and not passed yet."""
-        seen = np.cumsum(self.in_beam)[np.clip(np.searchsorted(
-            self.stamp_ns, stamp_ns, side='right') - 1, 0, len(self.stamp_ns) - 1)]
+        seen = np.cumsum(self.in_beam)[
+            np.clip(
+                np.searchsorted(self.stamp_ns, stamp_ns, side='right') - 1,
+                0,
+                len(self.stamp_ns) - 1,
+            )
+        ]
         distance, bearing, offset = self.at(stamp_ns, gap).T
         level = np.sqrt(np.maximum(distance**2 - offset**2, 0.0))
         with np.errstate(invalid='ignore'):
@@ -121,14 +127,17 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
 
     full = Series(
         ping_ns=np.array([one.stamp_ns for one in ordered], np.int64),
-        stamp_ns=np.repeat(np.array([one.stamp_ns for one in filled], np.int64),
-                           [len(one) for one in filled]),
+        stamp_ns=np.repeat(
+            np.array([one.stamp_ns for one in filled], np.int64), [len(one) for one in filled]
+        ),
         track_id=extra('track_id').astype(np.int64),
         state=stack([one.state for one in filled], (3,)),
         covariance=stack([one.covariance for one in filled], (3, 3)),
-        low=extra('vertical_offset_lo'), high=extra('vertical_offset_hi'),
+        low=extra('vertical_offset_lo'),
+        high=extra('vertical_offset_hi'),
         above=stack([one.probabilities[:, one.model_names.index('above')] for one in filled]),
-        nis=extra('nis'))
+        nis=extra('nis'),
+    )
     return full.pick(extra('track_state') > 0)
 
 
@@ -150,8 +159,9 @@ def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ..
             continue
         stamps = np.array(sorted(by_stamp), np.int64)
         values = np.array([by_stamp[stamp] for stamp in stamps.tolist()])
-        paths.append(TruePath(number, stamps - round(lag * SECOND), values[:, :3],
-                              values[:, 3] > 0))
+        paths.append(
+            TruePath(number, stamps - round(lag * SECOND), values[:, :3], values[:, 3] > 0)
+        )
     return tuple(paths)
 
 
@@ -176,8 +186,9 @@ def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: fl
         targets += who[hit].tolist()
     row, target = np.array(rows, np.int64), np.array(targets, np.int64)
     at = np.searchsorted(pings, series.stamp_ns[row])
-    return Matching(series, row, target, seen[target, at].reshape(-1, 3),
-                    np.reshape(scores, (-1, 4)))
+    return Matching(
+        series, row, target, seen[target, at].reshape(-1, 3), np.reshape(scores, (-1, 4))
+    )
 
 
 def level(seen: FloatArray) -> FloatArray:

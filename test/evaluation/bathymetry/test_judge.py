@@ -11,8 +11,8 @@ from sonar_imm.evaluation.bathymetry.figures import spectrum_figure
 from sonar_imm.evaluation.bathymetry.profiles import profile_of
 from sonar_imm.evaluation.judging import judge
 from sonar_imm.evaluation.run_folder import RunFolder
-from sonar_imm.simulation.bathymetry import scenario, simulate
-from sonar_imm.trackers.bathymetry import BathymetryConfig, BathymetryTracker
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 
 def run(*arguments):
@@ -22,8 +22,20 @@ def run(*arguments):
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp('bags') / 'floor'
-    assert run('simulate', 'bathymetry', path, '--seed', 4, '--set', 'pings=2',
-               '--set', 'last_range=55') == 0
+    assert (
+        run(
+            'simulate',
+            'bathymetry',
+            path,
+            '--seed',
+            4,
+            '--set',
+            'pings=2',
+            '--set',
+            'last_range=55',
+        )
+        == 0
+    )
     return path
 
 
@@ -43,8 +55,12 @@ def test_a_run_is_scored_and_has_a_page(tracked, capsys):
     assert metrics['segmentation']['iou'] > 0.6
     assert metrics['inside_band']['all'] > 0.85
     page = (tracked / 'report.html').read_text()
-    for title in ('Profile of the floor', 'What the array hears', 'Which terrain model held',
-                  'Rough floor over the whole run'):
+    for title in (
+        'Profile of the floor',
+        'What the array hears',
+        'Which terrain model held',
+        'Rough floor over the whole run',
+    ):
         assert title in page
 
 
@@ -64,12 +80,19 @@ def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
     assert judgement.accuracy(None) is None
     part = judgement.part([])
     assert 'What the array hears, and what the tracker makes of it' not in [
-        section.title for section in part.sections]
+        section.title for section in part.sections
+    ]
 
 
-@pytest.mark.parametrize('values', [
-    {'model_set': 'angle_two_rw'}, {'model_set': 'height_bank', 'sigmas': '0.01'},
-    {'model_set': 'height_rw_ncs'}, {'engine': 'grid', 'smoothing': 'states'}])
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'model_set': 'angle_two_rw'},
+        {'model_set': 'height_bank', 'sigmas': '0.01'},
+        {'model_set': 'height_rw_ncs'},
+        {'engine': 'grid', 'smoothing': 'states'},
+    ],
+)
 def test_every_model_set_is_judged(bag, tmp_path, values):
     settings = [word for name, value in values.items() for word in ('--set', f'{name}={value}')]
     assert run('track', bag, tmp_path / 'out', *settings) == 0
@@ -80,13 +103,35 @@ def test_every_model_set_is_judged(bag, tmp_path, values):
 
 
 def test_two_sides_need_a_choice(tmp_path, capsys):
-    assert run('simulate', 'bathymetry', tmp_path / 'both', '--scenario', 'two_sides', '--set',
-               'pings=1', '--set', 'last_range=30') == 0
+    assert (
+        run(
+            'simulate',
+            'bathymetry',
+            tmp_path / 'both',
+            '--scenario',
+            'two_sides',
+            '--set',
+            'pings=1',
+            '--set',
+            'last_range=30',
+        )
+        == 0
+    )
     assert run('track', tmp_path / 'both', tmp_path / 'out') == 2
     error = capsys.readouterr().err
     assert 'several topics fit snapshot: /port/snapshot, /starboard/snapshot' in error
-    assert run('track', tmp_path / 'both', tmp_path / 'out', '--topic', 'snapshot=/port/snapshot',
-               '--set', 'side=port') == 0
+    assert (
+        run(
+            'track',
+            tmp_path / 'both',
+            tmp_path / 'out',
+            '--topic',
+            'snapshot=/port/snapshot',
+            '--set',
+            'side=port',
+        )
+        == 0
+    )
     judgement = judge(RunFolder(tmp_path / 'out'))
     assert judgement.metrics['scored_pings'] == 1
     assert judgement.metrics['height']['all']['rmse_m'] < 0.2

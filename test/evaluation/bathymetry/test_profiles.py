@@ -13,19 +13,37 @@ def estimate(state='height', *, stamp_ns=7, ranges=RANGES, **columns):
     n = len(ranges)
     other = 'angle' if state == 'height' else 'height'
     return Estimate(
-        stamp_ns=stamp_ns, frame_id='sonar',
+        stamp_ns=stamp_ns,
+        frame_id='sonar',
         xyz=np.column_stack([np.zeros(n), np.full(n, -8.0), np.full(n, -15.0)]),
-        state_names=(state,), state=np.full((n, 1), 0.25), covariance=np.full((n, 1, 1), 0.04),
-        model_names=('rw_smooth', 'rw_rough'), probabilities=np.tile([0.9, 0.1], (n, 1)),
-        extras={'range': ranges, other: np.full(n, 0.5), 'valid': np.array([1, 1, 0, 1][:n])})
+        state_names=(state,),
+        state=np.full((n, 1), 0.25),
+        covariance=np.full((n, 1, 1), 0.04),
+        model_names=('rw_smooth', 'rw_rough'),
+        probabilities=np.tile([0.9, 0.1], (n, 1)),
+        extras={'range': ranges, other: np.full(n, 0.5), 'valid': np.array([1, 1, 0, 1][:n])},
+    )
 
 
 def truth(ranges, *, stamp_ns=7, **columns):
     n = len(ranges)
-    values = {'range': ranges, 'height': np.arange(n) * 1.0, 'angle': np.arange(n) * 0.1,
-              'patch': np.arange(n) % 2, 'valid': np.ones(n, np.uint8), **columns}
-    return Estimate(stamp_ns=stamp_ns, frame_id='sonar', xyz=np.zeros((n, 3)), state_names=(),
-                    state=np.empty((n, 0)), covariance=np.empty((n, 0, 0)), extras=values)
+    values = {
+        'range': ranges,
+        'height': np.arange(n) * 1.0,
+        'angle': np.arange(n) * 0.1,
+        'patch': np.arange(n) % 2,
+        'valid': np.ones(n, np.uint8),
+        **columns,
+    }
+    return Estimate(
+        stamp_ns=stamp_ns,
+        frame_id='sonar',
+        xyz=np.zeros((n, 3)),
+        state_names=(),
+        state=np.empty((n, 0)),
+        covariance=np.empty((n, 0, 0)),
+        extras=values,
+    )
 
 
 def test_the_standard_deviation_of_what_is_no_state_follows_from_the_arm():
@@ -54,8 +72,7 @@ def test_truth_with_hardly_a_bin(ranges):
 
 
 def test_pings_meet_the_truth_of_their_own_stamp():
-    swath = profiles_of([estimate(stamp_ns=7), estimate(stamp_ns=8)],
-                        [truth(RANGES, stamp_ns=8)])
+    swath = profiles_of([estimate(stamp_ns=7), estimate(stamp_ns=8)], [truth(RANGES, stamp_ns=8)])
     assert [profile.truth is None for profile in swath.profiles] == [True, False]
     assert swath.model_names == ('rw_smooth', 'rw_rough')
     np.testing.assert_allclose(swath.roughness(swath.profiles[0]), 0.1)

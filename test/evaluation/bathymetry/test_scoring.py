@@ -5,14 +5,15 @@ import pytest
 
 from sonar_imm.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
 from sonar_imm.evaluation.bathymetry.scoring import runs, score
-from sonar_imm.evaluation.bathymetry.words import lines, summary_sentence
+from sonar_imm.evaluation.bathymetry.summary import lines, summary_sentence
 
 N = 20
 PATCH = slice(8, 14)
 
 
-def profile(*, height=0.1, rough=slice(9, 15), known=True, shadow=slice(0, 0), heard=None,
-            stamp_ns=0):
+def profile(
+    *, height=0.1, rough=slice(9, 15), known=True, shadow=slice(0, 0), heard=None, stamp_ns=0
+):
     """Twenty bins of a floor at 0 with a patch in 8..13; estimates are off by `height`."""
     probabilities = np.tile([0.9, 0.1], (N, 1))
     probabilities[rough] = [0.2, 0.8]
@@ -21,10 +22,17 @@ def profile(*, height=0.1, rough=slice(9, 15), known=True, shadow=slice(0, 0), h
     echo = np.ones(N, bool)
     echo[shadow] = False
     truth = TrueFloor(np.zeros(N), np.full(N, 0.1), patch, echo)
-    return Profile(stamp_ns=stamp_ns, range=20.0 + np.arange(N), height=np.full(N, height),
-                   height_std=np.full(N, 0.06), angle=np.full(N, 0.1 + np.radians(2.0)),
-                   angle_std=np.full(N, 0.01), heard=np.ones(N, bool) if heard is None else heard,
-                   probabilities=probabilities, truth=truth if known else None)
+    return Profile(
+        stamp_ns=stamp_ns,
+        range=20.0 + np.arange(N),
+        height=np.full(N, height),
+        height_std=np.full(N, 0.06),
+        angle=np.full(N, 0.1 + np.radians(2.0)),
+        angle_std=np.full(N, 0.01),
+        heard=np.ones(N, bool) if heard is None else heard,
+        probabilities=probabilities,
+        truth=truth if known else None,
+    )
 
 
 def swath(*profiles, names=('rw_smooth', 'rw_rough')):
@@ -38,11 +46,11 @@ def test_errors_by_place_and_the_share_inside_the_band():
     assert metrics['height']['smooth']['rmse_m'] == pytest.approx(0.1)
     assert metrics['height']['patch']['rmse_m'] == pytest.approx(0.3)
     assert metrics['height']['all']['n'] == N
-    assert metrics['height']['all']['rmse_m'] == pytest.approx(
-        np.sqrt((14 * 0.01 + 6 * 0.09) / N))
+    assert metrics['height']['all']['rmse_m'] == pytest.approx(np.sqrt((14 * 0.01 + 6 * 0.09) / N))
     assert metrics['angle']['all']['rmse_deg'] == pytest.approx(2.0)
     assert metrics['inside_band'] == pytest.approx(
-        {'smooth': 1.0, 'patch': 0.0, 'all': 0.7, 'shadow': np.nan}, nan_ok=True)
+        {'smooth': 1.0, 'patch': 0.0, 'all': 0.7, 'shadow': np.nan}, nan_ok=True
+    )
 
 
 def test_overlap_and_delay_of_the_segmentation():

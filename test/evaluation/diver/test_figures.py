@@ -1,6 +1,6 @@
 """The figures of divers: ellipses, order of models, first view."""
 
-from dive_scenes import single_run
+from helpers.dive_scenes import single_run
 import numpy as np
 from scipy.stats import chi2
 
@@ -23,8 +23,11 @@ def test_ellipses_hold_the_probability_they_claim():
 
 def test_models_are_ordered_by_heading_with_the_others_below():
     names = ('heading_090', 'hover', 'heading_000')
-    assert [names[i] for i in figures.model_order(names)] == ['hover', 'heading_000',
-                                                              'heading_090']
+    assert [names[i] for i in figures.model_order(names)] == [
+        'hover',
+        'heading_000',
+        'heading_090',
+    ]
     assert figures.model_label('heading_022') == '22°'
 
 

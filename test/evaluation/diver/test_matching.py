@@ -2,7 +2,7 @@
 
 from itertools import permutations
 
-from dive_scenes import estimate_at, SECOND, START_NS, truth_estimate
+from helpers.dive_scenes import estimate_at, SECOND, START_NS, truth_estimate
 import numpy as np
 import pytest
 
@@ -20,8 +20,9 @@ def scene(rows_by_scan, ids_by_scan, *, targets=((0.0, 0.0), (30.0, 0.0)), cutof
         stamp = START_NS + k * SECOND
         states = np.array([[*place, 0.0, 0.0] for place in places]).reshape(-1, 4)
         estimates.append(estimate_at(stamp, states, ids))
-        truths.append(truth_estimate(stamp, [[*target, 0, 0] for target in targets],
-                                     range(len(targets))))
+        truths.append(
+            truth_estimate(stamp, [[*target, 0, 0] for target in targets], range(len(targets)))
+        )
     return match(series_of(estimates), Truth.from_series(series_of(truths)), cutoff=cutoff)
 
 

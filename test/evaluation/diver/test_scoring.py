@@ -2,7 +2,7 @@
 
 import json
 
-from dive_scenes import (
+from helpers.dive_scenes import (
     covariance,
     estimate_at,
     legs,
@@ -51,8 +51,10 @@ def test_errors_twice_as_large_as_stated_are_not():
 def test_numbers_of_three_known_errors():
     truth = [truth_estimate(START_NS + k * SECOND, [[0.0] * 4], [1]) for k in range(3)]
     errors = [[3.0, 4.0, 0.0, 1.0], [0.0, 1.0, 0.0, 1.0], [0.0, 2.0, 2.0, 1.0]]
-    estimates = [estimate_at(START_NS + k * SECOND, [error], [1], stated=np.eye(4))
-                 for k, error in enumerate(errors)]
+    estimates = [
+        estimate_at(START_NS + k * SECOND, [error], [1], stated=np.eye(4))
+        for k, error in enumerate(errors)
+    ]
     metrics = scored(estimates, truth)
     assert metrics['position']['rmse_m'] == pytest.approx(np.sqrt(30.0 / 3.0))
     assert metrics['position']['median_m'] == pytest.approx(2.0)
@@ -63,8 +65,10 @@ def test_numbers_of_three_known_errors():
 
 def test_raw_fixes_are_scored_beside_the_track():
     estimates, truth, times = single_run(count=40)
-    fixes = [Fix(stamp_ns=stamp, position=[*(place + [0.0, 2.0]), 0.0])
-             for stamp, place in zip(stamps(times), legs(times)[:, :2])]
+    fixes = [
+        Fix(stamp_ns=stamp, position=[*(place + [0.0, 2.0]), 0.0])
+        for stamp, place in zip(stamps(times), legs(times)[:, :2])
+    ]
     metrics = scored(estimates, truth, fixes=fix_series(fixes))
     assert metrics['raw_fix']['rmse_m'] == pytest.approx(2.0)
     assert metrics['raw_fix']['n'] == 40
@@ -72,20 +76,25 @@ def test_raw_fixes_are_scored_beside_the_track():
 
 def test_a_lagging_track_tells_its_lag():
     times = np.arange(200) * 0.5
-    truth = [truth_estimate(stamp, [state], [1]) for stamp, state in zip(stamps(times),
-                                                                        legs(times))]
-    estimates = [estimate_at(stamp, [state], [1])
-                 for stamp, state in zip(stamps(times + 3.0), legs(times))]
+    truth = [
+        truth_estimate(stamp, [state], [1]) for stamp, state in zip(stamps(times), legs(times))
+    ]
+    estimates = [
+        estimate_at(stamp, [state], [1]) for stamp, state in zip(stamps(times + 3.0), legs(times))
+    ]
     lag = scored(estimates, truth)['lag']
     assert lag['best_s'] == pytest.approx(-3.0, abs=0.05)
     assert lag['rmse_at_best_m'] < 0.1 < lag['rmse_at_zero_m']
 
 
 def test_several_targets_are_scored_by_gospa():
-    truth = [truth_estimate(START_NS + k, [[0.0] * 4, [50.0, 0.0, 0.0, 0.0]], [1, 2])
-             for k in range(2)]
-    estimates = [estimate_at(START_NS, [[3.0, 4.0, 0.0, 0.0]], [5]),
-                 estimate_at(START_NS + 1, [[0.0, 0.0, 0.0, 0.0], [50.0, 0.0, 0.0, 0.0]], [5, 6])]
+    truth = [
+        truth_estimate(START_NS + k, [[0.0] * 4, [50.0, 0.0, 0.0, 0.0]], [1, 2]) for k in range(2)
+    ]
+    estimates = [
+        estimate_at(START_NS, [[3.0, 4.0, 0.0, 0.0]], [5]),
+        estimate_at(START_NS + 1, [[0.0, 0.0, 0.0, 0.0], [50.0, 0.0, 0.0, 0.0]], [5, 6]),
+    ]
     gospa = scored(estimates, truth, cutoff=10.0)['gospa']
     # one target 5 m off, one missed at 10^2 / 2; then two hits
     assert gospa['mean_m'] == pytest.approx(np.sqrt(25.0 + 50.0) / 2.0)

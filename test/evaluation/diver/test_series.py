@@ -1,6 +1,6 @@
 """Estimates as flat arrays."""
 
-from dive_scenes import covariance, estimate_at, HEADINGS, START_NS, truth_estimate
+from helpers.dive_scenes import covariance, estimate_at, HEADINGS, START_NS, truth_estimate
 import numpy as np
 import pytest
 
@@ -22,8 +22,9 @@ def test_rows_come_out_by_stamp_with_their_columns():
 
 
 def test_scans_without_rows_are_remembered():
-    series = series_of([estimate_at(START_NS, np.empty((0, 4)), []),
-                        estimate_at(START_NS + 1, STATES[:1], [4])])
+    series = series_of(
+        [estimate_at(START_NS, np.empty((0, 4)), []), estimate_at(START_NS + 1, STATES[:1], [4])]
+    )
     assert series.scan_ns.tolist() == [START_NS, START_NS + 1]
     assert len(series) == 1
 
@@ -41,8 +42,12 @@ def test_truth_states_no_covariance():
 
 
 def test_tentative_rows_are_left_out_of_confirmed():
-    series = series_of([estimate_at(START_NS, STATES[:1], [4], tentative=True),
-                        estimate_at(START_NS + 1, STATES[:1], [4])])
+    series = series_of(
+        [
+            estimate_at(START_NS, STATES[:1], [4], tentative=True),
+            estimate_at(START_NS + 1, STATES[:1], [4]),
+        ]
+    )
     assert series.confirmed().stamp_ns.tolist() == [START_NS + 1]
 
 
@@ -55,8 +60,10 @@ def test_a_table_of_something_else_is_refused():
 
 def test_two_runs_in_one_are_refused():
     import attrs
+
     first = estimate_at(START_NS, STATES[:1], [4])
-    second = attrs.evolve(first, stamp_ns=START_NS + 1, model_names=('cv',),
-                          probabilities=np.ones((1, 1)))
+    second = attrs.evolve(
+        first, stamp_ns=START_NS + 1, model_names=('cv',), probabilities=np.ones((1, 1))
+    )
     with pytest.raises(ValueError, match='more than one run'):
         series_of([first, second])

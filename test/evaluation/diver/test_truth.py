@@ -1,14 +1,17 @@
 """Truth between its points, and where it is unknown."""
 
-from dive_scenes import SECOND, START_NS, truth_estimate
+from helpers.dive_scenes import SECOND, START_NS, truth_estimate
 import numpy as np
 import pytest
 
 from sonar_imm.evaluation.diver.series import series_of
 from sonar_imm.evaluation.diver.truth import Truth, TruthPath
 
-PATH = TruthPath(1, START_NS + np.array([0, 2, 100]) * SECOND,
-                 np.array([[0.0, 0.0, 1.0, 0.0], [4.0, -2.0, 3.0, 1.0], [9.0, 9.0, 0.0, 0.0]]))
+PATH = TruthPath(
+    1,
+    START_NS + np.array([0, 2, 100]) * SECOND,
+    np.array([[0.0, 0.0, 1.0, 0.0], [4.0, -2.0, 3.0, 1.0], [9.0, 9.0, 0.0, 0.0]]),
+)
 
 
 def at(seconds, **options):
@@ -42,8 +45,10 @@ def test_a_lag_compares_with_later_truth():
 
 
 def test_targets_are_told_apart_and_bad_rows_left_out():
-    rows = [truth_estimate(START_NS + k, [[k, 0, 0, 0], [5, k if k else np.nan, 0, 0]], [1, 2])
-            for k in range(3)]
+    rows = [
+        truth_estimate(START_NS + k, [[k, 0, 0, 0], [5, k if k else np.nan, 0, 0]], [1, 2])
+        for k in range(3)
+    ]
     truth = Truth.from_series(series_of(rows))
     assert [path.track_id for path in truth.paths] == [1, 2]
     assert [len(path.stamp_ns) for path in truth.paths] == [3, 2]
@@ -51,5 +56,5 @@ def test_targets_are_told_apart_and_bad_rows_left_out():
 
 def test_of_repeated_stamps_the_last_counts():
     rows = [truth_estimate(START_NS, [[x, 0, 0, 0]], [1]) for x in (1.0, 2.0)]
-    path, = Truth.from_series(series_of(rows)).paths
+    (path,) = Truth.from_series(series_of(rows)).paths
     assert path.state[:, 0].tolist() == [2.0]

@@ -2,8 +2,8 @@
 
 import json
 
+from helpers.obstacle_bags import tracked
 import numpy as np
-from obstacle_bags import tracked
 import pytest
 
 from sonar_imm.cli import main
@@ -24,20 +24,30 @@ def estimate(second, rows):
     covariance[:, [0, 1], [0, 1]] = 1e-2, 1e-4
     covariance[:, 2, 2] = rows[:, 5] ** 2
     return Estimate(
-        stamp_ns=second * SECOND, frame_id='odom', xyz=np.zeros((len(rows), 3), np.float32),
-        state_names=('range', 'bearing', 'vertical_offset'), state=rows[:, 2:5],
-        covariance=covariance, model_names=('above', 'below'),
+        stamp_ns=second * SECOND,
+        frame_id='odom',
+        xyz=np.zeros((len(rows), 3), np.float32),
+        state_names=('range', 'bearing', 'vertical_offset'),
+        state=rows[:, 2:5],
+        covariance=covariance,
+        model_names=('above', 'below'),
         probabilities=np.column_stack([rows[:, 8], 1.0 - rows[:, 8]]),
-        extras={'track_id': rows[:, 0].astype(np.uint32),
-                'track_state': rows[:, 1].astype(np.uint8), 'vertical_offset_lo': rows[:, 6],
-                'vertical_offset_hi': rows[:, 7], 'nis': np.full(len(rows), 2.0)})
+        extras={
+            'track_id': rows[:, 0].astype(np.uint32),
+            'track_state': rows[:, 1].astype(np.uint8),
+            'vertical_offset_lo': rows[:, 6],
+            'vertical_offset_hi': rows[:, 7],
+            'nis': np.full(len(rows), 2.0),
+        },
+    )
 
 
 def straight(track_id, offset, bearing=0.0, count=20):
     """An obstacle that comes 2 m nearer each second from 60 m, always in the beam."""
     stamps = np.arange(1, count + 1) * SECOND
-    seen = np.column_stack([60.0 - 2.0 * np.arange(count), np.full(count, bearing),
-                            np.full(count, offset)])
+    seen = np.column_stack(
+        [60.0 - 2.0 * np.arange(count), np.full(count, bearing), np.full(count, offset)]
+    )
     return TruePath(track_id, stamps, seen, np.ones(count, bool))
 
 
@@ -45,10 +55,21 @@ def test_scores_are_those_done_by_hand():
     # At seconds 10 and 11 the range is 42 and 40 m. One track is 1 m too deep, then 2 m; the band
     # holds the truth once; a false track and a tentative one are about.
     estimates = [
-        estimate(10, [[4, 1, 42.3, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1],
-                      [5, 1, 20.0, 0.3, 0.0, 1.0, -1.0, 1.0, 0.5]]),
-        estimate(11, [[4, 2, 40.0, 0.01, 5.0, 1.0, 4.0, 6.0, 0.2],
-                      [6, 0, 40.0, 0.0, 3.0, 1.0, 2.0, 4.0, 0.5]])]
+        estimate(
+            10,
+            [
+                [4, 1, 42.3, 0.0, 4.0, 1.0, 2.0, 5.0, 0.1],
+                [5, 1, 20.0, 0.3, 0.0, 1.0, -1.0, 1.0, 0.5],
+            ],
+        ),
+        estimate(
+            11,
+            [
+                [4, 2, 40.0, 0.01, 5.0, 1.0, 4.0, 6.0, 0.2],
+                [6, 0, 40.0, 0.0, 3.0, 1.0, 2.0, 4.0, 0.5],
+            ],
+        ),
+    ]
     metrics, found = score(series_of(estimates), (straight(1, 3.0),), cutoff=5.0, gap=60.0)
     assert metrics['vertical_offset']['rmse_m'] == pytest.approx(np.sqrt((1.0 + 4.0) / 2.0))
     assert metrics['range']['rmse_m'] == pytest.approx(0.3 / np.sqrt(2.0))
@@ -58,13 +79,21 @@ def test_scores_are_those_done_by_hand():
     assert metrics['consistency']['band_coverage'] == 0.5
     assert metrics['above']['brier'] == pytest.approx((0.01 + 0.04) / 2.0)
     assert metrics['above']['bins']['0.1 to 0.3'] == {
-        'n': 2, 'stated': pytest.approx(0.15), 'came_true': 0.0}
+        'n': 2,
+        'stated': pytest.approx(0.15),
+        'came_true': 0.0,
+    }
     # GOSPA: sqrt(0.3^2 + 5^2/2), sqrt((40 * 0.01)^2).
     chord = np.hypot(40.0 * (1.0 - np.cos(0.01)), 40.0 * np.sin(0.01))
     assert metrics['gospa']['mean_m'] == pytest.approx((np.sqrt(0.09 + 12.5) + chord) / 2.0)
     assert metrics['gospa']['false_per_ping'] == pytest.approx(0.5)
-    assert metrics['tracks'] == {'true_obstacles': 1, 'found_obstacles': 1, 'tracks': 2,
-                                 'false_tracks': 1, 'identity_switches': 0}
+    assert metrics['tracks'] == {
+        'true_obstacles': 1,
+        'found_obstacles': 1,
+        'tracks': 2,
+        'false_tracks': 1,
+        'identity_switches': 0,
+    }
     assert found.target.tolist() == [0, 0]
 
 
@@ -73,8 +102,13 @@ def test_an_obstacle_taken_over_by_another_track_is_a_switch():
     # other obstacle, 0.4 rad to port, loses track 5 for a ping only (none).
     def row(track_id, second, bearing):
         return [track_id, 1, 62.0 - 2.0 * second, bearing, 3.0, 1.0, 2.0, 4.0, 0.1]
-    estimates = [estimate(7, [row(4, 7, 0.0), row(5, 7, 0.4)]), estimate(8, []),
-                 estimate(9, [row(5, 9, 0.4), row(9, 9, 0.0)]), estimate(10, [row(9, 10, 0.0)])]
+
+    estimates = [
+        estimate(7, [row(4, 7, 0.0), row(5, 7, 0.4)]),
+        estimate(8, []),
+        estimate(9, [row(5, 9, 0.4), row(9, 9, 0.0)]),
+        estimate(10, [row(9, 10, 0.0)]),
+    ]
     truth = (straight(1, 3.0), straight(2, 3.0, bearing=0.4))
     metrics, _ = score(series_of(estimates), truth, cutoff=5.0, gap=60.0)
     assert metrics['tracks']['identity_switches'] == 1
@@ -88,8 +122,9 @@ def test_an_obstacle_is_asked_for_from_its_sixth_ping_until_it_is_passed():
     path = straight(1, -3.0)
     wanted = path.there(path.stamp_ns, 60.0)
     assert wanted.tolist() == [False] * 5 + [True] * 15
-    passed = TruePath(1, path.stamp_ns, path.seen * [1.0, 0.0, 1.0] + [0.0, 1.5, 0.0],
-                      path.in_beam)
+    passed = TruePath(
+        1, path.stamp_ns, path.seen * [1.0, 0.0, 1.0] + [0.0, 1.5, 0.0], path.in_beam
+    )
     assert not passed.there(path.stamp_ns, 60.0).any()
     blind = TruePath(1, path.stamp_ns, path.seen, np.zeros(20, bool))
     assert not blind.there(path.stamp_ns, 60.0).any()
@@ -105,13 +140,31 @@ def test_truth_between_its_stamps_is_interpolated_but_not_across_gaps():
 
 def test_estimates_and_truth_of_something_else_are_refused():
     with pytest.raises(ValueError, match='not those of obstacles'):
-        series_of([Estimate(stamp_ns=1, frame_id='', xyz=np.zeros((1, 3), np.float32),
-                            state_names=('px',), state=np.zeros((1, 1)),
-                            covariance=np.ones((1, 1, 1)))])
+        series_of(
+            [
+                Estimate(
+                    stamp_ns=1,
+                    frame_id='',
+                    xyz=np.zeros((1, 3), np.float32),
+                    state_names=('px',),
+                    state=np.zeros((1, 1)),
+                    covariance=np.ones((1, 1, 1)),
+                )
+            ]
+        )
     with pytest.raises(ValueError, match="no column 'range'"):
-        truth_of([Estimate(stamp_ns=1, frame_id='', xyz=np.zeros((1, 3), np.float32),
-                           state_names=(), state=np.zeros((1, 0)),
-                           covariance=np.zeros((1, 0, 0)))])
+        truth_of(
+            [
+                Estimate(
+                    stamp_ns=1,
+                    frame_id='',
+                    xyz=np.zeros((1, 3), np.float32),
+                    state_names=(),
+                    state=np.zeros((1, 0)),
+                    covariance=np.zeros((1, 0, 0)),
+                )
+            ]
+        )
 
 
 @pytest.fixture(scope='module')
@@ -137,9 +190,16 @@ def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
 
 
 def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):
-    run = tracked(tmp_path, 'approach', ideal_navigation='true', sound_speed_error='0',
-                  range_std='0.001', bearing_std_deg='0.001', range_step='0',
-                  bearing_step_deg='0')
+    run = tracked(
+        tmp_path,
+        'approach',
+        ideal_navigation='true',
+        sound_speed_error='0',
+        range_std='0.001',
+        bearing_std_deg='0.001',
+        range_step='0',
+        bearing_step_deg='0',
+    )
     back = judge(RunFolder(run)).metrics['looking_back']
     assert back['truth_m'] == pytest.approx(3.0, abs=0.2)
     assert abs(back['rmsd_error_m']) < 0.1 and abs(back['refit_error_m']) < 0.1

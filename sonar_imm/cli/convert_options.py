@@ -1,0 +1,139 @@
+"""The options that several kinds of ``sonar-imm convert`` share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .common import pairs_option
+
+FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+def origin(
+    _ctx: click.Context, _param: click.Parameter, value: str | None
+) -> tuple[float, ...] | None:
+    if value is None:
+        return None
+    try:
+        numbers = tuple(float(part) for part in value.split(','))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (2, 3):
+        raise click.BadParameter(f"'{value}' is not of the form LAT,LON or LAT,LON,HEIGHT")
+    return numbers
+
+
+def nanoseconds(_ctx: click.Context, _param: click.Parameter, value: str) -> int:
+    try:
+        return int(Decimal(value) * 10**9)
+    except (InvalidOperation, ValueError, OverflowError):
+        raise click.BadParameter(f"'{value}' is not a number of seconds") from None
+
+
+def staves(
+    _ctx: click.Context, _param: click.Parameter, value: str | None
+) -> list[list[int]] | None:
+    if value is None:
+        return None
+    try:
+        return [[int(channel) for channel in stave.split('+')] for stave in value.split(',')]
+    except ValueError:
+        raise click.BadParameter(f"'{value}' is not of the form 0+3,1+2") from None
+
+
+def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]:
+    """The options that describe a CSV file; `prefix` tells several files apart."""
+    dashed, name = (f'{prefix}-', f'{prefix}_') if prefix else ('', '')
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for option in (
+            click.option(
+                f'--{dashed}delimiter',
+                f'{name}delimiter',
+                default='',
+                help=f'Between the columns of {what}; found by itself.',
+            ),
+            click.option(
+                f'--{dashed}time-offset',
+                f'{name}time_offset',
+                default='0',
+                callback=nanoseconds,
+                metavar='SECONDS',
+                help=f'Added to every time of {what}.',
+            ),
+            click.option(
+                f'--{dashed}time-unit',
+                f'{name}time_unit',
+                default='',
+                type=click.Choice(['', 's', 'ms', 'us', 'ns']),
+                metavar='UNIT',
+                help=f'Of numeric times in {what}: s, ms, us or ns.',
+            ),
+            pairs_option(
+                f'--{dashed}column',
+                f'{name}columns',
+                metavar='NAME=HEADER',
+                help=f'Which column of {what} is what, e.g. x=easting.',
+            ),
+        ):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Frame and origin, for all that has positions."""
+    function = click.option(
+        '--origin',
+        callback=origin,
+        metavar='LAT,LON[,HEIGHT]',
+        help='Of local metres; by default the first good row.',
+    )(function)
+    return frame_option(function)
+
+
+def frame_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--frame-id``."""
+    return click.option(
+        '--frame-id',
+        default='map',
+        show_default=True,
+        help='Frame of the positions, east-north-up.',
+    )(function)
+
+
+def storage_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--storage``."""
+    return click.option(
+        '--storage',
+        type=click.Choice(['mcap', 'sqlite3']),
+        default='mcap',
+        show_default=True,
+        help='Kind of bag.',
+    )(function)
+
+
+def truth_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--truth``, with its own columns."""
+    function = csv_options('truth', 'the truth')(function)
+    return click.option('--truth', type=FILE, help='CSV of true positions for the same bag.')(
+        function
+    )
+
+
+def options(values: dict[str, Any], prefix: str = '') -> Any:
+    """Take the options of one CSV file out of `values`."""
+    from ..recordings.csv_table import CsvOptions
+
+    return CsvOptions(
+        columns=values.pop(f'{prefix}columns'),
+        time_unit=values.pop(f'{prefix}time_unit'),
+        time_offset_ns=values.pop(f'{prefix}time_offset'),
+        delimiter=values.pop(f'{prefix}delimiter'),
+    )

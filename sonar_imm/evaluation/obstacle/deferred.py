@@ -1,0 +1,113 @@
+"""The deferred estimate of the paper beside the online one: RMSD against the vertical offset.
+
+The echoes of a track are those nearest to where the track was at its hits. With them, and the
+navigation of the recording, `trackers.obstacle_deferred` draws the paper's Figure 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+
+from ...measurements import Altitude, Detections, FloatArray, Navigation
+from ...trackers.obstacle.config import ObstacleConfig
+from ...trackers.obstacle.deferred import Deferred, deferred, sonar_poses
+from .series import Series, TruePath
+
+MOST_ECHOES = 300
+LEAST_ECHOES = 5
+
+
+@frozen(eq=False, kw_only=True)
+class LookingBack:
+    """Both curves of one track, and what to compare them with, all offsets at its first echo
+    (NaN when unknown): `truth`; `online` the tracker's at its last echo with its band; `altitude`
+    of the sonar's vehicle above the sea floor."""
+
+    track_id: int
+    echoes: int
+    plain: Deferred
+    refit: Deferred
+    online: float
+    band: tuple[float, float]
+    altitude: float
+    truth: float = float('nan')
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for `metrics.json`."""
+        result = {
+            'track_id': self.track_id,
+            'echoes': self.echoes,
+            'rmsd_m': self.plain.best,
+            'refit_m': self.refit.best,
+            'online_m': self.online,
+            'altitude_m': self.altitude,
+        }
+        if np.isfinite(self.truth):
+            result |= {
+                'truth_m': self.truth,
+                'rmsd_error_m': self.plain.best - self.truth,
+                'refit_error_m': self.refit.best - self.truth,
+                'online_error_m': self.online - self.truth,
+            }
+        return result
+
+
+def look_back(
+    series: Series,
+    measurements: Iterable[Any],
+    config: ObstacleConfig,
+    truth: dict[int, TruePath],
+    gap: float,
+) -> LookingBack | None:
+    """The deferred estimates of the track with most hits; None when it has too few echoes.
+
+    truth: obstacle by track id, of the tracks that met one.
+    """
+    track_id = series.longest_track()
+    if track_id is None:
+        return None
+    track = series.pick((series.track_id == track_id) & np.isfinite(series.nis))
+    received = list(measurements)
+    pings = {one.stamp_ns: one for one in received if isinstance(one, Detections) and len(one)}
+    track = track.pick(np.array([stamp in pings for stamp in track.stamp_ns.tolist()], bool))
+    navigation = [one for one in received if isinstance(one, Navigation)]
+    poses, known = sonar_poses(navigation, track.stamp_ns, config)
+    rows = np.flatnonzero(known)
+    rows = rows[:: max(1, -(-len(rows) // MOST_ECHOES))]
+    if len(rows) < LEAST_ECHOES:
+        return None
+    z = np.array(
+        [_echo(pings[int(track.stamp_ns[row])], track.state[row], config) for row in rows]
+    )
+    at = type(poses)(poses.position[rows], poses.R[rows])
+    sunk = float(at.position[-1, 2] - at.position[0, 2])
+    first, last = track.stamp_ns[rows[:1]], rows[-1]
+    path = truth.get(track_id)
+    heights = [one for one in received if isinstance(one, Altitude)]
+    return LookingBack(
+        track_id=track_id,
+        echoes=len(rows),
+        plain=deferred(z, at, config),
+        refit=deferred(z, at, config, refit=True),
+        online=float(track.state[last, 2]) + sunk,
+        band=(float(track.low[last]) + sunk, float(track.high[last]) + sunk),
+        altitude=min(heights, key=lambda one: abs(one.stamp_ns - int(first[0]))).altitude
+        if heights
+        else float('nan'),
+        truth=float(path.at(first, gap)[0, 2]) if path else float('nan'),
+    )
+
+
+def _echo(ping: Detections, state: FloatArray, config: ObstacleConfig) -> FloatArray:
+    """Range and azimuth (to starboard) of the detection nearest to a track's state (3,)."""
+    bearing = ping.bearing if config.bearing_positive == 'port' else -ping.bearing
+    away = np.hypot(
+        (ping.range - state[0]) / config.range_std,
+        (bearing - state[1]) / np.radians(config.bearing_std_deg),
+    )
+    nearest = int(np.nanargmin(away))
+    return np.array([ping.range[nearest], -bearing[nearest]])

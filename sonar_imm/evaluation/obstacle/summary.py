@@ -1,0 +1,73 @@
+"""The scores of a run of obstacles in words and lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..numbers import chi2_line, error_line
+from .scoring import NEAR
+
+
+def summary_sentence(metrics: Mapping[str, Any]) -> str:
+    """The result in plain words."""
+    offset = metrics.get('vertical_offset', {})
+    if not offset.get('n'):
+        known = 'scored_rows' in metrics
+        return (
+            f'{metrics["tracks_confirmed"]} confirmed obstacles in {metrics["span_s"]:.0f} s. '
+            + (
+                'None of them met the truth.'
+                if known
+                else 'There is no truth to compare '
+                'with, so this page shows what the tracker says of itself.'
+            )
+        )
+    near = metrics['vertical_offset_near']
+    words = []
+    if near['n']:
+        words.append(
+            f'Within {NEAR:.0f} m the height of an obstacle is right to '
+            f'{near["rmse_m"]:.2f} m (RMS).'
+        )
+    held = metrics['consistency']['band_coverage']
+    words.append(f'Its 90 % band holds the truth {100 * held:.0f} % of the time.')
+    tracks = metrics['tracks']
+    words.append(
+        f'{tracks["found_obstacles"]} of {tracks["true_obstacles"]} obstacles were '
+        f'found, {tracks["false_tracks"]} tracks were false.'
+    )
+    return ' '.join(words)
+
+
+def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Title and value of the numbers a person wants to see first."""
+    consistency = metrics['consistency']
+    result = [
+        *error_line('range error', metrics.get('range', {}), 'm'),
+        *error_line('bearing error', metrics.get('bearing', {}), 'deg'),
+        *error_line('vertical offset error', metrics.get('vertical_offset', {}), 'm'),
+        *error_line(f'the same within {NEAR:.0f} m', metrics.get('vertical_offset_near', {}), 'm'),
+        *chi2_line('NEES, vertical offset', consistency.get('nees_offset', {})),
+        *chi2_line('NEES, whole state', consistency.get('nees_state', {})),
+        *chi2_line('NIS', consistency['nis']),
+    ]
+    if metrics.get('vertical_offset', {}).get('n'):
+        held = consistency['band_coverage']
+        result.append(('truth inside the 90 % band', f'{100 * held:.0f} %'))
+        result.append(('Brier score of P(above)', f'{metrics["above"]["brier"]:.3f}'))
+        result.append(('GOSPA', f'{metrics["gospa"]["mean_m"]:.2f} m'))
+    if back := metrics.get('looking_back'):
+        result.append(
+            (
+                'vertical offset: online / RMSD / refitted',
+                ' / '.join(f'{back[name]:+.2f}' for name in ('online_m', 'rmsd_m', 'refit_m'))
+                + ' m'
+                + (f', truth {back["truth_m"]:+.2f} m' if 'truth_m' in back else ''),
+            )
+        )
+    result += [
+        (name.replace('_', ' '), f'{value:.3g}')
+        for name, value in metrics.get('tracks', {}).items()
+    ]
+    return result

@@ -1,0 +1,47 @@
+"""What a tracker takes in: frozen values in SI units and radians, stamps in integer nanoseconds.
+
+A measurement that cannot be used is never built: its class raises `Rejection`, which carries a
+reason code to count and one sentence to show. The classes know nothing of ROS; `msg_adapters`
+makes them from messages.
+"""
+
+from __future__ import annotations
+
+from .bathymetry import MAX_BINS, Snapshot
+from .checks import check_covariance, check_stamp, FloatArray, nanoseconds, Rejection
+from .diver import Arrivals, Fix
+from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
+from .obstacle import Altitude, Detections, Navigation
+
+__all__ = [
+    'Altitude',
+    'ArrayDepth',
+    'Arrivals',
+    'check_covariance',
+    'check_stamp',
+    'CrossSpectra',
+    'Detections',
+    'Fix',
+    'FloatArray',
+    'MAX_BINS',
+    'Measurement',
+    'nanoseconds',
+    'Navigation',
+    'Pressure',
+    'Rejection',
+    'Snapshot',
+    'Trace',
+]
+
+Measurement = (
+    Fix
+    | Arrivals
+    | Snapshot
+    | Trace
+    | CrossSpectra
+    | Pressure
+    | ArrayDepth
+    | Detections
+    | Navigation
+    | Altitude
+)

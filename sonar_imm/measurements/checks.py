@@ -1,0 +1,80 @@
+"""What every measurement class checks with: the one way to refuse input, stamps, arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Rejection(ValueError):
+    """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
+    tells the user."""
+
+    def __init__(self, reason: str, sentence: str):
+        self.reason = reason
+        self.sentence = sentence
+        super().__init__(sentence)
+
+
+def floats(*shape: int | None) -> Any:
+    """Converter to a read-only float64 array; a None in `shape` matches any length."""
+
+    def convert(value: Any) -> FloatArray:
+        array = np.array(value, dtype=np.float64)
+        if len(shape) != array.ndim or any(
+            want not in (None, got) for want, got in zip(shape, array.shape)
+        ):
+            raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
+        array.flags.writeable = False
+        return array
+
+    return convert
+
+
+def nanoseconds(seconds: float) -> int:
+    """`seconds` in the unit of stamps."""
+    return round(seconds * 1e9)
+
+
+def check_stamp(stamp_ns: int) -> None:
+    """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
+    2262."""
+    if not 0 < stamp_ns < 2**63:
+        raise Rejection(
+            'bad_stamp', f'the header stamp is {stamp_ns} ns; the sensor driver has to fill it in'
+        )
+
+
+def positives(value: Any) -> FloatArray | None:
+    """Read-only (n,), NaN where the value is no variance or standard deviation, which are finite
+    and positive; None when none is."""
+    if value is None:
+        return None
+    array = np.array(value, np.float64)
+    array[~(np.isfinite(array) & (array > 0.0))] = np.nan
+    array.flags.writeable = False
+    return None if np.isnan(array).all() else array
+
+
+def complexes(value: Any) -> NDArray[np.complexfloating]:
+    """Read-only copy, complex64 or complex128 as it came, anything else as complex128."""
+    array = np.asarray(value)
+    kept = array.dtype in (np.dtype(np.complex64), np.dtype(np.complex128))
+    array = array.astype(array.dtype if kept else np.complex128, copy=True)
+    array.flags.writeable = False
+    return array
+
+
+def check_covariance(covariance: FloatArray, what: str) -> None:
+    """Raise `Rejection` unless `covariance` (n, n) is finite, symmetric and positive definite."""
+    if not np.isfinite(covariance).all():
+        raise Rejection('nan', f'the covariance of {what} is not finite')
+    scale = float(np.abs(covariance).max())
+    if not np.allclose(covariance, covariance.T, rtol=0.0, atol=1e-6 * scale):
+        raise Rejection('bad_covariance', f'the covariance of {what} is not symmetric')
+    if scale <= 0.0 or np.linalg.eigvalsh(covariance)[0] <= 1e-12 * scale:
+        raise Rejection('bad_covariance', f'the covariance of {what} is not positive definite')

@@ -1,0 +1,91 @@
+"""What the diver tracker takes in: position fixes and arrival times."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from attrs import field, frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from .checks import check_covariance, check_stamp, FloatArray, floats, Rejection
+
+
+def _ids(value: Any) -> NDArray[np.uint16]:
+    array = np.array(value, dtype=np.uint16)
+    array.flags.writeable = False
+    return array
+
+
+@frozen(eq=False, kw_only=True)
+class Fix:
+    """A position found elsewhere: multistatic fusion, USBL, GPS.
+
+    position: (3,) x, y, z in `frame_id`, metres (ENU by default; z may be 0).
+    covariance: (2, 2) of x and y in m^2, or None when the sender does not know it.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=floats(3))
+    covariance: FloatArray | None = None
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if not np.isfinite(self.position[:2]).all():
+            raise Rejection('nan', 'the fix has a position that is not finite')
+        if np.abs(self.position[:2]).max() > 1e8:
+            raise Rejection(
+                'out_of_range',
+                f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin',
+            )
+        if self.covariance is not None:
+            covariance = floats(2, 2)(self.covariance)
+            check_covariance(covariance, 'a fix')
+            covariance = 0.5 * covariance + 0.5 * covariance.T
+            covariance.flags.writeable = False
+            object.__setattr__(self, 'covariance', covariance)
+
+
+@frozen(eq=False, kw_only=True)
+class Arrivals:
+    """Arrival times of one ping, one row a transmitter-receiver pair.
+
+    toa: (n,) seconds after the stamp. With a known transmitter (`tx` finite) the stamp is the
+    transmission and the path is transmitter - target - receiver. With `tx` NaN the target itself
+    emits at an unknown time near the stamp (an acoustic tag) and only differences between
+    receivers carry information. tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where
+    unknown; bearing: (n,) rad at the receiver, counter-clockwise from +x, NaN where not measured;
+    var_bearing: (n,) rad^2.
+    """
+
+    stamp_ns: int
+    tx_id: NDArray[np.uint16] = field(converter=_ids)
+    rx_id: NDArray[np.uint16] = field(converter=_ids)
+    tx: FloatArray = field(converter=floats(None, 3))
+    rx: FloatArray = field(converter=floats(None, 3))
+    toa: FloatArray = field(converter=floats(None))
+    var_toa: FloatArray = field(converter=floats(None))
+    bearing: FloatArray = field(converter=floats(None))
+    var_bearing: FloatArray = field(converter=floats(None))
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        n = len(self.toa)
+        for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing'):
+            if len(getattr(self, name)) != n:
+                raise Rejection(
+                    'bad_shape',
+                    f'arrivals: {name} has {len(getattr(self, name))} rows, toa has {n}',
+                )
+        if not np.isfinite(self.rx).all():
+            raise Rejection('nan', 'arrivals: a receiver position is not finite')
+
+    def __len__(self) -> int:
+        return len(self.toa)
+
+    @property
+    def passive(self) -> bool:
+        """True when the target itself emits, at an unknown time."""
+        return len(self) > 0 and bool(np.isnan(self.tx).all())

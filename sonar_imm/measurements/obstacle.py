@@ -1,0 +1,99 @@
+"""What the obstacle tracker takes in: pings of a forward-looking sonar, navigation, altitude."""
+
+from __future__ import annotations
+
+from attrs import field, frozen
+import numpy as np
+
+from .checks import check_stamp, FloatArray, floats, Rejection
+
+
+@frozen(eq=False, kw_only=True)
+class Detections:
+    """What a forward-looking sonar saw in one ping, one row an echo; none is a ping too.
+
+    The stamp is the transmission. range: (n,) metres; bearing: (n,) rad, REP-103: positive to
+    port; var_range: (n,) m^2 and var_bearing: (n,) rad^2, NaN where the sender does not know them;
+    intensity: (n,), NaN where unknown. Columns left out are unknown. A row without a finite range
+    and bearing is no echo.
+    """
+
+    stamp_ns: int
+    range: FloatArray = field(converter=floats(None))
+    bearing: FloatArray = field(converter=floats(None))
+    var_range: FloatArray | None = None
+    var_bearing: FloatArray | None = None
+    intensity: FloatArray | None = None
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        for name in ('var_range', 'var_bearing', 'intensity'):
+            given = getattr(self, name)
+            column = np.full(len(self.range), np.nan) if given is None else given
+            object.__setattr__(self, name, floats(None)(column))
+        for name in ('bearing', 'var_range', 'var_bearing', 'intensity'):
+            rows = len(getattr(self, name))
+            if rows != len(self):
+                raise Rejection(
+                    'bad_shape', f'detections: {name} has {rows} rows, range has {len(self)}'
+                )
+
+    def __len__(self) -> int:
+        return len(self.range)
+
+
+@frozen(eq=False, kw_only=True)
+class Navigation:
+    """Where the vehicle was: its pose in the world and its velocity in its own frame.
+
+    position: (3,) metres and orientation: (4,) quaternion x, y, z, w, world from body; velocity:
+    (3,) m/s and turn_rate: (3,) rad/s of the body, NaN where unknown. ENU and FLU unless the
+    sender keeps another convention. pose_covariance, twist_covariance: (6, 6) or None when
+    unknown.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=floats(3))
+    orientation: FloatArray = field(converter=floats(4))
+    velocity: FloatArray = field(converter=floats(3), factory=lambda: np.full(3, np.nan))
+    turn_rate: FloatArray = field(converter=floats(3), factory=lambda: np.full(3, np.nan))
+    pose_covariance: FloatArray | None = None
+    twist_covariance: FloatArray | None = None
+    frame_id: str = ''
+    child_frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if not (np.isfinite(self.position).all() and np.isfinite(self.orientation).all()):
+            raise Rejection('nan', 'the navigation has a pose that is not finite')
+        if np.abs(self.position).max() > 1e8:
+            raise Rejection(
+                'out_of_range', 'the vehicle lies further than 100,000 km from the origin'
+            )
+        length = float(np.linalg.norm(self.orientation))
+        if abs(length - 1.0) > 0.01:
+            raise Rejection(
+                'bad_orientation',
+                f'the orientation is a quaternion of length {length:.3g}, not 1',
+            )
+        for name in ('pose_covariance', 'twist_covariance'):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, floats(6, 6)(getattr(self, name)))
+
+
+@frozen(eq=False, kw_only=True)
+class Altitude:
+    """How high above the sea floor the vehicle was, metres; variance m^2, NaN when unknown."""
+
+    stamp_ns: int
+    altitude: float
+    variance: float = float('nan')
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if not np.isfinite(self.altitude):
+            raise Rejection('nan', 'the altitude is not finite')
+        if self.altitude < 0.0:
+            raise Rejection('out_of_range', f'the altitude is {self.altitude:g} m, below zero')

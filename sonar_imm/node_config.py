@@ -1,0 +1,95 @@
+"""What a node can be told besides the parameters of its tracker; offline tools read it too."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from attrs import frozen
+
+from msg_adapters.inputs import INPUTS, InputTopic
+
+from .parameters import Config, parameter, ParameterSpec
+
+
+def _max_wait(default: float) -> Any:
+    return parameter(
+        default,
+        'a message that waited longer than this while the tracker was busy is dropped, '
+        'and counted, so that the output does not lag; 0: never',
+        unit='s',
+        low=0.0,
+        high=1e6,
+        read_only=False,
+    )
+
+
+@frozen(kw_only=True)
+class NodeConfig(Config):
+    """What every node can be told besides the parameters of its tracker."""
+
+    queue_depth: int = parameter(
+        50, 'messages an input holds while the tracker is busy', low=1, high=100000
+    )
+    max_wait: float = _max_wait(0.0)
+    frame_id: str = parameter(
+        '', 'frame the input must be in; empty: that of the first message accepted'
+    )
+    world_frame_convention: str = parameter(
+        'enu',
+        'axes of the input: enu (x east, y north, z up) or ned (x north, y east, z down); '
+        'the output is always enu',
+        choices=('enu', 'ned'),
+    )
+    publish_revisions: bool = parameter(
+        True,
+        'late input changes estimates already made: publish those again too, oldest first; '
+        'false: only the newest',
+        read_only=False,
+    )
+    diagnostics_period: float = parameter(
+        1.0, 'time between two messages on /diagnostics', unit='s', low=0.05, high=3600.0
+    )
+    stale_after: float = parameter(
+        10.0,
+        'silence after which diagnostics call the input stale',
+        unit='s',
+        low=0.01,
+        high=1e6,
+        read_only=False,
+    )
+
+
+@frozen(kw_only=True)
+class BathymetryNodeConfig(NodeConfig):
+    """A swath is looked at while it is surveyed, and no ping needs the one before."""
+
+    max_wait: float = _max_wait(0.5)
+
+
+_SPECIAL = {'bathymetry': BathymetryNodeConfig}
+
+
+def node_config_type(system: str) -> type[NodeConfig]:
+    """What the node of `system` can be told besides the parameters of its tracker."""
+    return _SPECIAL.get(system, NodeConfig)
+
+
+def type_specs(system: str) -> tuple[ParameterSpec, ...]:
+    """The parameters ``<input>_type`` of the node of `system`."""
+    return tuple(spec for topic in INPUTS[system] if (spec := type_spec(topic)) is not None)
+
+
+def type_spec(topic: InputTopic) -> ParameterSpec | None:
+    """``<input>_type``, needed where an input can be one of several message types; else None.
+
+    In ROS one topic name has one type, so the user has to say which.
+    """
+    if len(topic.readers) == 1:
+        return None
+    return ParameterSpec(
+        name=f'{topic.name}_type',
+        kind='str',
+        default=next(iter(topic.readers)),
+        description=f"message type of the input '{topic.name}'; a recording knows its own",
+        choices=tuple(topic.readers),
+    )

@@ -1,0 +1,47 @@
+"""Conversion of other people's recordings into bags.
+
+Every converter takes the file, the path of the new bag and options, and gives a
+`ConversionReport`. Rows that cannot be used are counted and named by line; only a file that gives
+nothing at all raises `BagError`. Records are written in the order of their stamps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ..conversion import ConversionReport
+from ..csv_table import CsvOptions
+from .arrivals import convert_arrivals
+from .autoferry import convert_autoferry
+from .fixes import convert_fixes
+from .images import convert_images
+from .segy import convert_segy
+from .snapshots import convert_snapshots
+from .traces import convert_traces
+from .truth import convert_truth
+
+__all__ = [
+    'convert_arrivals',
+    'convert_autoferry',
+    'convert_fixes',
+    'convert_images',
+    'convert_segy',
+    'convert_snapshots',
+    'convert_traces',
+    'convert_truth',
+    'ConversionReport',
+    'CsvOptions',
+    'KINDS',
+]
+
+KINDS: dict[str, Callable[..., ConversionReport]] = {
+    'fixes': convert_fixes,
+    'arrivals': convert_arrivals,
+    'truth': convert_truth,
+    'autoferry': convert_autoferry,
+    'snapshots': convert_snapshots,
+    'images': convert_images,
+    'segy': convert_segy,
+    'traces': convert_traces,
+}
+"""The converters by the name that the command gives them."""

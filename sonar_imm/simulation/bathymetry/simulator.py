@@ -1,0 +1,277 @@
+"""Sea floors as a tilted side-scan array hears them, ping by ping.
+
+`paper` is the scene of Saucan et al. 2013: a sonar 15 m above a flat floor with one rough patch,
+whose signal-to-noise ratio falls from 30 to 10 dB along the swath (linearly in decibels over the
+logarithm of range, as spreading has it). The other scenarios add one difficulty each: slope,
+undulation, roughness that is correlated as real roughness is, shadows, spikes, echoes by way of
+the surface, Gaussian echoes, a second side.
+
+One bin is y = sqrt(z) (s a(u) + n), the law of `acoustics.laplace`. Surface echoes fade with a z
+of their own. A spike is a burst as incoherent across the array as it is strong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from ...acoustics import array
+from ...measurements import FloatArray, Snapshot
+from ...parameters import parameter
+from ..scene import Received, Scenario, Scene, TrueProfile
+
+ComplexArray = NDArray[np.complex128]
+
+SIDES = ('starboard', 'port', 'both')
+LAWS = ('laplace', 'gaussian')
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+
+
+@frozen(kw_only=True)
+class BathymetryScenario(Scenario):
+    """Everything a bathymetry scene can be told; the defaults are the scene of the paper."""
+
+    INSTRUMENT = ('tilt_deg', 'conjugate', 'sonar_height', 'sonar_depth')
+
+    pings: int = parameter(20, 'number of pings', low=1, high=1_000_000)
+    ping_rate: float = parameter(10.0, 'pings a second', unit='Hz', low=0.01, high=1000.0)
+    side: str = parameter('starboard', 'which sides the sonar looks to', choices=SIDES)
+
+    staves: int = parameter(8, 'staves of the array', low=2, high=64)
+    spacing_wavelengths: float = parameter(
+        0.5, 'distance between staves, in wavelengths', low=0.01, high=100.0
+    )
+    frequency: float = parameter(455e3, 'of the sonar', unit='Hz', low=1e3, high=1e7)
+    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
+    tilt_deg: float = parameter(
+        30.0, 'direction the array looks to, below the horizon', unit='deg', low=-90.0, high=90.0
+    )
+    conjugate: bool = parameter(False, 'the array is wired the other way round')
+    sonar_height: float = parameter(
+        15.0, 'height of the sonar above the reference floor', unit='m', low=0.1, high=12000.0
+    )
+    sonar_depth: float = parameter(
+        3.0, 'depth of the sonar below the surface', unit='m', low=0.0, high=12000.0
+    )
+
+    first_range: float = parameter(17.0, 'slant range of the first bin', unit='m', low=0.0)
+    last_range: float = parameter(77.0, 'slant range where the swath ends', unit='m', low=0.1)
+    bin_width: float = parameter(0.05, 'distance between bins', unit='m', low=1e-3, high=10.0)
+    snr_near_db: float = parameter(30.0, 'signal to noise at a stave, first echo', unit='dB')
+    snr_far_db: float = parameter(10.0, 'signal to noise at a stave, end of the swath', unit='dB')
+    noise_variance: float = parameter(1.0, 'noise power at a stave', low=1e-12, high=1e12)
+    state_noise: bool = parameter(True, 'the snapshot says its noise variance')
+    state_signal: bool = parameter(False, 'the snapshot says its signal variance')
+    law: str = parameter('laplace', 'how the power of echoes varies', choices=LAWS)
+
+    slope: float = parameter(
+        0.0, 'rise of the floor over a metre of slant range', low=-1.0, high=1.0
+    )
+    undulation_height: float = parameter(0.0, 'amplitude of an undulation', unit='m', low=0.0)
+    undulation_length: float = parameter(20.0, 'its length in slant range', unit='m', low=0.1)
+    patch_start: float = parameter(40.0, 'slant range at which the rough patch begins', unit='m')
+    patch_end: float = parameter(50.0, 'slant range at which it ends', unit='m')
+    patch_std: float = parameter(
+        0.5, 'standard deviation of its heights', unit='m', low=0.0, high=100.0
+    )
+    patch_drift: float = parameter(
+        0.0, 'the patch lies so much further out from ping to ping', unit='m'
+    )
+    correlation_length: float = parameter(
+        0.0,
+        'standard deviation of the kernel that smooths its heights; 0: white',
+        unit='m',
+        low=0.0,
+        high=100.0,
+    )
+
+    shadows: tuple[float, ...] = parameter(
+        (), 'slant ranges where shadows begin and end, in pairs', kind='float[]', unit='m', low=0.0
+    )
+    spike_probability: float = parameter(0.0, 'that a bin has a burst of noise', low=0.0, high=1.0)
+    spike_db: float = parameter(20.0, 'power of bursts above echo and noise', unit='dB')
+    multipath: bool = parameter(False, 'a calm surface returns echoes too')
+    multipath_level_db: float = parameter(
+        0.0, 'power of each surface echo against the floor', unit='dB', low=-60.0, high=60.0
+    )
+
+    def check(self) -> list[str]:
+        problems = []
+        if self.last_range < self.first_range + 2.0 * self.bin_width:
+            problems.append('last_range must lie at least two bins beyond first_range')
+        elif (self.last_range - self.first_range) / self.bin_width > 100_000:
+            problems.append('a ping has at most 100,000 bins; bin_width is too small')
+        if self.patch_end < self.patch_start:
+            problems.append('patch_end cannot lie before patch_start')
+        if len(self.shadows) % 2 or any(np.diff(self.shadows) < 0.0):
+            problems.append('shadows needs increasing ranges in pairs, begin and end of each')
+        return problems
+
+
+SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+    'paper': ('flat floor with a rough patch, 30 to 10 dB: the scene of the paper', {}),
+    'slope': ('paper on a floor that rises 0.1 m a metre', {'slope': 0.1}),
+    'correlated': (
+        'paper with roughness correlated over a metre, as real roughness is',
+        {'correlation_length': 1.0},
+    ),
+    'undulating': (
+        'paper on an undulating floor',
+        {'undulation_height': 0.5, 'undulation_length': 15.0},
+    ),
+    'shadow': ('paper with two shadows', {'shadows': (30.0, 33.0, 58.0, 63.0)}),
+    'spikes': ('paper with a burst of noise in every tenth bin', {'spike_probability': 0.1}),
+    'multipath': ('paper under a calm surface', {'multipath': True}),
+    'water_column': (
+        'paper from 5 m on, so that the noise is heard and need not be stated',
+        {'first_range': 5.0, 'state_noise': False},
+    ),
+    'gaussian': ('paper with Gaussian echoes', {'law': 'gaussian'}),
+    'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
+    'drifting_patch': (
+        'paper with a patch that lies further out each ping',
+        {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0},
+    ),
+}
+"""Name: (what it is, what differs from the defaults of `BathymetryScenario`)."""
+
+
+def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> BathymetryScenario:
+    """The scenario called `name` with some values replaced. Raises `ConfigError` naming
+    mistakes."""
+    return BathymetryScenario.named(name, SCENARIOS, overrides)
+
+
+def simulate(config: BathymetryScenario, seed: int) -> Scene:
+    """Run a scene. The same config and seed give the same scene.
+
+    A measurement is received when its last echo is. With both sides, each has a namespace of its
+    own. The frame is that of the sonar: x forward, y to port, z up.
+    """
+    rng = np.random.default_rng(seed)
+    sides = ('port', 'starboard') if config.side == 'both' else (config.side,)
+    ranges = config.first_range + config.bin_width * np.arange(
+        round((config.last_range - config.first_range) / config.bin_width)
+    )
+    listening_ns = round(2e9 * ranges[-1] / config.sound_speed)
+    received, truth = [], []
+    for ping in range(config.pings):
+        stamp = FIRST_STAMP_NS + round(ping * 1e9 / config.ping_rate)
+        for side in sides:
+            namespace = side if len(sides) > 1 else ''
+            profile = _floor(config, ping, ranges, rng, stamp, side, namespace)
+            truth.append(profile)
+            snapshot = _hear(config, profile, rng)
+            received.append(Received(stamp + listening_ns, snapshot, namespace))
+    return Scene(tuple(received), tuple(truth), frame_id=truth[0].frame_id)
+
+
+def snr(config: BathymetryScenario, ranges: FloatArray) -> FloatArray:
+    """Signal-to-noise ratio (n,) at one stave, linear."""
+    nearest = max(config.first_range, min(config.sonar_height, 0.5 * config.last_range))
+    share = np.log(np.maximum(ranges, nearest) / nearest) / math.log(config.last_range / nearest)
+    decibels = config.snr_near_db + share * (config.snr_far_db - config.snr_near_db)
+    return 10.0 ** (0.1 * decibels)
+
+
+def _floor(
+    config: BathymetryScenario,
+    ping: int,
+    ranges: FloatArray,
+    rng: np.random.Generator,
+    stamp_ns: int,
+    side: str,
+    namespace: str,
+) -> TrueProfile:
+    drift = ping * config.patch_drift
+    patch = (ranges >= config.patch_start + drift) & (ranges < config.patch_end + drift)
+    height = config.slope * (ranges - ranges[0]) + patch * _roughness(config, len(ranges), rng)
+    height += config.undulation_height * np.sin(
+        2.0 * np.pi * (ranges - ranges[0]) / config.undulation_length
+    )
+    depth = config.sonar_height - height
+    valid = np.abs(depth) <= ranges  # before that, the sound is still in the water column
+    for begin, end in zip(config.shadows[::2], config.shadows[1::2]):
+        valid &= (ranges < begin) | (ranges >= end)
+    outward = array.across_track(depth, ranges)
+    return TrueProfile(
+        stamp_ns=stamp_ns,
+        frame_id='sonar',
+        range=ranges,
+        height=height,
+        angle=array.angle_of_depth(depth, ranges, math.radians(config.tilt_deg)),
+        patch=patch,
+        valid=valid,
+        xyz=np.column_stack(
+            [np.zeros(len(ranges)), outward if side == 'port' else -outward, -depth]
+        ),
+        namespace=namespace,
+    )
+
+
+def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
+    white = rng.normal(size=bins)
+    width = config.correlation_length / config.bin_width
+    if width > 0.0:
+        smooth = gaussian_filter1d(white, width, mode='wrap')
+        kernel = gaussian_filter1d(np.eye(1, bins, bins // 2)[0], width, mode='wrap')
+        white = smooth / np.linalg.norm(kernel)
+    return config.patch_std * white
+
+
+def _hear(config: BathymetryScenario, floor: TrueProfile, rng: np.random.Generator) -> Snapshot:
+    """What the staves hear of a floor."""
+    bins = len(floor.range)
+    sine = np.nan_to_num(np.sin(floor.angle))
+    signal = config.noise_variance * snr(config, floor.range) * floor.valid
+    y = np.sqrt(signal)[:, None] * _echo(config, sine, rng)
+    y += math.sqrt(config.noise_variance) * _circular(rng, bins, config.staves)
+    y *= np.sqrt(_fading(config, bins, rng))[:, None]
+    if config.multipath:
+        level = np.sqrt(signal * 10.0 ** (0.1 * config.multipath_level_db))
+        depth = config.sonar_height - floor.height
+        tilt = math.radians(config.tilt_deg)
+        others = array.multipath_sines(depth, floor.range, tilt, config.sonar_depth)
+        for other in others.T:
+            strength = level * np.sqrt(_fading(config, bins, rng)) * np.isfinite(other)
+            y += strength[:, None] * _echo(config, np.nan_to_num(other), rng)
+    spikes = rng.uniform(size=bins) < config.spike_probability
+    if spikes.any():
+        power = (signal + config.noise_variance) * 10.0 ** (0.1 * config.spike_db) * spikes
+        y += np.sqrt(power)[:, None] * _circular(rng, bins, config.staves)
+    return Snapshot(
+        stamp_ns=floor.stamp_ns,
+        frame_id=floor.frame_id,
+        range=floor.range,
+        iq=y.astype(np.complex64),
+        noise_variance=np.full(bins, config.noise_variance) if config.state_noise else None,
+        signal_variance=signal if config.state_signal else None,
+        sound_speed=config.sound_speed,
+        frequency=config.frequency,
+        element_spacing=config.spacing_wavelengths * config.sound_speed / config.frequency,
+        sample_rate=0.5 * config.sound_speed / config.bin_width,
+    )
+
+
+def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator) -> ComplexArray:
+    """Plane waves (n, P) of unit power from direction sines (n,)."""
+    vectors = array.steering(
+        sine, config.staves, config.spacing_wavelengths, conjugate=config.conjugate
+    )
+    return vectors * _circular(rng, len(sine), 1)
+
+
+def _fading(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
+    """The power z (n,) of echoes, one on average."""
+    return rng.exponential(size=bins) if config.law == 'laplace' else np.ones(bins)
+
+
+def _circular(rng: np.random.Generator, *shape: int) -> ComplexArray:
+    """Circular complex Gaussian numbers of unit variance."""
+    return rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5)

@@ -1,0 +1,1 @@
+"""The bathymetry tracker: the sea floor from side-scan array snapshots."""

@@ -1,0 +1,239 @@
+"""Parameters of the bathymetry tracker, each with its unit, range and meaning.
+
+Pings are independent of each other, so every parameter may change while the tracker runs: the
+next ping is the first to see it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+import math
+
+from attrs import frozen
+
+from ...acoustics.laplace import LAWS
+from ...parameters import Config
+from ...parameters import parameter as fixed_parameter
+from ..model_checks import chain_problems
+
+parameter = partial(fixed_parameter, read_only=False)
+
+DEFAULT_SIGMAS = {
+    'height_rw_ncs': (0.5, 1.0),
+    'height_two_rw': (0.01, 0.5),
+    'height_bank': (0.01, 0.05, 0.3, 1.5),
+}
+"""Noise of each model a range bin: metres, but 1/m for the slope model `ncs`."""
+DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
+MODEL_SETS = ('height_rw_ncs', 'height_two_rw', 'angle_two_rw', 'height_bank')
+SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
+"""The sets of one state, which the grid engine can run."""
+
+
+@frozen(kw_only=True)
+class BathymetryConfig(Config):
+    """Everything the bathymetry tracker can be told."""
+
+    # -- which models ----------------------------------------------------------------------------
+    model_set: str = parameter(
+        'height_two_rw', 'terrain models run side by side', choices=MODEL_SETS
+    )
+    variant: str = parameter(
+        'corrected',
+        'corrected, or the formulas as the paper prints them (see the docs for what is wrong)',
+        choices=('corrected', 'paper'),
+    )
+    sigmas: tuple[float, ...] = parameter(
+        (),
+        'noise of each model over a range bin, in the order of the set: m, but 1/m for ncs; '
+        'empty: values that suit most floors; any number for height_bank',
+        kind='float[]',
+        low=0.0,
+        high=1000.0,
+    )
+    sigmas_deg: tuple[float, ...] = parameter(
+        (),
+        'angle_two_rw: noise of the first model over a range bin, and of the second at the first '
+        'and at the last bin, linear between; empty: 0.1, 0.1, 2',
+        kind='float[]',
+        unit='deg',
+        low=0.0,
+        high=90.0,
+    )
+    sigma_reference_bin: float = parameter(
+        0.0,
+        'range bin at which the noises are stated, they grow with sqrt(bin / reference); '
+        '0: as stated whatever the bin',
+        unit='m',
+        low=0.0,
+        high=100.0,
+    )
+    transition_matrix: tuple[float, ...] = parameter(
+        (),
+        'transition matrix over a range bin, row-major, row = from; empty: stay_probability',
+        kind='float[]',
+        low=0.0,
+        high=1.0,
+    )
+    stay_probability: float = parameter(
+        0.995,
+        'probability of keeping the model over a range bin, without transition_matrix; the paper '
+        'has 0.98',
+        low=0.0,
+        high=1.0,
+    )
+    initial_probabilities: tuple[float, ...] = parameter(
+        (),
+        'model probabilities before the first bin; empty: uniform',
+        kind='float[]',
+        low=0.0,
+        high=1.0,
+    )
+    initial_mean: float = parameter(
+        0.0,
+        'state before the first bin: height of the floor in m, or angle in rad (see initial_std)',
+        low=-1000.0,
+        high=1000.0,
+    )
+    initial_std: float = parameter(
+        0.0,
+        'its standard deviation, m or rad; 0: 1 m, or 5 deg around the angle at which the '
+        'reference floor is first heard',
+        low=0.0,
+        high=1000.0,
+    )
+    initial_slope_std: float = parameter(
+        0.1, 'standard deviation of the slope before the first bin', low=0.0, high=100.0
+    )
+    redrawn_slope_std: float = parameter(
+        0.1,
+        'height_rw_ncs: standard deviation of the slope while the random walk holds, where it '
+        'means nothing; the paper has 0',
+        low=0.0,
+        high=100.0,
+    )
+
+    # -- sonar -----------------------------------------------------------------------------------
+    sonar_height: float = parameter(
+        15.0, 'height of the sonar above the reference floor', unit='m', low=0.01, high=12000.0
+    )
+    side: str = parameter('starboard', 'side the array looks to', choices=('port', 'starboard'))
+    tilt_deg: float = parameter(
+        30.0, 'direction the array looks to, below the horizon', unit='deg', low=-90.0, high=90.0
+    )
+    element_spacing_wavelengths: float = parameter(
+        0.0,
+        'distance between staves in wavelengths; 0: as the snapshot says, else 0.5',
+        low=0.0,
+        high=100.0,
+    )
+    conjugate: bool = parameter(
+        False, 'the phase of an echo from below broadside falls from stave to stave'
+    )
+    sound_speed: float = parameter(
+        1500.0,
+        'for snapshots that have times, and no sound speed of their own',
+        unit='m/s',
+        low=1300.0,
+        high=1700.0,
+    )
+
+    # -- what is heard ---------------------------------------------------------------------------
+    likelihood: str = parameter('laplace', 'law of the samples of one bin', choices=LAWS)
+    noise_variance: float = parameter(
+        0.0,
+        'noise power at a stave, for snapshots that do not bring it; 0: from the water column, '
+        'or blindly where there is none',
+        low=0.0,
+        high=1e30,
+    )
+    shadow_gate: bool = parameter(
+        True, 'bins without a coherent echo are passed over by the smoothest model'
+    )
+    gate_false_alarm: float = parameter(
+        1e-3, 'probability of taking noise for an echo', low=1e-9, high=0.5
+    )
+    multipath: bool = parameter(
+        False, 'expect echoes by way of the surface, as noise from where they would come'
+    )
+    sonar_depth: float = parameter(
+        3.0, 'depth of the sonar below the surface, for multipath', unit='m', low=0.0, high=12000.0
+    )
+    multipath_level_db: float = parameter(
+        0.0, 'power of those echoes against the floor', unit='dB', low=-60.0, high=60.0
+    )
+
+    # -- computation -----------------------------------------------------------------------------
+    engine: str = parameter(
+        'particles',
+        'particles, or a grid: exact, without Monte Carlo noise, for sets of one state',
+        choices=('particles', 'grid'),
+    )
+    particles_per_model: int = parameter(100, 'particles of each model', low=2, high=100_000)
+    grid_step: float = parameter(
+        0.0,
+        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most',
+        low=0.0,
+        high=100.0,
+    )
+    grid_extent: float = parameter(
+        20.0,
+        'the grid reaches so far to both sides of initial_mean (angles: all that can be)',
+        unit='m',
+        low=0.1,
+        high=1000.0,
+    )
+    smoothing: str = parameter(
+        'none',
+        'use the whole ping for each bin: modes (Kim: the model probabilities only), or states '
+        '(forward-backward on the grid: everything)',
+        choices=('none', 'modes', 'states'),
+    )
+    seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
+
+    def check(self) -> list[str]:
+        problems = self._check_sigmas()
+        models = self.model_count()
+        problems += chain_problems(
+            self.transition_matrix, self.initial_probabilities, models, self.model_set
+        )
+        if self.engine == 'grid' and self.model_set not in SCALAR_SETS:
+            problems.append(
+                f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '
+                f'{self.model_set} has two'
+            )
+        if self.smoothing == 'states' and self.engine != 'grid':
+            problems.append('smoothing of the states needs engine grid; particles smooth modes')
+        if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
+            problems.append(
+                f'initial_mean is an angle for angle_two_rw, between -pi/2 and pi/2, not '
+                f'{self.initial_mean:g}'
+            )
+        return problems
+
+    def _check_sigmas(self) -> list[str]:
+        if self.model_set == 'angle_two_rw':
+            problems = ['angle_two_rw takes sigmas_deg, not sigmas'] if self.sigmas else []
+            if len(self.sigmas_deg) not in (0, 3):
+                problems.append(
+                    'sigmas_deg needs three values (first model, second at the first and at the '
+                    f'last bin), got {len(self.sigmas_deg)}'
+                )
+            return problems
+        problems = ['sigmas_deg is for angle_two_rw only'] if self.sigmas_deg else []
+        wanted = len(DEFAULT_SIGMAS[self.model_set])
+        if self.model_set == 'height_bank':
+            if len(self.sigmas) > 16:
+                problems.append(f'height_bank takes at most 16 sigmas, got {len(self.sigmas)}')
+        elif len(self.sigmas) not in (0, wanted):
+            problems.append(
+                f'sigmas needs {wanted} values for model_set {self.model_set}, got '
+                f'{len(self.sigmas)}'
+            )
+        return problems
+
+    def model_count(self) -> int:
+        """Number of models in the set these parameters describe."""
+        if self.model_set == 'angle_two_rw':
+            return 2
+        return len(self.sigmas or DEFAULT_SIGMAS[self.model_set])

@@ -1,0 +1,180 @@
+"""From a snapshot to the likelihood of every bin: what is heard, how loud, and from where.
+
+The engines know nothing of arrays. They are given, for each bin, whether it is `heard` at all
+(`acoustics.coherence`) and the coefficients of its likelihood over directions
+(`acoustics.laplace`, or `acoustics.interference` when multipath is expected).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acoustics import array, coherence, interference, laplace, likelihood_kernels, variances
+from ...measurements import FloatArray, Snapshot
+from .config import BathymetryConfig
+
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+
+WATER_COLUMN = 0.8
+"""Bins nearer than this share of the sonar's height hold no echo of the floor."""
+FEWEST_QUIET_BINS = 16
+
+
+@frozen(eq=False)
+class PingLikelihood:
+    """The likelihood of each of T bins; see `likelihood_kernels.log_likelihoods` for form (T, P),
+    base (T,), spread (T, P or 0), signal (T,) and table; noise (T,) is the variance
+    it was made for.
+
+    heard (T,): bins that say something; constant (T,): what the kernels leave out of the log
+    likelihood; geometry: see `bathymetry_kernels.sines_of`.
+    """
+
+    ranges: FloatArray
+    heard: BoolArray
+    form: ComplexArray
+    base: FloatArray
+    spread: ComplexArray
+    signal: FloatArray
+    noise: FloatArray
+    constant: FloatArray
+    table: FloatArray
+    geometry: FloatArray
+
+
+def spacing_of(snapshot: Snapshot, config: BathymetryConfig) -> float:
+    """Distance between staves in wavelengths, negative for a conjugated array: what the config
+    says, else the snapshot, else 0.5."""
+    spacing = config.element_spacing_wavelengths or snapshot.spacing_wavelengths or 0.5
+    return -spacing if config.conjugate else spacing
+
+
+def ping_law(snapshot: Snapshot, config: BathymetryConfig) -> PingLikelihood:
+    """The likelihood of every bin of a snapshot under `config`."""
+    ranges = np.array(snapshot.ranges(config.sound_speed))
+    spacing, tilt = spacing_of(snapshot, config), math.radians(config.tilt_deg)
+    noise = _noise(snapshot, ranges, config)
+    iq = np.where(snapshot.usable[:, None], snapshot.iq, 0.0)
+    height = math.nan if config.model_set == 'angle_two_rw' else config.sonar_height
+    make = _beside_surface if config.multipath else _in_white_noise
+    parts = make(snapshot, iq, ranges, spacing, noise, config)
+    P = snapshot.staves
+    laplacian = config.likelihood == 'laplace'
+    constant = laplace.log_constant if laplacian else laplace.gaussian_log_constant
+    return PingLikelihood(
+        ranges=ranges,
+        heard=_heard(snapshot.usable, parts.coherence, P, abs(spacing), config),
+        form=np.ascontiguousarray(parts.form),
+        base=np.ascontiguousarray(parts.base),
+        spread=np.ascontiguousarray(parts.spread),
+        signal=parts.signal,
+        noise=noise,
+        constant=constant(P, parts.log_determinant),
+        table=likelihood_kernels.law_table(P, config.likelihood),
+        geometry=np.array([height, math.cos(tilt), math.sin(tilt), spacing]),
+    )
+
+
+class _Parts(NamedTuple):
+    form: ComplexArray
+    base: FloatArray
+    spread: ComplexArray
+    signal: FloatArray
+    log_determinant: FloatArray
+    coherence: FloatArray
+
+
+def _in_white_noise(
+    snapshot: Snapshot,
+    iq: ComplexArray,
+    ranges: FloatArray,
+    spacing: float,
+    noise: FloatArray,
+    config: BathymetryConfig,
+) -> _Parts:
+    T, P = iq.shape
+    signal = _signal(snapshot, noise, np.ones(T))
+    return _Parts(
+        form=laplace.form_coefficients(iq, signal, noise),
+        base=np.zeros(T),
+        spread=np.empty((T, 0), np.complex128),
+        signal=signal,
+        log_determinant=P * np.log(noise) + np.log1p(P * signal / noise),
+        coherence=coherence.coherence(iq, abs(spacing))[0] if config.shadow_gate else np.ones(T),
+    )
+
+
+def _beside_surface(
+    snapshot: Snapshot,
+    iq: ComplexArray,
+    ranges: FloatArray,
+    spacing: float,
+    noise: FloatArray,
+    config: BathymetryConfig,
+) -> _Parts:
+    """With echoes by way of the surface as noise from where a flat floor would send them."""
+    T, P = iq.shape
+    level = 10.0 ** (0.1 * config.multipath_level_db)
+    sines = array.multipath_sines(
+        np.full(T, config.sonar_height), ranges, math.radians(config.tilt_deg), config.sonar_depth
+    )
+    signal = _signal(snapshot, noise, 1.0 + level * np.isfinite(sines).sum(axis=1))
+    step = 2.0 * math.pi * spacing
+    R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
+    form = interference.interference_form(iq, R)
+    return _Parts(
+        form=-signal[:, None] * form.beam,
+        base=form.base,
+        spread=form.spread,
+        signal=signal,
+        log_determinant=form.log_determinant,
+        coherence=interference.coherence_beside(form, abs(spacing)),
+    )
+
+
+def _heard(
+    usable: BoolArray, gamma: FloatArray, staves: int, spacing: float, config: BathymetryConfig
+) -> BoolArray:
+    if not config.shadow_gate:
+        return np.array(usable)
+    false_alarm = config.gate_false_alarm
+    silent = coherence.silent_bins(gamma, staves, spacing=spacing, false_alarm=false_alarm)
+    return usable & ~silent
+
+
+def _noise(snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig) -> FloatArray:
+    """Noise variance (T,) at a stave: from the snapshot, the config, the water column, or from
+    what is not coherent."""
+    known = snapshot.noise_variance
+    if known is not None and np.isfinite(known).all():
+        return np.array(known)
+    level = config.noise_variance
+    if not level > 0.0:
+        quiet = (ranges < WATER_COLUMN * config.sonar_height) & snapshot.usable
+        if quiet.sum() >= FEWEST_QUIET_BINS:
+            level = variances.noise_variance(snapshot.iq, quiet)
+        else:
+            level = variances.blind_noise_variance(snapshot.iq)
+    if not level > 0.0:
+        # Too few bins to tell noise from echo: suppose the 20 dB of a usual swath.
+        level = 0.01 * float(np.mean(variances.mean_power(snapshot.iq[snapshot.usable])))
+    noise = np.full(len(snapshot), level)
+    return noise if known is None else np.where(np.isfinite(known), known, noise)
+
+
+def _signal(snapshot: Snapshot, noise: FloatArray, echoes: FloatArray) -> FloatArray:
+    """Signal variance (T,) at a stave: from the snapshot, else a moving mean of the power, of
+    which the floor has one part in `echoes` (T,)."""
+    known = snapshot.signal_variance
+    if known is not None and np.isfinite(known).all():
+        return np.array(known)
+    power = np.where(snapshot.usable, variances.mean_power(snapshot.iq), 0.0)
+    signal = variances.signal_variance(power, noise, usable=snapshot.usable) / echoes
+    signal = np.fmax(signal, variances.LEAST_SNR * noise)
+    return signal if known is None else np.where(np.isfinite(known), known, signal)

@@ -1,0 +1,1 @@
+"""The diver tracker: divers from fixes or raw arrival times."""

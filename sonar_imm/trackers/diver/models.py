@@ -1,0 +1,333 @@
+"""The motion models a diver tracker can run side by side.
+
+All sets give the same outputs, position and velocity ``(px, py, vx, vy)``, through their output
+map E, and are stated at a reference step T but usable at any step dt: noises grow like the
+processes they stand for, and the chain has a rate generator. With ``u_j = (cos a_j, sin a_j)`` the
+heading of model j and ``w_j`` its left normal:
+
+heading_speed
+    State (x, y, s): the heading is in the model, the speed in the state. p += dt s u_j + wander
+    along w_j; s is a slow random walk; `hover` stands still.
+heading_speed_lateral
+    State (x, y, s, l): as above, with a lateral speed l that fades (Ornstein-Uhlenbeck), for
+    headings between the models.
+world_headings
+    State (px, py, vx, vy), but v is drawn afresh around s u_j with a speed s that is given.
+relative_headings
+    v' = R(a_j) v, p += dt v': model j turns by a_j once; model 0 goes straight.
+cv, cv_cv, cv_ct
+    The single-direction baselines: white-noise acceleration, quiet and lively, or with turns.
+
+Source: docs/diver.md; the multi-directional set after the paper, whose equations are partly lost:
+these are reconstructions.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import NamedTuple
+
+from attrs import field, frozen
+import numpy as np
+
+from ...estimation import markov
+from ...estimation.adaptation import Chain
+from ...measurements import FloatArray
+from .config import DiverConfig
+
+OUTPUTS = ('px', 'py', 'vx', 'vy')
+_CACHED_STEPS = 64
+
+BASELINE_NOISE = {'cv': (0.25,), 'cv_cv': (0.05, 0.6), 'cv_ct': (0.1, 0.3, 0.3)}
+"""Acceleration noise, m/s^2, that suits divers: tuned on the scene of the paper's Table 1."""
+
+
+class Motion(NamedTuple):
+    """One step of all models: x <- F x + B + N(0, Q). F, Q (M, n, n), B (M, n)."""
+
+    F: FloatArray
+    Q: FloatArray
+    B: FloatArray
+
+
+@frozen(eq=False)
+class ModelSet:
+    """M models over a common state of n components.
+
+    names: of the models; E: (M, 4, n) outputs; chain: the law of switching; start: state
+    components after the position for a new track, mean and variance, (n - 2,) each; initial: (M,)
+    model probabilities of a new track.
+    """
+
+    names: tuple[str, ...]
+    E: FloatArray
+    chain: Chain
+    start_mean: FloatArray
+    start_variance: FloatArray
+    initial: FloatArray
+    _motion: Callable[[float], Motion]
+    _cache: OrderedDict[float, Motion] = field(factory=OrderedDict, init=False)
+
+    @property
+    def n(self) -> int:
+        return int(self.E.shape[2])
+
+    def motion(self, dt: float) -> Motion:
+        """The models over a step of dt seconds, dt >= 0."""
+        found = self._cache.get(dt)
+        if found is None:
+            found = self._cache[dt] = Motion(*map(np.ascontiguousarray, self._motion(dt)))
+            if len(self._cache) > _CACHED_STEPS:
+                self._cache.popitem(last=False)
+        return found
+
+    def new_track(
+        self, position: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x (M, n), P (M, n, n), mu (M,) of a track first seen at `position` (2,) with
+        `covariance` (2, 2)."""
+        M, n = len(self.names), self.n
+        x = np.tile(np.concatenate([position, self.start_mean]), (M, 1))
+        P = np.zeros((M, n, n))
+        P[:, :2, :2] = covariance
+        P[:, range(2, n), range(2, n)] = self.start_variance
+        return x, P, self.initial.copy()
+
+
+def build_models(config: DiverConfig) -> ModelSet:
+    """The model set that `config` names."""
+    return {
+        'heading_speed': _heading_speed,
+        'heading_speed_lateral': _heading_speed_lateral,
+        'world_headings': _world_headings,
+        'relative_headings': _relative_headings,
+        'cv': _single_direction,
+        'cv_cv': _single_direction,
+        'cv_ct': _single_direction,
+    }[config.model_set](config)
+
+
+def _headings(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """u (M, 2), w (M, 2) and the names."""
+    angle = 2.0 * np.pi * np.arange(config.directions) / config.directions
+    u = np.column_stack([np.cos(angle), np.sin(angle)])
+    w = np.column_stack([-np.sin(angle), np.cos(angle)])
+    return (
+        u,
+        w,
+        tuple(f'heading_{360 * j // config.directions:03d}' for j in range(config.directions)),
+    )
+
+
+def _chain(config: DiverConfig, matrix: FloatArray) -> markov.RateChain:
+    if config.transition_matrix:
+        matrix = np.reshape(config.transition_matrix, matrix.shape)
+    return markov.RateChain(matrix, config.reference_step)
+
+
+def _initial(config: DiverConfig, models: int) -> FloatArray:
+    if config.initial_probabilities:
+        return np.array(config.initial_probabilities)
+    return np.full(models, 1.0 / models)
+
+
+def _outer(v: FloatArray) -> FloatArray:
+    """v v^T for each row: (M, 2) -> (M, 2, 2)."""
+    return np.asarray(v[:, :, None] * v[:, None, :])
+
+
+def _heading_speed(config: DiverConfig) -> ModelSet:
+    u, w, names = _headings(config)
+    P = markov.persistent_headings(
+        config.directions, config.stay_probability, config.heading_concentration
+    )
+    if config.hover:
+        P = markov.with_hover(P, config.hover_enter, config.hover_stay)
+        u, w, names = np.vstack([u, np.zeros(2)]), np.vstack([w, np.zeros(2)]), (*names, 'hover')
+    M, T = len(names), config.reference_step
+    E = np.zeros((M, 4, 3))
+    E[:, :2, :2] = np.eye(2)
+    E[:, 2:, 2] = u
+    wander = config.lateral_noise**2 * _outer(w)
+    if config.hover:
+        wander[-1] = config.hover_noise**2 * np.eye(2)
+    speed_rate = config.speed_noise**2 / T
+
+    def motion(dt: float) -> Motion:
+        F, Q = np.tile(np.eye(3), (M, 1, 1)), np.zeros((M, 3, 3))
+        F[:, :2, 2] = dt * u
+        Q[:, :2, :2] = wander * (dt / T) + speed_rate * dt**3 / 3.0 * _outer(u)
+        Q[:, :2, 2] = Q[:, 2, :2] = speed_rate * dt**2 / 2.0 * u
+        Q[:, 2, 2] = speed_rate * dt
+        return Motion(F, Q, np.zeros((M, 3)))
+
+    return ModelSet(
+        names,
+        E,
+        _chain(config, P),
+        np.array([config.speed_mean]),
+        np.array([config.speed_std**2]),
+        _initial(config, M),
+        motion,
+    )
+
+
+def _heading_speed_lateral(config: DiverConfig) -> ModelSet:
+    base = _heading_speed(config)
+    M = len(base.names)
+    u = base.E[:, 2:, 2]
+    w = np.column_stack([-u[:, 1], u[:, 0]])
+    E = np.zeros((M, 4, 4))
+    E[:, :, :3] = base.E
+    E[:, 2:, 3] = w
+    variance, fade = config.lateral_speed_std**2, config.lateral_speed_time
+
+    def motion(dt: float) -> Motion:
+        small = base.motion(dt)
+        F, Q = np.zeros((M, 4, 4)), np.zeros((M, 4, 4))
+        F[:, :3, :3], Q[:, :3, :3] = small.F, small.Q
+        keep = np.exp(-dt / fade)
+        reach = fade * (1.0 - keep)
+        F[:, 3, 3] = keep
+        F[:, :2, 3] = reach * w
+        along = 2.0 * variance * (fade * dt - 2.0 * fade * reach + 0.5 * fade**2 * (1.0 - keep**2))
+        cross = variance * fade * (1.0 - keep) ** 2
+        Q[:, :2, :2] += along * _outer(w)
+        Q[:, :2, 3] = Q[:, 3, :2] = cross * w
+        Q[:, 3, 3] = variance * (1.0 - keep**2)
+        return Motion(F, Q, np.zeros((M, 4)))
+
+    return ModelSet(
+        base.names,
+        E,
+        base.chain,
+        np.append(base.start_mean, 0.0),
+        np.append(base.start_variance, variance),
+        base.initial,
+        motion,
+    )
+
+
+def _velocity_state(M: int) -> FloatArray:
+    return np.tile(np.eye(4), (M, 1, 1))
+
+
+def _world_headings(config: DiverConfig) -> ModelSet:
+    u, _, names = _headings(config)
+    M, T = len(names), config.reference_step
+    P = markov.persistent_headings(
+        config.directions, config.stay_probability, config.heading_concentration
+    )
+    variance = config.velocity_noise**2
+
+    def motion(dt: float) -> Motion:
+        F, Q = np.zeros((4, 4)), np.zeros((4, 4))
+        F[:2, :2] = np.eye(2)
+        Q[:2, :2] = variance * T * dt * np.eye(2)
+        Q[2:, 2:] = variance * np.eye(2)
+        Q[:2, 2:] = Q[2:, :2] = variance * min(T, dt) * np.eye(2)
+        return Motion(
+            np.tile(F, (M, 1, 1)),
+            np.tile(Q, (M, 1, 1)),
+            config.fixed_speed * np.hstack([dt * u, u]),
+        )
+
+    return ModelSet(
+        names,
+        _velocity_state(M),
+        _chain(config, P),
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        _initial(config, M),
+        motion,
+    )
+
+
+def _relative_headings(config: DiverConfig) -> ModelSet:
+    u, _, _ = _headings(config)
+    M, T = len(u), config.reference_step
+    names = tuple(f'turn_{360 * j // M:03d}' for j in range(M))
+    turning = markov.persistent_headings(M, config.stay_probability, config.heading_concentration)[
+        0
+    ]
+    chain: Chain = (
+        _chain(config, turning[None].repeat(M, 0))
+        if config.transition_matrix
+        else markov.EventChain(turning, T)
+    )
+    R = np.stack([np.stack([u[:, 0], -u[:, 1]], -1), np.stack([u[:, 1], u[:, 0]], -1)], -2)
+    rate = config.velocity_noise**2 / T
+
+    def motion(dt: float) -> Motion:
+        F, Q = np.tile(np.eye(4), (M, 1, 1)), _white_acceleration(rate, 0.0, dt)
+        F[:, :2, 2:], F[:, 2:, 2:] = dt * R, R
+        return Motion(F, np.tile(Q, (M, 1, 1)), np.zeros((M, 4)))
+
+    return ModelSet(
+        names,
+        _velocity_state(M),
+        chain,
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        _initial(config, M),
+        motion,
+    )
+
+
+def _white_acceleration(rate: float, turn: float, dt: float) -> FloatArray:
+    """Process noise of a velocity that walks at random, `rate` (m/s)^2 a second, while it turns by
+    `turn` rad/s: the exact integral, so steps compose."""
+    angle = turn * dt
+    lag = (angle - np.sin(angle)) / angle**3 if abs(angle) > 1e-2 else 1.0 / 6.0 - angle**2 / 120.0
+    along, across = 0.5 * dt**2 * np.sinc(0.5 * angle / np.pi) ** 2, dt**2 * angle * lag
+    Q = np.empty((4, 4))
+    Q[:2, :2] = 2.0 * rate * dt**3 * lag * np.eye(2)
+    Q[:2, 2:] = rate * np.array([[along, across], [-across, along]])
+    Q[2:, :2] = Q[:2, 2:].T
+    Q[2:, 2:] = rate * dt * np.eye(2)
+    return Q
+
+
+def _single_direction(config: DiverConfig) -> ModelSet:
+    turn = np.deg2rad(config.turn_rate_deg)
+    names, turns = {
+        'cv': (('cv',), (0.0,)),
+        'cv_cv': (('cv_quiet', 'cv_lively'), (0.0, 0.0)),
+        'cv_ct': (('cv', 'ct_left', 'ct_right'), (0.0, turn, -turn)),
+    }[config.model_set]
+    M = len(names)
+    noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
+    rates = [value**2 * config.reference_step for value in noise]
+    stay = config.baseline_stay_probability
+    P = np.full((M, M), (1.0 - stay) / max(M - 1, 1))
+    np.fill_diagonal(P, stay if M > 1 else 1.0)
+
+    def motion(dt: float) -> Motion:
+        return Motion(
+            np.stack([_turning(turn, dt) for turn in turns]),
+            np.stack([_white_acceleration(*both, dt) for both in zip(rates, turns)]),
+            np.zeros((M, 4)),
+        )
+
+    return ModelSet(
+        names,
+        _velocity_state(M),
+        _chain(config, P),
+        np.zeros(2),
+        np.full(2, config.velocity_std**2),
+        _initial(config, M),
+        motion,
+    )
+
+
+def _turning(rate: float, dt: float) -> FloatArray:
+    """Transition of (px, py, vx, vy) under a constant turn rate, rad/s, counter-clockwise."""
+    F = np.eye(4)
+    angle = rate * dt
+    # sin(a)/rate and (1 - cos(a))/rate, whose limits at rate 0 are dt and 0
+    along = dt * np.sinc(angle / np.pi)
+    across = dt * np.sin(0.5 * angle) * np.sinc(0.5 * angle / np.pi)
+    F[:2, 2:] = [[along, -across], [across, along]]
+    F[2:, 2:] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return F

@@ -1,0 +1,1 @@
+"""The fathometer tracker: sub-bottom reflectors from array noise or traces."""

@@ -1,0 +1,238 @@
+"""Parameters of the fathometer tracker, each with its unit, range and meaning."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from attrs import frozen
+import numpy as np
+
+from ...acoustics.fathometer import PROCESSORS
+from ...acoustics.spectra import WINDOWS
+from ...estimation.set_particles import PRIORS
+from ...parameters import Config, parameter
+
+live = partial(parameter, read_only=False)
+
+PULSES = ('band', 'gaussian', 'file')
+PROPOSALS = ('data', 'prior')
+
+
+@frozen(kw_only=True)
+class FathometerConfig(Config):
+    """Everything the fathometer tracker can be told."""
+
+    # -- array and sound --------------------------------------------------------------------------
+    phones: int = parameter(
+        32, 'phones of the array; 0: as many as the first record has', low=0, high=256
+    )
+    element_spacing: float = parameter(
+        0.18, 'distance between phones', unit='m', low=1e-4, high=100.0
+    )
+    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
+    array_depth: float = parameter(
+        0.0,
+        'depth of the deepest phone, where neither the record nor a companion instrument tells; '
+        '0: depths are counted from it',
+        unit='m',
+        low=0.0,
+        high=12000.0,
+    )
+    array_depth_age: float = parameter(
+        30.0, 'a depth from the companion is used so long', unit='s', low=0.0, high=86400.0
+    )
+    array_depth_std: float = live(
+        0.03,
+        'error of the depth of the array as it is told, a part of the error of every reflector; '
+        '0: depths are judged as seen from the array',
+        unit='m',
+        low=0.0,
+        high=1000.0,
+    )
+
+    # -- from pressure to cross-spectra -----------------------------------------------------------
+    snapshot_seconds: float = parameter(
+        1.4, 'length of a snapshot', unit='s', low=1e-3, high=1000.0
+    )
+    overlap: float = parameter(0.5, 'share that snapshots have in common', low=0.0, high=0.95)
+    window: str = parameter('hann', 'window of a snapshot', choices=WINDOWS)
+    record_seconds: float = parameter(
+        89.6, 'pressure averaged for one record', unit='s', low=1e-3, high=86400.0
+    )
+    preview_seconds: float = parameter(
+        0.0,
+        'an estimate that is not committed, from the sliding average, so often; 0: none',
+        unit='s',
+        low=0.0,
+        high=86400.0,
+    )
+
+    # -- from cross-spectra to a depth response ---------------------------------------------------
+    processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
+    loading: float = live(
+        1e-2, 'mvdr: diagonal loading, in units of the mean phone power', low=0.0, high=1e6
+    )
+    white_noise_gain_db: float = live(
+        -3.0,
+        'white_noise: least gain, against the most there is',
+        unit='dB',
+        low=-60.0,
+        high=-0.01,
+    )
+    frequency_min: float = parameter(50.0, 'lower edge of the band', unit='Hz', low=0.0, high=1e6)
+    frequency_max: float = parameter(
+        4000.0, 'upper edge of the band', unit='Hz', low=1.0, high=1e6
+    )
+    depth_min: float = parameter(
+        0.0,
+        'least depth of a reflector; 0 together with depth_max: the whole trace, or 10 m to 110 m '
+        'below the array',
+        unit='m',
+        low=0.0,
+        high=12000.0,
+    )
+    depth_max: float = parameter(
+        0.0, 'greatest depth of a reflector', unit='m', low=0.0, high=12000.0
+    )
+    depth_step: float = parameter(
+        0.0,
+        'distance of the depths that are told apart; 0: as the trace has it, or a sixth of the '
+        'shortest half wavelength',
+        unit='m',
+        low=0.0,
+        high=100.0,
+    )
+    noise_depth_min: float = live(
+        180.0,
+        'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
+        'the whole trace when it does not reach there',
+        unit='m',
+        low=0.0,
+        high=12000.0,
+    )
+    noise_depth_max: float = live(
+        300.0, 'end of the depths where noise is measured', unit='m', low=0.0, high=12000.0
+    )
+    noise_sigma: float = live(
+        0.0, 'standard deviation of the noise; 0: as the trace says, else measured', low=0.0
+    )
+    remove_background: bool = live(
+        False, 'take the median of the noise off the trace first: for envelopes'
+    )
+
+    # -- pulse ------------------------------------------------------------------------------------
+    pulse: str = parameter(
+        'band',
+        'what one reflector leaves on the response: that of a flat band, a Gaussian, or from a '
+        'file',
+        choices=PULSES,
+    )
+    pulse_width: float = parameter(
+        0.5, 'gaussian: its standard deviation', unit='m', low=1e-4, high=100.0
+    )
+    pulse_file: str = parameter(
+        '', 'file: a CSV of two columns, distance in m from 0 on, and value'
+    )
+
+    # -- the set of reflectors --------------------------------------------------------------------
+    order_min: int = parameter(1, 'least number of reflectors', low=0, high=64)
+    order_max: int = parameter(12, 'greatest number of reflectors', low=1, high=64)
+    order_switch_probability: float = parameter(
+        0.05, 'that a record has one reflector more, and one less', low=0.0, high=0.5
+    )
+    order_transition_matrix: tuple[float, ...] = parameter(
+        (),
+        'transition matrix of the number of reflectors, row-major, row = from; empty: '
+        'order_switch_probability',
+        kind='float[]',
+        low=0.0,
+        high=1.0,
+    )
+    depth_std: float = parameter(
+        0.1, 'how far a reflector moves from record to record', unit='m', low=1e-4, high=100.0
+    )
+    min_separation: float = parameter(
+        0.4, 'least distance of two reflectors', unit='m', low=1e-4, high=1000.0
+    )
+    amplitude_prior: str = parameter(
+        'marginal',
+        'amplitudes integrated out, or the best ones with a fine of log(N)/2 or log(N) for each',
+        choices=PRIORS,
+    )
+    amplitude_std_sigmas: float = parameter(
+        7.5,
+        'marginal: standard deviation of amplitudes, in units of the noise',
+        low=0.01,
+        high=1e6,
+    )
+    amplitude_memory: float = parameter(
+        0.0,
+        'marginal: how much of its amplitude a reflector keeps from record to record; 0: none',
+        low=0.0,
+        high=0.9999,
+    )
+
+    # -- computation ------------------------------------------------------------------------------
+    particles: int = parameter(20_000, 'sets of reflectors tried', low=2, high=10_000_000)
+    proposal: str = parameter(
+        'data',
+        'where particles go: where the record has peaks, or blindly (the bootstrap filter)',
+        choices=PROPOSALS,
+    )
+    threads: int = parameter(
+        1, 'processor cores used; the result does not depend on it', low=1, high=256
+    )
+    seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
+    smoothing_lag: int = parameter(0, 'revise the estimate so many records later', low=0, high=100)
+
+    # -- output -----------------------------------------------------------------------------------
+    existence_min: float = live(
+        0.5, 'least probability with which a reflector is reported', low=0.0, high=1.0
+    )
+    track_memory: int = live(
+        5, 'a reflector not seen for so many records gets a new id', low=0, high=10_000
+    )
+
+    def check(self) -> list[str]:
+        problems = []
+        for low, high in (
+            ('frequency_min', 'frequency_max'),
+            ('noise_depth_min', 'noise_depth_max'),
+        ):
+            if getattr(self, low) >= getattr(self, high):
+                problems.append(f'{high} must exceed {low}')
+        if self.depth_max <= self.depth_min and (self.depth_min or self.depth_max):
+            problems.append('depth_max must exceed depth_min')
+        if self.order_max < self.order_min:
+            problems.append('order_max cannot be less than order_min')
+        elif self.order_transition_matrix:
+            problems += self._check_matrix()
+        if self.pulse == 'file' and not self.pulse_file:
+            problems.append('pulse file needs pulse_file')
+        if self.amplitude_memory and self.amplitude_prior != 'marginal':
+            problems.append('amplitude_memory needs amplitude_prior marginal')
+        if self.preview_seconds > self.record_seconds:
+            problems.append('preview_seconds cannot exceed record_seconds')
+        if self.record_seconds < self.snapshot_seconds:
+            problems.append('record_seconds cannot be less than snapshot_seconds')
+        return problems
+
+    def _check_matrix(self) -> list[str]:
+        orders = self.orders
+        if len(self.order_transition_matrix) != orders * orders:
+            return [
+                f'order_transition_matrix needs {orders} x {orders} = {orders * orders} values '
+                f'for order_min {self.order_min} to order_max {self.order_max}, got '
+                f'{len(self.order_transition_matrix)}'
+            ]
+        sums = np.reshape(self.order_transition_matrix, (orders, orders)).sum(axis=1)
+        return [
+            f'row {row} of order_transition_matrix sums to {total:.6g}, not 1'
+            for row, total in enumerate(sums)
+            if abs(total - 1.0) > 1e-6
+        ]
+
+    @property
+    def orders(self) -> int:
+        """How many numbers of reflectors are possible."""
+        return self.order_max - self.order_min + 1

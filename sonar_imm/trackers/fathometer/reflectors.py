@@ -1,0 +1,169 @@
+"""Reflectors as they are reported: depth, amplitude, identity.
+
+The filter knows sets; who is who from record to record is decided here, after it. A reflector
+found near one of the record before takes over its id, the nearest pair first; one that was missed
+is waited for `track_memory` records, and ids are never used again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from attrs import evolve, frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from ...acoustics.pulse import gram, Pulse
+from ...acoustics.spectra import window_overlap
+from ...estimates import Estimate
+from ...estimation.set_members import Members
+from ...measurements import FloatArray
+from .config import FathometerConfig
+from .response import Lattice, Response
+
+IdArray = NDArray[np.uint32]
+
+
+class Known(NamedTuple):
+    """A reflector that has an id: where it was last seen, and for how many records it was not."""
+
+    track_id: int
+    depth: float
+    missed: int
+
+
+@frozen
+class Identities:
+    """The ids given so far. A value: naming the reflectors of a record makes a new one."""
+
+    known: tuple[Known, ...] = ()
+    next_id: int = 1
+
+    def name(self, depth: FloatArray, config: FathometerConfig) -> tuple[Identities, IdArray]:
+        """Ids (K,) for reflectors at `depth` (K,) of the next record."""
+        ids = nearest_ids(depth, self.known, config)
+        new = np.flatnonzero(ids == 0)
+        ids[new] = self.next_id + np.arange(len(new))
+        seen = [Known(int(i), float(z), 0) for i, z in zip(ids, depth)]
+        missed = [
+            one._replace(missed=one.missed + 1)
+            for one in self.known
+            if one.track_id not in ids and one.missed < config.track_memory
+        ]
+        return Identities((*seen, *missed), self.next_id + len(new)), ids
+
+    def forget(self) -> Identities:
+        """No reflector is known any more; ids go on."""
+        return evolve(self, known=())
+
+
+def nearest_ids(depth: FloatArray, known: Sequence[Known], config: FathometerConfig) -> IdArray:
+    """Ids (K,) of the known reflectors that are near enough, the nearest pairs first; 0: none."""
+    ids = np.zeros(len(depth), np.uint32)
+    taken = np.zeros(len(known), np.bool_)
+    if not len(depth) or not known:
+        return ids
+    distance = np.abs(depth[:, None] - np.array([one.depth for one in known]))
+    records = 1.0 + np.array([one.missed for one in known])
+    reach = np.maximum(config.min_separation, 4.0 * config.depth_std * np.sqrt(records))
+    for place in np.argsort(distance, axis=None, kind='stable'):
+        row, column = divmod(int(place), len(known))
+        if not ids[row] and not taken[column] and distance[row, column] <= reach[column]:
+            ids[row], taken[column] = known[column].track_id, True
+    return ids
+
+
+@frozen(eq=False)
+class Reflectors:
+    """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
+    covariance (K, 2, 2) of both, existence (K,)."""
+
+    depth: FloatArray
+    amplitude: FloatArray
+    covariance: FloatArray
+    existence: FloatArray
+
+
+def reflectors_of(
+    members: Members,
+    response: Response,
+    lattice: Lattice,
+    pulse: Pulse,
+    config: FathometerConfig,
+) -> Reflectors:
+    """Members of the set in cells and units of the noise, as reflectors in m and amplitudes."""
+    depth = lattice.first + lattice.step * members.place
+    sigma = np.interp(depth, response.depth, response.sigma)
+    covariance = members.covariance.copy()
+    # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
+    covariance[:, 0, 0] += 1.0 / 12.0
+    covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse, config)
+    scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
+    covariance *= scale[:, :, None] * scale[:, None, :]
+    # The particles know depths as they follow from the depth told with this record: it alone fixes
+    # them to some centimetres, so that the errors of earlier records have no say.
+    covariance[:, 0, 0] += config.array_depth_std**2
+    return Reflectors(depth, sigma * members.amplitude, covariance, members.existence)
+
+
+def _conditional_variance(
+    depth: FloatArray, prior_variance: FloatArray, pulse: Pulse, config: FathometerConfig
+) -> FloatArray:
+    """Of amplitudes (K,) in units of the noise, all places given; prior_variance (K,) from a
+    memory, or of amplitudes drawn anew."""
+    ridge = 1.0 / prior_variance if config.amplitude_prior == 'marginal' else 1e-9
+    precision = gram(pulse, depth) + ridge * np.eye(len(depth))
+    return np.diag(np.linalg.pinv(precision, hermitian=True)).clip(min=0.0)
+
+
+def relative_amplitude(
+    reflectors: Reflectors, response: Response, config: FathometerConfig
+) -> FloatArray:
+    """Amplitudes (K,) freed of spreading and of the window, in m: A (2 H + L) / taper(tau / T), H
+    below the array of length L, tau = 2 H / c, T the length of a snapshot. NaN when the depth of
+    the array is not known."""
+    height = reflectors.depth - response.reference_depth
+    share = 2.0 * height / (config.sound_speed * config.snapshot_seconds)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        taper = window_overlap(config.window, share) if response.aperture else 1.0
+        return np.asarray(reflectors.amplitude * (2.0 * height + response.aperture) / taper)
+
+
+def write_estimate(
+    reflectors: Reflectors,
+    ids: IdArray,
+    pmf: FloatArray,
+    response: Response,
+    config: FathometerConfig,
+    *,
+    preview: bool = False,
+) -> Estimate:
+    """One row a reflector; without any, one row whose depth is NaN, for the PMF's sake."""
+    rows = max(1, len(ids))
+    state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
+    extras = {
+        'track_id': np.zeros(rows, np.uint32),
+        'existence': np.zeros(rows),
+        'relative_amplitude': np.full(rows, np.nan),
+        'sigma': np.full(rows, float(np.median(response.sigma))),
+        'preview': np.full(rows, int(preview), np.uint8),
+    }
+    if len(ids):
+        state[:] = np.column_stack([reflectors.depth, reflectors.amplitude])
+        covariance[:] = reflectors.covariance
+        extras['track_id'][:] = ids
+        extras['existence'][:] = reflectors.existence
+        extras['relative_amplitude'][:] = relative_amplitude(reflectors, response, config)
+    zero = np.zeros(rows)
+    return Estimate(
+        stamp_ns=response.stamp_ns,
+        frame_id=response.frame_id,
+        xyz=np.column_stack([zero, zero, -state[:, 0]]).astype(np.float32),
+        state_names=('depth', 'amplitude'),
+        state=state,
+        covariance=covariance,
+        model_names=tuple(f'order_{k}' for k in range(config.order_min, config.order_max + 1)),
+        probabilities=np.tile(pmf, (rows, 1)),
+        extras=extras,
+    )

@@ -1,0 +1,291 @@
+"""Reflectors below the sea floor, their number unknown and changing, from the noise of the sea.
+
+    pressure -> cross-spectra (`pressure`)
+             -> depth response (`response`): traces come in here
+             -> multiple-model particle filter (`estimation.set_filter`)
+             -> reflectors with ids (`reflectors`) -> one estimate a record
+
+Records are minutes of averaging apart, so that each is taken in once and for good: one that is
+late or repeated is counted and dropped. The random numbers of a record come from its own stamp.
+
+With a `smoothing_lag`, `process` gives the revised estimate of an earlier record before that of
+the newest. A preview is the newest, too, but leaves the filter as it was: windows that overlap are
+not independent, and taking them for that invents reflectors.
+
+Source: docs/fathometer.md, after C. Yardim, P. Gerstoft, Z.-H. Michalopoulou, *Passive fathometer
+reflector identification with multiple model particle filtering*.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right, insort
+from collections import Counter, deque
+import math
+from typing import Any
+
+from attrs import evolve, frozen
+import numpy as np
+
+from ...acoustics.pulse import independent_samples
+from ...estimates import Estimate
+from ...estimation.history import StampGate
+from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
+from ...estimation.set_members import find_members
+from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
+from ...measurements import ArrayDepth, CrossSpectra, FloatArray, Pressure, Rejection, Trace
+from .config import FathometerConfig
+from .pressure import PressureStream
+from .reflectors import Identities, Known, nearest_ids, Reflectors, reflectors_of, write_estimate
+from .response import (
+    array_response,
+    Lattice,
+    lattice_of_array,
+    lattice_of_trace,
+    pulse_of,
+    rank_deficient,
+    Response,
+    trace_response,
+)
+
+__all__ = ['FathometerConfig', 'FathometerTracker']
+
+_MAX_GAP_NS = 30 * 86_400 * 10**9
+_RESTART_AFTER = 3
+_DEPTHS_KEPT = 10_000
+
+
+@frozen(eq=False)
+class _Taken:
+    """A record that was taken in: what was seen and how it was named."""
+
+    response: Response
+    named: tuple[Known, ...]
+
+
+class FathometerTracker:
+    """The tracker of `trackers.Tracker` for reflectors: `process` takes `Pressure`,
+    `CrossSpectra`, `Trace` and `ArrayDepth`.
+
+    response: the depth response of the newest record or preview, for display; None before.
+    """
+
+    def __init__(self, config: FathometerConfig):
+        self.config = config
+        self.pulse = pulse_of(config)
+        self.reset()
+
+    def reset(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.response: Response | None = None
+        self._ids = Identities()
+        self._gate: StampGate[Any] = StampGate(0, _MAX_GAP_NS, _RESTART_AFTER)
+        self._array_depths: list[tuple[int, float]] = []
+        self._forget()
+
+    def _forget(self) -> None:
+        """Begin anew, but for counts and ids."""
+        self._newest_ns = 0
+        self._phones = self.config.phones
+        self._stream = PressureStream(self.config, self.counts)
+        self._ids = self._ids.forget()
+        self._lattice: Lattice | None = None
+        self._filter: SetFilter | None = None
+        self._known: Weighted | None = None
+        self._smoother = LagSmoother(self.config.smoothing_lag)
+        self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
+        self._health: dict[str, float] = {}
+
+    def reconfigure(self, config: FathometerConfig) -> None:
+        self.config.require_changeable(config)
+        self.config = config
+
+    def warm(self) -> None:
+        depth = 0.05 * np.arange(200)
+        config = evolve(
+            self.config, depth_min=0.0, depth_max=0.0, depth_step=0.05, min_separation=0.05
+        )
+        tracker = FathometerTracker(evolve(config, particles=8, threads=1))
+        amplitude = np.exp(-np.square((depth - 5.0) / 0.1)) + 0.01 * np.sin(31.0 * depth)
+        for second in (1, 2):
+            trace = Trace(stamp_ns=second * 10**9, depth=depth, amplitude=amplitude)
+            tracker.process(trace)
+
+    def health(self) -> dict[str, float]:
+        """Numbers of the last record: effective sample size, log evidence against an empty one,
+        noise, most probable number of reflectors; and phones left out, snapshots waiting."""
+        return {**self._health, 'snapshots_waiting': float(self._stream.waiting)}
+
+    def process(self, measurement: Any) -> list[Estimate]:
+        if isinstance(measurement, ArrayDepth):
+            self._hear_depth(measurement)
+            return []
+        if not isinstance(measurement, (Pressure, CrossSpectra, Trace)):
+            self.counts['unknown_type'] += 1
+            return []
+        if measurement.stamp_ns == self._newest_ns:
+            self.counts['duplicate'] += 1
+            return []
+        judgement = self._gate.judge(measurement.stamp_ns, measurement)
+        judgement.count_in(self.counts)
+        if judgement.verdict == 'restart':
+            self._forget()
+        estimates: list[Estimate] = []
+        for item in sorted(judgement.released, key=lambda one: one.stamp_ns):
+            self._newest_ns = item.stamp_ns
+            try:
+                estimates += self._take(item)
+            except Rejection as rejection:
+                self.counts[rejection.reason] += 1
+        return estimates
+
+    def _take(self, item: Pressure | CrossSpectra | Trace) -> list[Estimate]:
+        if isinstance(item, Trace):
+            depth = self._array_depth(item, 0)
+            if self._lattice is None:
+                self._begin(lattice_of_trace(item, self.config))
+            assert self._lattice is not None
+            known = math.nan if depth is None else depth
+            return self._record(trace_response(item, self._lattice, self.config, known))
+        self._count_phones(item)
+        if isinstance(item, CrossSpectra):
+            return self._record(self._hear(item, 0))
+        records, previews = self._stream.push(item)
+        self.counts['blocks'] += 1
+        span_ns = round(self.config.record_seconds * 1e9)
+        estimates = [one for each in records for one in self._record(self._hear(each, span_ns))]
+        return estimates + [self._preview(self._hear(each, span_ns)) for each in previews]
+
+    def _count_phones(self, item: Pressure | CrossSpectra) -> None:
+        if self._phones and item.phones != self._phones:
+            raise Rejection(
+                'wrong_phones', f'the array has {item.phones} phones, not {self._phones}'
+            )
+        self._phones = item.phones
+        if not item.alive.all():
+            self.counts['dead_phones_masked'] += 1
+        self._health['dead_phones'] = float((~item.alive).sum())
+
+    # -- where the array is -----------------------------------------------------------------------
+
+    def _hear_depth(self, depth: ArrayDepth) -> None:
+        insort(self._array_depths, (depth.stamp_ns, depth.depth))
+        del self._array_depths[:-_DEPTHS_KEPT]
+        self.counts['array_depths'] += 1
+
+    def _array_depth(self, item: CrossSpectra | Trace, span_ns: int) -> float | None:
+        """As the record says; else the mean of what the companion said over `span_ns` before its
+        stamp; else the companion's nearest word, unless too old; else as configured."""
+        if item.reference_depth is not None:
+            return item.reference_depth
+        stamps = [stamp for stamp, _ in self._array_depths]
+        low = bisect_left(stamps, item.stamp_ns - span_ns)
+        high = bisect_right(stamps, item.stamp_ns)
+        if high > low:
+            return float(np.mean([depth for _, depth in self._array_depths[low:high]]))
+        near = self._array_depths[max(0, low - 1) : high + 1]
+        if near:
+            stamp, depth = min(near, key=lambda one: abs(one[0] - item.stamp_ns))
+            if abs(stamp - item.stamp_ns) <= self.config.array_depth_age * 1e9:
+                return depth
+        self.counts['array_depth_unknown'] += not self.config.array_depth
+        return self.config.array_depth or None
+
+    # -- one record -------------------------------------------------------------------------------
+
+    def _hear(self, record: CrossSpectra, span_ns: int) -> Response:
+        if rank_deficient(record):
+            self.counts['rank_deficient'] += 1
+        depth = self._array_depth(record, span_ns) or 0.0
+        if self._lattice is None:
+            self._begin(lattice_of_array(depth, self.config))
+        assert self._lattice is not None
+        return array_response(record, self._lattice, self.config, depth)
+
+    def _begin(self, lattice: Lattice) -> None:
+        try:
+            self._filter = SetFilter(
+                set_model(self.config, lattice), self.config.particles, self.config.threads
+            )
+        except ValueError as error:
+            raise Rejection('too_crowded', str(error)) from None
+        self._lattice = lattice
+
+    def _try(self, response: Response) -> Step:
+        """What this record would change."""
+        assert self._filter is not None
+        b = np.ascontiguousarray(response.amplitude / response.sigma)
+        self.response = response
+        return self._filter.step(self._known, b, (self.config.seed, response.stamp_ns))
+
+    def _record(self, response: Response) -> list[Estimate]:
+        step = self._try(response)
+        self._known = step.after if step.ok else None
+        self.counts['used'] += 1
+        self.counts['unexplained'] += not step.ok
+        reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
+        self._ids, ids = self._ids.name(reflectors.depth, self.config)
+        self._taken.append(_Taken(response, self._ids.known))
+        self._health.update(
+            effective_sample_size=step.effective,
+            log_evidence=step.log_evidence,
+            sigma=float(np.median(response.sigma)),
+            order=float(self.config.order_min + int(np.argmax(pmf))),
+        )
+        newest = write_estimate(reflectors, ids, pmf, response, self.config)
+        return [*self._smoothed(step), newest]
+
+    def _preview(self, response: Response) -> Estimate:
+        step = self._try(response)
+        reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
+        _, ids = self._ids.name(reflectors.depth, self.config)
+        self.counts['previews'] += 1
+        return write_estimate(reflectors, ids, pmf, response, self.config, preview=True)
+
+    def _smoothed(self, newest: Step) -> list[Estimate]:
+        """The record `smoothing_lag` ago, seen with all since."""
+        found = self._smoother.push(newest)
+        if found is None:
+            return []
+        step, w = found
+        response = self._taken[0].response
+        reflectors, pmf = self._reflectors(step, w, step.sets, response)
+        # A reflector that only smoothing finds so early has its id from a later record.
+        ids = np.zeros(len(reflectors.depth), np.uint32)
+        for taken in self._taken:
+            free = [one for one in taken.named if one.track_id not in ids]
+            missing = np.flatnonzero(ids == 0)
+            ids[missing] = nearest_ids(reflectors.depth[missing], free, self.config)
+        return [write_estimate(reflectors, ids, pmf, response, self.config)]
+
+    def _reflectors(
+        self, step: Step, w: FloatArray, sets: Sets, response: Response
+    ) -> tuple[Reflectors, FloatArray]:
+        """Those of the most probable number, and the PMF (orders,) of the number."""
+        assert self._filter is not None and self._lattice is not None
+        pmf, sums = self._filter.summary(step, w, sets)
+        most = self.config.order_min + int(np.argmax(pmf))
+        separation = self._filter.model.separation
+        members = find_members(sums, separation, most, self.config.existence_min)
+        return reflectors_of(members, response, self._lattice, self.pulse, self.config), pmf
+
+
+def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
+    """What the particle filter assumes. Raises ValueError when the most reflectors do not fit."""
+    pulse, step = pulse_of(config), lattice.step
+    transition = banded_transition(config.orders, config.order_switch_probability)
+    if config.order_transition_matrix:
+        transition = np.reshape(config.order_transition_matrix, (config.orders, config.orders))
+    blind = config.proposal == 'prior'
+    return SetModel(
+        cells=lattice.cells,
+        separation=max(1, math.ceil(config.min_separation / step - 1e-6)),
+        order_min=config.order_min,
+        transition=transition,
+        move=gaussian_move(config.depth_std / step),
+        gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells))),
+        amplitude_prior=config.amplitude_prior,
+        amplitude_std=config.amplitude_std_sigmas,
+        independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
+        amplitude_memory=config.amplitude_memory,
+        **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
+    )

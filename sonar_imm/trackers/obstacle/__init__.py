@@ -1,0 +1,1 @@
+"""The obstacle tracker: obstacles ahead of a vehicle, with their vertical offset."""

@@ -1,0 +1,231 @@
+"""Parameters of the obstacle tracker, each with its unit, range and meaning."""
+
+from __future__ import annotations
+
+from attrs import frozen
+
+from ...acoustics.geometry import AZIMUTH_MODELS
+from ...parameters import Config, parameter
+
+METHODS = ('gaussian_sum', 'seafloor', 'landmark')
+
+
+@frozen(kw_only=True)
+class ObstacleConfig(Config):
+    """Everything the obstacle tracker can be told. The defaults fit a Blueview P450 on a survey
+    AUV."""
+
+    method: str = parameter(
+        'gaussian_sum',
+        'how the vertical offset is treated: estimated by a Gaussian sum over depth slices, '
+        'assumed on the sea floor (the paper), or estimated by one filter in world coordinates',
+        choices=METHODS,
+    )
+    components: int = parameter(9, 'depth slices of gaussian_sum', low=1, high=201)
+
+    # -- where the sonar sits and how things are written -----------------------------------------
+    sonar_lever: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        'from the navigation reference to the sonar, x forward, y port, z up (vehicle FLU)',
+        unit='m',
+        low=-100.0,
+        high=100.0,
+    )
+    sonar_mount_rpy_deg: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        'roll, pitch, yaw of the sonar in the vehicle (FLU: pitch positive nose down)',
+        unit='deg',
+        low=-180.0,
+        high=180.0,
+    )
+    azimuth_model: str = parameter(
+        'plane',
+        'what a bearing is: of the vertical plane of the echo, or of the cone a linear array '
+        'measures',
+        choices=AZIMUTH_MODELS,
+    )
+    bearing_positive: str = parameter(
+        'port', 'side to which bearings of detections count up', choices=('port', 'starboard')
+    )
+    beam_axes: str = parameter(
+        'auto',
+        'axes of the beam vectors of SonarRanges and sonar images: marine (z forward, y to '
+        'starboard, as their definition says), rep103 (x forward, y to port), or by which of the '
+        'two the beams point along',
+        choices=('marine', 'rep103', 'auto'),
+    )
+    nav_twist_frame: str = parameter(
+        'child',
+        'axes of the twist of the navigation: those of the vehicle, as Odometry defines it, or '
+        'those of the world',
+        choices=('child', 'world'),
+    )
+    ping_timing: str = parameter(
+        'instant',
+        'instant: an echo belongs to the pose at its stamp; two_way: bearing belongs to the pose '
+        'when the echo arrived, range to the mean of both ways',
+        choices=('instant', 'two_way'),
+    )
+    sound_speed: float = parameter(
+        1500.0,
+        'speed of sound: for two_way, and for travel times that come without one',
+        unit='m/s',
+        low=1300.0,
+        high=1700.0,
+    )
+    world_frame_convention: str = parameter(
+        'enu',
+        'axes of the navigation: enu (world ENU, body FLU) or ned (world NED, body FRD)',
+        choices=('enu', 'ned'),
+    )
+    depth_is_absolute: bool = parameter(
+        True, "the navigation's vertical is zero at the sea surface: nothing lies higher than that"
+    )
+
+    # -- what the sonar measures -----------------------------------------------------------------
+    range_std: float = parameter(
+        0.15, 'error of a range that comes without variance', unit='m', low=1e-6, high=100.0
+    )
+    bearing_std_deg: float = parameter(
+        0.25, 'error of a bearing that comes without variance', unit='deg', low=1e-6, high=45.0
+    )
+    range_step: float = parameter(
+        0.17, 'sampling step of such a range, adds step^2 / 12', unit='m', low=0.0, high=100.0
+    )
+    bearing_step_deg: float = parameter(
+        0.18, 'sampling step of such a bearing, adds step^2 / 12', unit='deg', low=0.0, high=45.0
+    )
+    max_range: float = parameter(
+        100.0, 'range to which the sonar sees', unit='m', low=1.0, high=10000.0
+    )
+    horizontal_fov_deg: float = parameter(
+        45.0, 'full width of the sector', unit='deg', low=1.0, high=170.0
+    )
+    vertical_fov_deg: float = parameter(
+        15.0, 'full height of the beam', unit='deg', low=0.5, high=90.0
+    )
+    detection_probability: float = parameter(
+        0.9, 'that a ping shows an obstacle in the beam', low=0.01, high=0.9999
+    )
+    clutter_density: float = parameter(
+        0.05,
+        'false detections of a ping for each metre of range and radian of bearing',
+        unit='1/(m rad)',
+        low=1e-9,
+        high=1e4,
+    )
+    outlier_probability: float = parameter(
+        0.02, 'that a detection inside the gate is not the obstacle', low=0.0, high=0.5
+    )
+    gate_probability: float = parameter(
+        0.9995,
+        'chi-square probability inside which a detection may belong to a track',
+        low=0.5,
+        high=0.9999999,
+    )
+
+    # -- what is believed of depth and navigation ------------------------------------------------
+    max_offset: float = parameter(
+        0.0,
+        'largest vertical offset believed of a new obstacle; 0: what beam, surface and altitude '
+        'allow',
+        unit='m',
+        low=0.0,
+        high=1000.0,
+    )
+    altitude_std: float = parameter(
+        0.1, 'error of an altitude that comes without variance', unit='m', low=1e-6, high=100.0
+    )
+    max_altitude_age: float = parameter(
+        5.0, 'age to which an altitude is used', unit='s', low=0.0, high=3600.0
+    )
+    scale_std: float = parameter(
+        0.003,
+        "scale error of the navigation's horizontal distances against sonar ranges",
+        low=0.0,
+        high=0.2,
+    )
+    position_noise: float = parameter(
+        0.01, 'random walk of the horizontal position', unit='m/sqrt(s)', low=0.0, high=10.0
+    )
+    yaw_noise_deg: float = parameter(
+        0.02, 'random walk of the yaw', unit='deg/sqrt(s)', low=0.0, high=10.0
+    )
+    depth_noise: float = parameter(
+        0.01, 'random walk of the depth', unit='m/sqrt(s)', low=0.0, high=10.0
+    )
+
+    # -- tracks ----------------------------------------------------------------------------------
+    max_tracks: int = parameter(40, 'most obstacles at once', low=1, high=2000)
+    confirm_hits: int = parameter(
+        4, 'hits within confirm_window that confirm a track', low=1, high=100, read_only=False
+    )
+    confirm_window: int = parameter(
+        6, 'pings looked at for confirmation', low=1, high=100, read_only=False
+    )
+    delete_misses: int = parameter(
+        10,
+        'consecutive misses, while the obstacle is in the beam, that end a confirmed track',
+        low=1,
+        high=10000,
+        read_only=False,
+    )
+    max_coast: float = parameter(
+        60.0,
+        'time without a hit that ends any track',
+        unit='s',
+        low=0.01,
+        high=1e6,
+        read_only=False,
+    )
+
+    # -- time ------------------------------------------------------------------------------------
+    max_navigation_gap: float = parameter(
+        1.0,
+        'longest time between two poses that is interpolated; pings in longer gaps are skipped',
+        unit='s',
+        low=0.001,
+        high=3600.0,
+    )
+    max_extrapolation: float = parameter(
+        0.0,
+        'time by which a ping may be newer than the newest pose and still be used at once; 0: it '
+        'waits for the next pose',
+        unit='s',
+        low=0.0,
+        high=10.0,
+    )
+    history: float = parameter(
+        5.0,
+        'how late a measurement may be and still be used, in its right place',
+        unit='s',
+        low=0.0,
+        high=600.0,
+    )
+    max_gap: float = parameter(
+        600.0,
+        'a stamp further ahead than this is doubted until the following ones agree',
+        unit='s',
+        low=1.0,
+        high=1e8,
+    )
+    restart_after: int = parameter(
+        5,
+        'consecutive agreeing stamps outside history and max_gap that count as a restarted clock',
+        low=2,
+        high=1000,
+    )
+    seed: int = parameter(0, 'of random numbers; this tracker draws none', low=0, high=2**31 - 1)
+
+    def check(self) -> list[str]:
+        problems = [
+            f'{name} needs three values, got {len(getattr(self, name))}'
+            for name in ('sonar_lever', 'sonar_mount_rpy_deg')
+            if len(getattr(self, name)) != 3
+        ]
+        if self.confirm_hits > self.confirm_window:
+            problems.append(
+                f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '
+                f'({self.confirm_window})'
+            )
+        return problems

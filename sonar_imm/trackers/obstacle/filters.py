@@ -1,0 +1,331 @@
+"""What is known of an obstacle, and how a ping changes it: one filter a method.
+
+`DepthSlices` is the default. The vertical offset d_st shows in two ways: while the vehicle rolls,
+an obstacle above and one below the sonar swing to opposite sides; and on the approach the range
+closes more slowly the further off the course in the vertical the obstacle lies, whether above or
+below. Both are so weak at first, and the second so ambiguous, that no single Gaussian holds what
+is known. So the vertical reach of the beam is cut into slices, each slice is an unscented Kalman
+filter over (d, delta, z, s), and their likelihoods say in which of them the obstacle is. The state
+that stays constant is the obstacle's own depth z; d_st follows from it and the vehicle's depth.
+
+With a single slice that is nailed to the sea floor below the vehicle the same filter is the
+paper's (`seafloor`). `Landmark` keeps one Gaussian in world coordinates instead.
+
+Everything is in NED and FRD; T targets, K components. Component weights mu (T, K).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...acoustics import geometry
+from ...acoustics.geometry import Pose
+from ...estimation import kalman, unscented
+from ...estimation.association import gate_threshold
+from ...measurements import FloatArray
+from . import kernels as kernels
+from .config import ObstacleConfig
+
+BAND = 0.9
+"""Probability of the interval `low` to `high`."""
+
+BEAM_MARGIN = 1.6
+"""A new obstacle lies within this many half beams of the axis: an edge is not sharp."""
+
+
+class Sonar(NamedTuple):
+    """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
+    when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise."""
+
+    pose: Pose
+    altitude: float = np.nan
+    late: Pose | None = None
+    late_by: float = 0.0
+
+
+class Mixture(NamedTuple):
+    """x (T, K, n), P (T, K, n, n), mu (T, K)."""
+
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+
+    def rows(self, which: np.ndarray) -> Mixture:
+        return Mixture(self.x[which], self.P[which], self.mu[which])
+
+    def joined(self, other: Mixture) -> Mixture:
+        return Mixture(*(np.concatenate(both) for both in zip(self, other)))
+
+
+class View(NamedTuple):
+    """A mixture in words a user knows, all (T, ...): range, azimuth and vertical offset with their
+    covariance; the interval of the offset; probability that the obstacle is above; its place in
+    the world with covariance."""
+
+    state: FloatArray
+    covariance: FloatArray
+    low: FloatArray
+    high: FloatArray
+    above: FloatArray
+    place: FloatArray
+    place_covariance: FloatArray
+
+
+class DepthSlices:
+    """A Gaussian sum over depth slices, states (d, delta, z, s)."""
+
+    n = 4
+
+    def __init__(self, config: ObstacleConfig):
+        self.config = config
+        self.seafloor = config.method == 'seafloor'
+        self.K = 1 if self.seafloor else config.components
+        self.cone = config.azimuth_model == 'cone'
+        self.scale = 0.0 if self.seafloor else config.scale_std
+        self.outlier_density = _outlier_density(config)
+        self._noise = (
+            config.position_noise**2,
+            np.radians(config.yaw_noise_deg) ** 2,
+            config.depth_noise**2,
+        )
+
+    def ready(self, sonar: Sonar) -> bool:
+        """Whether a target can begin: the sea floor has to be known for `seafloor`."""
+        return not self.seafloor or bool(np.isfinite(sonar.altitude))
+
+    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+        """New targets from detections z (B, 2), R (B, 2, 2)."""
+        B = len(z)
+        x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
+        x[..., :2] = z[:, None]
+        P[..., :2, :2] = R[:, None]
+        P[..., 3, 3] = self.scale**2
+        lowest, highest = depth_span(z, sonar, self.config)
+        width = (highest - lowest) / self.K
+        # Slices above and below the sonar in pairs: on a level path they stay equally probable.
+        first = np.round((2.0 * lowest + width) / width) * 0.5 * width
+        slices = first[:, None] + np.arange(self.K) * width[:, None]
+        x[..., 2] = sonar.pose.position[2] + slices
+        P[..., 2, 2] = np.square(0.5 * width)[:, None]
+        fresh = self._nailed(Mixture(x, P, np.full((B, self.K), 1.0 / self.K)), sonar)
+        for _ in range(2 if sonar.late else 0):  # the shift hardly depends on where it starts
+            fresh.x[..., :2] += z[:, None] - self._echo(fresh, sonar)
+        return fresh
+
+    def advance(self, known: Mixture, before: Sonar, after: Sonar, dt: float) -> Mixture:
+        """The targets as the sonar will see them `dt` seconds later."""
+        known = self._nailed(known, before)
+        noise = np.array(self._noise) * dt
+        x, P = kernels.advance(known.x, known.P, *before.pose, *after.pose, noise, self.cone)
+        return Mixture(x, P, known.mu)
+
+    def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
+        without the sonar's own error."""
+        return self._echo(known, sonar), np.ascontiguousarray(known.P[..., :2, :2])
+
+    def update(
+        self, known: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
+    ) -> tuple[Mixture, FloatArray]:
+        """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,)."""
+        wild = self.config.outlier_probability
+        *after, nis = kernels.soft_update(*known, h, z, R, wild, self.outlier_density)
+        return Mixture(*after), nis
+
+    def view(self, known: Mixture, sonar: Sonar) -> View:
+        """See `View`."""
+        x, P, mu = known
+        offset = x[..., 2] - sonar.pose.position[2]
+        three = np.concatenate([x[..., :2], offset[..., None]], axis=-1)
+        mean = np.einsum('tk,tki->ti', mu, three)
+        spread = three - mean[:, None]
+        covariance = np.einsum('tk,tkij->tij', mu, P[..., :3, :3])
+        covariance += np.einsum('tk,tki,tkj->tij', mu, spread, spread)
+        std = np.sqrt(P[..., 2, 2])
+        low, high, above = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
+        place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
+        return View(mean, kalman.symmetrise(covariance), low, high, above, *place)
+
+    def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+        """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
+        m = kernels.points(known.x, *sonar.pose, self.cone)
+        spread = np.sqrt(known.P[..., 2, 2]) / known.x[..., 0]
+        inside = np.einsum('tk,tk->t', known.mu, _in_beam(m, spread, self.config))
+        return inside, _ahead(np.einsum('tk,tki->ti', known.mu, m))
+
+    def _echo(self, known: Mixture, sonar: Sonar) -> FloatArray:
+        """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
+        arrives, and the mean of the ranges out and back."""
+        if sonar.late is None:
+            return np.ascontiguousarray(known.x[..., :2])
+        out = kernels.points(known.x, *sonar.pose, self.cone)
+        return _two_way(out, sonar, self.config)
+
+    def _nailed(self, known: Mixture, sonar: Sonar) -> Mixture:
+        """For `seafloor`: the depth is the sea floor's, whatever was measured."""
+        if not self.seafloor or not np.isfinite(sonar.altitude):
+            return known
+        x, P = known.x.copy(), known.P.copy()
+        x[..., 2] = sonar.pose.position[2] + sonar.altitude
+        P[..., 2, :] = P[..., :, 2] = 0.0
+        P[..., 2, 2] = self.config.altitude_std**2
+        return Mixture(x, P, known.mu)
+
+
+class Landmark:
+    """One Gaussian a target over its place in the world, north, east, depth, and the scale of the
+    navigation: the unscented filter a navigator would write first."""
+
+    n = 4
+    K = 1
+
+    def __init__(self, config: ObstacleConfig):
+        self.config = config
+        self.model = config.azimuth_model
+        self._noise = (config.position_noise**2, config.depth_noise**2)
+
+    def ready(self, sonar: Sonar) -> bool:
+        return True
+
+    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+        lowest, highest = depth_span(z, sonar, self.config)
+        seen = np.zeros((len(z), 4))
+        seen[:, :2], seen[:, 2] = z, sonar.pose.position[2] + 0.5 * (lowest + highest)
+        covariance = np.zeros((len(z), 4, 4))
+        covariance[:, :2, :2] = R
+        covariance[:, 2, 2] = np.square(highest - lowest) / 12.0
+        covariance[:, 3, 3] = self.config.scale_std**2
+
+        def place(points: FloatArray) -> FloatArray:
+            m = kernels.points(points, *sonar.pose, self.model == 'cone')
+            return np.concatenate([geometry.to_world(sonar.pose, m), points[..., 3:]], axis=-1)
+
+        moved = unscented.unscented_transform(place, seen, covariance)
+        return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
+
+    def advance(self, known: Mixture, before: Sonar, after: Sonar, dt: float) -> Mixture:
+        """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
+        level, depth = (part * dt for part in self._noise)
+        F = np.eye(4)
+        F[:2, 3] = (before.pose.position - after.pose.position)[:2]
+        x, P = kalman.predict(known.x, known.P, F, np.diag([level, level, depth, 0.0]))
+        return Mixture(x, P, known.mu)
+
+    def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        seen = unscented.unscented_transform(
+            lambda points: self._echo(points, sonar), known.x, known.P, angles=_ANGLES
+        )
+        return seen.mean, seen.covariance
+
+    def update(
+        self, known: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
+    ) -> tuple[Mixture, FloatArray]:
+        after = unscented.update(
+            known.x, known.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
+            angles=_ANGLES,
+        )  # fmt: skip
+        return Mixture(after.x, after.P, known.mu), after.nis[:, 0]
+
+    def view(self, known: Mixture, sonar: Sonar) -> View:
+        x, P = known.x[:, 0], known.P[:, 0]
+
+        def words(points: FloatArray) -> FloatArray:
+            m = geometry.to_body(sonar.pose, points[..., :3])
+            offset = points[..., 2] - sonar.pose.position[2]
+            return np.stack([*geometry.project(m, self.model), offset], axis=-1)
+
+        seen = unscented.unscented_transform(words, x, P, angles=np.array([False, True, False]))
+        std = np.sqrt(seen.covariance[:, 2:, 2])
+        low, high, above = kernels.bands(
+            np.ascontiguousarray(seen.mean[:, 2:]), std, known.mu, 0.5 * (1.0 - BAND)
+        )
+        return View(seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3])
+
+    def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+        m = geometry.to_body(sonar.pose, known.x[:, 0, :3])
+        spread = np.sqrt(known.P[:, 0, 2, 2]) / np.linalg.norm(m, axis=-1)
+        return _in_beam(m, spread, self.config), _ahead(m)
+
+    def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
+        out = geometry.to_body(sonar.pose, points[..., :3])
+        if sonar.late is None:
+            return np.stack(geometry.project(out, self.model), axis=-1)
+        return _two_way(out, sonar, self.config)
+
+
+Filter = DepthSlices | Landmark
+
+
+def build_filter(config: ObstacleConfig) -> Filter:
+    """The filter `config.method` names."""
+    return Landmark(config) if config.method == 'landmark' else DepthSlices(config)
+
+
+def depth_span(
+    z: FloatArray, sonar: Sonar, config: ObstacleConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Smallest and largest vertical offset (B,) that detections z (B, 2) can have: inside the
+    beam, below the surface, above the sea floor."""
+    a, b, c = sonar.pose.R[2]
+    d, delta = z.T
+    k = a * np.cos(delta) + b * np.sin(delta)
+    edge = np.radians(min(0.5 * BEAM_MARGIN * config.vertical_fov_deg, 85.0))
+    ends = d * (k * np.cos(edge) + c * np.array([[-1.0], [1.0]]) * np.sin(edge))
+    lowest, highest = ends.min(axis=0), ends.max(axis=0)
+    if config.max_offset > 0.0:
+        lowest, highest = (
+            np.maximum(lowest, -config.max_offset),
+            np.minimum(highest, config.max_offset),
+        )
+    least = 0.02 * d
+    if np.isfinite(sonar.altitude):
+        highest = np.minimum(highest, max(sonar.altitude, 0.0) + least)
+    if config.depth_is_absolute:
+        lowest = np.maximum(lowest, np.minimum(-sonar.pose.position[2], 0.0) - least)
+    # A beam that looks at nothing but rock or air shows an echo all the same: keep some reach.
+    middle = 0.5 * (lowest + highest)
+    half = np.maximum(0.5 * (highest - lowest), least)
+    return middle - half, middle + half
+
+
+_ANGLES = np.array([False, True])
+
+
+def _outlier_density(config: ObstacleConfig) -> float:
+    """Of a detection that passed the gate but is not the target's: uniform over a gate as wide as
+    the sonar's own error makes it."""
+    threshold = gate_threshold(config.gate_probability, 2)
+    range_std = np.sqrt(config.range_std**2 + config.range_step**2 / 12.0)
+    bearing_std = np.radians(np.hypot(config.bearing_std_deg, config.bearing_step_deg / 12.0**0.5))
+    return float(1.0 / (np.pi * threshold * range_std * bearing_std))
+
+
+def _two_way(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArray:
+    """Range and azimuth (..., 2) of points seen at `out` (..., 3) when the ping left."""
+    d_out = np.linalg.norm(out, axis=-1)
+    fraction = np.clip(2.0 * d_out / config.sound_speed / sonar.late_by, 0.0, 1.0)
+    late = geometry.predict(out, sonar.pose, sonar.late)
+    back = out + fraction[..., None] * (late - out)
+    d_back, azimuth = geometry.project(back, config.azimuth_model)
+    return np.stack([0.5 * (d_out + d_back), azimuth], axis=-1)
+
+
+def _in_beam(m: FloatArray, elevation_std: FloatArray, config: ObstacleConfig) -> FloatArray:
+    from scipy.special import ndtr
+
+    d = np.linalg.norm(m, axis=-1)
+    elevation = np.arcsin(np.clip(m[..., 2] / d, -1.0, 1.0))
+    half = np.radians(0.5 * config.vertical_fov_deg)
+    spread = np.maximum(elevation_std, 1e-6)
+    inside = ndtr((half - elevation) / spread) - ndtr((-half - elevation) / spread)
+    azimuth = np.arctan2(m[..., 1], m[..., 0])
+    return inside * (
+        (np.abs(azimuth) <= np.radians(0.5 * config.horizontal_fov_deg)) & (d <= config.max_range)
+    )
+
+
+def _ahead(m: FloatArray) -> np.ndarray:
+    """Ahead means within 78 degrees of the axis: beyond, range and azimuth fix nothing."""
+    return m[..., 0] > 0.2 * np.linalg.norm(m, axis=-1)

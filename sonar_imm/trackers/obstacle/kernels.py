@@ -1,0 +1,316 @@
+"""The arithmetic of the obstacle filter, compiled: sigma points through the sonar's geometry.
+
+A target is K components of four states (d, delta, z, s): range m, azimuth rad positive to
+starboard, depth m of the obstacle, scale of the navigation's horizontal distances. A kernel takes
+x (T, K, 4) and P (T, K, 4, 4) of all targets at once; `cone` says which azimuth is meant. What a
+point and a projection are is told in `acoustics.geometry`; here they are written out again for
+speed, and where no point exists, as can happen at a sigma point, the nearest existing one is
+taken. Sigma points are on the columns of the Cholesky root with kappa = 1, so that no weight is
+negative and the centre weighs 1/5.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...estimation.jit import kernel
+
+FloatArray = NDArray[np.float64]
+
+KAPPA = 1.0
+NEGLIGIBLE = 1e-12
+"""A component that weighs less plays no part in a quantile or a place."""
+
+
+@kernel
+def root(P: FloatArray, L: FloatArray) -> None:
+    """Lower Cholesky root of a P that may be singular: a direction without variance has none."""
+    n = P.shape[0]
+    for b in range(n):
+        pivot = P[b, b]
+        for k in range(b):
+            pivot -= L[b, k] * L[b, k]
+        known = pivot <= 1e-14 * P[b, b] or not pivot > 0.0
+        L[b, b] = 0.0 if known else math.sqrt(pivot)
+        for a in range(b + 1, n):
+            value = P[a, b]
+            for k in range(b):
+                value -= L[a, k] * L[b, k]
+            L[a, b] = 0.0 if known else value / L[b, b]
+
+
+@kernel
+def point(d: float, delta: float, d_st: float, R: FloatArray, cone: bool, m: FloatArray) -> None:
+    """`geometry.reconstruct` into m (3,)."""
+    a, b, c = R[2, 0], R[2, 1], R[2, 2]
+    cosine, sine = math.cos(delta), math.sin(delta)
+    if cone:
+        m_y, r = d * sine, d * cosine
+        reach = r * math.sqrt(a * a + c * c)
+        eta = math.asin(min(1.0, max(-1.0, (d_st - b * m_y) / reach))) - math.atan2(a, c)
+        m[0], m[1], m[2] = r * math.cos(eta), m_y, r * math.sin(eta)
+    else:
+        k = a * cosine + b * sine
+        reach = d * math.sqrt(k * k + c * c)
+        eps = math.asin(min(1.0, max(-1.0, d_st / reach))) - math.atan2(k, c)
+        level = d * math.cos(eps)
+        m[0], m[1], m[2] = level * cosine, level * sine, d * math.sin(eps)
+
+
+@kernel
+def echo(m: FloatArray, cone: bool) -> tuple[float, float]:
+    """`geometry.project`: range and azimuth of m (3,)."""
+    d = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    if cone:
+        return d, math.asin(min(1.0, max(-1.0, m[1] / d)))
+    return d, math.atan2(m[1], m[0])
+
+
+@kernel
+def _to_world(R: FloatArray, m: FloatArray, world: FloatArray) -> None:
+    for i in range(3):
+        world[i] = R[i, 0] * m[0] + R[i, 1] * m[1] + R[i, 2] * m[2]
+
+
+@kernel
+def _sigma_point(x: FloatArray, L: FloatArray, number: int, y: FloatArray) -> None:
+    """Point `number` of 2n + 1 into y (n,): the centre, then plus and minus each column of L."""
+    n = len(x)
+    reach = math.sqrt(n + KAPPA)
+    for a in range(n):
+        y[a] = x[a]
+        if number > n:
+            y[a] -= reach * L[a, number - n - 1]
+        elif number > 0:
+            y[a] += reach * L[a, number - 1]
+
+
+@kernel
+def advance(
+    x: FloatArray,
+    P: FloatArray,
+    p0: FloatArray,
+    R0: FloatArray,
+    p1: FloatArray,
+    R1: FloatArray,
+    noise: FloatArray,
+    cone: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict what sonar pose (p1, R1) will see of what (p0, R0) saw, by the unscented transform.
+
+    noise (3,): variances the time between adds to horizontal position, azimuth and depth.
+    """
+    T, K, n = x.shape
+    x1, P1 = np.empty((T, K, n)), np.empty((T, K, n, n))
+    L, images = np.zeros((n, n)), np.empty((2 * n + 1, n))
+    y, m, world = np.empty(n), np.empty(3), np.empty(3)
+    weight = 0.5 / (n + KAPPA)
+    centre = KAPPA / (n + KAPPA)
+    for t in range(T):
+        for j in range(K):
+            root(P[t, j], L)
+            for number in range(2 * n + 1):
+                _sigma_point(x[t, j], L, number, y)
+                point(y[0], y[1], y[2] - p0[2], R0, cone, m)
+                _to_world(R0, m, world)
+                world[0] += (p0[0] - p1[0]) * (1.0 + y[3])
+                world[1] += (p0[1] - p1[1]) * (1.0 + y[3])
+                world[2] += p0[2] - p1[2]
+                for i in range(3):
+                    m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
+                images[number, 0], images[number, 1] = echo(m, cone)
+                images[number, 2], images[number, 3] = y[2], y[3]
+                turns = (images[number, 1] - images[0, 1]) / (2.0 * math.pi)
+                images[number, 1] -= 2.0 * math.pi * np.round(turns)
+            for a in range(n):
+                total = centre * images[0, a]
+                for number in range(1, 2 * n + 1):
+                    total += weight * images[number, a]
+                x1[t, j, a] = total
+            for a in range(n):
+                for b in range(a + 1):
+                    total = 0.0
+                    for number in range(2 * n + 1):
+                        share = centre if number == 0 else weight
+                        total += (
+                            share
+                            * (images[number, a] - x1[t, j, a])
+                            * (images[number, b] - x1[t, j, b])
+                        )
+                    P1[t, j, a, b] = total
+                    P1[t, j, b, a] = total
+            P1[t, j, 0, 0] += noise[0]
+            P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
+            P1[t, j, 2, 2] += noise[2]
+    return x1, P1
+
+
+@kernel
+def points(x: FloatArray, p: FloatArray, R: FloatArray, cone: bool) -> FloatArray:
+    """Where the means lie, seen from the sonar at (p, R): (T, K, 3)."""
+    T, K, _ = x.shape
+    out = np.empty((T, K, 3))
+    for t in range(T):
+        for j in range(K):
+            point(x[t, j, 0], x[t, j, 1], x[t, j, 2] - p[2], R, cone, out[t, j])
+    return out
+
+
+@kernel
+def locate(
+    x: FloatArray, P: FloatArray, mu: FloatArray, p: FloatArray, R: FloatArray, cone: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, 3) and covariance (T, 3, 3) of the targets' places in the world."""
+    T, K, n = x.shape
+    mean, covariance = np.zeros((T, 3)), np.zeros((T, 3, 3))
+    L, y, m = np.zeros((n, n)), np.empty(n), np.empty(3)
+    world = np.empty((K, 2 * n + 1, 3))
+    weight = 0.5 / (n + KAPPA)
+    centre = KAPPA / (n + KAPPA)
+    for t in range(T):
+        for j in range(K):
+            if mu[t, j] <= NEGLIGIBLE:
+                continue
+            root(P[t, j], L)
+            for number in range(2 * n + 1):
+                _sigma_point(x[t, j], L, number, y)
+                point(y[0], y[1], y[2] - p[2], R, cone, m)
+                _to_world(R, m, world[j, number])
+                share = mu[t, j] * (centre if number == 0 else weight)
+                for i in range(3):
+                    mean[t, i] += share * world[j, number, i]
+        for j in range(K):
+            if mu[t, j] <= NEGLIGIBLE:
+                continue
+            for number in range(2 * n + 1):
+                share = mu[t, j] * (centre if number == 0 else weight)
+                for a in range(3):
+                    for b in range(a + 1):
+                        covariance[t, a, b] += (
+                            share
+                            * (world[j, number, a] - mean[t, a])
+                            * (world[j, number, b] - mean[t, b])
+                        )
+        for a in range(3):
+            for b in range(a):
+                covariance[t, b, a] = covariance[t, a, b]
+            mean[t, a] += p[a]
+    return mean, covariance
+
+
+@kernel
+def soft_update(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    h: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    outlier_probability: float,
+    outlier_density: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Update with one detection a target that may be an outlier; range and azimuth are states.
+
+    h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). With probability beta the detection is
+    the target's, else it says nothing; both cases together are matched in mean and covariance.
+    Gives x, P, mu (T, K) and the normalised innovation squared (T,) of the mixture's mean.
+    """
+    T, K, n = x.shape
+    x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
+    g0, g1, k0, k1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    for t in range(T):
+        total = 0.0
+        v0 = v1 = 0.0
+        for j in range(K):
+            v0 += mu[t, j] * (z[t, 0] - h[t, j, 0])
+            v1 += mu[t, j] * (z[t, 1] - h[t, j, 1])
+        s00 = s01 = s11 = 0.0
+        for j in range(K):
+            e0, e1 = z[t, 0] - h[t, j, 0] - v0, z[t, 1] - h[t, j, 1] - v1
+            s00 += mu[t, j] * (P[t, j, 0, 0] + R[t, 0, 0] + e0 * e0)
+            s01 += mu[t, j] * (P[t, j, 0, 1] + R[t, 0, 1] + e0 * e1)
+            s11 += mu[t, j] * (P[t, j, 1, 1] + R[t, 1, 1] + e1 * e1)
+        nis[t] = (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / (s00 * s11 - s01 * s01)
+        for j in range(K):
+            r0, r1 = z[t, 0] - h[t, j, 0], z[t, 1] - h[t, j, 1]
+            s00 = P[t, j, 0, 0] + R[t, 0, 0]
+            s01 = P[t, j, 0, 1] + R[t, 0, 1]
+            s11 = P[t, j, 1, 1] + R[t, 1, 1]
+            determinant = s00 * s11 - s01 * s01
+            distance = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / determinant
+            own = (1.0 - outlier_probability) * math.exp(-0.5 * distance)
+            own /= 2.0 * math.pi * math.sqrt(determinant)
+            wild = outlier_probability * outlier_density
+            mu1[t, j] = mu[t, j] * (own + wild)
+            total += mu1[t, j]
+            beta = own / (own + wild) if own + wild > 0.0 else 0.0
+            for a in range(n):
+                g0[a], g1[a] = P[t, j, a, 0], P[t, j, a, 1]
+                k0[a] = (s11 * g0[a] - s01 * g1[a]) / determinant
+                k1[a] = (s00 * g1[a] - s01 * g0[a]) / determinant
+                x1[t, j, a] = x[t, j, a] + beta * (k0[a] * r0 + k1[a] * r1)
+            for a in range(n):
+                for b in range(a + 1):
+                    known = k0[a] * g0[b] + k1[a] * g1[b]
+                    spread = (k0[a] * r0 + k1[a] * r1) * (k0[b] * r0 + k1[b] * r1)
+                    value = P[t, j, a, b] - beta * known + beta * (1.0 - beta) * spread
+                    P1[t, j, a, b] = value
+                    P1[t, j, b, a] = value
+        for j in range(K):
+            mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
+    return x1, P1, mu1, nis
+
+
+@kernel
+def below(mean: FloatArray, std: FloatArray, mu: FloatArray, value: float) -> tuple[float, float]:
+    """Probability of a Gaussian mixture (K,) below `value`, and its density there."""
+    probability = density = 0.0
+    for j in range(len(mu)):
+        if mu[j] > NEGLIGIBLE:
+            u = (value - mean[j]) / std[j]
+            probability += 0.5 * mu[j] * math.erfc(-u / math.sqrt(2.0))
+            density += mu[j] * math.exp(-0.5 * u * u) / (std[j] * math.sqrt(2.0 * math.pi))
+    return probability, density
+
+
+@kernel
+def quantile(mean: FloatArray, std: FloatArray, mu: FloatArray, probability: float) -> float:
+    """The value (K components) below which a mixture lies with `probability`: Newton's steps,
+    halving the bracket where they leave it."""
+    low, high = np.inf, -np.inf
+    for j in range(len(mu)):
+        if mu[j] > NEGLIGIBLE:
+            low = min(low, mean[j] - 9.0 * std[j])
+            high = max(high, mean[j] + 9.0 * std[j])
+    value = 0.5 * (low + high)
+    for _ in range(100):
+        reached, density = below(mean, std, mu, value)
+        if reached < probability:
+            low = value
+        else:
+            high = value
+        step = (probability - reached) / density if density > 0.0 else np.inf
+        following = value + step
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        if abs(following - value) <= 1e-9 * (1.0 + abs(value)):
+            return following
+        value = following
+    return value
+
+
+@kernel
+def bands(
+    mean: FloatArray, std: FloatArray, mu: FloatArray, tail: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of mixtures (T, K): the quantiles `tail` and 1 - `tail`, and the probability below zero."""
+    T = len(mean)
+    low, high, negative = np.empty(T), np.empty(T), np.empty(T)
+    for t in range(T):
+        low[t] = quantile(mean[t], std[t], mu[t], tail)
+        high[t] = quantile(mean[t], std[t], mu[t], 1.0 - tail)
+        negative[t] = below(mean[t], std[t], mu[t], 0.0)[0]
+    return low, high, negative

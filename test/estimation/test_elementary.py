@@ -1,0 +1,58 @@
+"""exp of a row."""
+
+import numpy as np
+from scipy import stats
+
+from sonar_imm.estimation.elementary import exponentials, normals, phasors
+
+
+def row(values):
+    values = np.array(values, float)
+    out = np.empty_like(values)
+    exponentials(values, np.empty_like(values), out)
+    return out
+
+
+def test_exponentials_are_those_of_the_library():
+    values = np.concatenate([-np.logspace(-18, np.log10(699.0), 20_001), np.linspace(-2, 0, 9999)])
+    exact = np.exp(values)
+    assert (np.abs(row(values) - exact) <= 4e-16 * exact).all()
+    assert row([0.0])[0] == 1.0
+
+
+def test_what_is_impossible_is_zero():
+    assert (row([-np.inf, np.nan, -701.0, -1e300]) == 0.0).all()
+
+
+def test_a_row_gives_the_same_bits_however_it_is_cut():
+    values = -np.random.default_rng(1).exponential(30.0, 101)
+    whole = row(values)
+    assert all(row([value])[0] == one for value, one in zip(values, whole))
+
+
+def test_phasors_are_cosines_and_sines():
+    values = np.concatenate([np.linspace(-60.0, 60.0, 4001), [np.nan]])
+    cosine, sine = np.empty_like(values), np.empty_like(values)
+    phasors(values, 0.7, cosine, sine)
+    assert np.abs(cosine - np.cos(1.4 * np.pi * values))[:-1].max() < 1e-13
+    assert np.abs(sine - np.sin(1.4 * np.pi * values))[:-1].max() < 1e-13
+    assert np.isnan(cosine[-1]) and np.isnan(sine[-1])
+
+
+def test_normals_are_those_of_box_and_muller():
+    uniform = np.random.default_rng(1).random(10_000)
+    uniform[:3] = 0.0, 1.0 - 2.0**-53, 0.5
+    radius = np.sqrt(-2.0 * np.log1p(-uniform[:5000]))
+    angle = 2.0 * np.pi * uniform[5000:]
+    exact = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+    out = np.empty(10_000)
+    normals(uniform, out)
+    assert np.abs(out - exact).max() < 1e-13
+
+
+def test_normals_are_normal():
+    uniform = np.random.default_rng(2).random(200_000)
+    out = np.empty_like(uniform)
+    normals(uniform, out)
+    assert stats.kstest(out, 'norm').pvalue > 1e-3
+    assert abs(np.corrcoef(out[:100_000], out[100_000:])[0, 1]) < 0.015

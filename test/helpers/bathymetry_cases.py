@@ -1,0 +1,72 @@
+"""Snapshots for the bathymetry tests: the independent vectors, and small floors of our own."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from sonar_imm.acoustics import array
+from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
+
+
+def vector(name):
+    """A case: its arrays, the config that describes it, its snapshot."""
+    with np.load(VECTORS / f'{name}.npz') as archive:
+        case = dict(archive)
+    values = {
+        'sonar_height': float(case['H']),
+        'tilt_deg': math.degrees(case['tilt']),
+        'element_spacing_wavelengths': float(case['dlam']),
+        'transition_matrix': case['Pi'].ravel().tolist(),
+        'initial_probabilities': case['mu0'].tolist(),
+        'initial_std': float(case['sd0']),
+        'particles_per_model': 3000,
+        'shadow_gate': False,
+    }
+    if name.startswith('set_ii_'):
+        values |= {'model_set': 'height_two_rw', 'sigmas': case['sigmas'].tolist()}
+    elif name.startswith('set_iii'):
+        sigmas = [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()]
+        values |= {'model_set': 'angle_two_rw', 'sigmas_deg': sigmas}
+        values['initial_mean'] = float(case['th0'])
+    else:
+        values |= {
+            'model_set': 'height_rw_ncs',
+            'sigmas': [float(case['s_rw']), float(case['s_ncs'])],
+            'initial_slope_std': float(case['sb0']),
+            'redrawn_slope_std': float(case['gb']),
+        }
+    noise = np.full(len(case['r']), float(case['sn2']))
+    snapshot = Snapshot(
+        stamp_ns=1_000,
+        range=case['r'],
+        iq=case['Y'],
+        noise_variance=noise,
+        signal_variance=case['rho'] * noise,
+    )
+    return case, BathymetryConfig.from_mapping(values), snapshot
+
+
+def floor(height, *, seed=1, stamp_ns=1_000, snr_db=25.0, H=15.0, tilt_deg=30.0, P=8, **more):
+    """A snapshot of a floor of `height` (T,) or a number, noise variance 1."""
+    ranges = more.pop('ranges', 20.0 + 0.05 * np.arange(300))
+    height = np.broadcast_to(height, ranges.shape)
+    rng = np.random.default_rng(seed)
+    spacing, conjugate = more.pop('spacing', 0.5), more.pop('conjugate', False)
+    sine = array.direction_sine(H - height, ranges, math.radians(tilt_deg))
+
+    def circular(*shape):
+        return (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * math.sqrt(0.5)
+
+    y = (
+        10.0 ** (snr_db / 20.0)
+        * circular(len(ranges), 1)
+        * array.steering(sine, P, spacing, conjugate=conjugate)
+    )
+    y = (y + circular(len(ranges), P)) * np.sqrt(rng.exponential(size=(len(ranges), 1)))
+    y[more.pop('shadow', slice(0, 0))] = circular(1, P)
+    more.setdefault('noise_variance', np.ones(len(ranges)))
+    return Snapshot(stamp_ns=stamp_ns, range=ranges, iq=y.astype(np.complex64), **more)

@@ -1,0 +1,51 @@
+"""Small recordings with fixes and truth, written by the package itself."""
+
+import numpy as np
+
+from helpers.dive_scenes import legs, stamps
+from msg_adapters.estimates import write_truth
+from msg_adapters.fixes import write_fix
+from sonar_imm.measurements import Fix
+from sonar_imm.recordings.writer import BagWriter, ros_message
+
+FIX_SIGMA = 1.2
+
+
+def write_dive(path, *, count=120, seed=4, truth=True, topic='/fix', spoilt=(), shuffle=False):
+    """One diver, a fix a second, truth at half seconds; `spoilt` fixes have a NaN position."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(count) * 1.0
+    place = legs(times)[:, :2] + rng.normal(0.0, FIX_SIGMA, (count, 2))
+    order = np.arange(count)
+    if shuffle:
+        for pair in range(10, count - 1, 7):
+            order[[pair, pair + 1]] = order[[pair + 1, pair]]
+    with BagWriter(path) as bag:
+        if truth:
+            dense = np.arange(2 * count) * 0.5
+            for stamp, state in zip(stamps(dense), legs(dense)):
+                bag.write(
+                    '/truth/estimate',
+                    write_truth(
+                        state[None, :2],
+                        state[None, 2:],
+                        [0],
+                        stamp_ns=stamp,
+                        frame_id='map',
+                        make=ros_message,
+                    ),
+                    stamp,
+                )
+        stamp_ns = stamps(times)
+        for arrival, index in enumerate(order):
+            fix = Fix(
+                stamp_ns=stamp_ns[index],
+                position=[*place[index], 0.0],
+                frame_id='map',
+                covariance=np.eye(2) * FIX_SIGMA**2,
+            )
+            message = write_fix(fix, ros_message)
+            if index in spoilt:
+                message.pose.pose.position.x = float('nan')
+            bag.write(topic, message, stamp_ns[arrival])
+    return path

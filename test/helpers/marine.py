@@ -1,0 +1,103 @@
+"""The messages of marine_acoustic_msgs that are read, as rosbags makes them of a definition that a
+bag brings along: the package need not be installed."""
+
+from functools import cache
+
+import numpy as np
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+PACKAGE = 'marine_acoustic_msgs/msg/'
+DEFINITIONS = {
+    'PingInfo': 'float32 frequency\nfloat32 sound_speed\nfloat32[] tx_beamwidths\n'
+    'float32[] rx_beamwidths',
+    'DetectionFlag': 'uint8 flag',
+    'SonarDetections': 'std_msgs/Header header\nPingInfo ping_info\nDetectionFlag[] flags\n'
+    'float32[] two_way_travel_times\nfloat32[] tx_delays\n'
+    'float32[] intensities\nfloat32[] tx_angles\nfloat32[] rx_angles',
+    'SonarRanges': 'std_msgs/Header header\nPingInfo ping_info\nDetectionFlag[] flags\n'
+    'float32[] transmit_delays\nfloat32[] intensities\n'
+    'geometry_msgs/Vector3[] beam_unit_vec\nfloat32[] ranges',
+    'SonarImageData': 'bool is_bigendian\nuint32 dtype\nuint32 beam_count\nuint8[] data',
+    'RawSonarImage': 'std_msgs/Header header\nPingInfo ping_info\nfloat32 sample_rate\n'
+    'uint32 samples_per_beam\nuint32 sample0\nfloat32[] tx_delays\n'
+    'float32[] tx_angles\nfloat32[] rx_angles\nSonarImageData image',
+    'ProjectedSonarImage': 'std_msgs/Header header\nPingInfo ping_info\n'
+    'geometry_msgs/Vector3[] beam_directions\nfloat32[] ranges\n'
+    'SonarImageData image',
+}
+
+
+@cache
+def typestore():
+    types = get_typestore(Stores.ROS2_JAZZY)
+    found = {}
+    for name, text in DEFINITIONS.items():
+        found |= get_types_from_msg(text, PACKAGE + name)
+    types.register(found)
+    return types
+
+
+def floats(values):
+    return np.array(values, np.float32)
+
+
+def make(name, **fields):
+    """A message of the package, or of another by its full name."""
+    return typestore().types[name if '/' in name else PACKAGE + name](**fields)
+
+
+def header(sec=100, frame_id='sonar'):
+    return make(
+        'std_msgs/msg/Header',
+        frame_id=frame_id,
+        stamp=make('builtin_interfaces/msg/Time', sec=sec, nanosec=5),
+    )
+
+
+def ping_info(sound_speed=1500.0):
+    return make(
+        'PingInfo',
+        frequency=450e3,
+        sound_speed=sound_speed,
+        tx_beamwidths=floats([]),
+        rx_beamwidths=floats([]),
+    )
+
+
+def vectors(rows):
+    return [
+        make('geometry_msgs/msg/Vector3', x=float(x), y=float(y), z=float(z)) for x, y, z in rows
+    ]
+
+
+def sonar_ranges(beams, ranges, flags=(), intensities=(), **head):
+    return make(
+        'SonarRanges',
+        header=header(**head),
+        ping_info=ping_info(),
+        flags=[make('DetectionFlag', flag=flag) for flag in flags],
+        transmit_delays=floats([]),
+        intensities=floats(intensities),
+        beam_unit_vec=vectors(beams),
+        ranges=floats(ranges),
+    )
+
+
+def sonar_detections(times, rx_angles, flags=(), intensities=(), sound_speed=1500.0, **head):
+    return make(
+        'SonarDetections',
+        header=header(**head),
+        ping_info=ping_info(sound_speed),
+        flags=[make('DetectionFlag', flag=flag) for flag in flags],
+        two_way_travel_times=floats(times),
+        tx_delays=floats([]),
+        intensities=floats(intensities),
+        tx_angles=floats([]),
+        rx_angles=floats(rx_angles),
+    )
+
+
+def sent(message):
+    """The message after a way through CDR, as a bag gives it."""
+    types, name = typestore(), message.__msgtype__
+    return types.deserialize_cdr(bytes(types.serialize_cdr(message, name)), name)

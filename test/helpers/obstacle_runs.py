@@ -1,0 +1,159 @@
+"""Helpers of the obstacle tests: recorded approaches as measurements, runs, errors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.filters import build_filter, Sonar
+from sonar_imm.trackers.obstacle.navigation import Mount, NavigationBuffer
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+
+SECOND = 10**9
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'
+FAITHFUL = {
+    'components': 41,
+    'max_offset': 12.0,
+    'scale_std': 0.0,
+    'position_noise': 0.0,
+    'yaw_noise_deg': 0.0,
+    'depth_noise': 0.0,
+    'outlier_probability': 0.0,
+    'gate_probability': 0.9999999,
+    'max_tracks': 1,
+    'confirm_hits': 1,
+}
+"""A tracker that does what the exact posterior of the vectors does."""
+
+
+def meta(name):
+    return json.loads((VECTORS / 'approach_meta.json').read_text())[f'{name}.csv']
+
+
+def rows(name):
+    return np.genfromtxt(VECTORS / f'{name}.csv', delimiter=',', names=True)
+
+
+def navigation(row, stamp_ns):
+    return Navigation(
+        stamp_ns=stamp_ns,
+        position=[row['odom_x'], row['odom_y'], row['odom_z']],
+        orientation=[row['qx'], row['qy'], row['qz'], row['qw']],
+        frame_id='odom',
+    )
+
+
+def approach(name):
+    """The measurements of a vector file, ROS axes."""
+    out = []
+    for row in rows(name):
+        stamp = SECOND + round(row['t'] * SECOND)
+        seen = np.isfinite(row['meas_range'])
+        out.append(Altitude(stamp_ns=stamp, altitude=row['altitude']))
+        out.append(navigation(row, stamp))
+        out.append(
+            Detections(
+                stamp_ns=stamp,
+                range=[row['meas_range']] if seen else [],
+                bearing=[-row['meas_delta']] if seen else [],
+            )
+        )
+    return out
+
+
+def lever(name):
+    """Of a vector file, vehicle FLU."""
+    x, y, z = meta(name)['cfg']['lever']
+    return (x, -y, -z)
+
+
+def run(tracker, measurements):
+    """The last word on every ping, by stamp."""
+    final = {}
+    for measurement in measurements:
+        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(measurement))
+    return dict(sorted(final.items()))
+
+
+def track_approach(name, **values):
+    """The estimates of a vector file, ping by ping."""
+    config = ObstacleConfig(sonar_lever=lever(name), **values)
+    return list(run(ObstacleTracker(config), approach(name)).values())
+
+
+def track_scene(name, seed, overrides=None, **values):
+    """A simulated scene and the estimates of it."""
+    scene_config = scenario(name, overrides)
+    scene = simulate(scene_config, seed)
+    config = ObstacleConfig(
+        **{
+            'sonar_lever': scene_config.sonar_lever,
+            'sonar_mount_rpy_deg': scene_config.sonar_mount_rpy_deg,
+            'azimuth_model': scene_config.azimuth_model,
+            'ping_timing': scene_config.ping_timing,
+            **values,
+        }
+    )
+    return scene, run(ObstacleTracker(config), [one.measurement for one in scene.measurements])
+
+
+def followed(estimate, truth, ping, near=5.0):
+    """The row of the confirmed track that follows `truth` at number `ping`, None when there is
+    none."""
+    r, b = estimate.state[:, 0], estimate.state[:, 1]
+    true_r, true_b = truth.range[ping], truth.bearing[ping]
+    distance = np.hypot(
+        r * np.cos(b) - true_r * np.cos(true_b), r * np.sin(b) - true_r * np.sin(true_b)
+    )
+    good = (estimate.extras['track_state'] > 0) & (distance < near)
+    return int(np.argmin(np.where(good, distance, np.inf))) if good.any() else None
+
+
+def offset_at(scene, final, at_range):
+    """Error of the vertical offset of the first obstacle, its variance, its band's success and
+    P(above) when the range first falls to `at_range`; None when it is not tracked."""
+    truth = scene.truth[0]
+    for ping in np.flatnonzero(truth.range <= at_range)[:6]:
+        estimate = final.get(int(truth.stamp_ns[ping]))
+        row = None if estimate is None else followed(estimate, truth, ping)
+        if row is not None:
+            true = truth.vertical_offset[ping]
+            low, high = (estimate.extras[f'vertical_offset_{end}'][row] for end in ('lo', 'hi'))
+            return (
+                estimate.state[row, 2] - true,
+                estimate.covariance[row, 2, 2],
+                low <= true <= high,
+                estimate.probabilities[row, 0],
+            )
+    return None
+
+
+def mean_nis(final):
+    """Mean normalised innovation squared over all hits; 2 when all is right."""
+    values = np.concatenate([estimate.extras['nis'] for estimate in final.values()])
+    return float(np.nanmean(values))
+
+
+def follow(measurements, config):
+    """A vector file's obstacle without gate or track logic: NIS (n,) of each echo, and the last
+    view."""
+    tracker, mount = ObstacleTracker(config), Mount(config)
+    filter_, known, before, nis = build_filter(config), None, None, []
+    for i in range(0, len(measurements), 3):
+        altitude, pose, ping = measurements[i : i + 3]
+        sonar = Sonar(
+            mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
+        )
+        z, R = tracker._detections(ping)
+        if known is None:
+            known = filter_.begin(z, R, sonar)
+        else:
+            known = filter_.advance(known, before, sonar, 0.5)
+            if len(z):
+                h, _ = filter_.expected(known, sonar)
+                known, squared = filter_.update(known, h, z, R, sonar)
+                nis.append(squared[0])
+        before = sonar
+    return np.array(nis), filter_.view(known, sonar)

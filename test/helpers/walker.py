@@ -1,0 +1,112 @@
+"""A small real system for tests of the nodes: the walker. As a program, its node."""
+
+from collections import Counter
+import sys
+
+import attrs
+import numpy as np
+
+from msg_adapters.inputs import INPUTS
+from sonar_imm.estimates import Estimate
+from sonar_imm.parameters import Config, parameter
+from sonar_imm.trackers import System, SYSTEMS
+
+
+@attrs.frozen(kw_only=True)
+class WalkerConfig(Config):
+    """A walker who stays where he is, and one that is slow or fast."""
+
+    sound_speed: float = parameter(
+        1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0, read_only=False
+    )
+    fast_share: float = parameter(0.25, 'share of fast', low=0.0, high=1.0, read_only=False)
+    slow_share: float = parameter(0.75, 'share of slow', low=0.0, high=1.0, read_only=False)
+    steps: int = parameter(3, 'steps', low=1, high=9)
+    mood: str = parameter('calm', 'mood', choices=('calm', 'hasty'), read_only=False)
+    weights: tuple = parameter((), 'weights', kind='float[]', low=0.0, high=1.0, read_only=False)
+    offsets: tuple = parameter((0.5, 1.5), 'offsets', unit='m', low=-9.0, high=9.0)
+
+    def check(self):
+        if abs(self.fast_share + self.slow_share - 1.0) > 1e-9:
+            return ['fast_share and slow_share must sum to 1']
+        return []
+
+
+class WalkerTracker:
+    """The running mean of the fixes, in the order of their stamps; late ones revise it."""
+
+    def __init__(self, config):
+        self.config = config
+        self.counts = Counter()
+        self.explode = False
+        self.reset()
+
+    def reset(self):
+        self.fixes = {}
+
+    def reconfigure(self, config):
+        self.config = config
+
+    def warm(self):
+        pass
+
+    def health(self):
+        return {'NIS': 1.25, 'tracks': float(bool(self.fixes))}
+
+    def process(self, measurement):
+        if self.explode:
+            raise ZeroDivisionError('a bug')
+        if measurement.stamp_ns in self.fixes:
+            self.counts['duplicate'] += 1
+            return []
+        self.counts['used'] += 1
+        self.fixes[measurement.stamp_ns] = measurement
+        return [
+            self._estimate(stamp) for stamp in sorted(self.fixes) if stamp >= measurement.stamp_ns
+        ]
+
+    def _estimate(self, stamp):
+        used = [fix.position for key, fix in self.fixes.items() if key <= stamp]
+        x, y, z = np.mean(used, axis=0)
+        return Estimate(
+            stamp_ns=stamp,
+            frame_id=self.fixes[stamp].frame_id,
+            xyz=np.array([[x, y, z]] * 2, np.float32),
+            state_names=('px', 'py', 'vx', 'vy'),
+            state=np.array([[x, y, 0.5, -0.25]] * 2),
+            covariance=np.stack([np.diag([1.0, 2.0, 3.0, 4.0])] * 2),
+            model_names=('slow', 'fast'),
+            probabilities=np.array([[self.config.slow_share, self.config.fast_share]] * 2),
+            extras={
+                'track_id': np.array([7, 4], np.uint32),
+                'track_state': np.array([1, 2], np.uint8),
+                'nis': np.full(2, 0.5),
+            },
+        )
+
+
+class WalkerSystem(System):
+    """The walker, known by its classes instead of their names."""
+
+    def config_type(self):
+        return WalkerConfig
+
+    def build(self, config):
+        return WalkerTracker(config)
+
+
+def register(set_item):
+    """Make the walker known by ``set_item(mapping, key, value)``; it hears what divers do."""
+    set_item(SYSTEMS, 'walker', WalkerSystem('walker', '', '', '', 'test system'))
+    set_item(INPUTS, 'walker', INPUTS['diver'])
+
+
+def main():
+    from sonar_imm.nodes.base import run, TrackerNode
+
+    register(dict.__setitem__)
+    return run(lambda: TrackerNode('walker'))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,216 @@
+import csv
+
+import numpy as np
+import pymap3d
+import pytest
+
+from msg_adapters.estimates import read_estimate
+from sonar_imm.recordings.conversion import MOST_NAMED
+from sonar_imm.recordings.convert import (
+    ConversionReport,
+    convert_fixes,
+    convert_truth,
+    CsvOptions,
+    KINDS,
+)
+from sonar_imm.recordings.convert.truth import difference_velocity, number_names
+from sonar_imm.recordings.measurements import measurements_of
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.sources import BagError
+
+
+@pytest.fixture
+def convert(tmp_path):
+    def run(text, kind='fixes', **options):
+        source = tmp_path / 'in.csv'
+        source.write_text(text)
+        return KINDS[kind](source, tmp_path / 'out', **options)
+
+    return run
+
+
+def fixes_of(path):
+    with BagReader(path) as bag:
+        return [item.measurement for item in measurements_of(bag, 'diver')]
+
+
+def truth_of(path):
+    with BagReader(path) as bag:
+        return [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
+
+
+def test_bad_rows_are_named_by_line_and_the_rest_is_converted(convert):
+    report = convert('stamp,x,y\n5,1,2\n6,abc,2\n7,1\n8,nan,1\n9,1e12,1\n0,1,1\n4,3,4\n')
+    assert isinstance(report, ConversionReport)
+    assert (report.rows, report.bad_rows, report.messages) == (7, 5, {'/fix': 2})
+    assert [problem.split(':')[0] for problem in report.problems] == [
+        f'in.csv, line {line}' for line in (3, 4, 5, 6, 7)
+    ]
+    fixes = fixes_of(report.path)
+    assert [fix.stamp_ns for fix in fixes] == [4 * 10**9, 5 * 10**9]  # sorted by stamp
+    assert fixes[0].position.tolist() == [3.0, 4.0, 0.0] and fixes[0].frame_id == 'map'
+
+
+def test_many_bad_rows_are_counted_but_not_all_listed(convert):
+    report = convert('stamp,x,y\n5,1,2\n' + 'bad,1,2\n' * 500)
+    assert report.bad_rows == 500 and len(report.problems) == MOST_NAMED + 1
+
+
+def test_nothing_good_is_an_error_and_leaves_no_bag(convert, tmp_path):
+    with pytest.raises(BagError, match='line 2'):
+        convert('stamp,x,y\nbad,1,2\n')
+    with pytest.raises(BagError, match='nothing that could be converted'):
+        convert('stamp,x,y\n')
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(
+    'header, cells, covariance',
+    [
+        ('var_x,cov_xy,var_y', '4,1,9', [[4, 1], [1, 9]]),
+        ('var_x,var_y', '4,9', [[4, 0], [0, 9]]),
+        ('std_x,std_y', '2,3', [[4, 0], [0, 9]]),
+        ('accuracy', '3', [[9, 0], [0, 9]]),
+        ('sigma_east,sigma_north', '2,3', [[4, 0], [0, 9]]),
+        ('std', '', None),
+        ('std', '-1', None),
+        ('std', '0', None),
+        ('var_x,cov_xy,var_y', '-1,0,4', None),
+        ('var_x,cov_xy,var_y', '4,,9', None),
+        ('foo', '3', None),
+    ],
+)
+def test_uncertainty_in_every_form(convert, header, cells, covariance):
+    (fix,) = fixes_of(convert(f'stamp,x,y,{header}\n5,1,2,{cells}\n').path)
+    assert (None if fix.covariance is None else fix.covariance.tolist()) == covariance
+
+
+@pytest.mark.parametrize('cells', ['4,7,9', '1e300,0,1e308', '1e-300,0,1e-300', '1e-300,0,1'])
+def test_an_impossible_covariance_is_a_bad_row(convert, cells):
+    report = convert(f'stamp,x,y,var_x,cov_xy,var_y\n5,1,2,{cells}\n6,1,2,4,0,9\n')
+    assert report.bad_rows == 1 and 'line 2' in report.problems[0]
+
+
+def test_depth_points_down_and_z_up(convert):
+    (fix,) = fixes_of(convert('stamp,x,y,depth\n5,1,2,7\n').path)
+    assert fix.position[2] == -7.0
+
+
+def test_columns_units_and_delimiters_of_other_people(convert):
+    report = convert(
+        'when;rechts;hoch\n1500,5;1,5;2,5\n',
+        frame_id='pool',
+        options=CsvOptions(columns={'stamp': 'when', 'x': 'rechts', 'y': 'hoch'}, time_unit='ms'),
+    )
+    (fix,) = fixes_of(report.path)
+    assert fix.stamp_ns == 1_500_500_000 and fix.position[:2].tolist() == [1.5, 2.5]
+    assert fix.frame_id == 'pool'
+
+
+@pytest.mark.parametrize('origin', [None, (50.0, 8.0), (50.0, 8.0, 100.0)])
+def test_latitudes_become_metres_around_the_origin(convert, origin):
+    report = convert(
+        'time,lat,lon,alt\n5,50.001,8.002,90\n6,50.003,8.004,95\n7,91,8,0\n', origin=origin
+    )
+    first, second = fixes_of(report.path)
+    around = origin or (50.001, 8.002)
+    around = (*around, 0.0)[:3]
+    for fix, place in ((first, (50.001, 8.002, 90.0)), (second, (50.003, 8.004, 95.0))):
+        ecef = np.array(pymap3d.geodetic2ecef(*place)) - pymap3d.geodetic2ecef(*around)
+        assert np.linalg.norm(fix.position) == pytest.approx(np.linalg.norm(ecef), abs=1e-6)
+    offset = second.position - first.position  # north 222 m and east 143 m at 50 degrees
+    assert offset[:2] == pytest.approx([143.4, 222.5], abs=0.5)
+    assert report.bad_rows == 1 and 'no place on Earth' in report.problems[0]
+    assert f'latitude {around[0]!r}' in report.notes['origin']
+    with BagReader(report.path) as bag:
+        assert bag.custom_data['origin'] == report.notes['origin']
+
+
+def test_a_bad_origin_is_explained(convert):
+    with pytest.raises(BagError, match='an origin is'):
+        convert('time,lat,lon\n5,50,8\n', origin=(91.0, 0.0))
+
+
+def test_the_same_input_gives_the_same_bag(convert, tmp_path):
+    text = 'stamp,x,y\n5,1,2\n6,2,3\n'
+    first = {file.name: file.read_bytes() for file in convert(text).path.iterdir()}
+    (tmp_path / 'out').rename(tmp_path / 'before')
+    second = {file.name: file.read_bytes() for file in convert(text).path.iterdir()}
+    assert first == second
+    with pytest.raises(BagError, match='exists already'):
+        convert(text)
+
+
+def test_truth_of_several_named_targets(convert):
+    report = convert(
+        'time,name,x,y\n5,ann,0,0\n6,ann,1,2\n8,ann,5,4\n8,bob,7,7\n8,ann,9,9\n', kind='truth'
+    )
+    truth = truth_of(report.path)
+    assert [estimate.extras['track_id'][0] for estimate in truth] == [1, 1, 1, 2]
+    # central differences with uneven steps, by hand: one-sided at the ends, weighted inside
+    assert truth[0].extras['vx'][0] == pytest.approx(1.0)
+    inside = (1.0 * 2.0 + 2.0 * 1.0) / 3.0
+    assert truth[1].extras['vx'][0] == pytest.approx(inside)
+    assert truth[2].extras['vy'][0] == pytest.approx(1.0)
+    assert np.isnan(truth[3].extras['vx'][0])
+    assert report.notes['truth_velocity'] == 'central differences'
+
+
+def test_a_stated_velocity_is_kept(convert):
+    report = convert('time,x,y,vx,vy\n5,0,0,0.1,0.2\n6,9,9,,0.4\n', kind='truth')
+    first, second = truth_of(report.path)
+    assert first.extras['vx'][0] == 0.1 and np.isnan(second.extras['vx'][0])
+    assert report.notes['truth_velocity'] == 'stated'
+
+
+def test_difference_velocity_is_exact_for_constant_speed():
+    stamps = np.array([0, 10**9, 4 * 10**9, 5 * 10**9]) + 10**18
+    seconds = (stamps - stamps[0]) * 1e-9
+    velocity = difference_velocity(stamps, np.column_stack([2.0 * seconds, -seconds]))
+    assert np.allclose(velocity, [2.0, -1.0])
+    assert np.isnan(difference_velocity(stamps[:1], [[1.0, 2.0]])).all()
+
+
+def test_names_become_numbers():
+    assert number_names(['7', '3', '7']) == {'7': 7, '3': 3}
+    assert number_names(['b', 'a', 'b']) == {'b': 1, 'a': 2}
+    assert number_names(['1', '70000']) == {'1': 1, '70000': 2}
+    assert number_names([]) == {}
+
+
+def test_the_real_fixes_and_truth(real_data, tmp_path):
+    folder = real_data / 'yaps_ssu1'
+    report = convert_fixes(folder / 'fixes.csv', tmp_path / 'bag', truth=folder / 'gps_truth.csv')
+    assert report.messages == {'/fix': 119, '/truth/estimate': 450} and not report.bad_rows
+    with (folder / 'fixes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    fixes = fixes_of(report.path)
+    for row, fix in zip(rows, fixes):
+        assert fix.stamp_ns == int(row['stamp_s'].replace('.', '')) * 1000
+        assert fix.position[:2].tolist() == [float(row['east_m']), float(row['north_m'])]
+        assert fix.covariance[0, 1] == float(row['cov_east_north_m2'])
+        assert fix.covariance[1, 1] == float(row['var_north_m2'])
+    truth = truth_of(report.path)
+    stamp = np.array([estimate.stamp_ns for estimate in truth])
+    place = np.array([[estimate.extras['px'][0], estimate.extras['py'][0]] for estimate in truth])
+    inside = [fix for fix in fixes if stamp[0] <= fix.stamp_ns <= stamp[-1]]
+    error = [
+        np.hypot(
+            *(
+                fix.position[:2]
+                - [np.interp(fix.stamp_ns, stamp, place[:, axis]) for axis in (0, 1)]
+            )
+        )
+        for fix in inside
+    ]
+    assert len(inside) == 116
+    assert np.sqrt(np.mean(np.square(error))) == pytest.approx(3.69, abs=0.01)
+
+
+def test_the_real_truth_alone(real_data, tmp_path):
+    report = convert_truth(real_data / 'yaps_ssu1' / 'gps_truth.csv', tmp_path / 'bag')
+    speed = [
+        np.hypot(estimate.extras['vx'][0], estimate.extras['vy'][0])
+        for estimate in truth_of(report.path)
+    ]
+    assert np.median(speed) == pytest.approx(0.48, abs=0.05)

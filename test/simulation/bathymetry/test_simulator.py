@@ -1,0 +1,149 @@
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import array, coherence, variances
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate, snr
+
+
+def run(name='paper', seed=1, **overrides):
+    scene = simulate(scenario(name, {'pings': 4, **overrides}), seed)
+    return [(one.measurement, true) for one, true in zip(scene.measurements, scene.truth)]
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_every_scenario_is_the_same_for_the_same_seed(name):
+    first, again, other = (run(name, seed) for seed in (5, 5, 6))
+    assert all((a.iq == b.iq).all() for (a, _), (b, _) in zip(first, again))
+    assert not any((a.iq == b.iq).all() for (a, _), (b, _) in zip(first, other))
+    for snapshot, true in first:
+        assert snapshot.stamp_ns == true.stamp_ns and snapshot.frame_id == true.frame_id
+        assert snapshot.usable.all() and (snapshot.range == true.range).all()
+        assert np.isfinite(true.height).all() and true.valid.any()
+
+
+def test_the_scene_of_the_paper():
+    config = scenario('paper')
+    snapshot, true = run(pings=1)[0]
+    assert snapshot.iq.shape == (1200, 8) and snapshot.bin_width == pytest.approx(0.05)
+    assert snapshot.range[0] == 17.0 and snapshot.range[-1] < 77.0
+    assert snapshot.spacing_wavelengths == pytest.approx(0.5)
+    assert (true.height[~true.patch] == 0.0).all() and true.patch.sum() == 200
+    decibels = 10.0 * np.log10(snr(config, snapshot.range))
+    assert decibels[0] == 30.0 and decibels[-1] == pytest.approx(10.0, abs=0.02)
+    assert (np.diff(decibels) < 0.0).all()
+
+
+def test_power_and_direction_are_those_of_the_floor():
+    config = scenario('paper')
+    pings = run(pings=40)
+    power = np.mean([variances.mean_power(snapshot.iq) for snapshot, _ in pings], axis=0)
+    ratio = power / (1.0 + snr(config, pings[0][0].range))
+    assert ratio.mean() == pytest.approx(1.0, abs=0.03)
+    errors = [
+        coherence.coherence(snapshot.iq[:600], 0.5)[1] - np.sin(true.angle[:600])
+        for snapshot, true in pings
+    ]
+    assert np.median(np.abs(errors)) < 0.01 and abs(np.median(errors)) < 1e-3
+
+
+def test_patch_heights_have_their_deviation_and_correlation():
+    white = np.concatenate([true.height[true.patch] for _, true in run(pings=30)])
+    assert white.std() == pytest.approx(0.5, rel=0.05)
+    smooth = [true.height[true.patch] for _, true in run('correlated', pings=200)]
+    assert np.std(smooth) == pytest.approx(0.5, rel=0.1)
+    # A Gaussian kernel of 1 m correlates neighbours 1 m apart by exp(-1/4).
+    lag = np.mean([h[20:] * h[:-20] for h in smooth]) / np.mean(np.square(smooth))
+    assert lag == pytest.approx(np.exp(-0.25), abs=0.05)
+    assert abs(np.mean([h[1:] * h[:-1] for h in np.split(white, 30)]) / 0.25) < 0.05
+
+
+def test_slope_undulation_and_drift():
+    _, slope = run('slope')[0]
+    smooth = ~slope.patch
+    assert np.allclose(slope.height[smooth], 0.1 * (slope.range - 17.0)[smooth])
+    _, waves = run('undulating')[0]
+    assert waves.height[~waves.patch].max() == pytest.approx(0.5, abs=0.01)
+    starts = [true.range[true.patch][0] for _, true in run('drifting_patch')]
+    assert np.allclose(np.diff(starts), 0.2, atol=0.06)
+
+
+def test_shadows_hold_noise_only():
+    snapshot, true = run('shadow', pings=1)[0]
+    assert true.valid.mean() == pytest.approx(1.0 - 8.0 / 60.0, abs=0.01)
+    power = variances.mean_power(snapshot.iq)
+    assert power[~true.valid].mean() == pytest.approx(1.0, rel=0.2)
+    silent = coherence.silent_bins(coherence.coherence(snapshot.iq, 0.5)[0], 8)
+    assert silent[~true.valid].mean() > 0.97 and silent[true.valid].mean() < 0.2
+
+
+def test_the_water_column_has_no_floor():
+    snapshot, true = run('water_column', pings=1)[0]
+    assert (true.valid == (true.range >= 15.0)).all() and snapshot.noise_variance is None
+    assert np.isnan(true.angle[~true.valid]).all() and np.isnan(true.xyz[0, 1])
+    power = variances.mean_power(snapshot.iq)
+    assert power[~true.valid].mean() == pytest.approx(1.0, rel=0.2)
+    assert power[true.valid][:40].mean() > 100.0
+
+
+def test_spikes_are_strong_and_incoherent():
+    plain, spiky = (run(name, pings=1)[0][0] for name in ('paper', 'spikes'))
+    ratio = variances.mean_power(spiky.iq) / variances.mean_power(plain.iq)
+    spikes = ratio > 8.0
+    assert 0.06 < spikes.mean() < 0.14
+    gamma = coherence.coherence(spiky.iq, 0.5)[0]
+    assert np.median(gamma[spikes]) < 0.5 < 0.9 < np.median(gamma[~spikes])
+
+
+def test_surface_echoes_come_from_the_surface_and_the_mirrored_floor():
+    options = {'sonar_depth': 10.0, 'multipath_level_db': 40.0, 'patch_std': 0.0, 'pings': 30}
+    pings = run('multipath', **options)
+    R = np.mean([s.iq[200:201].T @ s.iq[200:201].conj() for s, _ in pings], axis=0)
+    values, vectors = np.linalg.eigh(R)
+    assert values[-2] > 20.0 * values[-3]
+    true = pings[0][1]
+    sines = array.multipath_sines(15.0, true.range[200], np.deg2rad(30.0), 10.0)
+    for sine in np.atleast_1d(sines)[np.isfinite(sines)]:
+        a = array.steering(sine, 8, 0.5) / np.sqrt(8.0)
+        assert np.linalg.norm(vectors[:, -2:].conj().T @ a) > 0.99
+
+
+def test_both_sides_have_names_and_one_frame():
+    scene = simulate(scenario('two_sides', {'pings': 2}), 1)
+    assert [one.namespace for one in scene.measurements] == ['port', 'starboard'] * 2
+    assert [true.namespace for true in scene.truth] == ['port', 'starboard'] * 2
+    port, starboard = scene.truth[:2]
+    assert (port.xyz[:, 1] > 0.0).all() and (starboard.xyz[:, 1] < 0.0).all()
+    assert port.frame_id == starboard.frame_id == scene.frame_id
+    assert port.stamp_ns == starboard.stamp_ns
+    # Received when the last echo is.
+    assert scene.measurements[0].received_ns - port.stamp_ns == pytest.approx(102.6e6, abs=1e5)
+
+
+def test_a_conjugated_array_looks_mirrored():
+    straight, turned = (run(conjugate=value, pings=1)[0][0] for value in (False, True))
+    for snapshot, sign in ((straight, 1.0), (turned, -1.0)):
+        sine = coherence.coherence(snapshot.iq[:200], 0.5)[1]
+        assert sign * np.median(sine) > 0.1
+
+
+@pytest.mark.parametrize(
+    'overrides, word',
+    [
+        ({'last_range': 17.0}, 'last_range'),
+        ({'bin_width': 0.001, 'last_range': 500.0}, 'bin_width'),
+        ({'patch_start': 60.0}, 'patch_end'),
+        ({'shadows': [30.0]}, 'pairs'),
+        ({'shadows': [30.0, 20.0]}, 'pairs'),
+        ({'stave': 8}, "did you mean 'staves'"),
+        ({'staves': 1}, 'between 2 and 64'),
+    ],
+)
+def test_mistakes_are_named(overrides, word):
+    with pytest.raises(ConfigError, match=word):
+        scenario('paper', overrides)
+
+
+def test_an_unknown_scenario_is_named():
+    with pytest.raises(ConfigError, match="did you mean 'shadow'"):
+        scenario('shadows')

@@ -1,0 +1,80 @@
+"""Scenes of the fathometer: what they promise, and that they are the same each time."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.fathometer.simulator import drift_of, scenario, SCENARIOS, simulate
+
+TINY = {'records': 2, 'phones': 6, 'snapshot_seconds': 0.1, 'frequency_max': 1000.0}
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_every_scenario_can_be_made_small(name):
+    overrides = dict(TINY)
+    if SCENARIOS[name][1].get('level') == 'pressure':
+        overrides |= {'records': 1, 'record_seconds': 1.0, 'sample_rate': 4000.0}
+    scene = simulate(scenario(name, overrides), 1)
+    assert len(scene.truth) == overrides['records']
+    stamps = [one.received_ns for one in scene.measurements]
+    assert stamps == sorted(stamps)
+    assert scene.truth[-1].stamp_ns == scene.measurements[-1].measurement.stamp_ns
+    kinds = {type(one.measurement) for one in scene.measurements}
+    assert kinds <= {CrossSpectra, Trace, Pressure, ArrayDepth}
+
+
+def test_the_same_seed_gives_the_same_scene():
+    config = scenario('small', {'records': 2})
+    one, same, other = (
+        simulate(config, seed).measurements[1].measurement.csdm.tobytes() for seed in (1, 1, 2)
+    )
+    assert one == same != other
+
+
+def test_layers_fade_and_appear_as_told():
+    config = scenario('drift', {'appearing': (10, 50), 'fading': (30,), 'records': 100})
+    drift = drift_of(config, np.random.default_rng(0))
+    assert drift.present.sum(axis=1)[[0, 20, 45, 99]].tolist() == [8, 9, 8, 9]
+    assert drift.present[:, 0].all()
+    assert (drift.amplitude[:, 0] > 0.2).all()
+
+
+def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
+    config = scenario(
+        'drift_traces', {'records': 50, 'layers': 1, 'appearing': (), 'fading': (),
+                         'array_depth_std': 0.0},
+    )  # fmt: skip
+    scene = simulate(config, 0)
+    noise = []
+    for received, truth in zip(scene.measurements, scene.truth):
+        trace = received.measurement
+        pulse = band_pulse(50.0, 4000.0, 1500.0)(trace.depth - truth.depth[0])
+        amplitude = trace.amplitude @ pulse / (pulse @ pulse)
+        noise.append(trace.amplitude - amplitude * pulse)
+        assert amplitude > 0.01
+    assert np.std(noise) == pytest.approx(1.3e-3, rel=0.05)
+    # The noise is as correlated as the pulse.
+    lag = 3
+    seen = np.mean(np.multiply(np.array(noise)[:, lag:], np.array(noise)[:, :-lag])) / np.var(
+        noise
+    )
+    assert seen == pytest.approx(band_pulse(50.0, 4000.0, 1500.0)(lag / 32.0), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    'name, overrides, word',
+    [
+        ('drfit', {}, "did you mean 'drift'"),
+        ('drift', {'frequency_min': 5000.0}, 'frequency_max'),
+        ('drift', {'ship_pass': (3,)}, 'ship_pass'),
+        ('drift', {'level': 'pressure'}, '600 s'),
+        ('drift', {'layers': 1}, 'no layer'),
+        ('drift', {'level': 'csdm'}, '13.6 GB'),
+        ('drift', {'records': 0}, 'records'),
+    ],
+)
+def test_scenes_that_cannot_be(name, overrides, word):
+    with pytest.raises(ConfigError, match=word):
+        scenario(name, overrides)

@@ -1,0 +1,368 @@
+"""The bathymetry tracker as its users see it: snapshots in, the floor out."""
+
+import math
+
+from attrs import evolve
+from helpers.bathymetry_cases import floor
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import array
+from sonar_imm.measurements import Fix, Snapshot
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.bathymetry.config import MODEL_SETS
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+
+RNG = np.random.default_rng(1)
+PATCH = np.zeros(300)
+PATCH[120:200] = 0.5 * RNG.normal(size=80)
+
+
+def run(snapshot, **values):
+    return BathymetryTracker(BathymetryConfig(**values)).process(snapshot)[0]
+
+
+def rmse(estimate, height):
+    values = estimate.columns()['height']
+    return float(np.sqrt(np.mean(np.square(values - height))))
+
+
+def same(one, other):
+    a, b = one.columns(), other.columns()
+    return list(a) == list(b) and all(
+        np.asarray(a[key]).tobytes() == np.asarray(b[key]).tobytes() for key in a
+    )
+
+
+# -- the columns ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'model_set, columns',
+    [
+        ('height_two_rw', 'height cov_height_height prob_rw_smooth prob_rw_rough range angle'),
+        ('angle_two_rw', 'angle cov_angle_angle prob_rw_smooth prob_rw_rough range height'),
+        (
+            'height_rw_ncs',
+            'height slope cov_height_height cov_height_slope cov_slope_slope prob_rw prob_ncs '
+            'range angle',
+        ),
+        (
+            'height_bank',
+            'height cov_height_height prob_rw_1 prob_rw_2 prob_rw_3 prob_rw_4 range angle',
+        ),
+    ],
+)
+def test_columns_are_those_of_the_contract(model_set, columns):
+    snapshot = floor(0.0)
+    table = run(snapshot, model_set=model_set).columns()
+    after = 'valid log_likelihood label label_probability'
+    assert list(table) == ['x', 'y', 'z', *columns.split(), *after.split()]
+    assert table['valid'].dtype == np.uint8
+    assert all(len(column) == len(snapshot) for column in table.values())
+    probability = sum(table[key] for key in table if key.startswith('prob_'))
+    assert probability == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize('model_set', MODEL_SETS)
+@pytest.mark.parametrize('variant', ['corrected', 'paper'])
+def test_every_set_finds_a_flat_floor(model_set, variant):
+    estimate = run(floor(0.4), model_set=model_set, variant=variant)
+    assert rmse(estimate, 0.4) < 0.15
+
+
+@pytest.mark.parametrize('side, sign', [('port', 1.0), ('starboard', -1.0)])
+def test_points_lie_on_their_side_and_below_the_sonar(side, sign):
+    snapshot = floor(0.0)
+    x, y, z = run(snapshot, side=side, engine='grid').xyz.T
+    assert (x == 0.0).all()
+    assert y == pytest.approx(sign * np.sqrt(snapshot.range**2 - 15.0**2), rel=0.02)
+    assert z == pytest.approx(-15.0, abs=0.5)
+    assert np.hypot(y, z) == pytest.approx(snapshot.range, rel=1e-6)
+
+
+def test_angle_and_height_say_the_same():
+    snapshot = floor(PATCH)
+    table = run(snapshot).columns()
+    depth = array.depth_of_angle(table['angle'], table['range'], math.radians(30.0))
+    assert 15.0 - depth == pytest.approx(table['height'], abs=1e-9)
+
+
+def test_a_label_is_the_likeliest_model():
+    estimate = run(floor(PATCH))
+    label = estimate.extras['label']
+    assert np.array_equal(label, estimate.probabilities.argmax(axis=1))
+    assert np.array_equal(estimate.extras['label_probability'], estimate.probabilities.max(axis=1))
+    assert label[125:195].mean() > 0.9 and label[:100].mean() < 0.1
+
+
+# -- sameness -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('engine', ['particles', 'grid'])
+def test_a_ping_does_not_depend_on_other_pings(engine):
+    config = BathymetryConfig(engine=engine)
+    pings = [floor(PATCH, seed=k, stamp_ns=1000 + k) for k in range(4)]
+    tracker = BathymetryTracker(config)
+    forward = [tracker.process(ping)[0] for ping in pings]
+    tracker.reset()
+    backward = [tracker.process(ping)[0] for ping in reversed(pings)][::-1]
+    again = [BathymetryTracker(config).process(ping)[0] for ping in pings]
+    assert all(map(same, forward, backward)) and all(map(same, forward, again))
+
+
+def test_seed_stamp_and_side_name_the_random_numbers():
+    snapshot = floor(PATCH)
+    first = run(snapshot)
+    assert same(first, run(snapshot, seed=0))
+    for other in (
+        run(snapshot, seed=1),
+        run(snapshot, side='port'),
+        run(evolve(snapshot, stamp_ns=1_001)),
+    ):
+        assert not np.array_equal(first.state, other.state)
+        assert rmse(first, other.columns()['height']) < 0.15
+
+
+def test_a_conjugated_array_is_a_matter_of_wiring():
+    wired, other = floor(PATCH), floor(PATCH, conjugate=True)
+    assert rmse(run(other, conjugate=True, engine='grid'), PATCH) == pytest.approx(
+        rmse(run(wired, engine='grid'), PATCH), rel=0.3
+    )
+    assert rmse(run(other), PATCH) > 1.0
+
+
+def test_staves_are_taken_as_they_come():
+    for P in (2, 3, 16, 64):
+        estimate = run(floor(PATCH, P=P), shadow_gate=False)
+        assert rmse(estimate, PATCH) < 0.6 / math.sqrt(P)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(1e-9, 1e9))
+def test_the_scale_of_the_samples_does_not_matter(scale):
+    snapshot = floor(PATCH)
+    louder = evolve(
+        snapshot,
+        iq=snapshot.iq.astype(np.complex128) * math.sqrt(scale),
+        noise_variance=snapshot.noise_variance * scale,
+    )
+    one, other = run(snapshot, engine='grid'), run(louder, engine='grid')
+    assert other.state == pytest.approx(one.state, abs=1e-5)
+
+
+# -- errata of the paper --------------------------------------------------------------------------
+
+
+def ncs_only(snapshot, variant):
+    return run(
+        snapshot,
+        model_set='height_rw_ncs',
+        variant=variant,
+        transition_matrix=(1.0, 0.0, 0.0, 1.0),
+        initial_probabilities=(0.0, 1.0),
+    )
+
+
+def test_the_slope_model_as_printed_is_a_random_walk_in_disguise():
+    ranges = 17.0 + 0.05 * np.arange(800)
+    height = 0.1 * (ranges - ranges[0])
+    snapshot = floor(height, ranges=ranges)
+    corrected = rmse(ncs_only(snapshot, 'corrected'), height)
+    assert corrected < 0.25
+    assert rmse(ncs_only(snapshot, 'paper'), height) > 3.0 * corrected
+
+
+def test_the_slope_is_found_where_the_slope_model_holds():
+    ranges = 20.0 + 0.05 * np.arange(600)
+    estimate = ncs_only(floor(-0.1 * (ranges - 20.0), ranges=ranges), 'corrected')
+    assert estimate.state[200:, 1].mean() == pytest.approx(-0.1, abs=0.03)
+
+
+# -- what is not heard ----------------------------------------------------------------------------
+
+
+def test_a_shadow_is_passed_over_and_marked():
+    shadow = slice(100, 160)
+    snapshot = floor(0.0, shadow=shadow)
+    gated, blind = run(snapshot), run(snapshot, shadow_gate=False)
+    valid = gated.extras['valid'].astype(bool)
+    assert not valid[shadow].any() and valid[:90].mean() > 0.9
+    assert rmse(gated, 0.0) < 0.2 < 0.5 < rmse(blind, 0.0)
+    assert (gated.extras['log_likelihood'][shadow] == 0.0).all()
+    width = np.sqrt(gated.covariance[:, 0, 0])
+    assert width[159] > width[99]
+
+
+@pytest.mark.parametrize('engine', ['particles', 'grid'])
+def test_bins_that_are_not_finite_are_passed_over(engine):
+    snapshot = floor(0.0)
+    iq = snapshot.iq.copy()
+    iq[50:60] = np.nan
+    iq[70, 3] = np.inf
+    iq[80] = 0.0
+    tracker = BathymetryTracker(BathymetryConfig(engine=engine, shadow_gate=False))
+    estimate = tracker.process(evolve(snapshot, iq=iq))[0]
+    assert np.flatnonzero(estimate.extras['valid'] == 0).tolist() == [*range(50, 60), 70, 80]
+    assert tracker.counts['bins_unusable'] == 12
+    assert rmse(estimate, 0.0) < 0.15
+
+
+@pytest.mark.parametrize('engine', ['particles', 'grid'])
+def test_nothing_is_heard_before_the_floor_can_answer(engine):
+    """Bins nearer than the floor is deep are impossible: the state waits for the first echo."""
+    ranges = 5.0 + 0.05 * np.arange(500)
+    silent = ranges < 15.0
+    snapshot = floor(0.0, ranges=ranges, shadow=silent)
+    estimate = run(evolve(snapshot, noise_variance=None), engine=engine)
+    assert np.isfinite(estimate.state).all()
+    assert np.abs(estimate.state[~silent][20:, 0]).mean() < 0.1
+
+
+@pytest.mark.parametrize('known', ['stated', 'water column', 'blind'])
+def test_the_noise_is_found(known):
+    ranges = (5.0 if known == 'water column' else 20.0) + 0.05 * np.arange(600)
+    snapshot = floor(0.0, ranges=ranges, shadow=ranges < 15.0)
+    if known != 'stated':
+        snapshot = evolve(snapshot, noise_variance=None)
+    tracker = BathymetryTracker(BathymetryConfig())
+    tracker.process(snapshot)
+    assert 0.5 < tracker.health()['noise_variance'] < 1.6
+
+
+@pytest.mark.parametrize(
+    'name, values, worst',
+    [
+        ('paper', {}, 0.165),
+        ('shadow', {}, 0.18),
+        ('spikes', {}, 0.20),
+        ('multipath', {'multipath': True}, 0.20),
+        ('slope', {'model_set': 'height_rw_ncs'}, 0.20),
+    ],
+)
+def test_scenes_reach_what_is_attainable(name, values, worst):
+    scene = simulate(scenario(name, {'pings': 6}), 3)
+    tracker = BathymetryTracker(BathymetryConfig(**values))
+    error = [
+        tracker.process(item.measurement)[0].columns()['height'] - truth.height
+        for item, truth in zip(scene.measurements, scene.truth)
+    ]
+    assert math.sqrt(np.mean(np.square(error))) < worst
+
+
+def test_smoothing_helps_modes_and_states():
+    scene = simulate(scenario('paper', {'pings': 4}), 5)
+    config = {'engine': 'grid', 'sigmas': (0.01, 0.7)}
+
+    def score(**more):
+        square, hits, either = [], 0, 0
+        for item, truth in zip(scene.measurements, scene.truth):
+            estimate = run(item.measurement, **config, **more)
+            square.append(np.square(estimate.state[:, 0] - truth.height))
+            rough = estimate.extras['label'] == 1
+            hits, either = hits + (rough & truth.patch).sum(), either + (rough | truth.patch).sum()
+        return math.sqrt(np.mean(square)), hits / either
+
+    none, modes, states = (score(smoothing=name) for name in ('none', 'modes', 'states'))
+    assert modes[0] == none[0] and states[0] < 0.95 * none[0]
+    assert modes[1] >= none[1] - 0.01 and states[1] > none[1] - 0.02
+
+
+# -- input nobody wants ---------------------------------------------------------------------------
+
+
+def test_what_is_no_snapshot_is_counted():
+    tracker = BathymetryTracker(BathymetryConfig())
+    assert tracker.process(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0])) == []
+    assert tracker.process(None) == []
+    assert tracker.counts['unknown_type'] == 2
+
+
+def test_a_snapshot_of_another_array_is_counted():
+    tracker = BathymetryTracker(BathymetryConfig(element_spacing_wavelengths=0.5))
+    other = {'element_spacing': 0.01, 'frequency': 300e3, 'sound_speed': 1500.0}
+    assert tracker.process(floor(0.0, **other)) == []
+    assert tracker.counts == {'other_spacing': 1}
+    follows = BathymetryTracker(BathymetryConfig())
+    assert rmse(follows.process(floor(0.0, spacing=2.0, **other))[0], 0.0) < 0.1
+
+
+def test_sizes_may_change_from_ping_to_ping():
+    tracker = BathymetryTracker(BathymetryConfig())
+    for bins, P in ((300, 8), (2, 8), (50, 2), (1000, 16), (300, 8)):
+        estimate = tracker.process(floor(0.0, ranges=20.0 + 0.05 * np.arange(bins), P=P))[0]
+        assert len(estimate) == bins and np.isfinite(estimate.state).all()
+    assert tracker.counts['used'] == 5
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    bins=st.integers(2, 40),
+    P=st.integers(2, 12),
+    exponent=st.floats(-15.0, 15.0),
+    holes=st.floats(0.0, 0.9),
+    values=st.fixed_dictionaries(
+        {
+            'model_set': st.sampled_from(MODEL_SETS),
+            'shadow_gate': st.booleans(),
+            'multipath': st.booleans(),
+            'likelihood': st.sampled_from(['laplace', 'gaussian']),
+            'variant': st.sampled_from(['corrected', 'paper']),
+            'sonar_height': st.floats(0.1, 200.0),
+        }
+    ),
+)
+def test_noise_of_any_kind_gives_finite_answers(bins, P, exponent, holes, values):
+    rng = np.random.default_rng(bins * P)
+    iq = 10.0**exponent * (rng.normal(size=(bins, P)) + 1j * rng.normal(size=(bins, P)))
+    iq[1:][rng.random(bins - 1) < holes] = np.nan
+    snapshot = Snapshot(stamp_ns=1, range=np.sort(rng.uniform(0.0, 100.0, bins)), iq=iq)
+    engines = ('particles',) if values['model_set'] == 'height_rw_ncs' else ('particles', 'grid')
+    for engine in engines:
+        estimate = run(snapshot, engine=engine, particles_per_model=20, **values)
+        assert np.isfinite(estimate.state).all() and np.isfinite(estimate.covariance).all()
+        assert (estimate.covariance[:, 0, 0] >= 0.0).all()
+        assert estimate.probabilities.sum(axis=1) == pytest.approx(1.0)
+        assert np.isfinite(estimate.xyz).all()
+
+
+@pytest.mark.parametrize(
+    'values, words',
+    [
+        ({'sigmas': [0.1]}, 'sigmas needs 2 values'),
+        ({'model_set': 'angle_two_rw', 'sigmas': [0.1, 1.0]}, 'takes sigmas_deg'),
+        ({'model_set': 'angle_two_rw', 'sigmas_deg': [0.1]}, 'sigmas_deg needs three'),
+        ({'sigmas_deg': [0.1, 0.1, 2.0]}, 'angle_two_rw only'),
+        ({'transition_matrix': [1.0, 0.0]}, 'transition_matrix needs 2 x 2'),
+        ({'transition_matrix': [1.0, 0.1, 0.0, 1.0]}, 'row 0 of transition_matrix'),
+        ({'initial_probabilities': [1.0]}, 'initial_probabilities needs 2'),
+        ({'initial_probabilities': [0.7, 0.7]}, 'sum to 1.4'),
+        ({'model_set': 'height_rw_ncs', 'engine': 'grid'}, 'one state'),
+        ({'smoothing': 'states'}, 'needs engine grid'),
+        ({'model_set': 'angle_two_rw', 'initial_mean': 2.0}, 'initial_mean is an angle'),
+        ({'model_set': 'height_two_rws'}, "did you mean 'height_two_rw'"),
+        ({'particles_per_model': 1}, 'between 2 and'),
+    ],
+)
+def test_a_config_that_cannot_be_is_named(values, words):
+    with pytest.raises(ConfigError, match=words):
+        BathymetryConfig.from_mapping(values)
+
+
+def test_the_system_is_registered():
+    system = SYSTEMS['bathymetry']
+    tracker = system.build(system.config_type()())
+    tracker.warm()
+    assert tracker.counts == {} and tracker.health() == {}
+    tracker.process(floor(0.0))
+    assert 50 < tracker.health()['effective_sample_size'] <= 100
+    assert tracker.health()['heard_share'] > 0.9
+    tracker.reconfigure(system.config_type()(engine='grid'))
+    tracker.process(floor(0.0))
+    assert math.isnan(tracker.health()['effective_sample_size'])
+    tracker.reset()
+    assert tracker.counts == {} and tracker.health() == {}

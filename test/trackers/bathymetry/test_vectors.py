@@ -1,0 +1,97 @@
+"""The bathymetry tracker against exact answers computed independently."""
+
+from attrs import evolve
+from helpers.bathymetry_cases import vector
+import numpy as np
+import pytest
+
+from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
+
+SCALAR = ['set_ii_0', 'set_ii_1', 'set_iii_0', 'set_iii_1']
+
+
+def errors(case, estimate, mean='m', variance='v', mu='mu'):
+    """abs(dm) / sd and abs(dmu), each (T,)."""
+    deviation = np.abs(estimate.state[:, 0] - case[mean]) / np.sqrt(case[variance])
+    return deviation, np.abs(estimate.probabilities - case[mu]).max(axis=1)
+
+
+def run(config, snapshot):
+    return BathymetryTracker(config).process(snapshot)[0]
+
+
+@pytest.mark.parametrize('name', [*SCALAR, 'set_i_corr_0', 'set_i_corr_1'])
+def test_particles_are_the_exact_filter_within_monte_carlo_error(name):
+    case, config, snapshot = vector(name)
+    estimate = run(config, snapshot)
+    deviation, dmu = errors(case, estimate)
+    assert deviation.mean() <= 0.035
+    assert dmu.mean() <= 0.006
+    assert np.abs(estimate.covariance[:, 0, 0] / case['v'] - 1.0).mean() < 0.06
+    if 'slope' in case:
+        slope_sd = np.sqrt(estimate.covariance[:, 1, 1])
+        assert (np.abs(estimate.state[:, 1] - case['slope']) / slope_sd).mean() < 0.06
+
+
+@pytest.mark.parametrize('name', ['set_ii_0', 'set_iii_1'])
+def test_error_falls_with_the_root_of_the_number_of_particles(name):
+    case, config, snapshot = vector(name)
+    few, many = (
+        errors(case, run(evolve(config, particles_per_model=N), snapshot))[0].mean()
+        for N in (300, 4800)
+    )
+    assert 2.8 < few / many < 5.7
+
+
+@pytest.mark.parametrize('name', SCALAR)
+def test_the_grid_is_the_exact_filter(name):
+    case, config, snapshot = vector(name)
+    estimate = run(evolve(config, engine='grid'), snapshot)
+    deviation, dmu = errors(case, estimate)
+    assert deviation.max() < 1e-3 and dmu.max() < 1e-4
+    assert estimate.covariance[:, 0, 0] == pytest.approx(case['v'], rel=1e-3)
+
+
+@pytest.mark.parametrize('name', SCALAR)
+def test_the_grid_smoother_is_the_exact_smoother(name):
+    case, config, snapshot = vector(name)
+    estimate = run(evolve(config, engine='grid', smoothing='states'), snapshot)
+    deviation, dmu = errors(case, estimate, 's_m', 's_v', 's_mu')
+    assert deviation.max() < 1e-3 and dmu.max() < 2e-4
+    assert estimate.covariance[:, 0, 0] == pytest.approx(case['s_v'], rel=1e-3)
+
+
+@pytest.mark.parametrize('engine, tolerance', [('grid', 2e-4), ('particles', 0.05)])
+def test_log_likelihood_of_each_bin(engine, tolerance):
+    """The reference leaves out what does not depend on the direction; so does the difference of
+    two bins less the logarithm of the determinants."""
+    case, config, snapshot = vector('set_ii_0')
+    estimate = run(evolve(config, engine=engine), snapshot)
+    constant = np.log(2.0) - 8.0 * np.log(np.pi) - np.log1p(8.0 * case['rho'])
+    error = estimate.extras['log_likelihood'] - constant - case['lev']
+    assert np.abs(error).mean() < tolerance
+
+
+def test_identical_models_leave_the_chain_at_its_prediction():
+    """At the first bin both models of set_iii have the same noise."""
+    _, config, snapshot = vector('set_iii_0')
+    estimate = run(evolve(config, engine='grid'), snapshot)
+    assert estimate.probabilities[0] == pytest.approx([0.796, 0.204], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    'wrong',
+    [
+        {'transition_matrix': (0.9, 0.1, 0.03, 0.97)},
+        {'sigmas': (0.0001, 1.0)},
+        {'tilt_deg': 30.2},
+        {'likelihood': 'gaussian'},
+        {'conjugate': True},
+    ],
+    ids=lambda wrong: next(iter(wrong)),
+)
+def test_wrong_filters_are_found_out(wrong):
+    """The vectors can fail: each mistake exceeds the tolerance of the right filter."""
+    case, config, snapshot = vector('set_ii_0')
+    deviation, dmu = errors(case, run(evolve(config, engine='grid', **wrong), snapshot))
+    assert deviation.mean() > 0.1 or dmu.mean() > 0.02

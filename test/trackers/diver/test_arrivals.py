@@ -1,0 +1,147 @@
+"""The diver tracker on raw arrival times: echoes of a known transmitter, tags that emit alone."""
+
+from helpers.diver_runs import errors, run, SECOND
+import numpy as np
+
+from sonar_imm.measurements import Arrivals
+from sonar_imm.simulation.diver.simulator import RECEIVERS, scenario, simulate
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+
+def test_arrivals_are_better_than_fixes_made_of_them():
+    squared = {'arrivals': [], 'multistatic_fixes': []}
+    for sensor, found in squared.items():
+        for seed in range(4):
+            scene = simulate(
+                scenario(
+                    'multistatic', {'sensor': sensor, 'outlier_probability': 0.0, 'duration': 60.0}
+                ),
+                seed,
+            )
+            tracker = DiverTracker(DiverConfig(max_tracks=1))
+            error, _ = errors(
+                run(tracker, [one.measurement for one in scene.measurements]), scene.truth[0]
+            )
+            found += np.sum(error**2, axis=1).tolist()
+    rmse = {sensor: np.sqrt(np.mean(found)) for sensor, found in squared.items()}
+    assert rmse['arrivals'] < rmse['multistatic_fixes']
+    assert rmse['arrivals'] < 0.35
+
+
+def tag_ping(second, position, rng, receivers=RECEIVERS, emitted=0.123, std=1e-4):
+    distance = np.linalg.norm(np.append(position, 0.0) - receivers, axis=1)
+    n = len(receivers)
+    nothing = np.full(n, np.nan)
+    return Arrivals(
+        stamp_ns=round(second * SECOND),
+        tx_id=np.zeros(n),
+        rx_id=np.arange(n),
+        tx=np.full((n, 3), np.nan),
+        rx=receivers,
+        toa=emitted + distance / 1500.0 + std * rng.normal(size=n),
+        var_toa=np.full(n, std**2),
+        bearing=nothing,
+        var_bearing=nothing,
+        frame_id='map',
+    )
+
+
+def test_a_tag_of_unknown_emission_time_is_followed_also_by_two_receivers():
+    """Two receivers give one time difference: no fix, but it does hold a track."""
+    rng = np.random.default_rng(6)
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    for second in range(1, 60):
+        position = np.array([0.6 * second - 20.0, 30.0])
+        heard = RECEIVERS if second < 25 or second % 3 == 0 else RECEIVERS[[1, 2]]
+        estimate = tracker.process(tag_ping(second, position, rng, heard, rng.uniform(0, 5)))[-1]
+    assert np.hypot(*(estimate.state[0, :2] - position)) < 1.0
+    assert estimate.extras['track_id'].tolist() == [1]
+    assert tracker.health()['confirmed'] == 1
+
+
+def test_a_late_reflection_in_a_tag_ping_is_left_out():
+    rng = np.random.default_rng(7)
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    receivers = np.vstack([RECEIVERS, [[80.0, 80.0, 0.0], [-30.0, -40.0, 0.0]]])
+    for second in range(1, 30):
+        ping = tag_ping(second, np.array([0.5 * second, 30.0]), rng, receivers)
+        if second == 29:
+            toa = ping.toa.copy()
+            toa[2] += 0.02
+            ping = Arrivals(
+                stamp_ns=ping.stamp_ns,
+                tx_id=ping.tx_id,
+                rx_id=ping.rx_id,
+                tx=ping.tx,
+                rx=ping.rx,
+                toa=toa,
+                var_toa=ping.var_toa,
+                bearing=ping.bearing,
+                var_bearing=ping.var_bearing,
+                frame_id='map',
+            )
+        estimate = tracker.process(ping)[-1]
+    assert estimate.extras['nis_dof'][0] == 2  # the fix of the five others
+    assert np.hypot(*(estimate.state[0, :2] - [14.5, 30.0])) < 0.5
+
+
+def test_bearings_help_a_single_receiver():
+    rng = np.random.default_rng(8)
+
+    def final_error(with_bearing):
+        tracker = DiverTracker(DiverConfig(max_tracks=1))
+        for second in range(1, 40):
+            p = np.array([-20.0 + 0.6 * second, 30.0])
+            heard = RECEIVERS if second < 8 else RECEIVERS[:1]
+            path = np.linalg.norm(p) + np.linalg.norm(p - heard[:, :2], axis=1)
+            n = len(heard)
+            bearing = np.arctan2(*(p - heard[:, :2]).T[::-1]) + 0.01 * rng.normal(size=n)
+            tracker_out = tracker.process(
+                Arrivals(
+                    stamp_ns=second * SECOND,
+                    tx_id=np.zeros(n),
+                    rx_id=np.arange(n),
+                    tx=np.zeros((n, 3)),
+                    rx=heard,
+                    toa=path / 1500.0 + 1e-4 * rng.normal(size=n),
+                    var_toa=np.full(n, 1e-8),
+                    bearing=bearing if with_bearing else np.full(n, np.nan),
+                    var_bearing=np.full(n, 1e-4),
+                    frame_id='map',
+                )
+            )
+        return np.hypot(*(tracker_out[-1].state[0, :2] - p))
+
+    assert final_error(True) < 0.4 < final_error(False) + 0.4
+
+
+def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
+    receivers = np.vstack([RECEIVERS, [[60.0, 70.0, 0.0]]])
+    rng = np.random.default_rng(9)
+    tracker = DiverTracker(DiverConfig())
+    for second in range(1, 25):
+        divers = np.array([[0.5 * second - 10.0, 30.0], [30.0 - 0.4 * second, 55.0]])
+        path = np.linalg.norm(divers, axis=1)[:, None] + np.linalg.norm(
+            divers[:, None] - receivers[None, :, :2], axis=2
+        )
+        n = path.size
+        order = rng.permutation(n)
+        receiver = np.tile(np.arange(5), 2)[order]
+        estimate = tracker.process(
+            Arrivals(
+                stamp_ns=second * SECOND,
+                tx_id=np.zeros(n),
+                rx_id=receiver,
+                tx=np.zeros((n, 3)),
+                rx=receivers[receiver],
+                toa=path.ravel()[order] / 1500.0 + 1e-4 * rng.normal(size=n),
+                var_toa=np.full(n, 1e-8),
+                bearing=np.full(n, np.nan),
+                var_bearing=np.full(n, np.nan),
+                frame_id='map',
+            )
+        )[-1]
+    confirmed = estimate.state[estimate.extras['track_state'] > 0, :2]
+    assert len(confirmed) == 2
+    for diver in divers:
+        assert np.hypot(*(confirmed - diver).T).min() < 0.5

@@ -1,0 +1,155 @@
+"""The motion models: steps compose, outputs agree, scenes may be turned."""
+
+from attrs import evolve
+import numpy as np
+import pytest
+
+from sonar_imm.estimation import imm
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.diver.config import DiverConfig, MODEL_SETS
+from sonar_imm.trackers.diver.models import build_models
+
+CENTRE, SPREAD = np.array([3.0, -2.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+COMPOSE = [name for name in MODEL_SETS if name not in ('world_headings', 'relative_headings')]
+
+
+@pytest.mark.parametrize('model_set', MODEL_SETS)
+def test_every_set_is_consistent(model_set):
+    config = DiverConfig(model_set=model_set)
+    models = build_models(config)
+    M, n = len(models.names), models.n
+    assert M == config.model_count() and len(set(models.names)) == M
+    assert models.E.shape == (M, 4, n) and models.initial.shape == (M,)
+    np.testing.assert_allclose(models.initial.sum(), 1.0)
+    for dt in (0.0, 1e-3, 0.3, 1.0, 29.0, 600.0):
+        F, Q, B = models.motion(dt)
+        assert F.shape == Q.shape == (M, n, n) and B.shape == (M, n)
+        np.testing.assert_array_equal(Q, np.swapaxes(Q, -1, -2))
+        assert np.linalg.eigvalsh(Q).min() > -1e-9 * max(Q.max(), 1e-9)
+        np.testing.assert_allclose(models.chain.transition(dt).sum(axis=1), 1.0)
+    x, P, mu = models.new_track(CENTRE, SPREAD)
+    mean, covariance = imm.combine(x[None], P[None], mu[None], models.E)
+    np.testing.assert_allclose(mean[0, :2], CENTRE)
+    np.testing.assert_allclose(covariance[0, :2, :2], SPREAD)
+
+
+@pytest.mark.parametrize('model_set', COMPOSE)
+def test_ten_short_steps_are_one_long_step(model_set):
+    models = build_models(DiverConfig(model_set=model_set, speed_noise=0.2))
+    x, P, _ = models.new_track(CENTRE, SPREAD)
+    long_x, long_P = imm.predict(x[None], P[None], *models.motion(1.0))
+    short_x, short_P = x[None], P[None]
+    for _ in range(10):
+        short_x, short_P = imm.predict(short_x, short_P, *models.motion(0.1))
+    np.testing.assert_allclose(short_x, long_x, atol=1e-12)
+    np.testing.assert_allclose(short_P, long_P, atol=1e-12)
+    ten = np.linalg.matrix_power(models.chain.transition(0.1), 10)
+    np.testing.assert_allclose(ten, models.chain.transition(1.0), atol=1e-12)
+
+
+def test_world_headings_compose_in_position():
+    """Their velocity is drawn afresh at each step; the law of the position composes."""
+    models = build_models(DiverConfig(model_set='world_headings'))
+    x, P, _ = models.new_track(CENTRE, SPREAD)
+    long_x, long_P = imm.predict(x[None], P[None], *models.motion(1.0))
+    for _ in range(10):
+        x, P = (a[0] for a in imm.predict(x[None], P[None], *models.motion(0.1)))
+    np.testing.assert_allclose(x[:, :2], long_x[0, :, :2], atol=1e-12)
+    np.testing.assert_allclose(P[:, :2, :2], long_P[0, :, :2, :2], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('case', 'config', 'exact'),
+    [
+        (
+            'A4_world16',
+            DiverConfig(
+                model_set='world_headings',
+                velocity_noise=0.15,
+                heading_concentration=1.0,
+                stay_probability=0.88,
+                velocity_std=0.7,
+            ),
+            ('F', 'B', 'Q', 'E', 'Pi'),
+        ),
+        (
+            'A12_speedstate16_hover',
+            DiverConfig(
+                stay_probability=0.88,
+                heading_concentration=2.0,
+                speed_noise=0.03,
+                lateral_noise=0.2,
+                hover_noise=0.05,
+            ),
+            ('F', 'B', 'E', 'Pi'),
+        ),
+    ],
+)
+def test_the_sets_are_those_of_the_reference(case, config, exact):
+    from pathlib import Path
+
+    models = build_models(config)
+    ours = dict(zip(('F', 'Q', 'B'), models.motion(1.0)), E=models.E, Pi=models.chain.matrix)
+    with np.load(Path(__file__).parents[2] / 'vectors/diver/imm_reference.npz') as reference:
+        for key in exact:
+            np.testing.assert_allclose(ours[key], reference[f'{case}/{key}'], atol=1e-12)
+        # The speed's random walk is integrated over the step, exactly: a third, not all, of its
+        # square reaches the position.
+        np.testing.assert_allclose(ours['Q'], reference[f'{case}/Q'], atol=config.speed_noise**2)
+
+
+def test_headings_and_the_velocity_they_put_out():
+    models = build_models(DiverConfig(hover=True))
+    assert models.names[:3] == ('heading_000', 'heading_022', 'heading_045')
+    assert models.names[-2:] == ('heading_337', 'hover')
+    x = np.tile([0.0, 0.0, 0.5], (17, 1))
+    velocity = np.einsum('jqa,ja->jq', models.E, x)[:, 2:]
+    np.testing.assert_allclose(velocity[4], [0.0, 0.5], atol=1e-12)
+    np.testing.assert_array_equal(velocity[16], [0.0, 0.0])
+
+
+def test_turning_models_turn_left_and_right():
+    models = build_models(DiverConfig(model_set='cv_ct', turn_rate_deg=90.0))
+    state = np.tile([0.0, 0.0, 1.0, 0.0], (3, 1))
+    moved = np.einsum('jab,jb->ja', models.motion(1.0).F, state)
+    radius = 2.0 / np.pi
+    np.testing.assert_allclose(moved[0], [1.0, 0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(moved[1], [radius, radius, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(moved[2], [radius, -radius, 0.0, -1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('values', 'says'),
+    [
+        ({'model_set': 'heading_sped'}, 'did you mean'),
+        ({'confirm_hits': 6}, 'cannot exceed'),
+        ({'transition_matrix': (0.5, 0.5)}, '17 x 17'),
+        ({'model_set': 'cv_cv', 'transition_matrix': (0.9, 0.2, 0.5, 0.5)}, 'row 0 .* 1.1'),
+        ({'model_set': 'cv_cv', 'acceleration_noise': (0.1,)}, 'each of the 2'),
+        ({'initial_probabilities': (1.0,)}, '17 values'),
+        ({'model_set': 'cv_cv', 'initial_probabilities': (0.5, 0.6)}, 'sum to 1.1'),
+        ({'history': float('nan')}, 'finite'),
+        ({'directions': 3}, 'between 4 and 64'),
+        ({'sped_mean': 1.0}, "did you mean 'speed_mean'"),
+    ],
+)
+def test_bad_parameters_get_a_sentence(values, says):
+    with pytest.raises(ConfigError, match=says):
+        DiverConfig.from_mapping(values)
+
+
+def test_a_given_matrix_is_used_in_its_orientation():
+    asymmetric = (0.9, 0.1, 0.4, 0.6)
+    models = build_models(DiverConfig(model_set='cv_cv', transition_matrix=asymmetric))
+    np.testing.assert_allclose(models.chain.matrix, np.reshape(asymmetric, (2, 2)))
+
+
+def test_the_cache_of_steps_is_bounded():
+    models = build_models(DiverConfig())
+    for k in range(1000):
+        models.motion(1.0 + 1e-4 * k)
+    assert len(models._cache) < 100
+
+
+def test_a_config_is_a_value():
+    assert evolve(DiverConfig(), directions=8) == DiverConfig(directions=8)

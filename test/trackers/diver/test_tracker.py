@@ -1,0 +1,260 @@
+"""The diver tracker as its users see it: measurements in, estimates out."""
+
+from helpers.diver_runs import errors, fix, run, same, SECOND
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from sonar_imm.estimation.consistency import average_bounds
+from sonar_imm.estimation.imm_kernels import combine
+from sonar_imm.measurements import Fix
+from sonar_imm.simulation.diver.simulator import scenario, simulate
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.diver.config import ADAPTATIONS, MODEL_SETS
+from sonar_imm.trackers.diver.scan import cross
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+
+@pytest.mark.parametrize('model_set', MODEL_SETS)
+@pytest.mark.parametrize('adaptation', ADAPTATIONS)
+def test_every_set_follows_a_diver_better_than_its_fixes(model_set, adaptation):
+    scene = simulate(scenario('zigzag'), seed=3)
+    tracker = SYSTEMS['diver'].build(
+        DiverConfig(
+            model_set=model_set,
+            adaptation=adaptation,
+            max_tracks=1,
+            fixed_speed=0.75,
+            gate_probability=0.999999,
+        )
+    )
+    estimates = run(tracker, [one.measurement for one in scene.measurements])
+    error, _ = errors(estimates, scene.truth[0])
+    raw = (
+        np.array([one.measurement.position[:2] for one in scene.measurements])
+        - scene.truth[0].position[:, :2]
+    )
+    assert len(error) >= 95  # confirmed by the third fix or so, never lost
+    ours, theirs = (np.sqrt(np.mean(np.sum(each**2, axis=1))) for each in (error, raw))
+    # A single CV model swings wide at every corner of a zigzag; it has to beat the fixes only.
+    assert ours < (1.0 if model_set == 'cv' else 0.9) * theirs
+    for estimate in estimates:
+        assert np.isfinite(estimate.state).all()
+        np.testing.assert_allclose(estimate.probabilities.sum(axis=1), 1.0)
+
+
+def test_the_estimate_is_the_contract():
+    tracker = DiverTracker(DiverConfig())
+    estimate = tracker.process(fix(1, 2.0, 3.0))[0]
+    columns = estimate.columns()
+    assert list(columns)[:8] == ['x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px']
+    assert [name for name in columns if name.startswith('prob_')][0] == 'prob_heading_000'
+    assert list(columns)[-4:] == ['track_id', 'track_state', 'nis', 'nis_dof']
+    assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64
+    assert columns['track_id'].dtype == np.uint32 and columns['track_state'].dtype == np.uint8
+    assert estimate.stamp_ns == SECOND and estimate.frame_id == 'map'
+
+
+def test_consistency_where_the_models_hold():
+    """A diver drawn from the models themselves: NEES within its bounds."""
+    rng = np.random.default_rng(4)
+    config = DiverConfig(
+        adaptation='fixed', max_tracks=1, confirm_hits=1, hover=False, gate_probability=0.9999999
+    )
+    models = SYSTEMS['diver'].build(config).models
+    runs, steps, squared = 100, 40, []
+    for _ in range(runs):
+        tracker = DiverTracker(config)
+        mode = rng.integers(16)
+        state = np.array([0.0, 0.0, max(rng.normal(0.75, 0.4), 0.05)])
+        for k in range(steps):
+            if k:
+                mode = rng.choice(16, p=models.chain.matrix[mode])
+                motion = models.motion(1.0)
+                state = rng.multivariate_normal(motion.F[mode] @ state, motion.Q[mode])
+            z = state[:2] + 0.5 * rng.normal(size=2)
+            estimate = tracker.process(fix(k + 1, *z, 0.25 * np.eye(2)))[-1]
+        d = estimate.state[0] - np.concatenate([state[:2], models.E[mode, 2:, 2] * state[2]])
+        squared.append(d[:2] @ np.linalg.solve(estimate.covariance[0, :2, :2], d[:2]))
+    low, high = average_bounds(runs, 2, 0.999)
+    assert low < np.mean(squared) < high
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.randoms(use_true_random=False))
+def test_shuffled_input_gives_the_same_bits(random):
+    scene = simulate(scenario('irregular', {'duration': 25.0, 'clutter': 1.0}), seed=8)
+    ordered = sorted((one.measurement for one in scene.measurements), key=lambda m: m.stamp_ns)
+    shuffled = sorted(ordered, key=lambda m: m.stamp_ns + random.uniform(0.0, 9.0) * SECOND)
+    expected, late = (run(DiverTracker(DiverConfig()), items) for items in (ordered, shuffled))
+    assert len(expected) == len(late)
+    assert all(same(*pair) for pair in zip(expected, late))
+
+
+def test_a_late_fix_revises_everything_after_it():
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    for second in (1, 2, 4, 5):
+        tracker.process(fix(second, second, 0.0))
+    revised = tracker.process(fix(3, 3.0, 0.0))
+    assert [estimate.stamp_ns // SECOND for estimate in revised] == [3, 4, 5]
+    assert tracker.counts == {'used': 5, 'late': 1, 'doubted': 0}
+
+
+def test_bad_timing_is_counted_and_harmless():
+    tracker = DiverTracker(DiverConfig(history=2.0, max_tracks=1))
+    for second in range(1, 20):
+        tracker.process(fix(second, second, 0.0))
+    assert tracker.process(fix(5, 5.0, 0.0)) == []
+    assert tracker.counts['too_late'] == 1
+    assert tracker.process(fix(19, 19.0, 0.0)) == []
+    assert tracker.counts['duplicate'] == 1
+    assert tracker.process(fix(10**6, 0.0, 0.0)) == []  # a wild stamp far ahead
+    assert len(tracker.process(fix(20, 20.0, 0.0))) == 1
+    assert tracker.counts['doubted'] == 1
+
+
+def test_a_restarted_clock_is_noticed_and_loses_nothing():
+    tracker = DiverTracker(DiverConfig(restart_after=4, max_tracks=1))
+    first = run(tracker, [fix(second, second, 0.0) for second in range(1000, 1020)])
+    again = run(tracker, [fix(second, second, 0.0) for second in range(10, 30)])
+    assert tracker.counts['restarts'] == 1 and tracker.counts['too_late'] == 0
+    assert [estimate.stamp_ns // SECOND for estimate in again] == list(range(10, 30))
+    assert first[-1].extras['track_id'][0] != again[-1].extras['track_id'][0]
+
+
+def test_reset_equals_a_fresh_tracker():
+    scene = simulate(scenario('several', {'duration': 20.0}), seed=1)
+    items = [one.measurement for one in scene.measurements]
+    tracker = DiverTracker(DiverConfig())
+    first = run(tracker, items)
+    tracker.reset()
+    assert not tracker.counts
+    assert all(same(*pair) for pair in zip(first, run(tracker, items)))
+
+
+def test_another_frame_is_refused_by_name():
+    tracker = DiverTracker(DiverConfig())
+    tracker.process(fix(1, 0.0, 0.0))
+    assert tracker.process(fix(2, 0.0, 0.0, frame_id='odom')) == []
+    assert tracker.counts['other_frame'] == 1
+
+
+def test_an_outlier_is_not_believed():
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    clean = DiverTracker(DiverConfig(max_tracks=1))
+    for second in range(1, 30):
+        wild = second == 20
+        last = tracker.process(fix(second, 0.5 * second + 500.0 * wild, 0.0))[-1]
+        if not wild:
+            clean.process(fix(second, 0.5 * second, 0.0))
+    assert abs(last.state[0, 0] - 14.5) < 0.5
+    assert last.extras['track_id'][0] == 1
+
+
+def test_a_turned_and_shifted_scene_gives_the_turned_and_shifted_answer():
+    turn = 2.0 * np.pi * 3 / 16
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    shift = np.array([1000.0, -500.0])
+    scene = simulate(scenario('zigzag', {'duration': 30.0}), seed=5)
+    plain, turned = DiverTracker(DiverConfig()), DiverTracker(DiverConfig())
+    for one in scene.measurements:
+        z, C = one.measurement.position[:2], one.measurement.covariance
+        a = plain.process(one.measurement)[-1]
+        b = turned.process(
+            Fix(
+                stamp_ns=one.measurement.stamp_ns,
+                frame_id='map',
+                position=np.append(R @ z + shift, 0.0),
+                covariance=R @ C @ R.T,
+            )
+        )[-1]
+    np.testing.assert_allclose(b.state[0, :2], R @ a.state[0, :2] + shift, atol=1e-6)
+    np.testing.assert_allclose(
+        b.covariance[0, :2, :2], R @ a.covariance[0, :2, :2] @ R.T, atol=1e-6
+    )
+    np.testing.assert_allclose(b.probabilities[0, 3:16], a.probabilities[0, :13], atol=1e-6)
+
+
+def test_several_divers_keep_their_names():
+    scene = simulate(scenario('several', {'spacing': 25.0}), seed=2)
+    tracker = DiverTracker(DiverConfig(clutter_density=2.0 / 200.0**2))
+    estimates = run(tracker, [one.measurement for one in scene.measurements])
+    confirmed = [
+        estimate.extras['track_id'][estimate.extras['track_state'] > 0]
+        for estimate in estimates[10:]
+    ]
+    assert np.mean([len(ids) for ids in confirmed]) == pytest.approx(4.0, abs=0.35)
+    assert len(set(np.concatenate(confirmed).tolist())) <= 7
+
+
+def test_optimistic_covariances_can_be_found_out():
+    rng = np.random.default_rng(10)
+    tracker = DiverTracker(
+        DiverConfig(estimate_covariance_scale=True, max_tracks=1, gate_probability=0.9999999)
+    )
+    for second in range(1, 400):
+        z = np.array([0.4 * second, 0.0]) + 3.0 * rng.normal(size=2)
+        tracker.process(fix(second, *z))  # stated: 1 m, true: 3 m
+    assert 5.0 < tracker.health()['scale_fixes'] < 14.0
+
+
+def test_polled_divers_are_not_missed_when_another_one_answers():
+    tracker = DiverTracker(DiverConfig(fixes_are_scans=False, confirm_hits=2))
+    for second in range(1, 80):
+        diver = second % 8
+        last = tracker.process(fix(second, 60.0 * diver + 0.05 * second, 0.0))[-1]
+    assert sorted(last.extras['track_id'].tolist()) == list(range(1, 9))
+    assert (last.extras['track_state'] == 1).all()
+
+
+def test_parameters_that_may_change_do_and_others_do_not():
+    tracker = DiverTracker(DiverConfig())
+    tracker.process(fix(1, 0.0, 0.0))
+    tracker.reconfigure(DiverConfig(gate_probability=0.99))
+    assert tracker.config.gate_probability == 0.99
+    assert len(tracker.process(fix(2, 0.0, 0.0))[-1]) == 1
+    with pytest.raises(ValueError, match='directions'):
+        tracker.reconfigure(DiverConfig(directions=8))
+
+
+def test_smoothing_lowers_the_error_and_keeps_the_tracks():
+    filtered, smooth = [], []
+    for seed in range(3):
+        scene = simulate(scenario('table1', {'duration': 60.0}), seed)
+        tracker = SmoothingDiverTracker(DiverConfig(max_tracks=1))
+        estimates = run(tracker, [one.measurement for one in scene.measurements])
+        back = tracker.smoothed()
+        assert [one.stamp_ns for one in back] == [one.stamp_ns for one in estimates]
+        assert same(back[-1], estimates[-1])
+        for series, found in ((estimates, filtered), (back, smooth)):
+            found += np.sum(errors(series, scene.truth[0])[0] ** 2, axis=1).tolist()
+    assert np.sqrt(np.mean(smooth)) < 0.75 * np.sqrt(np.mean(filtered))
+
+
+def test_a_long_gap_is_no_straight_line():
+    """The spread predicted over half a minute is that of divers who turn as the chain says, not
+    that of divers who pick a heading and keep it."""
+    rng = np.random.default_rng(11)
+    config = DiverConfig(hover=False, adaptation='fixed', speed_noise=0.0, lateral_noise=0.0)
+    tracker = DiverTracker(config)
+    tracker.process(fix(1, 0.0, 0.0, 1e-6 * np.eye(2)))
+    before, dt = tracker._history.state, 30.0
+    P = tracker.models.chain.matrix
+    mode = rng.integers(16, size=4000)
+    speed = rng.normal(config.speed_mean, config.speed_std, size=4000)
+    place = np.zeros((4000, 2))
+    for _ in range(30):
+        mode = (rng.uniform(size=(4000, 1)) > np.cumsum(P[mode], axis=1)).sum(axis=1)
+        place += speed[:, None] * tracker.models.E[mode, 2:, 2]
+    walked = np.mean(np.sum(place**2, axis=1))
+
+    def spread(longest):
+        *_, last = cross(tracker.models, tracker._chain, before, dt, longest)
+        _, covariance = combine(last.x, last.P, last.mu, tracker.models.E)
+        return np.trace(covariance[0, :2, :2])
+
+    assert spread(1.0) == pytest.approx(walked, rel=0.1)
+    assert spread(config.longest_step) == pytest.approx(walked, rel=0.2)
+    assert spread(60.0) > 1.3 * walked

@@ -1,0 +1,222 @@
+"""The fathometer tracker with arrays: pressure, cross-spectra, dead phones, lost blocks."""
+
+from attrs import evolve
+from helpers.fathometer_runs import run
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
+from sonar_imm.simulation.fathometer.simulator import scenario, simulate
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig
+
+SMALL = {'phones': 8, 'element_spacing': 0.36, 'frequency_max': 2000.0, 'particles': 2000}
+
+
+@pytest.fixture(scope='module')
+def pressure_scene():
+    config = scenario('pressure', {'phones': 12, 'sample_rate': 6000.0, 'frequency_max': 2000.0})
+    return simulate(evolve(config, snapshot_seconds=0.7), 1)
+
+
+PRESSURE = {
+    'phones': 12,
+    'frequency_max': 2000.0,
+    'snapshot_seconds': 0.7,
+    'record_seconds': 9.8,
+    'depth_min': 122.0,
+    'depth_max': 172.0,
+    'particles': 500,
+}
+
+
+def blocks(scene, size=None):
+    """The scene's pressure, as it is or in blocks of `size` samples."""
+    own = [one.measurement for one in scene.measurements]
+    if size is None:
+        return own
+    p = np.concatenate([one.pressure for one in own])
+    return [
+        Pressure(
+            stamp_ns=own[0].stamp_ns + round(first / own[0].sample_rate * 1e9),
+            frame_id=own[0].frame_id,
+            pressure=p[first : first + size],
+            sample_rate=own[0].sample_rate,
+            reference_depth=own[0].reference_depth,
+        )
+        for first in range(0, len(p) - 1, size)
+    ]
+
+
+def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
+    own = blocks(pressure_scene)
+    tracker, found = run(own, **PRESSURE)
+    assert len(found) == 1 and tracker.counts['blocks'] == len(own)
+    (estimate,) = found.values()
+
+    p = np.concatenate([one.pressure for one in own]).astype(np.float64)
+    n = 4200
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
+    parts = [
+        np.fft.rfft(p[k : k + n] * window[:, None], axis=0)
+        for k in range(0, len(p) - n + 1, n // 2)
+    ]
+    R = sum(part[:, :, None] * part[:, None, :].conj() for part in parts)
+    frequency = np.arange(n // 2 + 1) / 0.7
+    band = (frequency >= 50.0) & (frequency < 2000.001)
+    spectra = CrossSpectra(
+        stamp_ns=estimate.stamp_ns,
+        frame_id='array',
+        frequency=frequency[band].astype(np.float32),
+        csdm=R[band].astype(np.complex64),
+        reference_depth=own[0].reference_depth,
+    )
+    other, same = run([spectra], **PRESSURE)
+    scale = tracker.response.sigma[0]
+    assert np.abs(other.response.amplitude - tracker.response.amplitude).max() < 0.01 * scale
+    assert other.response.sigma[0] == pytest.approx(scale, rel=1e-3)
+    assert np.allclose(same[estimate.stamp_ns].probabilities, estimate.probabilities, atol=0.02)
+
+
+def test_the_noise_is_measured_right_though_it_fades_with_depth():
+    """What windows do to noise: between 180 m and 300 m there is an eighth less of it."""
+    options = {'phones': 8, 'frequency_max': 2900.0, 'depth_min': 122.0, 'depth_max': 172.0}
+    rng = np.random.default_rng(0)
+    seen = []
+    for _ in range(4):
+        noise = [
+            Pressure(
+                stamp_ns=10**18 + round(k * 1.4e9),
+                frame_id='array',
+                pressure=rng.standard_normal((8400, 8), np.float32),
+                sample_rate=6000.0,
+                reference_depth=73.5,
+            )
+            for k in range(64)
+        ]
+        tracker, _ = run(noise, particles=50, **options)
+        seen.append(tracker.response.amplitude / tracker.response.sigma)
+    assert np.sqrt(np.mean(np.square(seen))) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize('size', [977, 50_000])
+def test_blocks_of_any_length_give_the_same(pressure_scene, size):
+    own, _ = run(blocks(pressure_scene), **PRESSURE)
+    other, _ = run(blocks(pressure_scene, size), **PRESSURE)
+    assert np.allclose(own.response.amplitude, other.response.amplitude, atol=1e-7)
+
+
+def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
+    own = blocks(pressure_scene)
+    tracker, found = run(own[:3] + own[4:], **PRESSURE)
+    assert tracker.counts['gaps'] == 1 and not found
+    late = [evolve(one, stamp_ns=one.stamp_ns + 60 * 10**9) for one in own]
+    tracker, found = run(own[:6] + late, **PRESSURE)
+    assert tracker.counts['records_abandoned'] == 1
+    assert len(found) == 1
+
+
+def test_a_preview_is_not_committed(pressure_scene):
+    own = blocks(pressure_scene)
+    again = [
+        evolve(one, stamp_ns=one.stamp_ns + k * round(9.8e9)) for k in range(3) for one in own
+    ]
+    plain, found = run(again, **PRESSURE)
+    eager, more = run(again, preview_seconds=2.8, **PRESSURE)
+    assert eager.counts['previews'] > 3
+    assert set(found) < set(more)
+    for stamp, one in more.items():
+        assert one.extras['preview'].all() == (stamp not in found)
+        if stamp in found:
+            assert one.state.tobytes() == found[stamp].state.tobytes()
+
+
+def test_the_small_drift_is_followed_from_cross_spectra_and_a_companion():
+    scene = simulate(scenario('small'), 3)
+    tracker, found = run([one.measurement for one in scene.measurements], **SMALL)
+    assert tracker.counts['array_depths'] == 12 and not tracker.counts['array_depth_unknown']
+    truth = {one.stamp_ns: one for one in scene.truth}
+    near = [
+        np.abs(one.state[0, 0] - truth[stamp].depth.min()) < 0.3 for stamp, one in found.items()
+    ]
+    assert len(near) == 12 and np.mean(near) > 0.9
+
+
+@pytest.fixture(scope='module')
+def spectra():
+    scene = simulate(scenario('small', {'records': 1, 'depth_companion': False}), 5)
+    return scene.measurements[0].measurement
+
+
+def changed(spectra, csdm=None, **fields):
+    return CrossSpectra(
+        stamp_ns=spectra.stamp_ns,
+        frequency=fields.pop('frequency', spectra.frequency),
+        csdm=spectra.csdm if csdm is None else csdm,
+        reference_depth=fields.pop('reference_depth', spectra.reference_depth),
+        **fields,
+    )
+
+
+@pytest.mark.parametrize('dead', [0, 3, 7])
+def test_a_dead_phone_is_left_out_and_changes_little(spectra, dead):
+    csdm = spectra.csdm.copy()
+    csdm[:, dead], csdm[:, :, dead] = np.nan, np.nan
+    config = FathometerConfig(**SMALL, depth_min=122.0, depth_max=172.0)
+    depth = spectra.reference_depth
+    lattice = lattice_of_array(depth, config)
+    whole = array_response(spectra, lattice, config, depth)
+    masked = array_response(changed(spectra, csdm), lattice, config, depth)
+    peak = whole.amplitude.argmax()
+    assert masked.amplitude[peak] > 0.5 * whole.amplitude[peak]
+    assert np.corrcoef(whole.amplitude, masked.amplitude)[0, 1] > 0.5
+    tracker, found = run([changed(spectra, csdm)], **SMALL)
+    assert found and tracker.counts['dead_phones_masked'] == 1
+
+
+def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
+    one = np.ones((len(spectra), 8, 8), np.complex64)
+    cases = {
+        'singular': ([changed(spectra, one)], {'loading': 0.0}),
+        'wrong_phones': ([changed(spectra, spectra.csdm[:, :7, :7])], {}),
+        'bad_band': ([spectra], {'frequency_min': 5000.0, 'frequency_max': 6000.0}),
+        'bad_frequency': (
+            [
+                changed(
+                    spectra, frequency=spectra.frequency + 0.3 * np.sin(np.arange(len(spectra)))
+                )
+            ],
+            {},
+        ),
+        'too_crowded': ([spectra], {'min_separation': 30.0}),
+        'too_large': ([spectra], {'depth_step': 1e-4}),
+    }
+    for reason, (items, options) in cases.items():
+        tracker, found = run(items, **{**SMALL, **options})
+        assert tracker.counts[reason] == 1, (reason, tracker.counts)
+        assert not found
+    tracker, found = run([changed(spectra, one)], **SMALL)
+    assert tracker.counts['rank_deficient'] == 1
+
+
+def test_missing_frequencies_do_no_harm(spectra):
+    keep = np.ones(len(spectra), bool)
+    keep[50:60] = False
+    tracker, _ = run([spectra], **SMALL)
+    other, _ = run(
+        [changed(spectra, spectra.csdm[keep], frequency=spectra.frequency[keep])], **SMALL
+    )
+    a, b = tracker.response.amplitude, other.response.amplitude
+    assert np.corrcoef(a, b)[0, 1] > 0.9
+
+
+def test_where_the_array_is(spectra):
+    bare = changed(spectra, reference_depth=None)
+    for companion, options, expected in (
+        ([ArrayDepth(stamp_ns=bare.stamp_ns - 10**9, depth=70.0)], {}, 70.0),
+        ([ArrayDepth(stamp_ns=bare.stamp_ns - 10**12, depth=70.0)], {'array_depth': 60.0}, 60.0),
+        ([], {}, 0.0),
+    ):
+        tracker, _ = run([*companion, bare], **{**SMALL, **options})
+        assert tracker.response.reference_depth == expected
+        assert tracker.counts['array_depth_unknown'] == (expected == 0.0)

@@ -1,0 +1,302 @@
+"""The fathometer tracker as its users see it: measurements in, estimates out."""
+
+from pathlib import Path
+
+from helpers.fathometer_runs import run
+import numpy as np
+import pytest
+
+from sonar_imm.estimation.consistency import nees, ospa
+from sonar_imm.measurements import Fix, Trace
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.fathometer.simulator import scenario, simulate
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+
+VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer'
+RECORD_NS = 90 * 10**9
+
+
+@pytest.fixture(scope='module')
+def vectors():
+    with np.load(VECTORS / 'mvdr_traces.npz') as file:
+        found = {name: file[name] for name in file}
+    amplitude = found['reflector_amplitude']
+    found['present'] = amplitude > 0.4 * amplitude.max(axis=0)
+    return found
+
+
+def traces(vectors, records, scale=1.0, given=True):
+    for k in records:
+        sigma = np.full(len(vectors['depth']), scale * vectors['sigma'][k])
+        yield Trace(
+            stamp_ns=(k + 1) * RECORD_NS,
+            frame_id='array',
+            depth=vectors['depth'],
+            amplitude=vectors['amplitude'][k],
+            sigma=sigma if given else None,
+            reference_depth=float(vectors['reference_depth'][k]),
+        )
+
+
+def score(found, vectors):
+    """Share of records whose order is right, and mean OSPA."""
+    right, distance = [], []
+    for stamp, estimate in found.items():
+        k = stamp // RECORD_NS - 1
+        there = vectors['reflector_depth'][k][vectors['present'][k]].astype(float)
+        order = int(estimate.model_names[estimate.probabilities[0].argmax()].split('_')[1])
+        right.append(order == len(there))
+        seen = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
+        distance.append(ospa(seen, there[:, None], cutoff=2.0, order=2.0))
+    return np.mean(right), np.mean(distance)
+
+
+@pytest.mark.parametrize('given', [True, False])
+def test_the_simulated_drift_is_followed(vectors, given):
+    tracker, found = run(traces(vectors, range(300), given=given), particles=5000)
+    right, distance = score(found, vectors)
+    assert right >= 0.94
+    assert distance <= 0.07
+    assert tracker.counts['used'] == 300 == len(found)
+    ids = np.concatenate([one.extras['track_id'] for one in found.values()])
+    names, lives = np.unique(ids, return_counts=True)
+    # Ten reflectors; what else got an id was soon gone.
+    assert np.count_nonzero(lives > 20) in (10, 11)
+    assert np.count_nonzero(lives <= 20) <= 15
+
+
+def depth_nees(found, true_depths):
+    """Mean of error^2 / variance over the reflectors that are near a true one."""
+    error, variance = [], []
+    for stamp, estimate in found.items():
+        offset = estimate.state[:, :1] - true_depths[stamp]
+        nearest = offset[np.arange(len(offset)), np.abs(offset).argmin(axis=1)]
+        near = np.abs(nearest) < 0.3
+        error.append(nearest[near])
+        variance.append(estimate.covariance[near, 0, 0])
+    error, variance = np.concatenate(error), np.concatenate(variance)
+    assert len(error) > 500
+    return nees(error[:, None], variance[:, None, None]).mean()
+
+
+def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
+    """All reflectors of a record share the error of the array's depth, 0.03 m in the vectors and
+    the scenes, and it is greater than what the trace leaves open."""
+    options = {'particles': 3000}
+    true = {
+        (k + 1) * RECORD_NS: vectors['reflector_depth'][k][vectors['present'][k]]
+        for k in range(300)
+    }
+    _, found = run(traces(vectors, range(300)), **options)
+    assert 0.8 < depth_nees(found, true) < 1.2
+    scene = simulate(scenario('drift_traces', {'records': 100}), 0)
+    measured = [one.measurement for one in scene.measurements]
+    true = {one.stamp_ns: one.depth for one in scene.truth}
+    _, found = run(measured, **options)
+    assert 0.7 < depth_nees(found, true) < 1.3
+    _, found = run(measured, array_depth_std=0.0, **options)
+    assert depth_nees(found, true) > 4.0
+
+
+def test_a_perfect_depth_sensor_needs_no_allowance():
+    scene = simulate(scenario('drift_traces', {'records': 100, 'array_depth_std': 0.0}), 0)
+    _, found = run(
+        [one.measurement for one in scene.measurements], particles=3000, array_depth_std=0.0
+    )
+    assert 0.6 < depth_nees(found, {one.stamp_ns: one.depth for one in scene.truth}) < 1.2
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.98])
+def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
+    """A scene of known level: amplitudes change by a twentieth from record to record. What an
+    amplitude was before makes its variance smaller by a fourth."""
+    scene = simulate(scenario('drift_traces', {'records': 100}), 1)
+    _, found = run(
+        [one.measurement for one in scene.measurements], particles=3000, amplitude_memory=memory
+    )
+    error, variance = [], []
+    for received, truth in zip(scene.measurements, scene.truth, strict=True):
+        estimate = found[truth.stamp_ns]
+        way = 2.0 * (truth.depth - received.measurement.reference_depth) + 32 * 0.18
+        level = 12.0 * truth.amplitude / way
+        distance = np.abs(estimate.state[:, :1] - truth.depth)
+        near = distance.min(axis=1) < 0.3
+        error.append((estimate.state[:, 1] - level[distance.argmin(axis=1)])[near])
+        variance.append(estimate.covariance[near, 1, 1])
+    error, variance = np.concatenate(error), np.concatenate(variance)
+    assert len(error) > 700
+    assert 0.85 < nees(error[:, None], variance[:, None, None]).mean() < 1.25
+    expected = 0.8 if memory else 1.0
+    assert np.median(variance) == pytest.approx(expected * 1.3e-3**2, rel=0.1)
+
+
+def test_what_came_later_corrects_an_estimate(vectors):
+    options = {'particles': 3000, 'seed': 4}
+    now = score(run(traces(vectors, range(80, 280)), **options)[1], vectors)
+    later = score(run(traces(vectors, range(80, 280)), smoothing_lag=2, **options)[1], vectors)
+    assert later[0] > now[0]
+    assert later[1] <= now[1] + 0.003
+
+
+def test_mistakes_of_print_cost_what_they_cost(vectors):
+    records = range(0, 60)
+    right, distance = score(run(traces(vectors, records), particles=3000)[1], vectors)
+    low = score(run(traces(vectors, records, scale=0.7), particles=3000)[1], vectors)
+    assert low[0] < right - 0.5
+    blind = {'particles': 3000, 'proposal': 'prior'}
+    assert score(run(traces(vectors, records), **blind)[1], vectors)[1] > 5.0 * distance
+    fixed = {**blind, 'order_min': 7, 'order_max': 7}
+    assert score(run(traces(vectors, records), **fixed)[1], vectors)[1] > 0.5
+
+
+def test_noise_alone_has_no_reflector():
+    rng = np.random.default_rng(0)
+    depth = np.arange(100.0, 150.0, 0.1)
+    noise = [
+        Trace(stamp_ns=k, depth=depth, amplitude=rng.standard_normal(len(depth)))
+        for k in range(1, 30)
+    ]
+    _, found = run(noise, pulse='gaussian', pulse_width=0.05, order_min=0, particles=2000)
+    nothing = [one for one in found.values() if np.isnan(one.state[0, 0])]
+    assert len(nothing) > 24
+    for one in nothing:
+        assert len(one) == 1
+        assert one.probabilities[0].argmax() == 0
+        assert one.probabilities[0].sum() == pytest.approx(1.0)
+        assert one.extras['track_id'][0] == 0 and np.isnan(one.xyz[0, 2])
+
+
+def test_columns_are_those_of_the_contract(vectors):
+    _, found = run(traces(vectors, range(3)), particles=500)
+    columns = found[RECORD_NS].columns()
+    names = list(columns)
+    assert names[:3] == ['x', 'y', 'z']
+    assert names[3:8] == [
+        'depth', 'amplitude', 'cov_depth_depth', 'cov_depth_amplitude', 'cov_amplitude_amplitude',
+    ]  # fmt: skip
+    assert names[8:20] == [f'prob_order_{k}' for k in range(1, 13)]
+    assert {'track_id', 'existence'} <= set(names[20:])
+    assert columns['track_id'].dtype == np.uint32
+    assert np.allclose(columns['z'], -columns['depth'])
+    assert (np.diff(columns['depth']) > 0.0).all()
+    assert np.ptp(columns['prob_order_8']) == 0.0
+    assert (columns['cov_depth_depth'] > 0.0).all()
+    assert ((columns['existence'] >= 0.5) & (columns['existence'] <= 1.0)).all()
+
+
+def test_amplitudes_are_freed_of_spreading(vectors):
+    """The truth's amplitudes differ from the response's by the way the echo goes, and one factor
+    of the processor."""
+    _, found = run(traces(vectors, range(60)), particles=1000)
+    raw, freed = [], []
+    for stamp, one in found.items():
+        k = stamp // RECORD_NS - 1
+        nearest = np.abs(one.state[:, :1] - vectors['reflector_depth'][k]).argmin(axis=1)
+        true = vectors['reflector_amplitude'][k][nearest]
+        strong = true > 0.09
+        raw.append(one.state[strong, 1] / true[strong])
+        freed.append(one.extras['relative_amplitude'][strong] / true[strong])
+    spread = [np.std(one) / np.mean(one) for one in map(np.concatenate, (raw, freed))]
+    assert spread[1] < 0.9 * spread[0]
+
+
+def test_the_same_input_gives_the_same_bytes(vectors):
+    def columns(**parameters):
+        _, found = run(traces(vectors, range(12)), particles=1001, **parameters)
+        return [c.tobytes() for one in found.values() for c in one.columns().values()]
+
+    assert columns() == columns(threads=4)
+    assert columns() != columns(seed=1)
+
+
+def test_late_repeated_and_restarted_input(vectors):
+    one = list(traces(vectors, range(8)))
+    tracker = FathometerTracker(FathometerConfig(particles=200))
+    for k in (3, 3, 1, 4):
+        tracker.process(one[k])
+    assert tracker.counts['duplicate'] == 1
+    assert tracker.counts['too_late'] == 1
+    assert tracker.counts['used'] == 2
+    tracker = FathometerTracker(FathometerConfig(particles=200))
+    estimates = [tracker.process(one[k]) for k in (7, 0, 1, 2, 3)]
+    assert [len(each) for each in estimates] == [1, 0, 0, 3, 1]
+    assert tracker.counts['restarts'] == 1
+
+
+def test_reset_equals_a_fresh_tracker(vectors):
+    tracker = FathometerTracker(FathometerConfig(particles=300))
+    first, again = [], []
+    for out in (first, again):
+        for one in traces(vectors, range(5)):
+            out += [c.tobytes() for e in tracker.process(one) for c in e.columns().values()]
+        tracker.reset()
+    assert first == again
+
+
+def test_strange_input_is_counted():
+    tracker = SYSTEMS['fathometer'].build(FathometerConfig(particles=100))
+    assert tracker.process(Fix(stamp_ns=1, position=np.zeros(3))) == []
+    flat = Trace(stamp_ns=2, depth=np.arange(100.0), amplitude=np.ones(100))
+    assert tracker.process(flat) == []
+    assert tracker.counts['unknown_type'] == 1 and tracker.counts['no_noise'] == 1
+
+
+def test_a_trace_may_lie_elsewhere_later(vectors):
+    tracker, found = run(
+        [
+            *traces(vectors, range(2)),
+            Trace(stamp_ns=10**13, depth=np.arange(500.0, 600.0), amplitude=np.arange(100.0)),
+            next(traces(vectors, [250])),
+        ],
+        particles=300,
+    )
+    assert tracker.counts['other_depths'] == 1
+
+
+def test_a_running_tracker_takes_over_what_may_change():
+    tracker = FathometerTracker(FathometerConfig())
+    tracker.reconfigure(FathometerConfig(existence_min=0.7))
+    assert tracker.config.existence_min == 0.7
+    with pytest.raises(ValueError, match='particles'):
+        tracker.reconfigure(FathometerConfig(particles=7))
+
+
+def test_a_warm_tracker_is_as_new():
+    tracker = FathometerTracker(FathometerConfig(particles=50, depth_min=100.0, depth_max=150.0))
+    tracker.warm()
+    assert not tracker.counts and tracker.response is None
+
+
+@pytest.mark.parametrize(
+    'parameters, word',
+    [
+        ({'order_min': 9, 'order_max': 7}, 'order_max'),
+        ({'order_min': 7, 'order_max': 8, 'order_transition_matrix': [1.0]}, '2 x 2'),
+        (
+            {'order_min': 7, 'order_max': 8, 'order_transition_matrix': [0.5, 0.5, 0.5, 0.6]},
+            'row 1',
+        ),
+        ({'pulse': 'file'}, 'pulse_file'),
+        ({'frequency_min': 5000.0}, 'frequency_max'),
+        ({'depth_min': 50.0}, 'depth_max'),
+        ({'amplitude_prior': 'paper', 'amplitude_memory': 0.5}, 'marginal'),
+        ({'particles': 0}, 'particles'),
+    ],
+)
+def test_configurations_that_cannot_be(parameters, word):
+    with pytest.raises(ConfigError, match=word):
+        FathometerConfig(**parameters)
+
+
+def test_a_pulse_from_a_file(tmp_path):
+    path = tmp_path / 'pulse.csv'
+    path.write_text('distance,value\n0,2\n0.5,1\n1,0\n')
+    tracker = FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(path)))
+    assert tracker.pulse(np.array([0.25, 0.5])) == pytest.approx([0.75, 0.5])
+    for text in ('', 'a,b\n', '1,2\n'):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match='pulse_file'):
+            FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(path)))
+    with pytest.raises(ConfigError, match='No such file'):
+        FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(tmp_path / 'no')))

@@ -1,0 +1,123 @@
+"""What the obstacle tracker does with input and parameters that are wrong, odd or missing."""
+
+from helpers.obstacle_runs import approach, lever, navigation, rows, run, SECOND
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.measurements import Altitude, Detections, Fix, Navigation
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+
+NAME = 'approach_dst+3_noisy'
+
+
+def test_rows_that_are_no_echo_are_ignored():
+    tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
+    tracker.process(navigation(rows(NAME)[0], SECOND))
+    bad = Detections(
+        stamp_ns=SECOND,
+        range=[np.nan, 50.0, -3.0, 0.0, np.inf, 40.0, 30.0],
+        bearing=[0.0, np.nan, 0.0, 0.0, 0.1, 0.1, 3.0],
+    )
+    (estimate,) = tracker.process(bad)
+    assert len(estimate) == 1
+    assert estimate.state[0, 0] == pytest.approx(40.0)
+
+
+def test_variances_of_the_detections_win():
+    def first(**columns):
+        tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
+        tracker.process(navigation(rows(NAME)[0], SECOND))
+        ping = Detections(stamp_ns=SECOND, range=[40.0], bearing=[0.1], **columns)
+        return tracker.process(ping)[0].covariance[0]
+
+    own = first()
+    assert own[0, 0] == pytest.approx(0.15**2 + 0.17**2 / 12.0)
+    assert own[1, 1] == pytest.approx(np.radians(0.25) ** 2 + np.radians(0.18) ** 2 / 12.0)
+    stated = first(var_range=[0.5], var_bearing=[1e-4])
+    assert stated[0, 0] == pytest.approx(0.5)
+    assert stated[1, 1] == pytest.approx(1e-4)
+    assert_allclose(first(var_range=[0.0], var_bearing=[np.nan]), own)
+
+
+def test_strangers_are_counted():
+    tracker = ObstacleTracker(ObstacleConfig())
+    run(tracker, approach(NAME)[:6])
+    assert not tracker.process(Fix(stamp_ns=SECOND, position=[0.0, 0.0, 0.0]))
+    assert not tracker.process(
+        Detections(stamp_ns=2 * SECOND, range=[1.0], bearing=[0.0], frame_id='other')
+    )
+    assert tracker.counts['unknown_type'] == 1
+    assert tracker.counts['other_frame'] == 1
+
+
+def test_detections_without_navigation_wait_and_do_not_pile_up_results():
+    tracker = ObstacleTracker(ObstacleConfig())
+    for k in range(20):
+        ping = Detections(stamp_ns=SECOND * (k + 1), range=[50.0], bearing=[0.0])
+        assert not tracker.process(ping)
+    assert tracker.health()['pings_waiting'] == 20
+
+
+def test_the_seafloor_method_needs_an_altitude():
+    measurements = [one for one in approach(NAME) if not isinstance(one, Altitude)]
+    tracker = ObstacleTracker(ObstacleConfig(method='seafloor', sonar_lever=lever(NAME)))
+    assert all(len(one) == 0 for one in run(tracker, measurements).values())
+
+
+def test_parameters_are_checked_together():
+    with pytest.raises(ConfigError, match='confirm_hits'):
+        ObstacleConfig(confirm_hits=7, confirm_window=6)
+    with pytest.raises(ConfigError, match='sonar_lever needs three values'):
+        ObstacleConfig(sonar_lever=(1.0, 2.0))
+    with pytest.raises(ConfigError, match='did you mean'):
+        ObstacleConfig.from_mapping({'sonar_leaver': [0.0, 0.0, 0.0]})
+
+
+def test_rules_may_change_while_running():
+    tracker = ObstacleTracker(ObstacleConfig())
+    tracker.reconfigure(ObstacleConfig(delete_misses=20))
+    assert tracker.config.delete_misses == 20
+    with pytest.raises(ValueError, match='components'):
+        tracker.reconfigure(ObstacleConfig(components=5))
+
+
+@pytest.mark.parametrize('timing', ['instant', 'two_way'])
+@pytest.mark.parametrize('model', ['plane', 'cone'])
+@pytest.mark.parametrize('method', ['gaussian_sum', 'seafloor', 'landmark'])
+@pytest.mark.filterwarnings('error')
+def test_nonsense_gives_finite_numbers(method, model, timing):
+    """A vehicle that tumbles and leaps, wild ranges, bearings and variances."""
+    rng = np.random.default_rng(1)
+    tracker = ObstacleTracker(
+        ObstacleConfig(
+            method=method,
+            azimuth_model=model,
+            ping_timing=timing,
+            confirm_hits=1,
+            max_navigation_gap=5.0,
+        )
+    )
+    estimates = []
+    for k in range(1, 60):
+        q = rng.normal(size=4)
+        pose = Navigation(
+            stamp_ns=k * SECOND,
+            position=rng.normal(size=3) * 10 ** rng.uniform(-2.0, 6.0),
+            orientation=q / np.linalg.norm(q),
+        )
+        D = int(rng.integers(0, 40))
+        ping = Detections(
+            stamp_ns=k * SECOND + 1000,
+            range=10 ** rng.uniform(-6.0, 5.0, D),
+            bearing=rng.uniform(-1.7, 1.7, D),
+            var_range=10 ** rng.uniform(-14.0, 6.0, D),
+            var_bearing=10 ** rng.uniform(-14.0, 2.0, D),
+        )
+        height = Altitude(stamp_ns=k * SECOND, altitude=float(10 ** rng.uniform(-3.0, 4.0)))
+        estimates += [one for item in (height, pose, ping) for one in tracker.process(item)]
+    assert sum(map(len, estimates)) > 100
+    for estimate in estimates:
+        for name, column in estimate.columns().items():
+            assert name == 'nis' or np.isfinite(column).all()

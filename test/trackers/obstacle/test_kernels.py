@@ -1,0 +1,171 @@
+"""The compiled arithmetic against plain numpy, brute force and sampling."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.optimize import brentq
+from scipy.special import ndtr
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.trackers.obstacle import kernels as kernels
+
+MODELS = {'plane': False, 'cone': True}
+
+
+def poses(rng):
+    """Two poses a metre and a few degrees apart."""
+    angles = rng.normal(0.0, 0.1, 3)
+    before = Pose(rng.normal(0.0, 20.0, 3), geometry.rotation(*angles))
+    after = Pose(
+        before.position + rng.normal(0.0, 1.0, 3),
+        geometry.rotation(*(angles + rng.normal(0.0, 0.03, 3))),
+    )
+    return before, after
+
+
+def targets(rng, before, T=3, K=4):
+    x = np.empty((T, K, 4))
+    x[..., 0] = rng.uniform(30.0, 90.0, (T, K))
+    x[..., 1] = rng.uniform(-0.3, 0.3, (T, K))
+    x[..., 2] = before.position[2] + rng.uniform(-6.0, 6.0, (T, K))
+    x[..., 3] = rng.normal(0.0, 0.003, (T, K))
+    A = rng.normal(size=(T, K, 4, 4)) * np.array([0.2, 0.004, 1.5, 0.003])[:, None]
+    mu = rng.dirichlet(np.ones(K), T)
+    return x, A @ np.swapaxes(A, -1, -2), mu
+
+
+def sigma_points(x, P):
+    """Nine points (..., 9, 4) and their weights, by numpy."""
+    columns = np.swapaxes(np.sqrt(5.0) * np.linalg.cholesky(P), -1, -2)
+    centre = x[..., None, :]
+    weights = np.array([0.2] + [0.1] * 8)
+    return np.concatenate([centre, centre + columns, centre - columns], axis=-2), weights
+
+
+@pytest.mark.parametrize('model', MODELS)
+def test_prediction_equals_numpy(model):
+    rng = np.random.default_rng(1)
+    before, after = poses(rng)
+    x, P, _ = targets(rng, before)
+    noise = np.array([1e-3, 2e-7, 3e-4])
+    x1, P1 = kernels.advance(x, P, *before, *after, noise, MODELS[model])
+    points, weights = sigma_points(x, P)
+    d, delta, z, s = np.moveaxis(points, -1, 0)
+    m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
+    stretch = np.stack([1.0 + s, 1.0 + s, np.ones_like(s)], axis=-1)
+    moved = geometry.apply(before.R, m) + (before.position - after.position) * stretch
+    echo = geometry.project(geometry.apply(after.R.T, moved), model)
+    images = np.stack([*echo, z, s], axis=-1)
+    mean = np.einsum('s,tksi->tki', weights, images)
+    off = images - mean[..., None, :]
+    covariance = np.einsum('s,tksi,tksj->tkij', weights, off, off)
+    covariance[..., 0, 0] += noise[0]
+    covariance[..., 1, 1] += noise[0] / mean[..., 0] ** 2 + noise[1]
+    covariance[..., 2, 2] += noise[2]
+    assert_allclose(x1, mean, rtol=1e-12, atol=1e-13)
+    assert_allclose(P1, covariance, rtol=1e-9, atol=1e-15)
+    assert np.all(P1 == np.swapaxes(P1, -1, -2))
+
+
+def test_prediction_of_a_known_target_is_exact():
+    """Without variance the mean is the geometry's own prediction, and nothing is spread."""
+    rng = np.random.default_rng(2)
+    before, after = poses(rng)
+    x, _, _ = targets(rng, before)
+    x[..., 3] = 0.0
+    x1, P1 = kernels.advance(x, np.zeros((3, 4, 4, 4)), *before, *after, np.zeros(3), False)
+    m = geometry.reconstruct(x[..., 0], x[..., 1], x[..., 2] - before.position[2], before.R)
+    assert_allclose(
+        x1[..., :2], np.stack(geometry.project(geometry.predict(m, before, after)), -1), rtol=1e-12
+    )
+    assert_allclose(P1, 0.0, atol=1e-20)
+
+
+def test_a_turn_through_the_back_keeps_the_spread_of_the_azimuth():
+    """Azimuths on both sides of +-180 degrees are neighbours."""
+    x = np.array([[[50.0, 3.0, 0.0, 0.0]]])
+    P = np.diag([0.01, 1e-4, 0.01, 1e-6])[None, None]
+    still = np.zeros(3)
+    turned = geometry.rotation(0.0, 0.0, -(np.pi - 3.0))
+    _, P1 = kernels.advance(x, P, still, np.eye(3), still, turned, np.zeros(3), False)
+    assert_allclose(P1[0, 0, 1, 1], 1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize('model', MODELS)
+def test_where_no_point_exists_the_nearest_is_taken(model):
+    x = np.array([[[10.0, 0.1, 12.0, 0.0]]])
+    m = kernels.points(x, np.zeros(3), np.eye(3), MODELS[model])[0, 0]
+    assert np.isfinite(m).all()
+    assert_allclose(np.linalg.norm(m), 10.0)
+
+
+def test_places_equal_sampling():
+    rng = np.random.default_rng(3)
+    before, _ = poses(rng)
+    x, P, mu = targets(rng, before, T=1, K=2)
+    mean, covariance = kernels.locate(x, P, mu, *before, False)
+    which = rng.choice(2, 200_000, p=mu[0])
+    draws = np.array([rng.multivariate_normal(x[0, k], P[0, k], 200_000) for k in (0, 1)])
+    d, delta, z, _ = draws[which, np.arange(200_000)].T
+    m = geometry.reconstruct(d, delta, z - before.position[2], before.R)
+    world = geometry.to_world(before, m)
+    assert_allclose(mean[0], world.mean(axis=0), atol=0.1)
+    assert_allclose(covariance[0], np.cov(world.T), rtol=0.05, atol=0.2)
+
+
+def test_soft_update_equals_two_cases_put_together():
+    rng = np.random.default_rng(4)
+    before, _ = poses(rng)
+    x, P, mu = targets(rng, before)
+    z = x[:, 0, :2] + rng.normal(size=(3, 2)) * [0.3, 0.005]
+    R = np.tile(np.diag([0.025, 2.5e-5]), (3, 1, 1))
+    h = np.ascontiguousarray(x[..., :2])
+    after, covariance, weight, _ = kernels.soft_update(x, P, mu, h, z, R, 0.1, 0.5)
+    H = np.eye(2, 4)
+    for t in range(3):
+        likelihood = np.empty(4)
+        for k in range(4):
+            S = H @ P[t, k] @ H.T + R[t]
+            v = z[t] - x[t, k, :2]
+            own = 0.9 * np.exp(-0.5 * v @ np.linalg.solve(S, v))
+            own /= 2.0 * np.pi * np.sqrt(np.linalg.det(S))
+            likelihood[k] = mu[t, k] * (own + 0.05)
+            gain = P[t, k] @ H.T @ np.linalg.inv(S)
+            cases = [(own / (own + 0.05), x[t, k] + gain @ v, (np.eye(4) - gain @ H) @ P[t, k])]
+            cases.append((1.0 - cases[0][0], x[t, k], P[t, k]))
+            mean = sum(share * centre for share, centre, _ in cases)
+            spread = sum(
+                share * (C + np.outer(centre - mean, centre - mean)) for share, centre, C in cases
+            )
+            assert_allclose(after[t, k], mean, rtol=1e-9)
+            assert_allclose(covariance[t, k], spread, rtol=1e-7, atol=1e-12)
+        assert_allclose(weight[t], likelihood / likelihood.sum(), rtol=1e-9)
+
+
+def test_an_update_that_no_component_explains_keeps_the_weights():
+    x, P = np.zeros((1, 2, 4)), np.tile(np.eye(4) * 1e-6, (1, 2, 1, 1))
+    mu, z = np.array([[0.3, 0.7]]), np.full((1, 2), 1e3)
+    *_, weight, nis = kernels.soft_update(
+        x, P, mu, x[..., :2].copy(), z, np.eye(2)[None] * 1e-6, 0.0, 1.0
+    )
+    assert_allclose(weight, mu)
+    assert nis[0] > 1e6
+
+
+def test_quantiles_of_mixtures():
+    rng = np.random.default_rng(5)
+    mean, std = rng.normal(0.0, 5.0, (6, 3)), rng.uniform(0.1, 3.0, (6, 3))
+    mu = rng.dirichlet(np.ones(3), 6)
+    mu[0] = [1.0, 0.0, 0.0]
+    mean[1], std[1], mu[1] = [-500.0, 0.0, 500.0], 1e-3, [0.05 - 1e-9, 0.9, 0.05 + 1e-9]
+    low, high, negative = kernels.bands(mean, std, mu, 0.05)
+    for t in range(6):
+
+        def below(value):
+            return float(mu[t] @ ndtr((value - mean[t]) / std[t]))  # noqa: B023
+
+        assert_allclose(negative[t], below(0.0), atol=1e-12)
+        for quantile, probability in ((low[t], 0.05), (high[t], 0.95)):
+            exact = brentq(lambda value: below(value) - probability, -1e3, 1e3, xtol=1e-12)  # noqa: B023
+            assert_allclose(quantile, exact, atol=1e-6)

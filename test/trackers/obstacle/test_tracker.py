@@ -1,0 +1,332 @@
+"""The obstacle tracker as a whole: life of tracks, time, navigation, bad input."""
+
+from helpers.obstacle_runs import (
+    approach,
+    followed,
+    lever,
+    mean_nis,
+    navigation,
+    offset_at,
+    rows,
+    run,
+    SECOND,
+    track_approach,
+    track_scene,
+)
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+
+NAME = 'approach_dst+3_noisy'
+
+
+def same(one, other):
+    """Equal to the last bit."""
+    ours, theirs = one.columns(), other.columns()
+    return list(ours) == list(theirs) and all(
+        ours[name].tobytes() == theirs[name].tobytes() for name in ours
+    )
+
+
+def same_runs(one, other):
+    return list(one) == list(other) and all(same(one[stamp], other[stamp]) for stamp in one)
+
+
+# -- the contract ------------------------------------------------------------------------------
+
+
+def test_the_columns_of_an_estimate():
+    estimate = track_approach(NAME)[20]
+    columns = list(estimate.columns())
+    assert columns[:14] == [
+        'x', 'y', 'z', 'range', 'bearing', 'vertical_offset',
+        'cov_range_range', 'cov_range_bearing', 'cov_range_vertical_offset',
+        'cov_bearing_bearing', 'cov_bearing_vertical_offset',
+        'cov_vertical_offset_vertical_offset', 'prob_above', 'prob_below',
+    ]  # fmt: skip
+    assert {'track_id', 'track_state', 'vertical_offset_lo', 'vertical_offset_hi'} <= set(columns)
+    assert estimate.frame_id == 'odom'
+    assert_allclose(estimate.probabilities.sum(axis=1), 1.0)
+    assert np.linalg.eigvalsh(estimate.covariance).min() > 0.0
+    low, high = (estimate.extras[f'vertical_offset_{end}'] for end in ('lo', 'hi'))
+    assert np.all((low < estimate.state[:, 2]) & (estimate.state[:, 2] < high))
+
+
+def test_the_system_is_known_by_name():
+    system = SYSTEMS['obstacle']
+    tracker = system.build(system.config_type()())
+    tracker.warm()
+    assert tracker.health()['tracks'] == 0
+    assert not tracker.counts
+
+
+def test_an_empty_ping_is_a_ping():
+    tracker = ObstacleTracker(ObstacleConfig())
+    first = rows(NAME)[0]
+    tracker.process(navigation(first, SECOND))
+    (estimate,) = tracker.process(Detections(stamp_ns=SECOND, range=[], bearing=[]))
+    assert len(estimate) == 0
+    assert list(estimate.columns())[:6] == [
+        'x', 'y', 'z', 'range', 'bearing', 'vertical_offset',
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize('method', ['gaussian_sum', 'seafloor', 'landmark'])
+def test_every_method_follows(method):
+    scene, final = track_scene('approach', 3, method=method)
+    error, variance, _, _ = offset_at(scene, final, 40.0)
+    if method == 'seafloor':
+        assert error == pytest.approx(12.0, abs=1.0)  # it believes the sea floor, 15 m below
+    else:
+        assert abs(error) < 4.0 * np.sqrt(variance) + 1.0
+
+
+def test_the_seafloor_filter_sees_an_obstacle_that_comes_too_fast():
+    """The paper's observation: measured ranges run ahead of the prediction."""
+    _, on_seabed = track_scene('approach', 3, method='seafloor')
+    _, free = track_scene('approach', 3)
+    assert mean_nis(on_seabed) > 1.5 * mean_nis(free)
+
+
+@pytest.mark.parametrize('model', ['plane', 'cone'])
+@pytest.mark.parametrize('timing', ['instant', 'two_way'])
+def test_conventions_of_sonars(model, timing):
+    """The offset is found when tracker and sonar agree on azimuth and timing."""
+    overrides = {
+        'azimuth_model': model,
+        'ping_timing': timing,
+        'roll_rms_deg': 4.0,
+        'vertical_offset': -4.0,
+        'sonar_mount_rpy_deg': (2.0, 3.0, -4.0),
+    }
+    scene, final = track_scene('approach', 5, overrides)
+    error, variance, _, _ = offset_at(scene, final, 40.0)
+    assert abs(error) < 3.0 * np.sqrt(variance)
+    assert variance < 1.0
+    assert mean_nis(final) < 2.6
+
+
+def test_two_way_timing_matters():
+    sharp = {'bearing_std_deg': 0.05, 'bearing_step_deg': 0.0}
+    overrides = {'ping_timing': 'two_way', 'yaw_rms_deg': 4.0, **sharp}
+    _, right = track_scene('approach', 1, overrides, **sharp)
+    _, wrong = track_scene('approach', 1, overrides, ping_timing='instant', **sharp)
+    assert mean_nis(right) < 2.4
+    assert mean_nis(wrong) > 3.0
+
+
+# -- how good it says it is --------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def approaches():
+    """Error, variance, band and P(above) of twelve approaches each, at 30 m."""
+    found = {}
+    for name in ('approach', 'above', 'rolling'):
+        results = [offset_at(*track_scene(name, seed), 30.0) for seed in range(12)]
+        assert None not in results
+        found[name] = np.array(results, float)
+    return found
+
+
+def test_the_offset_is_found(approaches):
+    for name, most in {'approach': 1.7, 'above': 1.8, 'rolling': 0.8}.items():
+        assert np.sqrt(np.mean(approaches[name][:, 0] ** 2)) < most
+    assert np.all(approaches['above'][:, 3] > 0.8)
+    assert np.mean(approaches['above'][:, 3]) > 0.95
+    assert np.all(approaches['rolling'][:, 3] < 0.1)
+
+
+def test_the_offset_is_as_good_as_it_says(approaches):
+    every = np.concatenate(list(approaches.values()))
+    squared = every[:, 0] ** 2 / every[:, 1]
+    assert 0.5 < squared.mean() < 1.6  # chi-square mean of 36: 1 +- 0.24
+    assert 0.75 <= every[:, 2].mean() <= 1.0
+
+
+def test_a_level_path_says_half_and_half():
+    scene, final = track_scene('mirror', 1)
+    assert offset_at(scene, final, 40.0)[3] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_dive_does_not_disturb():
+    """What stays is the obstacle's depth, not its offset from a vehicle that dives."""
+    scene, final = track_scene('diving', 2)
+    error, variance, _, _ = offset_at(scene, final, 30.0)
+    assert abs(error) < 3.0 * np.sqrt(variance)
+
+
+def test_relief_of_the_sea_floor_does_not_disturb():
+    """The altimeter bounds the offset, it does not stand for the depth."""
+
+    def errors(relief):
+        overrides = {'seabed_relief': relief}
+        runs = (track_scene('approach', seed, overrides) for seed in range(4))
+        return [offset_at(*run, 30.0)[0] for run in runs]
+
+    assert errors(0.5) == pytest.approx(errors(0.0), abs=0.1)
+
+
+def test_navigation_that_is_late_shows_in_the_innovations():
+    def nis(delay):
+        overrides = {'navigation_delay': delay}
+        return np.mean([mean_nis(track_scene('approach', k, overrides)[1]) for k in range(4)])
+
+    assert nis(0.0) < 2.2
+    assert nis(0.5) > 3.0
+
+
+def test_the_scale_state_carries_an_error_of_the_log():
+    worse = {'log_scale_error': 0.008, 'sound_speed_error': 0.0}
+
+    def squared(scale_std):
+        found = [
+            offset_at(*track_scene('approach', seed, worse, scale_std=scale_std), 25.0)
+            for seed in range(10)
+        ]
+        return np.mean([error**2 / variance for error, variance, _, _ in filter(None, found)])
+
+    assert squared(0.008) < 2.0
+    assert squared(0.0) > 2.0 * squared(0.008)
+
+
+# -- several obstacles -------------------------------------------------------------------------
+
+
+def test_six_obstacles_in_clutter():
+    scene, final = track_scene('six', 2)
+    followed_share, identities = [], set()
+    for ping in range(10, 50):
+        estimate = final[int(scene.truth[0].stamp_ns[ping])]
+        for truth in scene.truth:
+            if truth.in_beam[: ping + 1].sum() >= 6 and truth.bearing[ping] ** 2 < 0.6:
+                row = followed(estimate, truth, ping, near=3.0)
+                followed_share.append(row is not None)
+                if row is not None:
+                    identities.add((truth.track_id, int(estimate.extras['track_id'][row])))
+    assert np.mean(followed_share) > 0.97
+    assert len(identities) <= 7
+
+
+def test_a_track_outlives_the_beam():
+    """Below 24 m the beam passes over an obstacle 3 m down; the track goes on to where it is."""
+    scene, final = track_scene('approach', 6)
+    truth = scene.truth[0]
+    gone = np.flatnonzero(truth.in_beam)[-1]
+    assert truth.range[gone] > 15.0
+    last = np.flatnonzero(truth.range > 8.0)[-1]
+    assert last - gone > 12
+    estimate = final[int(truth.stamp_ns[last])]
+    row = followed(estimate, truth, last, near=1.5)
+    before = final[int(truth.stamp_ns[gone])]
+    assert (
+        estimate.extras['track_id'][row]
+        == before.extras['track_id'][followed(before, truth, gone)]
+    )
+
+
+def test_an_obstacle_that_is_gone_is_given_up():
+    name = 'approach_dst+0.5_noisefree'
+    gone = [
+        Detections(stamp_ns=one.stamp_ns, range=[], bearing=[])
+        if isinstance(one, Detections) and one.stamp_ns > 31 * SECOND
+        else one
+        for one in approach(name)
+    ]
+    final = list(run(ObstacleTracker(ObstacleConfig(sonar_lever=lever(name))), gone).values())
+    assert len(final[60]) == 1
+    assert len(final[75]) == 0
+
+
+def test_clutter_alone_confirms_nothing():
+    scene, final = track_scene('approach', 1, {'detection_probability': 0.0, 'clutter': 8.0})
+    confirmed = [int((one.extras['track_state'] > 0).sum()) for one in final.values()]
+    assert np.mean(confirmed) < 0.2
+
+
+# -- time and navigation -----------------------------------------------------------------------
+
+
+def test_a_ping_waits_for_the_pose_after_it():
+    scene = simulate(scenario('approach', {'ping_jitter': 0.5}), 1)
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=(2.0, 0.0, -0.3)))
+    for one in scene.measurements[:100]:
+        estimates = tracker.process(one.measurement)
+        if isinstance(one.measurement, Detections):
+            assert not estimates
+            assert tracker.health()['pings_waiting'] == 1
+        elif estimates:
+            assert tracker.health()['pings_waiting'] == 0
+
+
+def test_extrapolation_stops_at_its_limit():
+    first, second = rows(NAME)[:2]
+    for limit, expected in ((0.3, 1), (0.1, 0)):
+        tracker = ObstacleTracker(ObstacleConfig(max_extrapolation=limit))
+        tracker.process(navigation(first, SECOND))
+        tracker.process(navigation(second, SECOND + SECOND // 2))
+        late = Detections(stamp_ns=SECOND + 700_000_000, range=[50.0], bearing=[0.0])
+        assert len(tracker.process(late)) == expected
+
+
+def test_pings_in_a_gap_of_the_navigation_are_skipped():
+    measurements = [
+        one
+        for one in approach(NAME)
+        if not (isinstance(one, Navigation) and 20 * SECOND < one.stamp_ns < 23 * SECOND)
+    ]
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
+    final = run(tracker, measurements)
+    assert tracker.health()['pings_skipped'] == 5
+    assert not [stamp for stamp in final if 20 * SECOND < stamp < 23 * SECOND]
+    identities = {int(i) for one in final.values() for i in one.extras['track_id']}
+    assert identities == {1}
+
+
+@pytest.mark.parametrize('name', ['approach', 'six', 'late'])
+def test_shuffled_input_gives_the_same_bits(name):
+    config = scenario(name, {'ping_jitter': 0.3, 'last_range': 60.0, 'first_range': 80.0})
+    scene = simulate(config, 8)
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=config.sonar_lever))
+    ordered = sorted(scene.measurements, key=lambda one: one.measurement.stamp_ns)
+    straight = run(tracker, [one.measurement for one in ordered])
+    rng = np.random.default_rng(1)
+    key = [one.measurement.stamp_ns + rng.uniform(0.0, 3.0) * SECOND for one in ordered]
+    shuffled = [ordered[i].measurement for i in np.argsort(key)]
+    again = ObstacleTracker(tracker.config)
+    assert same_runs(run(again, shuffled), straight)
+    assert again.counts['late'] > 10
+    tracker.reset()
+    assert same_runs(run(tracker, [one.measurement for one in ordered]), straight)
+
+
+def test_what_comes_twice_counts_once():
+    doubled = [one for one in approach(NAME)[:150] for _ in range(2)]
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
+    plain = ObstacleTracker(tracker.config)
+    assert same_runs(run(tracker, doubled), run(plain, approach(NAME)[:150]))
+    assert tracker.counts['duplicate'] == 150
+
+
+def test_what_is_too_late_is_dropped():
+    tracker = ObstacleTracker(ObstacleConfig(history=1.0))
+    run(tracker, approach(NAME)[:60])
+    before = tracker.counts['used']
+    assert not tracker.process(Detections(stamp_ns=SECOND, range=[50.0], bearing=[0.1]))
+    assert tracker.counts['too_late'] == 1
+    assert tracker.counts['used'] == before
+
+
+def test_a_restarted_clock_begins_anew():
+    tracker = ObstacleTracker(ObstacleConfig(sonar_lever=lever(NAME)))
+    first = run(tracker, approach(NAME))
+    again = run(tracker, approach(NAME))
+    assert tracker.counts['restarts'] == 1
+    used = {int(i) for one in first.values() for i in one.extras['track_id']}
+    new = {int(i) for one in list(again.values())[20:] for i in one.extras['track_id']}
+    assert new and not used & new

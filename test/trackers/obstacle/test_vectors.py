@@ -1,0 +1,198 @@
+"""The obstacle tracker on approaches computed elsewhere, with the exact posterior beside them."""
+
+from helpers.obstacle_runs import (
+    approach,
+    FAITHFUL,
+    follow,
+    lever,
+    meta,
+    rows,
+    run,
+    SECOND,
+    track_approach,
+)
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+
+NOISY = ('approach_dst+3_noisy', 'approach_level_mirror_noisy')
+NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')
+SHARP = {'range_std': 0.01, 'bearing_std_deg': 0.01, 'range_step': 0.0, 'bearing_step_deg': 0.0}
+
+
+@pytest.mark.parametrize('name', NOISY)
+def test_posterior_is_the_exact_one(name):
+    estimates = track_approach(name, **FAITHFUL)
+    for known in meta(name)['oracle_posterior_flat_prior_pm12']:
+        estimate = estimates[known['ping']]
+        assert len(estimate) == 1
+        assert estimate.state[0, 2] == pytest.approx(known['mean_dst'], abs=0.05)
+        assert np.sqrt(estimate.covariance[0, 2, 2]) == pytest.approx(known['sd'], abs=0.05)
+        assert estimate.probabilities[0, 0] == pytest.approx(known['p_above'], abs=0.02)
+
+
+def test_nine_slices_do_as_well():
+    name = NOISY[0]
+    estimates = track_approach(name, **{**FAITHFUL, 'components': 9})
+    for known in meta(name)['oracle_posterior_flat_prior_pm12']:
+        assert estimates[known['ping']].state[0, 2] == pytest.approx(known['mean_dst'], abs=0.1)
+
+
+@pytest.mark.parametrize('name', NOISE_FREE)
+@pytest.mark.parametrize('model', ['plane', 'cone'])
+def test_without_noise_the_offset_is_found(name, model):
+    measurements = approach(name)
+    if model == 'cone':  # the file has the plane azimuth
+        for i, row in enumerate(rows(name)):
+            m = geometry.reconstruct(
+                row['true_range'], row['true_delta'], row['true_dst'], sonar_rotation(row)
+            )
+            d, delta = geometry.project(m, 'cone')
+            ping = measurements[3 * i + 2]
+            if len(ping):
+                measurements[3 * i + 2] = Detections(
+                    stamp_ns=ping.stamp_ns, range=[d], bearing=[-delta]
+                )
+    config = ObstacleConfig(
+        sonar_lever=lever(name), azimuth_model=model, **{**FAITHFUL, **SHARP, 'components': 61}
+    )
+    final = list(run(ObstacleTracker(config), measurements).values())
+    true = rows(name)['true_dst']
+    assert final[60].state[0, 2] == pytest.approx(true[60], abs=0.1)
+    assert final[-1].state[0, 2] == pytest.approx(true[-1], abs=0.03)
+
+
+def sonar_rotation(row):
+    return geometry.rotation(row['roll'], row['pitch'], row['yaw'])
+
+
+@pytest.mark.parametrize('values', [{}, {'components': 5}, {'components': 6}, {'scale_std': 0.0}])
+@pytest.mark.parametrize('kind', ['noisy', 'noisefree'])
+def test_a_level_path_cannot_tell_above_from_below(kind, values):
+    """From the first ping on, although the prior reaches further up than down."""
+    estimates = track_approach(f'approach_level_mirror_{kind}', max_tracks=1, **values)
+    for ping, estimate in enumerate(estimates):
+        assert estimate.probabilities[0, 0] == pytest.approx(0.5, abs=0.005)
+        if ping > 40:
+            assert estimate.extras['vertical_offset_lo'][0] < -3.0
+            assert estimate.extras['vertical_offset_hi'][0] > 3.0
+
+
+def test_estimates_are_where_the_obstacle_is():
+    """Range, bearing to port and place in ENU against the file, without noise."""
+    name = 'approach_dst+3_noisefree'
+    estimates = track_approach(name, **{**FAITHFUL, **SHARP})
+    north, east, down = meta(name)['obstacle_ned']
+    truth = rows(name)
+    for ping in (60, 100):
+        estimate = estimates[ping]
+        assert estimate.state[0, 0] == pytest.approx(truth['true_range'][ping], abs=0.01)
+        assert estimate.state[0, 1] == pytest.approx(-truth['true_delta'][ping], abs=2e-4)
+        assert_allclose(estimate.xyz[0], [east, north, -down], atol=0.15)
+        spread = [np.sqrt(estimate.extras[f'place_cov_{a}_{a}'][0]) for a in 'xyz']
+        assert np.all(
+            np.abs(estimate.xyz[0] - [east, north, -down]) < 4.0 * np.array(spread) + 0.01
+        )
+
+
+def mistaken(measurement, change):
+    """Navigation with its roll, pitch and yaw (NED) changed by a function."""
+    if not isinstance(measurement, Navigation):
+        return measurement
+    R = geometry.flip_rotation(geometry.rotation_of_quaternion(measurement.orientation))
+    wrong = geometry.rotation(*change(*geometry.euler_angles(R)))
+    return Navigation(
+        stamp_ns=measurement.stamp_ns,
+        position=measurement.position,
+        orientation=Rotation.from_matrix(geometry.flip_rotation(wrong)).as_quat(),
+        frame_id='odom',
+    )
+
+
+def test_a_wrong_roll_sign_turns_the_answer_over_and_nis_does_not_see_it():
+    """Why the exact posterior is a test, and NIS alone is none."""
+    name = 'approach_dst+3_noisy'
+    config = ObstacleConfig(sonar_lever=lever(name), **FAITHFUL)
+    wrong = [mistaken(one, lambda r, p, y: (-r, p, y)) for one in approach(name)]
+    final = list(run(ObstacleTracker(config), wrong).values())
+    assert final[60].state[0, 2] < -1.5
+    nis = np.nanmean([estimate.extras['nis'][0] for estimate in final])
+    assert nis < 2.5
+
+
+MISTAKES = {
+    'yaw of ENU': ({}, lambda r, p, y: (r, p, 0.5 * np.pi - y)),
+    'yaw sign': ({}, lambda r, p, y: (r, p, -y)),
+    'azimuth sign': ({'bearing_positive': 'starboard'}, lambda r, p, y: (r, p, y)),
+}
+
+
+@pytest.mark.parametrize('mistake', MISTAKES)
+def test_a_wrong_direction_shows_in_the_innovations(mistake):
+    values, change = MISTAKES[mistake]
+    name = 'approach_dst+3_noisy'
+    wrong = [mistaken(one, change) for one in approach(name)]
+    assert follow(wrong, ObstacleConfig(sonar_lever=lever(name), **values))[0].mean() > 30.0
+    right = follow(approach(name), ObstacleConfig(sonar_lever=lever(name)))[0]
+    assert 1.5 < right.mean() < 2.3
+    # In the tracker nothing is followed for long: tracks come and go.
+    tracks, lasting = (
+        {int(i) for one in run(ObstacleTracker(config), measurements).values()
+         for i in one.extras['track_id']}
+        for config, measurements in (
+            (ObstacleConfig(sonar_lever=lever(name), **values), wrong),
+            (ObstacleConfig(sonar_lever=lever(name)), approach(name)),
+        )
+    )  # fmt: skip
+    assert len(tracks) > 5 > len(lasting)
+
+
+def test_outliers_are_taken_for_what_they_are():
+    """One echo in eight is wild by up to 8 m and 6 degrees, and no gate keeps them out."""
+    name = 'approach_dst+3_noisy'
+    true = rows(name)['true_dst'][-1]
+
+    def squared(probability, seed):
+        config = ObstacleConfig(sonar_lever=lever(name), outlier_probability=probability)
+        view = follow(with_outliers(approach(name), seed), config)[1]
+        return (view.state[0, 2] - true) ** 2 / view.covariance[0, 2, 2]
+
+    assert np.mean([squared(0.02, seed) for seed in range(8)]) < 2.0
+    assert np.mean([squared(0.0, seed) for seed in range(8)]) > 10.0
+
+
+def with_outliers(measurements, seed):
+    rng = np.random.default_rng(seed)
+    return [
+        Detections(
+            stamp_ns=one.stamp_ns,
+            range=one.range + rng.uniform(-8.0, 8.0),
+            bearing=one.bearing + np.radians(rng.uniform(-6.0, 6.0)),
+        )
+        if isinstance(one, Detections) and i > 9 and rng.uniform() < 0.125
+        else one
+        for i, one in enumerate(measurements)
+    ]
+
+
+def test_navigation_in_ned_gives_the_same_track():
+    name = 'approach_dst+3_noisy'
+    truth = rows(name)
+    measurements = approach(name)
+    for i, row in enumerate(truth):
+        measurements[3 * i + 1] = Navigation(
+            stamp_ns=SECOND + round(row['t'] * SECOND),
+            position=[row['n'], row['e'], row['d']],
+            orientation=Rotation.from_matrix(sonar_rotation(row)).as_quat(),
+            frame_id='odom',
+        )
+    config = ObstacleConfig(sonar_lever=lever(name), world_frame_convention='ned', **FAITHFUL)
+    ned = list(run(ObstacleTracker(config), measurements).values())
+    enu = track_approach(name, **FAITHFUL)
+    assert_allclose(ned[60].state, enu[60].state, atol=1e-6)
+    assert_allclose(ned[60].xyz[:, [1, 0, 2]] * [1, 1, -1], enu[60].xyz, atol=1e-3)
