@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sonar_imm.measurements import Detections, FloatArray, Rejection
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Detections, Rejection
 
 from .headers import Make, stamp_ns
 from .table import decode_table, encode_table, require_columns, scalar_column

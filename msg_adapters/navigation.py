@@ -13,7 +13,8 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from sonar_imm.measurements import Altitude, FloatArray, Navigation, Rejection
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Altitude, Navigation, Rejection
 
 from .headers import Make, make_header, stamp_ns, WORLD_FRAMES
 

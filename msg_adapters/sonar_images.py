@@ -14,7 +14,8 @@ from attrs import frozen
 import numpy as np
 
 from sonar_imm.acoustics.cfar import cfar_peaks
-from sonar_imm.measurements import Detections, FloatArray, Rejection
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Detections, Rejection
 from sonar_imm.parameters import Config, parameter
 
 from .detections import BEAM_AXES, beam_bearings, SOUND_SPEEDS

@@ -17,8 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from ..estimation.arrays import ComplexArray, FloatArray
 
 
 def noise_integral(x: ArrayLike) -> ComplexArray:

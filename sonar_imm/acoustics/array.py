@@ -26,10 +26,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from ..estimation.arrays import ComplexArray, FloatArray
 
 FEWEST_POINTS = 64
 """Cells of a grid of directions: the beams of two or three staves are wide, but sharp on top."""

@@ -15,13 +15,10 @@ from __future__ import annotations
 
 from attrs import astuple, frozen
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from .multistatic import bearing, bearing_jacobian, FloatArray, slant_range, wrap_angle
-
-BoolArray = NDArray[np.bool_]
-IndexArray = NDArray[np.intp]
+from ..estimation.arrays import BoolArray, FloatArray, IndexArray
+from .multistatic import bearing, bearing_jacobian, slant_range, wrap_angle
 
 ELLIPSES = 4
 ELLIPSE_ANGLES = 96

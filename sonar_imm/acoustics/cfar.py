@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ..estimation.arrays import FloatArray
 
 
 def noise_level(power: FloatArray, guard: int, training: int) -> tuple[FloatArray, FloatArray]:

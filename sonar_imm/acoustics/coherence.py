@@ -27,13 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
+from ..estimation.arrays import BoolArray, FloatArray
 from .array import direction_grid, phase_step
 from .laplace import autocorrelation
 from .likelihood_kernels import beam_peaks
 from .variances import moving_mean
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 GATE_BINS = 5
 FALSE_ALARM = 1e-3

@@ -38,7 +38,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from ..estimation.arrays import FloatArray
+
 ComplexArray = NDArray[np.complexfloating]
 
 PROCESSORS = ('conventional', 'mvdr', 'white_noise')

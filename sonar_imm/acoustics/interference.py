@@ -18,13 +18,11 @@ from __future__ import annotations
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..estimation.arrays import ComplexArray, FloatArray
 from .array import direction_grid, phase_step
 from .laplace import autocorrelation, gaussian_log_density, IMPOSSIBLE, log_density
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @frozen(eq=False)

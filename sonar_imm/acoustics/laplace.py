@@ -30,11 +30,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import kve
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from ..estimation.arrays import ComplexArray, FloatArray
 
 LAWS = ('laplace', 'gaussian')
 MAX_STAVES = 64

@@ -19,14 +19,11 @@ from functools import lru_cache
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..estimation.arrays import ComplexArray, FloatArray
 from ..estimation.elementary import phasors
 from ..estimation.jit import kernel
 from .laplace import LAWS, log_density, log_density_slope, MAX_STAVES
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _CELL_BITS = 5
 _OCTAVES = (-20, 50)

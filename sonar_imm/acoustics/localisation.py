@@ -27,8 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
+from ..estimation.arrays import FloatArray
 from .arrival_fit import ArrivalFit, BoolArray, Minima, minimise
-from .multistatic import emission_time, FloatArray
+from .multistatic import emission_time
 
 
 @frozen(kw_only=True)

@@ -29,7 +29,7 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from ..estimation.arrays import FloatArray
 
 COINCIDENT = 1e-6
 """Horizontal distance in metres below which target and receiver count as one point for a

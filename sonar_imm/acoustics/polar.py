@@ -21,9 +21,9 @@ Angles in radians, counter-clockwise from +x. Everything is vectorised over lead
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from ..estimation.arrays import FloatArray
 
 
 def unbiased_polar_to_cartesian(

@@ -14,9 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from ..estimation.arrays import FloatArray
+
 Pulse = Callable[[FloatArray], FloatArray]
 """Distances in m to values, one at 0, even."""
 

@@ -18,12 +18,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..estimation.arrays import ComplexArray, FloatArray
 from .array import phase_step, steering
 from .coherence import refined_peak
 from .variances import moving_mean, usable_bins
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 HALF_WIDTH = 5
 LOADING = 7e-4

@@ -21,7 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ..estimation.arrays import FloatArray
+
 ComplexArray = NDArray[np.complexfloating]
 
 WINDOWS = ('hann', 'rectangular')

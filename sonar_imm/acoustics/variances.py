@@ -16,8 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ..estimation.arrays import BoolArray, FloatArray
 
 HALF_WIDTH = 10
 """Bins to either side that share one signal variance."""

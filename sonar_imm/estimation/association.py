@@ -34,9 +34,8 @@ from attrs import evolve, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .kalman import BoolArray, factorise, FloatArray, log_density
-
-IntArray = NDArray[np.int64]
+from .arrays import FloatArray, IntArray
+from .kalman import BoolArray, factorise, log_density
 
 
 @lru_cache(maxsize=256)

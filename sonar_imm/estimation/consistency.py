@@ -22,11 +22,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .kalman import factorise, FloatArray, log_density, solve
-
-IntArray = NDArray[np.int64]
+from .arrays import FloatArray, IntArray
+from .kalman import factorise, log_density, solve
 
 
 def rmse(error: FloatArray) -> float:

@@ -10,11 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import FloatArray
 from .jit import kernel
-
-FloatArray = NDArray[np.float64]
 
 ROUND = 1.5 * 2.0**52
 """Adding this to a double and taking it away again rounds it to a whole number; in between, the

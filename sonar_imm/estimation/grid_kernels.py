@@ -14,13 +14,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from .arrays import FloatArray
 from .elementary import exponentials
 from .jit import kernel
-
-FloatArray = NDArray[np.float64]
 
 TAIL = 1e-13
 COARSE_SIGMA = 8

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from .arrays import FloatArray
 
 DEAD = 1e-200
 """A model that can be reached with no more than this probability counts as unreachable."""

@@ -13,11 +13,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import FloatArray
 from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import cholesky, gain, innovation_covariance, joseph, whitened_square
 
-FloatArray = NDArray[np.float64]
 LOG_2PI = math.log(2.0 * math.pi)
 
 

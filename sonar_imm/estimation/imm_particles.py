@@ -39,11 +39,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import FloatArray
 from .elementary import exponentials
-
-FloatArray = NDArray[np.float64]
 
 
 class Updated(NamedTuple):

@@ -8,14 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from .arrays import FloatArray, IntArray
 from .elementary import exponentials, ROUND
 from .jit import kernel
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 
 @kernel
@@ -27,7 +22,7 @@ def mix(
     uniform: FloatArray,
     running: FloatArray,
     points: FloatArray,
-    origin: IndexArray,
+    origin: IntArray,
     mixed: FloatArray,
     c: FloatArray,
 ) -> None:

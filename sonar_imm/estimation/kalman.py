@@ -24,10 +24,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from .arrays import BoolArray, FloatArray
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 

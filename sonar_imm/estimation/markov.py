@@ -14,9 +14,9 @@ from collections import OrderedDict
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from .arrays import FloatArray
 
 _CACHED_STEPS = 256
 

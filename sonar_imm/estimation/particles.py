@@ -11,9 +11,8 @@ allowed everywhere: ``x (..., n, N)``, ``w (..., N)``.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from .arrays import FloatArray
 
 
 def normalise(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:

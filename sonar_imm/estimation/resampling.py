@@ -31,10 +31,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.intp]
+from .arrays import FloatArray, IndexArray
+
 Scheme = Callable[[ArrayLike, int, np.random.Generator], IndexArray]
 
 

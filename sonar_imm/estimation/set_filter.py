@@ -19,15 +19,12 @@ from typing import NamedTuple
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from . import set_particles_kernels as kernels
+from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
 from .set_particles import gain, propose_births, SetModel, Sets
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 _STEP, _START, _RESAMPLE = range(3)
 
@@ -53,7 +50,7 @@ class Step:
     w: FloatArray
     amplitude: FloatArray
     after: Weighted
-    source: IndexArray
+    source: IntArray
     log_evidence: float
     effective: float
     ok: bool

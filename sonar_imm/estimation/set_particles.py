@@ -67,12 +67,9 @@ from typing import NamedTuple
 
 from attrs import field, frozen
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import FloatArray, IntArray
 from .markov import check_transition_matrix
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 PRIORS = ('marginal', 'bic_half', 'paper')
 IMPOSSIBLE = -math.inf
@@ -169,8 +166,8 @@ class Sets(NamedTuple):
     """N sets: order (N,), cell (N, J) of which the first `order` count, ascending; prior_mean and
     prior_variance (N, J) of the amplitudes in units of the noise, used with a memory only."""
 
-    order: IndexArray
-    cell: IndexArray
+    order: IntArray
+    cell: IntArray
     prior_mean: FloatArray
     prior_variance: FloatArray
 
@@ -184,7 +181,7 @@ class Sets(NamedTuple):
             np.full(shape, model.amplitude_std**2),
         )
 
-    def take(self, index: IndexArray) -> Sets:
+    def take(self, index: IntArray) -> Sets:
         return Sets(
             self.order[index],
             self.cell[index],

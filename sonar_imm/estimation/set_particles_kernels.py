@@ -11,16 +11,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import FloatArray, IntArray
 from .jit import kernel
-
-FloatArray = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 
 @kernel
 def fill_moves(
-    order: IndexArray,
-    cell: IndexArray,
+    order: IntArray,
+    cell: IntArray,
     g: FloatArray,
     move: FloatArray,
     share: float,
@@ -71,7 +69,7 @@ def _search(cumulative: FloatArray, low: int, high: int, point: float) -> int:
 
 @kernel
 def _birth(
-    cells: IndexArray,
+    cells: IntArray,
     m: int,
     separation: int,
     birth: FloatArray,
@@ -115,8 +113,8 @@ def start(
     birth: FloatArray,
     birth_ratio: FloatArray,
     uniform: FloatArray,
-    order: IndexArray,
-    cell: IndexArray,
+    order: IntArray,
+    cell: IntArray,
     log_ratio: FloatArray,
 ) -> None:
     """See `set_particles.start`; charge (orders,): what sets of each size cost in log ratio."""
@@ -151,12 +149,12 @@ def propagate(
     birth: FloatArray,
     birth_ratio: FloatArray,
     uniform: FloatArray,
-    old_order: IndexArray,
-    old_cell: IndexArray,
+    old_order: IntArray,
+    old_cell: IntArray,
     old_mean: FloatArray,
     old_variance: FloatArray,
-    order: IndexArray,
-    cell: IndexArray,
+    order: IntArray,
+    cell: IntArray,
     mean: FloatArray,
     variance: FloatArray,
     log_ratio: FloatArray,
@@ -217,8 +215,8 @@ def weigh(
     fine: float,
     marginal: bool,
     memory: bool,
-    order: IndexArray,
-    cell: IndexArray,
+    order: IntArray,
+    cell: IntArray,
     mean: FloatArray,
     variance: FloatArray,
     log_weight: FloatArray,
@@ -282,8 +280,8 @@ def remember(
     gram: FloatArray,
     phi: float,
     stationary: float,
-    order: IndexArray,
-    cell: IndexArray,
+    order: IntArray,
+    cell: IntArray,
     amplitude: FloatArray,
     mean: FloatArray,
     variance: FloatArray,
@@ -302,8 +300,8 @@ def remember(
 @kernel
 def moments(
     w: FloatArray,
-    order: IndexArray,
-    cell: IndexArray,
+    order: IntArray,
+    cell: IntArray,
     amplitude: FloatArray,
     prior_variance: FloatArray,
     order_min: int,

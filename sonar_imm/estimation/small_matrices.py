@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from .arrays import FloatArray
 from .jit import kernel
-
-FloatArray = NDArray[np.float64]
 
 
 @kernel

@@ -42,7 +42,8 @@ from typing import NamedTuple
 import numpy as np
 
 from . import imm
-from .kalman import apply, FloatArray, symmetrise, transpose
+from .arrays import FloatArray
+from .kalman import apply, symmetrise, transpose
 from .unscented import sigma_offsets
 
 # Eigenvalues of a correlation matrix below this are rounding.

@@ -31,12 +31,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .arrays import FloatArray
 from .kalman import (
     apply,
     BoolArray,
     CovarianceError,
     factorise,
-    FloatArray,
     log_density,
     solve,
     symmetrise,

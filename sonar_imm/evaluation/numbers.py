@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..estimation.arrays import FloatArray
 from ..estimation.consistency import average_bounds, nees
-from ..measurements import FloatArray
 
 SINGULAR = 1e-9
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import plotly.graph_objects as go
 from scipy.stats import chi2
 
-from ..measurements import FloatArray
+from ..estimation.arrays import FloatArray
 from . import SECOND
 
 INK, GRID, GREY, AMBER = '#1b2733', '#e4e9ee', '#8593a1', '#E69F00'

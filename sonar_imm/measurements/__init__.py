@@ -8,7 +8,7 @@ makes them from messages.
 from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
-from .checks import check_covariance, check_stamp, FloatArray, nanoseconds, Rejection
+from .checks import check_covariance, check_stamp, nanoseconds, Rejection
 from .diver import Arrivals, Fix
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .obstacle import Altitude, Detections, Navigation
@@ -22,7 +22,6 @@ __all__ = [
     'CrossSpectra',
     'Detections',
     'Fix',
-    'FloatArray',
     'MAX_BINS',
     'Measurement',
     'nanoseconds',

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..acoustics.variances import usable_bins
-from .checks import check_stamp, complexes, FloatArray, floats, positives, Rejection
+from ..estimation.arrays import FloatArray
+from .checks import check_stamp, complexes, floats, positives, Rejection
 
 MAX_BINS, MAX_STAVES = 131_072, 64
 FARTHEST_BIN = 20_000.0

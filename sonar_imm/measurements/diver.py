@@ -8,7 +8,8 @@ from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import check_covariance, check_stamp, FloatArray, floats, Rejection
+from ..estimation.arrays import FloatArray
+from .checks import check_covariance, check_stamp, floats, Rejection
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:

@@ -13,7 +13,8 @@ from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .checks import check_stamp, complexes, FloatArray, floats, positives, Rejection
+from ..estimation.arrays import FloatArray
+from .checks import check_stamp, complexes, floats, positives, Rejection
 
 MAX_SAMPLES, MAX_PHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
 LEAST_PHONES = 3

@@ -5,7 +5,8 @@ from __future__ import annotations
 from attrs import field, frozen
 import numpy as np
 
-from .checks import check_stamp, FloatArray, floats, Rejection
+from ..estimation.arrays import FloatArray
+from .checks import check_stamp, floats, Rejection
 
 
 @frozen(eq=False, kw_only=True)

@@ -9,7 +9,7 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from ..measurements import FloatArray
+from ..estimation.arrays import FloatArray
 from ..parameters import Config, ConfigError, did_you_mean
 
 S = TypeVar('S', bound='Scenario')

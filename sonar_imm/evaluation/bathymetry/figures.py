@@ -8,7 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 
 from ...acoustics import array, spatial
-from ...measurements import FloatArray, Snapshot
+from ...estimation.arrays import FloatArray
+from ...measurements import Snapshot
 from .. import SECOND
 from ..plotting import AMBER, COLOURS, INK, styled, thin, transparent
 from .profiles import Profile, Swath

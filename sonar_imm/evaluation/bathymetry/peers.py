@@ -16,7 +16,8 @@ import numpy as np
 from scipy.special import kve
 
 from ...acoustics.laplace import autocorrelation
-from ...measurements import FloatArray, Snapshot
+from ...estimation.arrays import FloatArray
+from ...measurements import Snapshot
 from ...trackers.bathymetry.tracker import BathymetryConfig
 
 CHAIN = np.array([[0.98, 0.02], [0.02, 0.98]])

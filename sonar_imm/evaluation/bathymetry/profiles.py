@@ -6,12 +6,10 @@ from collections.abc import Iterable
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from ...estimates import Estimate
-from ...measurements import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
 
-BoolArray = NDArray[np.bool_]
 FAR = 0.55
 """Share of a bin by which the range of a true floor may differ from that of an estimate. Half a
 bin, and what single precision adds."""

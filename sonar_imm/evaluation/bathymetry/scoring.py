@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...measurements import FloatArray
+from ...estimation.arrays import FloatArray
 from .. import SECOND
 from ..numbers import error_summary
 from .profiles import BoolArray, Profile, Swath, TrueFloor

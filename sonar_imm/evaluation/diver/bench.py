@@ -15,8 +15,8 @@ from attrs import frozen
 import numpy as np
 
 from ...estimation import imm, imm_kernels
+from ...estimation.arrays import FloatArray
 from ...estimation.association import assign, association_cost, gate_threshold
-from ...measurements import FloatArray
 from ..benches import Bench
 
 MODELS, STATES, STEP = 16, 4, 1.0

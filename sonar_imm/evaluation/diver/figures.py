@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from ...estimation.arrays import FloatArray
 from ..plotting import (
     add_band,
     COLOURS,
@@ -19,7 +20,7 @@ from ..plotting import (
     transparent,
 )
 from .matching import Matching
-from .series import FloatArray, IntArray, Series
+from .series import IntArray, Series
 from .truth import Truth
 
 MOST_ELLIPSES = 60

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from ...estimation.arrays import FloatArray
 from ...estimation.consistency import identity_switches
-from .series import FloatArray, IntArray, Series
+from .series import IntArray, Series
 from .truth import Truth
 
 

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...estimates import Estimate
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from ...estimation.arrays import FloatArray, IntArray
 
 STATES = ('px', 'py', 'vx', 'vy')
 

@@ -11,8 +11,9 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
+from ...estimation.arrays import FloatArray
 from .. import SECOND
-from .series import FloatArray, IntArray, Series
+from .series import IntArray, Series
 
 
 @frozen(eq=False)

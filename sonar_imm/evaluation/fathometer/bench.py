@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ...acoustics.pulse import band_pulse
-from ...measurements import FloatArray, Trace
+from ...estimation.arrays import FloatArray
+from ...measurements import Trace
 from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from ..benches import Bench
 

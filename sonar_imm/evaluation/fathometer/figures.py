@@ -11,7 +11,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from ...measurements import FloatArray
+from ...estimation.arrays import FloatArray
 from .. import SECOND
 from ..plotting import COLOURS, INK, styled
 from .records import Record

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...estimates import Estimate
-from ...measurements import FloatArray
+from ...estimation.arrays import FloatArray
 from ...recordings.sources import BagError
 from .. import SECOND
 

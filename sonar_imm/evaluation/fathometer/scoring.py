@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...estimation.arrays import FloatArray
 from ...estimation.consistency import ospa
-from ...measurements import FloatArray
 from ..numbers import error_summary
 from .records import Record, Reflections
 

@@ -12,7 +12,8 @@ from typing import Any
 from attrs import frozen
 import numpy as np
 
-from ...measurements import Altitude, Detections, FloatArray, Navigation
+from ...estimation.arrays import FloatArray
+from ...measurements import Altitude, Detections, Navigation
 from ...trackers.obstacle.config import ObstacleConfig
 from ...trackers.obstacle.deferred import Deferred, deferred, sonar_poses
 from .series import Series, TruePath

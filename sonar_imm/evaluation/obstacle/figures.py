@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import plotly.graph_objects as go
 
-from ...measurements import Detections, FloatArray
+from ...estimation.arrays import FloatArray
+from ...measurements import Detections
 from ...trackers.obstacle.deferred import Deferred
 from ..plotting import AMBER, COLOURS, GREY, INK, MOST_POINTS, styled, thin, transparent
 from .deferred import LookingBack

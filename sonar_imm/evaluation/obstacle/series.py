@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...estimates import Estimate
+from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.consistency import gospa
-from ...measurements import FloatArray
 from .. import SECOND
 
-IntArray = NDArray[np.int64]
 STATES = ('range', 'bearing', 'vertical_offset')
 PINGS_TO_SEE = 6
 """Pings in the beam after which an obstacle ought to be known."""

@@ -18,15 +18,13 @@ from typing import Any
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from ...acoustics import array
-from ...measurements import FloatArray, Snapshot
+from ...estimation.arrays import ComplexArray, FloatArray
+from ...measurements import Snapshot
 from ...parameters import parameter
 from ..scene import Received, Scenario, Scene, TrueProfile
-
-ComplexArray = NDArray[np.complex128]
 
 SIDES = ('starboard', 'port', 'both')
 LAWS = ('laplace', 'gaussian')

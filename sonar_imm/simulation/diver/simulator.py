@@ -17,7 +17,8 @@ import numpy as np
 from ...acoustics import multistatic
 from ...acoustics.localisation import Localisation, localise
 from ...acoustics.polar import unbiased_polar_to_cartesian
-from ...measurements import Arrivals, Fix, FloatArray
+from ...estimation.arrays import FloatArray
+from ...measurements import Arrivals, Fix
 from ...parameters import parameter
 from ..scene import Received, Scenario, Scene, TrueTrack
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acoustics.fathometer import PROCESSORS
-from ...measurements import FloatArray
+from ...estimation.arrays import FloatArray
 from ...parameters import parameter
 from ..scene import Scenario
 

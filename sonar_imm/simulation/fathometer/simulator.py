@@ -18,7 +18,8 @@ import numpy as np
 from ...acoustics import fathometer
 from ...acoustics.ambient import horizontal_noise_csdm, sample_csdm, surface_noise_csdm
 from ...acoustics.pulse import band_pulse
-from ...measurements import ArrayDepth, CrossSpectra, FloatArray, Pressure, Trace
+from ...estimation.arrays import FloatArray
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from ..scene import Received, Scene, TrueReflectors
 from .scenario import Drift, drift_of, FathometerScenario, PRESENT, scenario, SCENARIOS
 

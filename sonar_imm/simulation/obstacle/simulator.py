@@ -20,7 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...measurements import Altitude, Detections, FloatArray, nanoseconds, Navigation
+from ...estimation.arrays import FloatArray
+from ...measurements import Altitude, Detections, nanoseconds, Navigation
 from ..scene import Received, Scene
 from .scenario import ObstacleScenario, SCENARIOS
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from attrs import evolve, frozen
 import numpy as np
 
+from ...estimation.arrays import FloatArray
 from ...estimation.elementary import normals
-from ...measurements import FloatArray
 from .grid_kernels import filter_ping, smooth_ping
 from .kernels import filter_block
 from .likelihood import PingLikelihood

@@ -7,17 +7,12 @@ arguments that describe the ping.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acoustics import likelihood_kernels as law
 from ...estimation import grid_kernels as grid
+from ...estimation.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...estimation.jit import kernel
 from .kernels import sines_of
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
-IndexArray = NDArray[np.int64]
 
 
 @kernel
@@ -35,7 +30,7 @@ def filter_ping(
     signal: FloatArray,
     geometry: FloatArray,
     table: FloatArray,
-    window: IndexArray,
+    window: IntArray,
     mean: FloatArray,
     covariance: FloatArray,
     probability: FloatArray,
@@ -107,7 +102,7 @@ def filter_ping(
 @kernel
 def smooth_ping(
     kept: FloatArray,
-    window: IndexArray,
+    window: IntArray,
     cells: FloatArray,
     transition: FloatArray,
     sigma: FloatArray,

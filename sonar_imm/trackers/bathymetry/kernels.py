@@ -9,16 +9,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acoustics import likelihood_kernels as law
 from ...estimation import imm_particles_kernels as imm
+from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...estimation.elementary import phasors
 from ...estimation.jit import kernel
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 _HALF_CIRCLE = 0.5 * math.pi
 _TURNS = 0.5 / math.pi

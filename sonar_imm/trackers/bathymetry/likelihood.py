@@ -12,14 +12,11 @@ from typing import NamedTuple
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acoustics import array, coherence, interference, laplace, likelihood_kernels, variances
-from ...measurements import FloatArray, Snapshot
+from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
+from ...measurements import Snapshot
 from .config import BathymetryConfig
-
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 WATER_COLUMN = 0.8
 """Bins nearer than this share of the sonar's height hold no echo of the floor."""

@@ -30,8 +30,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from ...acoustics.array import angle_of_depth
+from ...estimation.arrays import FloatArray
 from ...estimation.markov import check_transition_matrix
-from ...measurements import FloatArray
 from .config import BathymetryConfig, DEFAULT_SIGMAS, DEFAULT_SIGMAS_DEG
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)

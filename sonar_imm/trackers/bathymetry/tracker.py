@@ -27,8 +27,9 @@ import numpy as np
 
 from ...acoustics.array import across_track, angle_of_depth, depth_of_angle
 from ...estimates import Estimate
+from ...estimation.arrays import FloatArray
 from ...estimation.mode_smoothing import smooth_modes
-from ...measurements import FloatArray, Snapshot
+from ...measurements import Snapshot
 from .config import BathymetryConfig
 from .engines import run_grid, run_particles, Track
 from .likelihood import ping_law, PingLikelihood

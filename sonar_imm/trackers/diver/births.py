@@ -8,7 +8,8 @@ from itertools import islice, product
 import numpy as np
 
 from ...acoustics import multistatic
-from ...measurements import Arrivals, FloatArray
+from ...estimation.arrays import FloatArray
+from ...measurements import Arrivals
 from .config import DiverConfig
 from .sensing import locate, Positions, toa_variance
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from ...estimation import markov
 from ...estimation.adaptation import Chain
-from ...measurements import FloatArray
+from ...estimation.arrays import FloatArray
 from .config import DiverConfig
 
 OUTPUTS = ('px', 'py', 'vx', 'vy')

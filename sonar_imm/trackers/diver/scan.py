@@ -12,8 +12,8 @@ import numpy as np
 
 from ...estimation import imm, imm_kernels
 from ...estimation.adaptation import AdaptiveChain
+from ...estimation.arrays import FloatArray
 from ...estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
-from ...measurements import FloatArray
 from .config import DiverConfig
 from .models import ModelSet
 from .sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing

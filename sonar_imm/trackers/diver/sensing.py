@@ -17,7 +17,8 @@ import numpy as np
 
 from ...acoustics import multistatic
 from ...acoustics.localisation import Localisation, localise
-from ...measurements import Arrivals, Fix, FloatArray, Measurement
+from ...estimation.arrays import FloatArray
+from ...measurements import Arrivals, Fix, Measurement
 from .config import DiverConfig
 
 

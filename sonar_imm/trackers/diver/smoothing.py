@@ -9,8 +9,9 @@ from attrs import evolve, field, frozen
 import numpy as np
 
 from ...estimates import Estimate
+from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
-from ...measurements import FloatArray, Measurement
+from ...measurements import Measurement
 from .scan import cross, Divers
 from .tracker import DiverTracker
 

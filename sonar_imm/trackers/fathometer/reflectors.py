@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
+from ...estimation.arrays import FloatArray
 from ...estimation.set_members import Members
-from ...measurements import FloatArray
 from .config import FathometerConfig
 from .response import Lattice, Response
 

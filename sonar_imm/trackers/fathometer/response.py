@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ...acoustics import fathometer
 from ...acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...acoustics.spectra import noise_taper
-from ...measurements import CrossSpectra, FloatArray, Rejection, Trace
+from ...estimation.arrays import FloatArray
+from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError
 from .config import FathometerConfig
 

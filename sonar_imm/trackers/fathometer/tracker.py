@@ -28,11 +28,12 @@ import numpy as np
 
 from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
+from ...estimation.arrays import FloatArray
 from ...estimation.history import StampGate
 from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
-from ...measurements import ArrayDepth, CrossSpectra, FloatArray, Pressure, Rejection, Trace
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from .config import FathometerConfig
 from .pressure import PressureStream
 from .reflectors import Identities, Known, nearest_ids, Reflectors, reflectors_of, write_estimate

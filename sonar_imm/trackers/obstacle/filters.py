@@ -23,8 +23,8 @@ import numpy as np
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation import kalman, unscented
+from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
-from ...measurements import FloatArray
 from . import kernels as kernels
 from .config import ObstacleConfig
 

@@ -14,11 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...estimation.arrays import FloatArray
 from ...estimation.jit import kernel
-
-FloatArray = NDArray[np.float64]
 
 KAPPA = 1.0
 NEGLIGIBLE = 1e-12

@@ -16,7 +16,8 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...measurements import FloatArray, Navigation
+from ...estimation.arrays import FloatArray
+from ...measurements import Navigation
 from .config import ObstacleConfig
 
 Readiness = Literal['ready', 'wait', 'gap']

@@ -24,9 +24,10 @@ import numpy as np
 
 from ...estimates import Estimate
 from ...estimation import imm_kernels
+from ...estimation.arrays import FloatArray
 from ...estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
 from ...estimation.history import ReplayHistory, StampGate
-from ...measurements import Altitude, Detections, FloatArray, Measurement, nanoseconds, Navigation
+from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
 from .config import ObstacleConfig
 from .filters import build_filter, Mixture, Sonar
