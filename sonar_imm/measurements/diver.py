@@ -48,6 +48,10 @@ class Fix:
             object.__setattr__(self, 'covariance', covariance)
 
 
+OPTIONAL_ARRIVALS = ('elevation', 'var_elevation', 'depth', 'var_depth')
+"""Columns of `Arrivals` that may be left out."""
+
+
 @frozen(eq=False, kw_only=True)
 class Arrivals:
     """Arrival times of one ping, one row a transmitter-receiver pair.
@@ -57,7 +61,9 @@ class Arrivals:
     emits at an unknown time near the stamp (an acoustic tag) and only differences between
     receivers carry information. tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where
     unknown; bearing: (n,) rad at the receiver, counter-clockwise from +x, NaN where not measured;
-    var_bearing: (n,) rad^2.
+    var_bearing: (n,) rad^2. elevation: (n,) rad at the receiver, up positive, with var_elevation,
+    and depth: (n,) m, down positive, the target's own report, with var_depth m^2; each NaN or left
+    out where not measured.
     """
 
     stamp_ns: int
@@ -69,12 +75,20 @@ class Arrivals:
     var_toa: FloatArray = field(converter=floats(None))
     bearing: FloatArray = field(converter=floats(None))
     var_bearing: FloatArray = field(converter=floats(None))
+    elevation: FloatArray = field(default=(), converter=floats(None))
+    var_elevation: FloatArray = field(default=(), converter=floats(None))
+    depth: FloatArray = field(default=(), converter=floats(None))
+    var_depth: FloatArray = field(default=(), converter=floats(None))
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
         n = len(self.toa)
-        for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing'):
+        for name in OPTIONAL_ARRIVALS:
+            if n and not len(getattr(self, name)):
+                object.__setattr__(self, name, floats(None)(np.full(n, np.nan)))
+        columns = ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing')
+        for name in (*columns, *OPTIONAL_ARRIVALS):
             if len(getattr(self, name)) != n:
                 raise Rejection(
                     'bad_shape',

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from attrs import frozen
 
-from ...parameters import Config, parameter
+from ...parameters import parameter
 from ..model_checks import chain_problems
+from .sea_parameters import SeaParameters
 
 MODEL_SETS = (
     'heading_speed',
@@ -23,7 +24,7 @@ ADAPTATIONS = ('counts', 'paper', 'fixed')
 
 
 @frozen(kw_only=True)
-class DiverConfig(Config):
+class DiverConfig(SeaParameters):
     """Everything the diver tracker can be told. The defaults are the `heading_speed` set of the
     docs."""
 
@@ -293,7 +294,7 @@ class DiverConfig(Config):
     )
 
     def check(self) -> list[str]:
-        problems = []
+        problems = super().check()
         if self.confirm_hits > self.confirm_window:
             problems.append(
                 f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '

@@ -23,15 +23,19 @@ import numpy as np
 from ...estimates import Estimate
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
+from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
 from ...estimation.history import ReplayHistory, StampGate
 from ...measurements import Arrivals, Fix, Measurement, nanoseconds
+from ...measurements.diver import OPTIONAL_ARRIVALS
 from ..model_checks import track_rules
 from .births import Birth, births_from_fixes, births_from_ping
 from .config import DiverConfig
-from .models import build_models, OUTPUTS
+from .instruments import Instruments
+from .models import build_models
+from .pings import begin_from_ping, FAR, ping_numbers
 from .scan import Divers, Scan
-from .sensing import Group, groups_of, Positions
+from .sensing import positions
 
 __all__ = ['DiverConfig', 'Divers', 'DiverTracker']
 
@@ -117,7 +121,7 @@ class DiverTracker:
         return inserted.revised
 
     def _new_history(self, life: Tracks) -> ReplayHistory[Divers, Measurement]:
-        M, n = len(self.models.names), self.models.n
+        M, n = self.models.copies * len(self.models.names), self.models.n
         nobody = Divers(
             stamp_ns=0,
             life=life,
@@ -138,28 +142,15 @@ class DiverTracker:
         """The state after all measurements of one stamp. Pure."""
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
         scan = Scan(self.config, self.models, self._chain, before, stamp_ns)
-        left = [
-            (group, ~taken)
-            for groups in groups_of(items, self.config, factor)
-            for group, taken in zip(groups, scan.take(groups))
-        ]
-        return self._census(scan.result(), self._births(items, left, float(factor[1])))
-
-    def _births(
-        self, items: Sequence[Measurement], left: Sequence[tuple[Group, np.ndarray]], factor: float
-    ) -> list[Birth]:
-        """Where the detections no track took put new divers."""
         births: list[Birth] = []
-        for group, free in left:
-            if isinstance(group, Positions):
-                births += births_from_fixes(group, free)
+        fixes = [item for item in items if isinstance(item, Fix)]
+        if fixes:
+            group = positions(fixes, self.config, self.config.covariance_scale * factor[0])
+            births += births_from_fixes(group, ~scan.take_fixes(group))
         for ping in (item for item in items if isinstance(item, Arrivals)):
-            rows = np.zeros(len(ping), bool)
-            for group, free in left:
-                if group.ping is ping:
-                    rows[group.rows] = free
-            births += births_from_ping(ping, rows, self.config, factor)
-        return births
+            taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
+            births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
+        return self._census(scan.result(), births)
 
     def _census(self, now: Divers, births: list[Birth]) -> Divers:
         """End the tracks that are over and begin new ones."""
@@ -182,8 +173,8 @@ class DiverTracker:
         births = births[: max(0, 10 + 5 * config.max_tracks - len(life))]
         if not births and kept.all():
             return evolve(now, life=life)
-        new = [self.models.new_track(*birth) for birth in births]
-        M, n, count = len(self.models.names), self.models.n, len(new)
+        new = [self._new_track(birth, now.instruments) for birth in births]
+        M, n, count = now.x.shape[1], now.x.shape[2], len(new)
         return Divers(
             stamp_ns=now.stamp_ns,
             life=life.born(count, now.stamp_ns, rules),
@@ -196,20 +187,50 @@ class DiverTracker:
             score=np.append(now.score[kept], np.zeros(count)),
             scale=now.scale,
             broken=now.broken + int((~sound).sum()),
+            instruments=now.instruments,
         )
 
+    def _new_track(
+        self, birth: Birth, instruments: Instruments
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x, P and mu of a track that begins."""
+        layout = instruments.layout(self.config, self.models.n)
+        plain = self.models.height < 0 and layout.size == self.models.n
+        if birth.ping is None or plain:
+            x, P, mu = self.models.new_track(birth.position, birth.covariance, birth.ping is None)
+            return *layout.widened(x, P), mu
+        x, P, mu = self.models.new_track(birth.position, np.eye(2) * FAR**2, False)
+        x, P = layout.widened(x, P)
+        factor = self.config.covariance_scale
+        ping = ping_numbers(birth.ping, birth.rows, self.config, factor, self.models, layout)
+        # All models of a copy begin alike: one of each is enough to ask.
+        M = len(self.models.names)
+        first = begin_from_ping(x[::M], P[::M], ping, birth.position, self.config, layout)
+        share = np.exp(first[2] - first[2].max())
+        mu = mu * np.repeat(share / share.sum() * len(share), M)
+        return np.repeat(first[0], M, axis=0), np.repeat(first[1], M, axis=0), mu
+
     def _estimate(self, state: Divers) -> Estimate:
-        mean, covariance = imm_kernels.combine(state.x, state.P, state.mu, self.models.E)
+        n = self.models.n
+        x, P = state.x, state.P
+        if x.shape[-1] > n:
+            x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
+        mean, covariance = imm_kernels.combine(x, P, state.mu, self.models.E)
         depth = np.full(len(mean), self.config.target_z)
+        if self.models.height >= 0:
+            depth = mean[:, 2]
+        mu = state.mu
+        if self.models.copies > 1:
+            mu = mu.reshape(len(mu), self.models.copies, -1).sum(axis=1)
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._frame_id,
             xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
-            state_names=OUTPUTS,
+            state_names=self.models.outputs,
             state=mean,
             covariance=covariance,
             model_names=self.models.names,
-            probabilities=state.mu,
+            probabilities=mu,
             extras={
                 'track_id': state.life.track_id,
                 'track_state': state.life.status,
@@ -225,4 +246,5 @@ def _key(measurement: Measurement) -> bytes:
         covariance = b'' if measurement.covariance is None else measurement.covariance.tobytes()
         return b'fix' + measurement.position.tobytes() + covariance
     names = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
+    names += OPTIONAL_ARRIVALS
     return b'arrivals' + b''.join(getattr(measurement, name).tobytes() for name in names)
