@@ -15,7 +15,7 @@ itself was set anew when nothing else explains it:
 2. It repeats stamps from the beginning of the stream, as a looped recording does: `restart_after`
    such stamps are enough.
 3. The stream has just begun, and all of its stamps are newer. Then those may be the outliers. The
-   run has to outvote them: `restart_after` distinct stamps for each, and as many again.
+   run has to outvote them: `restart_after` distinct stamps for each.
 4. Otherwise it may be a burst of late messages. Only a long run is no burst: `PATIENCE` times
    `restart_after` distinct stamps that span more than the window.
 
@@ -49,6 +49,9 @@ Step = Callable[[State, int, Sequence[Item]], State]
 
 PATIENCE = 20
 """A run of this many times `restart_after` stamps is longer than a burst of late messages."""
+
+MAX_LATE_NS = 300 * 10**9
+"""Five minutes: nothing that is meant to be tracked online comes later."""
 
 
 @frozen
@@ -121,9 +124,9 @@ class StampGate(Generic[Item]):
 
     window_ns: how much older than the newest stamp is still good; max_gap_ns: how far ahead of it
     is still believed; restart_after: distinct stamps in a row outside the stream that mean the
-    clock was restarted, where nothing else explains them; max_late_ns: a message cannot be later
-    than this, `max_gap_ns` by default. A scan of many items with one outlying stamp is no restart.
-    At most `hold` items are held, the latest ones.
+    clock was restarted, where nothing else explains them; max_late_ns: no message is later than
+    this. A scan of many items with one outlying stamp is no restart. At most `hold` items are
+    held, the latest ones.
     """
 
     def __init__(
@@ -132,7 +135,7 @@ class StampGate(Generic[Item]):
         max_gap_ns: int,
         restart_after: int,
         *,
-        max_late_ns: int | None = None,
+        max_late_ns: int = MAX_LATE_NS,
         hold: int = 1000,
     ):
         if window_ns < 0 or max_gap_ns <= 0 or restart_after < 1 or hold < restart_after:
@@ -142,7 +145,7 @@ class StampGate(Generic[Item]):
         self.window_ns = window_ns
         self.max_gap_ns = max_gap_ns
         self.restart_after = restart_after
-        self.max_late_ns = max_gap_ns if max_late_ns is None else max_late_ns
+        self.max_late_ns = max_late_ns
         self.hold = hold
         self._first: list[int] = []
         self._newest: list[int] = []
@@ -198,7 +201,7 @@ class StampGate(Generic[Item]):
         if len(set(run.stamps).intersection(self._first)) >= enough:
             return True
         young = len(self._newest) < PATIENCE and self._newest[0] > run.stamps[-1]
-        if young and len(run) >= enough * (1 + len(self._newest)):
+        if young and len(run) >= enough * len(self._newest):
             return True
         long = len(run) >= min(PATIENCE * enough, self.hold)
         return long and (run.span_ns > self.window_ns or run.full)

@@ -241,7 +241,7 @@ def test_a_looped_recording_restarts_each_time_and_loses_nothing(length, lossy):
     assert released(decisions) == arrivals.tolist()
 
 
-@pytest.mark.parametrize('back', [700, 3600, 10**9])
+@pytest.mark.parametrize('back', [350, 3600, 10**9])
 def test_a_clock_set_back_beyond_any_lateness_is_believed_at_once(back):
     again = [5 * 10**9 - back + i for i in range(10)]
     decisions = decide(StampGate(10 * S, 600 * S, 5), *range(5 * 10**9 - 50, 5 * 10**9), *again)
@@ -252,7 +252,7 @@ def test_a_clock_set_back_beyond_any_lateness_is_believed_at_once(back):
 @pytest.mark.parametrize('rate', [1, 10, 1000])
 def test_a_clock_set_back_inside_the_stream_is_believed_after_a_long_run(rate):
     stream = [1000 + i / rate for i in range(500 * rate)]
-    again = [1100 + i / rate for i in range(200 * rate)]
+    again = [1250 + i / rate for i in range(200 * rate)]
     decisions = decide(StampGate(10 * S, 600 * S, 5), *stream, *again)
     assert restarts(decisions) == 1
     assert released(decisions) == stream + again
@@ -266,11 +266,11 @@ def test_a_clock_set_back_a_little_reaches_its_old_time():
     assert released(decisions) == [*range(1000, 2000), *range(1989, 2100)]
 
 
-@pytest.mark.parametrize('ahead', [20, 100, 599])
+@pytest.mark.parametrize('ahead', [20, 100, 299])
 def test_an_outlying_first_stamp_inside_the_gap_is_outvoted(ahead):
     stream = list(range(1000, 1050))
     decisions = decide(StampGate(5 * S, 600 * S, 5), 1000 + ahead, *stream)
-    assert [d.verdict for d in decisions].index('restart') == 10
+    assert [d.verdict for d in decisions].index('restart') == 5
     assert released(decisions)[1:] == stream
 
 
@@ -323,7 +323,7 @@ def clocks(draw):
     st.sampled_from([4, 30, 1000]),
 )
 def test_every_item_has_exactly_one_fate(stamps, window, gap, hold):
-    stamp_gate = StampGate(window_ns=window, max_gap_ns=gap, restart_after=3, hold=hold)
+    stamp_gate = StampGate(window, gap, 3, max_late_ns=100, hold=hold)
     released = too_late = abandoned = 0
     for stamp in stamps:
         decision = stamp_gate.decide(stamp, stamp)
