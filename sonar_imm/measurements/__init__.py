@@ -11,6 +11,7 @@ from .bathymetry import MAX_BINS, Snapshot
 from .checks import check_covariance, check_stamp, nanoseconds, Rejection
 from .diver import Arrivals, Fix
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
+from .frames import FrameGuard
 from .obstacle import Altitude, Detections, Navigation
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     'CrossSpectra',
     'Detections',
     'Fix',
+    'FrameGuard',
     'MAX_BINS',
     'Measurement',
     'nanoseconds',

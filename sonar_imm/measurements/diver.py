@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
-from .checks import check_covariance, check_stamp, floats, Rejection
+from .checks import check_covariance, check_stamp, content_key, floats, Rejection
+from .frames import TRACKS
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:
@@ -30,6 +31,7 @@ class Fix:
     position: FloatArray = field(converter=floats(3))
     covariance: FloatArray | None = None
     frame_id: str = ''
+    frame_of: ClassVar[str] = TRACKS
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -46,6 +48,10 @@ class Fix:
             covariance = 0.5 * covariance + 0.5 * covariance.T
             covariance.flags.writeable = False
             object.__setattr__(self, 'covariance', covariance)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('fix', self.position, self.covariance)
 
 
 @frozen(eq=False, kw_only=True)
@@ -70,6 +76,7 @@ class Arrivals:
     bearing: FloatArray = field(converter=floats(None))
     var_bearing: FloatArray = field(converter=floats(None))
     frame_id: str = ''
+    frame_of: ClassVar[str] = TRACKS
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -85,6 +92,12 @@ class Arrivals:
 
     def __len__(self) -> int:
         return len(self.toa)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        where = (self.tx_id, self.rx_id, self.tx, self.rx)
+        heard = (self.toa, self.var_toa, self.bearing, self.var_bearing)
+        return content_key('arrivals', *where, *heard)
 
     @property
     def passive(self) -> bool:

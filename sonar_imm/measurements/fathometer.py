@@ -7,7 +7,7 @@ whoever uses the measurement (`alive`), and only when too few are left is the me
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from attrs import field, frozen
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, complexes, floats, positives, Rejection
+from .frames import TRACKS
 
 MAX_SAMPLES, MAX_PHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
 LEAST_PHONES = 3
@@ -53,6 +54,7 @@ class ArrayDepth:
     stamp_ns: int
     depth: float
     frame_id: str = ''
+    frame_of: ClassVar[str] = ''
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -73,6 +75,7 @@ class Trace:
     depth: FloatArray = field(converter=floats(None))
     amplitude: FloatArray = field(converter=floats(None))
     frame_id: str = ''
+    frame_of: ClassVar[str] = TRACKS
     sigma: FloatArray | None = field(default=None, converter=positives)
     reference_depth: float | None = field(default=None, converter=_depth)
 
@@ -129,6 +132,7 @@ class CrossSpectra:
     frequency: FloatArray = field(converter=floats(None))
     csdm: NDArray[np.complexfloating] = field(converter=complexes)
     frame_id: str = ''
+    frame_of: ClassVar[str] = TRACKS
     snapshots: int = 0
     reference_depth: float | None = field(default=None, converter=_depth)
     alive: NDArray[np.bool_] = field(init=False)
@@ -208,6 +212,7 @@ class Pressure:
     pressure: NDArray[np.float32] = field(converter=_samples)
     sample_rate: float
     frame_id: str = ''
+    frame_of: ClassVar[str] = TRACKS
     reference_depth: float | None = field(default=None, converter=_depth)
     alive: NDArray[np.bool_] = field(init=False)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, floats, Rejection
+from .checks import check_stamp, content_key, floats, Rejection
+from .frames import TRACKS
 
 
 @frozen(eq=False, kw_only=True)
@@ -26,6 +29,7 @@ class Detections:
     var_bearing: FloatArray | None = None
     intensity: FloatArray | None = None
     frame_id: str = ''
+    frame_of: ClassVar[str] = 'detections'
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -42,6 +46,12 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.range)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key(
+            'detections', self.range, self.bearing, self.var_range, self.var_bearing
+        )
 
 
 @frozen(eq=False, kw_only=True)
@@ -63,6 +73,7 @@ class Navigation:
     twist_covariance: FloatArray | None = None
     frame_id: str = ''
     child_frame_id: str = ''
+    frame_of: ClassVar[str] = TRACKS
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -82,6 +93,10 @@ class Navigation:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, floats(6, 6)(getattr(self, name)))
 
+    def key(self) -> bytes:
+        """See `content_key`; velocities are not used."""
+        return content_key('navigation', self.position, self.orientation)
+
 
 @frozen(eq=False, kw_only=True)
 class Altitude:
@@ -91,6 +106,7 @@ class Altitude:
     altitude: float
     variance: float = float('nan')
     frame_id: str = ''
+    frame_of: ClassVar[str] = 'altitude'
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -98,3 +114,7 @@ class Altitude:
             raise Rejection('nan', 'the altitude is not finite')
         if self.altitude < 0.0:
             raise Rejection('out_of_range', f'the altitude is {self.altitude:g} m, below zero')
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('altitude', np.float64(self.altitude))
