@@ -1,8 +1,8 @@
 """The ``sonar-imm`` command: one small module a subcommand, loaded only when it is called.
 
 Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141
-nobody reads the output, 129 and 143 ended by SIGHUP and SIGTERM. What a user can get wrong ends in one line on standard error; a traceback
-is a bug.
+nobody reads the output, 129 and 143 ended by SIGHUP and SIGTERM. What a user can get wrong ends in
+one line on standard error; a traceback is a bug.
 """
 
 from __future__ import annotations
