@@ -241,7 +241,9 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         text = (ROOT / 'config' / f'{system.name}.yaml').read_text(encoding='utf-8')
         values = parameters_from_yaml(text, node_name=system.name)
         config = system.config_type()
-        assert config.lint(values) == []
+        for spec in config.specs():
+            if spec.kind == 'float':  # ROS 2 refuses a whole number for a double
+                assert isinstance(values[spec.name], float), spec.name
         assert config.from_mapping(values, ignore_unknown=True) == config()
 
 
