@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from attrs import frozen
 
-from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic
 
 from .parameters import Config, inherited, parameter, ParameterSpec
+from .trackers import System
 
 
 @frozen(kw_only=True)
@@ -60,17 +61,15 @@ class BathymetryNodeConfig(NodeConfig):
     max_wait: float = inherited(NodeConfig, 'max_wait', 0.5)
 
 
-_SPECIAL = {'bathymetry': BathymetryNodeConfig}
-
-
-def node_config_type(system: str) -> type[NodeConfig]:
+def node_config_type(system: System) -> type[NodeConfig]:
     """What the node of `system` can be told besides the parameters of its tracker."""
-    return _SPECIAL.get(system, NodeConfig)
+    found: type[NodeConfig] = globals()[system.node_config]
+    return found
 
 
 def type_specs(system: str) -> tuple[ParameterSpec, ...]:
     """The parameters ``<input>_type`` of the node of `system`."""
-    return tuple(spec for topic in INPUTS[system] if (spec := type_spec(topic)) is not None)
+    return tuple(spec for topic in inputs_of(system) if (spec := type_spec(topic)) is not None)
 
 
 def type_spec(topic: InputTopic) -> ParameterSpec | None:

@@ -7,6 +7,7 @@ from functools import partial
 from attrs import frozen
 
 from ...acoustics.geometry import AZIMUTH_MODELS
+from ...measurements import BEAM_AXES
 from ...parameters import inherited, parameter
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
 
@@ -57,7 +58,7 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
         'axes of the beam vectors of SonarRanges and sonar images: marine (z forward, y to '
         'starboard, as their definition says), rep103 (x forward, y to port), or by which of the '
         'two the beams point along',
-        choices=('marine', 'rep103', 'auto'),
+        choices=BEAM_AXES,
     )
     nav_twist_frame: str = parameter(
         'child',
