@@ -18,9 +18,10 @@ import hashlib
 import inspect
 from pathlib import Path
 import re
-from typing import Any, TypeVar
+from typing import Any, cast, TypeVar
 
 import numba
+from numba import config
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.dispatcher import Dispatcher
 
@@ -35,13 +36,13 @@ def kernel(function: F) -> F:
 
     No fast-math and no threads: the same input gives the same bits on every call.
     """
-    compiled = numba.njit(nogil=True, error_model='numpy')(function)
+    compiled: Any = numba.njit(nogil=True, error_model='numpy')(function)
     if isinstance(compiled, Dispatcher):  # not with NUMBA_DISABLE_JIT
         try:
-            compiled._cache = _KernelCache(function)
+            compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
         except RuntimeError:  # numba: 'cannot cache function ...: no locator available'
             pass
-    return compiled
+    return cast(F, compiled)
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):
@@ -50,7 +51,7 @@ class _KernelCacheImpl(CompileResultCacheImpl):
     def __init__(self, function: Callable[..., Any]):
         super().__init__(function)
         own_stamp, digest = self._locator.get_source_stamp, digest_of(inspect.getfile(function))
-        checked = bool(numba.config.BOUNDSCHECK)
+        checked = bool(config.BOUNDSCHECK)  # type: ignore[attr-defined]
         self._locator.get_source_stamp = lambda: (own_stamp(), digest, checked)
 
 
