@@ -190,21 +190,6 @@ class Config:
             raise ConfigError(*problems)
         return cls(**known)
 
-    @classmethod
-    def lint(cls, values: Mapping[str, Any]) -> list[str]:
-        """Warnings about values that work offline but that a ROS 2 node refuses: a whole number
-        given to a double."""
-        specs = {spec.name: spec for spec in cls.specs()}
-        return [
-            f"parameter '{key}' is a double: write {float(value)!r} instead of {value!r}, "
-            'or ROS 2 refuses it'
-            for key, value in values.items()
-            if key in specs
-            and specs[key].kind == 'float'
-            and isinstance(value, int)
-            and not isinstance(value, bool)
-        ]
-
     def require_changeable(self, other: Config) -> None:
         """Raise ValueError naming the parameters of `other` that differ and are read-only."""
         fixed = [
@@ -252,8 +237,12 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
         return {str(key): value for key, value in tree.items()}
     values: dict[str, Any] = {}
     for key, section in sections.items():
-        if key in ('/**', '/*') or not node_name or key.strip('/').split('/')[-1] == node_name:
-            values.update(section or {})
+        if not isinstance(section, (dict, type(None))):
+            kind = type(section).__name__
+            raise ConfigError(f'ros__parameters of {key} must hold a mapping, it holds a {kind}')
+        name = str(key).strip('/').split('/')[-1]
+        if key in ('/**', '/*') or not node_name or name == node_name:
+            values.update((str(one), value) for one, value in (section or {}).items())
     return values
 
 
