@@ -22,7 +22,7 @@ from .table import decode_table, encode_table, require_columns
 
 
 def write_estimate(estimate: Estimate, make: Make) -> Any:
-    """Write the PointCloud2 table of ``~/estimate``, one row a target; zero rows are fine."""
+    """Write the PointCloud2 table of ``~/estimate``, one row per target; it may have no rows."""
     return encode_table(
         estimate.columns(), stamp_ns=estimate.stamp_ns, frame_id=estimate.frame_id, make=make
     )
@@ -74,7 +74,7 @@ def write_truth(
 def write_true_profile(
     xyz: ArrayLike, columns: Mapping[str, ArrayLike], *, stamp_ns: int, frame_id: str, make: Make
 ) -> Any:
-    """Write the true floor under one ping, one row a range bin: ``x y z``, then `columns`.
+    """Write the true floor under one ping, one row per range bin: ``x y z``, then `columns`.
 
     xyz: (n, 3) metres; columns: (n,) each, ``range height angle`` as f8, ``patch valid`` as u1.
     """
@@ -94,7 +94,7 @@ def write_true_reflectors(
 ) -> Any:
     """Write the true reflectors of one record as the table ``x y z depth amplitude track_id``.
 
-    depth: (K,) metres, down positive; amplitude, track_id: (K,); zero rows are fine.
+    depth: (K,) metres, down positive; amplitude, track_id: (K,). It may have no rows.
     """
     z = -np.asarray(depth, np.float64)
     zero = np.zeros(len(z), np.float32)
@@ -150,7 +150,7 @@ def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
 def write_model_probabilities(estimate: Estimate, row: int, make: Make) -> Any:
     """Write one row's model probabilities as JointState: name = model, position = probability.
 
-    A borrowed message: it is the one whose values every plotting tool shows by name.
+    JointState is borrowed because every plotting tool shows its values by name.
     """
     return make(
         'sensor_msgs/msg/JointState',

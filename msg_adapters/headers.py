@@ -12,6 +12,7 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
+from sonar_imm.estimation.angles import wrap_angle
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 
 Make = Callable[..., Any]
@@ -87,14 +88,9 @@ def ned_to_enu(measurement: Any) -> Any:
             frame_id=frame_id,
             tx=_swap(measurement.tx),
             rx=_swap(measurement.rx),
-            bearing=wrap(np.pi / 2 - measurement.bearing),
+            bearing=wrap_angle(np.pi / 2 - measurement.bearing),
         )
     raise TypeError(f'no north-east-down rule for {type(measurement).__name__}')
-
-
-def wrap(angle: Any) -> Any:
-    """Wrap an angle in radians into [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _swap(vector: Any) -> Any:

@@ -1,7 +1,7 @@
-"""Which topics each tracker hears, and how to read every message type it takes there.
+"""Which topics each tracker subscribes to, and how to read every message type it takes there.
 
-The nodes subscribe from this table and the recordings pick topics by it, so that live and recorded
-data are read by the same functions.
+The nodes subscribe by this table and recordings are read by it, so that live and recorded data are
+read by the same functions.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class InputTopic:
     doubt: gives a reason code to count when a message can be used but deserves a warning.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     one_topic: several topics are several instruments, each for a tracker of its own.
-    settings: parameters of the tracker that its readers take as keywords, too: how messages are to
-    be understood that do not say it themselves.
-    companion: says something about another input, known by its name and never enough alone.
+    settings: parameters of the tracker that its readers take as keywords too: what messages do not
+    say themselves.
+    companion: describes another input; found by its topic name, never enough alone.
     """
 
     name: str
@@ -52,7 +52,7 @@ class InputTopic:
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any]
     ) -> Callable[[Any], Any]:
-        """Give the reader of a message type, told everything; `settings` may hold more."""
+        """Give the reader of a message type with its settings; `settings` may hold more."""
         told = {name: settings[name] for name in self.settings if name in settings}
         return partial(self.readers[type_name], world_frame=world_frame, **told)
 
@@ -63,7 +63,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
     'bathymetry': (
         InputTopic(
             'snapshot',
-            'complex snapshots of a side-scan array, one row a range bin',
+            'complex snapshots of a side-scan array, one row per range bin',
             {
                 'sensor_msgs/msg/PointCloud2': read_snapshot,
             },
@@ -83,7 +83,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         ),
         InputTopic(
             'arrivals',
-            'arrival times of one ping, one row a transmitter-receiver pair',
+            'arrival times of one ping, one row per transmitter-receiver pair',
             {
                 'sensor_msgs/msg/PointCloud2': read_arrivals,
             },
@@ -92,7 +92,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
     'fathometer': (
         InputTopic(
             'csdm',
-            'cross-spectra of a vertical array, one row a frequency',
+            'cross-spectra of a vertical array, one row per frequency',
             {
                 'sensor_msgs/msg/PointCloud2': read_csdm,
             },
@@ -100,7 +100,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         ),
         InputTopic(
             'pressure',
-            'pressure at the phones of a vertical array, one row a sample',
+            'pressure at the hydrophones of a vertical array, one row per sample',
             {
                 'sensor_msgs/msg/PointCloud2': read_pressure,
             },
@@ -108,7 +108,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         ),
         InputTopic(
             'trace',
-            'ready-made traces, one row a depth',
+            'ready-made traces, one row per depth',
             {
                 'sensor_msgs/msg/PointCloud2': read_trace,
             },
@@ -116,7 +116,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
         ),
         InputTopic(
             'array_depth',
-            'depth of the deepest phone, from a companion instrument',
+            'depth of the deepest hydrophone, from a companion instrument',
             {
                 'geometry_msgs/msg/PointStamped': read_array_depth,
                 'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
@@ -127,7 +127,7 @@ INPUTS: dict[str, tuple[InputTopic, ...]] = {
     'obstacle': (
         InputTopic(
             'detections',
-            'echoes of one ping of a forward-looking sonar, also none',
+            'echoes of one ping of a forward-looking sonar, also when there are none',
             {
                 'sensor_msgs/msg/PointCloud2': read_detections,
                 'sensor_msgs/msg/LaserScan': read_laser_scan,

@@ -12,7 +12,7 @@ from ..trackers import SYSTEMS
 from .common import BAG, example, json_option, print_json, say
 
 if TYPE_CHECKING:
-    from .checking import Outcome
+    from .checking import CheckedRecording
 
 
 @click.command(
@@ -54,7 +54,7 @@ def command(
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
     with tempfile.TemporaryDirectory(prefix='sonar_imm_check_') as scratch:
-        outcomes = run_checks(
+        recordings = run_checks(
             systems or tuple(SYSTEMS),
             out or Path(scratch),
             bag=bag,
@@ -63,11 +63,11 @@ def command(
             quiet=as_json,
         )
     if as_json:
-        print_json([outcome.as_dict() for outcome in outcomes])
+        print_json([recording.as_dict() for recording in recordings])
     else:
-        for outcome in outcomes:
-            print_outcome(outcome)
-    if not all(outcome.good for outcome in outcomes):
+        for recording in recordings:
+            print_checks(recording)
+    if not all(recording.good for recording in recordings):
         raise click.exceptions.Exit(1)
 
 
@@ -79,7 +79,7 @@ def run_checks(
     params: Path | None = None,
     limit: float | None = None,
     quiet: bool = False,
-) -> list[Outcome]:
+) -> list[CheckedRecording]:
     """Check `bag`, or all shipped recordings, of each system; runs go below `folder`."""
     from .checking import check_recording, shipped_bags
 
@@ -90,15 +90,15 @@ def run_checks(
     ]
 
 
-def print_outcome(outcome: Outcome) -> None:
+def print_checks(recording: CheckedRecording) -> None:
     """The checks of one recording as a table."""
-    say(f'{outcome.system}: {outcome.bag.name}')
-    for check in outcome.checks:
+    say(f'{recording.system}: {recording.bag.name}')
+    for check in recording.checks:
         say(
             f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
             f' (wanted: {check.wanted})'
         )
     say(
-        f'        latency of an estimate: p50 {outcome.latency_ms["p50"]:.1f} ms, '
-        f'p99 {outcome.latency_ms["p99"]:.1f} ms'
+        f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
+        f'p99 {recording.latency_ms["p99"]:.1f} ms'
     )

@@ -25,7 +25,7 @@ from .track import track_recording
 
 
 @frozen
-class Outcome:
+class CheckedRecording:
     """All checks of one recording, and what is said of the offline run.
 
     `folder` holds the runs ``offline`` and ``live``.
@@ -70,7 +70,7 @@ def check_recording(
     params: Path | None = None,
     limit: float | None = None,
     quiet: bool = False,
-) -> Outcome:
+) -> CheckedRecording:
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
     params: None for those that the recording brings along, if any. limit: error to stay within, in
@@ -90,7 +90,7 @@ def check_recording(
     checks = [_answered(live, run), _equal(folder), _ended(live)]
     if (accuracy := judgement.accuracy(limit)) is not None:
         checks.append(accuracy)
-    return Outcome(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
+    return CheckedRecording(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
 
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:

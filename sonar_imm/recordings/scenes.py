@@ -1,7 +1,7 @@
 """Simulated scenes as bags.
 
-What a scene holds is told apart by its class: `MEASUREMENTS` says on which topic a measurement
-goes and who writes it, `TRUTHS` how the truth becomes messages.
+`MEASUREMENTS` gives the topic and the writer for each class of measurement, `TRUTHS` the writer
+for each class of truth.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ TRUTH_TOPIC = '/truth/estimate'
 def track_records(
     stamps: NDArray[np.int64], position: NDArray, velocity: NDArray, track_id: int, frame_id: str
 ) -> list[Record]:
-    """One truth message a stamp for one target."""
+    """One truth message per stamp, of one target."""
     return [
         (
             int(stamp),
@@ -38,7 +38,7 @@ def track_records(
 
 
 def true_track_records(track: TrueTrack, frame_id: str) -> list[Record]:
-    """One truth message a stamp."""
+    """One truth message per stamp."""
     return track_records(track.stamp_ns, track.position, track.velocity, track.track_id, frame_id)
 
 
@@ -80,7 +80,7 @@ def namespaced(namespace: str, topic: str) -> str:
 
 
 def true_obstacle_records(true: TrueObstacle, frame_id: str) -> list[Record]:
-    """One truth message a ping: where the obstacle is on the map and seen from the sonar."""
+    """One truth message per ping: the position on the map and relative to the sonar."""
     place = {name: np.array([value], np.float32) for name, value in zip('xyz', true.position)}
     records: list[Record] = []
     for k, stamp in enumerate(true.stamp_ns):

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from msg_adapters.headers import make_header, ned_to_enu, stamp_ns, to_enu, wrap
+from msg_adapters.headers import make_header, ned_to_enu, stamp_ns, to_enu
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.recordings.messages import ros_message
 
@@ -83,10 +83,3 @@ def test_a_ned_frame_is_refused_under_enu_and_read_under_ned():
     assert to_enu(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match='enu, ned'):
         to_enu(fix(), 'nwu')
-
-
-def test_wrap_stays_in_its_half_open_interval():
-    angles = np.linspace(-20.0, 20.0, 1001)
-    wrapped = wrap(angles)
-    assert (wrapped >= -np.pi).all() and (wrapped < np.pi).all()
-    assert np.allclose(np.exp(1j * wrapped), np.exp(1j * angles))
