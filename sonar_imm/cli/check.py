@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 @click.option(
     '--params',
     type=click.Path(path_type=Path, dir_okay=False),
-    help='Parameter file, for the node and offline alike.',
+    help='Parameter file for the node and the offline run.',
 )
 @click.option(
     '--limit',
     type=click.FloatRange(min=0.0),
     metavar='ERROR',
-    help='Error to stay within, of the kind and in the unit that the check prints: '
+    help='Largest error allowed, of the kind and in the unit that the check prints, e.g. '
     'position RMSE in metres for the diver.',
 )
 @click.option(
@@ -46,10 +46,10 @@ def command(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Start the real nodes, play recordings to them in lock-step and check what they say.
+    """Start the real nodes, play recordings to them in lock-step and check their estimates.
 
-    The estimates have to equal those of `track`, byte for byte, and to lie near the truth. SYSTEMS
-    are all there are unless named. Exit code 1 when anything falls short.
+    The estimates have to equal those of `track`, byte for byte, and to lie near the truth. Without
+    SYSTEMS all are checked. Exit code 1 when a check fails.
     """
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
@@ -80,7 +80,7 @@ def run_checks(
     limit: float | None = None,
     quiet: bool = False,
 ) -> list[CheckedRecording]:
-    """Check `bag`, or all shipped recordings, of each system; runs go below `folder`."""
+    """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`."""
     from .checking import check_recording, shipped_bags
 
     return [
@@ -91,7 +91,7 @@ def run_checks(
 
 
 def print_checks(recording: CheckedRecording) -> None:
-    """The checks of one recording as a table."""
+    """Print the checks of one recording."""
     say(f'{recording.system}: {recording.bag.name}')
     for check in recording.checks:
         say(

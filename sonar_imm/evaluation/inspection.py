@@ -160,8 +160,7 @@ def _stamp_problems(heard: _Heard) -> list[str]:
 
 
 def _content_problems(heard: _Heard) -> list[str]:
-    """Problems of the messages. Refusals count for the input that the topic suits or is named
-    after."""
+    """Problems of messages; refusals only for the input that the topic suits or is named after."""
     problems = []
     if len(heard.frames) > 1:
         problems.append(f'several frames: {", ".join(map(repr, heard.frames))}')

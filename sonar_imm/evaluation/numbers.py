@@ -87,14 +87,14 @@ def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
     }
 
 
-def belief_sentence(coverage: float) -> str:
+def coverage_sentence(coverage: float) -> str:
     """What `coverage`, the share of truth inside the stated 95 % ellipses, says about them."""
     held = f'its 95 % ellipses hold the truth {100 * coverage:.0f} % of the time'
     if coverage < 0.90:
         return f'The tracker is overconfident: {held}.'
     if coverage > 0.99:
         return f'The tracker is more cautious than it needs to be: {held}.'
-    return f'The stated uncertainty is right: {held}.'
+    return f'The stated uncertainty is consistent with the errors: {held}.'
 
 
 def bounds_remark(summary: Mapping[str, Any]) -> str:

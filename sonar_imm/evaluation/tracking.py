@@ -172,8 +172,7 @@ class OfflineRun:
         entry.count += 1
 
     def outcomes(self) -> dict[str, int]:
-        """What happened to the messages: the counts of the tracker, and those refused before
-        it."""
+        """What happened to the messages: counts of the tracker, and those refused before it."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ..numbers import belief_sentence, chi2_line, error_line
+from ..numbers import chi2_line, coverage_sentence, error_line
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
@@ -31,7 +31,7 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
                 else f'adds {-100 * change:.0f} % to it.'
             )
         )
-    sentences.append(belief_sentence(metrics['consistency']['coverage']['95']))
+    sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
     return ' '.join(sentences)
 
 

@@ -68,7 +68,7 @@ class Truth:
         return len(self.paths)
 
     def shifted(self, lag: float) -> Truth:
-        """The truth shifted by `lag` seconds: an estimate at t is compared with truth at t +
+        """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
         lag."""
         shift = round(lag * SECOND)
         return Truth(

@@ -121,8 +121,7 @@ def _by_gram(b: FloatArray, gram: FloatArray, places: np.ndarray) -> FloatArray:
 
 
 def _by_least_squares(x: FloatArray, shapes: FloatArray, places: np.ndarray) -> FloatArray:
-    """Half of the decrease of the residual sum of squares when each set is fitted to all
-    samples."""
+    """Half of the decrease of the residual sum of squares by fitting each set to all samples."""
     values = np.empty(len(places))
     for k, z in enumerate(places):
         A = shapes[:, z]

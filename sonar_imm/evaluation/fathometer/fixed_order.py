@@ -1,5 +1,4 @@
-"""Filters of a fixed number of reflectors on the same records, for comparison: the paper's Figure
-3.
+"""Filters of a fixed number of reflectors on the same records, as in the paper's Figure 3.
 
 These are bootstrap filters for the usual number of reflectors, for one less and for one more. They
 take the same responses as the tracker of the run.

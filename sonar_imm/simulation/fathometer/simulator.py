@@ -52,8 +52,7 @@ def simulate(config: FathometerScenario, seed: int) -> Scene:
 def stream(
     config: FathometerScenario, seed: int
 ) -> Iterator[tuple[list[Received], TrueReflectors]]:
-    """Like `simulate`, but record by record: long scenes of cross-spectra do not fit into
-    memory."""
+    """Like `simulate`, record by record: long scenes of cross-spectra do not fit into memory."""
     rng = np.random.default_rng(seed)
     drift = drift_of(config, rng)
     for record, measurements in enumerate(_measurements(config, drift, rng)):

@@ -183,7 +183,7 @@ def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
     assert verdict.accuracy(None).good and not verdict.accuracy(0.01).good
     assert 'obstacles were found' in verdict.summary
     titles = [section.title for section in verdict.part([]).sections]
-    assert {'Height over range', 'Seen by the sonar', 'Above or below'} <= set(titles)
+    assert {'Height over range', 'Image of the sonar', 'Above or below'} <= set(titles)
     assert any(title.startswith('Deferred estimate: RMSD') for title in titles)
     assert main(['evaluate', str(run), '--report', str(tmp_path / 'report.html')]) == 0
     assert 'Diamonds: the least RMSD' in (tmp_path / 'report.html').read_text()
