@@ -28,6 +28,7 @@ from .headers import Make, stamp_ns
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 MAX_DETECTIONS = 10_000
+COLUMNS = ('x', 'y', 'z', 'range', 'bearing', 'var_range', 'var_bearing', 'intensity')
 SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
 NEAREST, FARTHEST = 0.01, 1e5
@@ -42,7 +43,7 @@ def read_detections(message: Any, **_: Any) -> Detections:
 
     Raises `Rejection`.
     """
-    columns = decode_table(message)
+    columns = decode_table(message, COLUMNS, most_rows=MAX_DETECTIONS)
     if 'range' in columns or 'bearing' in columns:
         require_columns(columns, ('range', 'bearing'), 'detections')
         distance, bearing = scalar_column(columns, 'range'), scalar_column(columns, 'bearing')

@@ -33,7 +33,7 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
-from ..recordings.writer import BagWriter, ros_message
+from ..recordings.writer import BagWriter, naming, ros_message
 from .judging import JUDGES
 
 BAG, CSV, RUN, METRICS, REPORT = (
@@ -116,6 +116,7 @@ class CsvTable:
     """estimate.csv, one line per row; floats as the shortest text that reads back exactly."""
 
     def __init__(self, path: Path):
+        self._path = path
         self._file = path.open('w', encoding='utf-8', newline='')
         self._writer = csv.writer(self._file, lineterminator='\n')
         self._names: list[str] | None = None
@@ -124,7 +125,8 @@ class CsvTable:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with naming(self._path):
+            self._file.close()
 
     def write(self, estimate: Estimate) -> None:
         """Append the rows of one estimate. Raises ValueError when the columns change."""
@@ -134,8 +136,9 @@ class CsvTable:
             self._writer.writerow(['stamp_ns', *columns])
         elif self._names != list(columns):
             raise ValueError('the columns change from one estimate to another')
-        for row in zip(*(column.tolist() for column in columns.values())):
-            self._writer.writerow([estimate.stamp_ns, *row])
+        with naming(self._path):
+            for row in zip(*(column.tolist() for column in columns.values())):
+                self._writer.writerow([estimate.stamp_ns, *row])
 
 
 def read_truth(
