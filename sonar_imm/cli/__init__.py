@@ -1,8 +1,8 @@
 """The ``sonar-imm`` command: one small module per subcommand, loaded only when it is called.
 
 Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141 the
-reader of the output went away, 129 and 143 ended by SIGHUP and SIGTERM. A mistake of the user gives
-one line on standard error; a traceback is a bug.
+reader of the output went away, 129 and 143 ended by SIGHUP and SIGTERM. A mistake of the user
+gives one line on standard error; a traceback is a bug.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _signals_unwind() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP unwind every ``with`` block, as Ctrl-C does; otherwise a node that was
-    started would live on. Handlers that a program has set itself are kept."""
+    """Let SIGTERM and SIGHUP unwind every ``with`` block, as Ctrl-C does; otherwise a node that
+    was started would live on. Handlers that a program has set itself are kept."""
     ours = []
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
