@@ -312,6 +312,13 @@ def test_readme_names_every_subcommand() -> None:
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)
 
 
+def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+    (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    exec(compile(example, 'README.md', 'exec'), {})
+    assert capsys.readouterr().out
+
+
 def test_topics_page_names_every_input() -> None:
     from msg_adapters.inputs import inputs_of
     from sonar_imm.trackers import SYSTEMS
