@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from attrs import field, frozen
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ..acoustics.variances import usable_bins
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, complexes, floats, positives, Rejection
-from .frames import TRACKS
 
 MAX_BINS, MAX_STAVES = 131_072, 64
 FARTHEST_BIN = 20_000.0
@@ -44,7 +43,6 @@ class Snapshot:
     range: FloatArray = field(converter=floats(None))
     iq: NDArray[np.complexfloating] = field(converter=_snapshots)
     frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
     noise_variance: FloatArray | None = field(default=None, converter=positives)
     signal_variance: FloatArray | None = field(default=None, converter=positives)
     two_way_time: FloatArray | None = None

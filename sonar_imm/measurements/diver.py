@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from attrs import field, frozen
 import numpy as np
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
 from .checks import check_covariance, check_stamp, content_key, floats, Rejection
-from .frames import TRACKS
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:
@@ -31,7 +30,6 @@ class Fix:
     position: FloatArray = field(converter=floats(3))
     covariance: FloatArray | None = None
     frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -76,7 +74,6 @@ class Arrivals:
     bearing: FloatArray = field(converter=floats(None))
     var_bearing: FloatArray = field(converter=floats(None))
     frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)

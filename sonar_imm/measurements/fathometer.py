@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, complexes, floats, positives, Rejection
-from .frames import TRACKS
 
 MAX_SAMPLES, MAX_PHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
 LEAST_PHONES = 3
@@ -51,10 +50,11 @@ def _samples(value: Any) -> NDArray[np.float32]:
 class ArrayDepth:
     """How deep phone 0, the deepest, was at one instant: depth in m, down positive."""
 
+    FRAME: ClassVar[str] = 'none'
+
     stamp_ns: int
     depth: float
     frame_id: str = ''
-    frame_of: ClassVar[str] = ''
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -75,7 +75,6 @@ class Trace:
     depth: FloatArray = field(converter=floats(None))
     amplitude: FloatArray = field(converter=floats(None))
     frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
     sigma: FloatArray | None = field(default=None, converter=positives)
     reference_depth: float | None = field(default=None, converter=_depth)
 
@@ -132,7 +131,6 @@ class CrossSpectra:
     frequency: FloatArray = field(converter=floats(None))
     csdm: NDArray[np.complexfloating] = field(converter=complexes)
     frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
     snapshots: int = 0
     reference_depth: float | None = field(default=None, converter=_depth)
     alive: NDArray[np.bool_] = field(init=False)
@@ -212,7 +210,6 @@ class Pressure:
     pressure: NDArray[np.float32] = field(converter=_samples)
     sample_rate: float
     frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
     reference_depth: float | None = field(default=None, converter=_depth)
     alive: NDArray[np.bool_] = field(init=False)
 

@@ -9,7 +9,12 @@ import numpy as np
 
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, content_key, floats, Rejection
-from .frames import TRACKS
+
+BEAM_AXES = ('marine', 'rep103', 'auto')
+"""What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
+which of the two the beams point along."""
+IMAGE_ORDERS = ('range_major', 'beam_major')
+"""How the samples of an image may lie: all beams of a range together, or all ranges of a beam."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -22,6 +27,8 @@ class Detections:
     and bearing is no echo.
     """
 
+    FRAME: ClassVar[str] = 'own'
+
     stamp_ns: int
     range: FloatArray = field(converter=floats(None))
     bearing: FloatArray = field(converter=floats(None))
@@ -29,7 +36,6 @@ class Detections:
     var_bearing: FloatArray | None = None
     intensity: FloatArray | None = None
     frame_id: str = ''
-    frame_of: ClassVar[str] = 'detections'
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -55,6 +61,20 @@ class Detections:
 
 
 @frozen(eq=False, kw_only=True)
+class SonarImage:
+    """A ping of a forward-looking sonar before detection; no tracker takes it in.
+
+    range (R,) m and bearing (B,) rad, positive to port, of the magnitudes amplitude (R, B).
+    """
+
+    stamp_ns: int
+    range: FloatArray
+    bearing: FloatArray
+    amplitude: FloatArray
+    frame_id: str = ''
+
+
+@frozen(eq=False, kw_only=True)
 class Navigation:
     """Where the vehicle was: its pose in the world and its velocity in its own frame.
 
@@ -73,7 +93,6 @@ class Navigation:
     twist_covariance: FloatArray | None = None
     frame_id: str = ''
     child_frame_id: str = ''
-    frame_of: ClassVar[str] = TRACKS
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
@@ -102,11 +121,12 @@ class Navigation:
 class Altitude:
     """How high above the sea floor the vehicle was, metres; variance m^2, NaN when unknown."""
 
+    FRAME: ClassVar[str] = 'own'
+
     stamp_ns: int
     altitude: float
     variance: float = float('nan')
     frame_id: str = ''
-    frame_of: ClassVar[str] = 'altitude'
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)

@@ -1,7 +1,5 @@
 """The streams that every tracker stands on, with measurements of three lines."""
 
-from typing import ClassVar
-
 from attrs import frozen
 import pytest
 
@@ -18,7 +16,6 @@ class Number:
     stamp_ns: int
     value: int = 0
     frame_id: str = 'map'
-    frame_of: ClassVar[str] = 'tracks'
 
     def key(self):
         return self.value.to_bytes(4, 'big')

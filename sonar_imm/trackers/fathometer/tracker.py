@@ -32,7 +32,7 @@ from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
-from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from ...measurements import ArrayDepth, CrossSpectra, nanoseconds, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
 from .pressure import PressureStream
@@ -50,9 +50,6 @@ from .response import (
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
-_MAX_GAP_NS = 30 * 86_400 * 10**9
-_RESTART_AFTER = 3
-_RULES = StreamRules(window_ns=0, max_gap_ns=_MAX_GAP_NS, restart_after=_RESTART_AFTER)
 _DEPTHS_KEPT = 10_000
 
 
@@ -77,7 +74,8 @@ class FathometerTracker:
         self.reset()
 
     def reset(self) -> None:
-        self._stream = OnceStream((Pressure, CrossSpectra, Trace), _RULES)
+        rules = StreamRules(0, nanoseconds(self.config.max_gap), self.config.restart_after)
+        self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
         self.counts = self._stream.counts
         self.response: Response | None = None
         self._ids = Identities()
