@@ -1,4 +1,4 @@
-"""The source tree as the tests of the house read it: modules, their imports, circles of imports."""
+"""The source tree as the tests of the house read it: modules, imports, circles of imports."""
 
 from __future__ import annotations
 
