@@ -115,3 +115,14 @@ def chi2_line(title: str, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         (title, f'{summary["mean"]:.2f}, believable {summary["low"]:.2f} to {summary["high"]:.2f}')
     ]
+
+
+def flat(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Nested mappings as one, whose keys are joined by dots."""
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            result.update(flat(value, f'{prefix}{key}.'))
+        else:
+            result[f'{prefix}{key}'] = value
+    return result

@@ -12,6 +12,7 @@ from typing import Any
 
 from .. import __version__
 from .judging import Check
+from .numbers import flat
 from .page import Card, folded, mapping_table, Part, render, Section, table
 
 
@@ -114,14 +115,3 @@ def _about(run: Mapping[str, Any]) -> list[Section]:
             html=mapping_table(('what', 'value'), about),
         ),
     ]
-
-
-def flat(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Nested keys joined by dots."""
-    result: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            result.update(flat(value, f'{prefix}{key}.'))
-        else:
-            result[f'{prefix}{key}'] = value
-    return result

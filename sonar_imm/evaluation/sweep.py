@@ -31,6 +31,7 @@ from ..recordings.scenes import write_scene
 from ..recordings.sources import BagError
 from ..trackers import SYSTEMS
 from .judging import judge
+from .numbers import flat
 from .run_folder import RunFolder
 from .tracking import InputOptions, OfflineRun, write_run
 
@@ -96,7 +97,7 @@ def _run(sweep: Sweep, seed: int, place: Path) -> Outcome:
         offline = OfflineRun(reader, SYSTEMS[sweep.system], sweep.config, sweep.options)
         folder.prepare()
         run = write_run(folder, offline)
-    return Outcome(seed, dict(flat(judge(folder).metrics)), versions=run['versions'])
+    return Outcome(seed, flat_numbers(judge(folder).metrics), versions=run['versions'])
 
 
 def _sentence(error: BaseException) -> str:
@@ -106,13 +107,13 @@ def _sentence(error: BaseException) -> str:
     return told if expected and told else f'{type(error).__name__}: {told}'
 
 
-def flat(metrics: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, float]]:
+def flat_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     """The finite numbers among nested metrics by dotted name; True is 1, so a mean is a share."""
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f'{prefix}{name}.')
-        elif isinstance(value, (bool, int, float)) and math.isfinite(value):
-            yield prefix + name, int(value) if isinstance(value, bool) else value
+    return {
+        name: int(value) if isinstance(value, bool) else value
+        for name, value in flat(metrics).items()
+        if isinstance(value, (bool, int, float)) and math.isfinite(value)
+    }
 
 
 # -- where the runs run --------------------------------------------------------------------------
