@@ -19,7 +19,7 @@ STEP_NS = 500_000_000
 
 
 def bench_ping(rounds: int = 7, pings: int = 40, obstacles: int = OBSTACLES) -> dict[str, Any]:
-    """Milliseconds of a ping of `obstacles` that are all tracked: median over all rounds."""
+    """Milliseconds per ping with `obstacles` tracked obstacles: median over all rounds."""
     times, tracked = [], []
     for _ in range(rounds):
         spent, followed = _approach(pings, obstacles)
@@ -38,12 +38,12 @@ def bench_ping(rounds: int = 7, pings: int = 40, obstacles: int = OBSTACLES) -> 
 
 
 def _approach(pings: int, obstacles: int) -> tuple[list[float], int]:
-    """Fly at a wall of obstacles: milliseconds of each ping after confirmation, tracks at the
-    end."""
+    """Approach a wall of obstacles. Gives the milliseconds of each ping after confirmation, and
+    the number of tracks at the end."""
     rng = np.random.default_rng(0)
     tracker = ObstacleTracker(ObstacleConfig())
     tracker.warm()
-    # A lattice in front, far enough apart for the sonar to tell one from another.
+    # A lattice ahead, with spacings that the sonar resolves.
     ahead = 60.0 + 5.0 * (np.arange(obstacles) // 5)
     aside = 5.0 * (np.arange(obstacles) % 5 - 2.0)
     down = rng.uniform(-2.0, 2.0, obstacles)
@@ -74,7 +74,7 @@ def _approach(pings: int, obstacles: int) -> tuple[list[float], int]:
 
 def _sentence(result: Mapping[str, Any]) -> str:
     return (
-        f'{result["obstacles"]} obstacles a ping, association included: '
+        f'{result["obstacles"]} obstacles per ping, association included: '
         f'{result["median_ms"]:.2f} ms, p99 {result["p99_ms"]:.2f} ms '
         f'(wanted {result["wanted_ms"]:.0f}), {result["tracked"]:.0f} of them tracked'
     )
