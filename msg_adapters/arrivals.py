@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.estimation.angles import wrap_angle
 from sonar_imm.measurements import Arrivals, Rejection
 
-from .headers import Make, stamp_ns, to_enu
+from .headers import Make, stamp_ns, swap_axes, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
@@ -66,7 +67,17 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
         bearing=_bearings(columns, rows)[keep],
         var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep],
     )
-    return to_enu(arrivals, world_frame)
+    return to_enu(arrivals, world_frame, _turned)
+
+
+def _turned(arrivals: Arrivals) -> Arrivals:
+    """The same ping in ENU, of one in NED, whose bearings go clockwise from north."""
+    return evolve(
+        arrivals,
+        tx=swap_axes(arrivals.tx),
+        rx=swap_axes(arrivals.rx),
+        bearing=wrap_angle(np.pi / 2 - arrivals.bearing),
+    )
 
 
 def write_arrivals(arrivals: Arrivals, make: Make) -> Any:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Detections, Rejection
+from sonar_imm.measurements import BEAM_AXES, Detections, Rejection
 
 from .headers import Make, stamp_ns
 from .table import decode_table, encode_table, require_columns, scalar_column
@@ -35,7 +35,6 @@ NEAREST, FARTHEST = 0.01, 1e5
 """Metres: no echo comes from nearer or farther."""
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
 """A stated variance outside is a field that was not filled in."""
-BEAM_AXES = ('marine', 'rep103', 'auto')
 
 
 def read_detections(message: Any, **_: Any) -> Detections:

@@ -34,7 +34,7 @@ from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.writer import BagWriter, naming, ros_message
-from .judging import JUDGES
+from ..trackers import SYSTEMS
 
 BAG, CSV, RUN, METRICS, REPORT = (
     'estimate',
@@ -101,7 +101,7 @@ class RunFolder:
             run = json.loads(path.read_text(encoding='utf-8'))
             if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
                 raise ValueError('keys are missing')
-            if run['system'] not in JUDGES:
+            if run['system'] not in SYSTEMS:
                 raise ValueError(f"there is no system '{run['system']}'")
         except (ValueError, AttributeError, TypeError) as error:
             raise BagError(f'{path} cannot be understood: {error}') from None
