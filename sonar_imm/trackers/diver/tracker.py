@@ -97,7 +97,7 @@ class DiverTracker:
         elif measurement.frame_id != self._frame_id:
             self.counts['other_frame'] += 1
             return []
-        judgement = self._gate.judge(measurement.stamp_ns, measurement)
+        judgement = self._gate.decide(measurement.stamp_ns, measurement)
         judgement.count_in(self.counts)
         if judgement.verdict == 'restart':
             life = self._history.state.life

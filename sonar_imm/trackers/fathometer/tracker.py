@@ -126,7 +126,7 @@ class FathometerTracker:
         if measurement.stamp_ns == self._newest_ns:
             self.counts['duplicate'] += 1
             return []
-        judgement = self._gate.judge(measurement.stamp_ns, measurement)
+        judgement = self._gate.decide(measurement.stamp_ns, measurement)
         judgement.count_in(self.counts)
         if judgement.verdict == 'restart':
             self._forget()

@@ -132,7 +132,7 @@ class ObstacleTracker:
         if frame != measurement.frame_id:
             self.counts['other_frame'] += 1
             return []
-        judgement = self._gate.judge(measurement.stamp_ns, measurement)
+        judgement = self._gate.decide(measurement.stamp_ns, measurement)
         judgement.count_in(self.counts)
         if judgement.verdict == 'restart':
             self._history = ReplayHistory(
