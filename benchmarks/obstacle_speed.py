@@ -46,7 +46,7 @@ def field(obstacles: int, pings: int, clutter: int, seed: int = 0) -> list[tuple
 
 
 def measure(config: ObstacleConfig, pings: list[tuple]) -> dict[str, float]:
-    """Milliseconds a ping."""
+    """Milliseconds per ping."""
     tracker = ObstacleTracker(config)
     tracker.warm()
     took, rows = [], []
