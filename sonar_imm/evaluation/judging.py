@@ -78,8 +78,8 @@ class Judgement:
 
     metrics: the content of ``metrics.json``. summary: the result in a few sentences. lines: title
     and value of the most important numbers. part: makes the part of the report for the run, with
-    further checks. accuracy: compares the error with a limit (None for `LIMIT` of the system); None
-    without truth.
+    further checks. accuracy: compares the error with a limit (None for `LIMIT` of the system);
+    None without truth.
     """
 
     metrics: dict[str, Any]
