@@ -15,10 +15,8 @@ from typing import Any
 from attrs import asdict, define, frozen
 import numpy as np
 
-from msg_adapters.frames import FrameGuard
-
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import FrameGuard, Rejection
 from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
