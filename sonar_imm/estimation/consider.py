@@ -97,8 +97,8 @@ def consider_models(
     estimated: BoolArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
     """`imm.update` with considered components: x (T, M, n), P (T, M, n, n), c (T, M), innovation
-    (T, M, m), H (M, m, n), R (T, m, m). Gives x, P, mu, the NIS (T,) of the mixture and whether (T,)
-    it was positive and finite."""
+    (T, M, m), H (M, m, n), R (T, m, m). Gives x, P, mu, the NIS (T,) of the mixture and whether
+    (T,) it was finite."""
     PHt = P @ np.swapaxes(H, -1, -2)
     S = H @ PHt + R[:, None]
     x1, P1 = x.copy(), P.copy()

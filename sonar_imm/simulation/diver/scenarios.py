@@ -23,7 +23,7 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 @frozen(kw_only=True)
 class DiverScenario(Scenario):
-    """Everything a diver scene can be told; the defaults are Table 1 of the paper."""
+    """Parameters of a diver scene; the defaults are Table 1 of the paper."""
 
     motion: str = parameter('legs', 'how the diver moves', choices=MOTIONS)
     speed: float = parameter(1.0, 'swimming speed', unit='m/s', low=0.0, high=10.0)
@@ -60,7 +60,9 @@ class DiverScenario(Scenario):
     detection_probability: float = parameter(
         1.0, 'that a sensor sees a diver in a scan', low=0.0, high=1.0
     )
-    outlier_probability: float = parameter(0.0, 'that a detection is wild', low=0.0, high=1.0)
+    outlier_probability: float = parameter(
+        0.0, 'that a detection is an outlier', low=0.0, high=1.0
+    )
     depth: tuple[float, ...] = parameter(
         (0.0, 0.0), 'least and greatest depth at which a diver swims, drawn between', unit='m'
     )
@@ -158,7 +160,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         {'step_jitter': 0.4, 'late_fraction': 0.25, 'detection_probability': 0.9},
     ),
     'multistatic': (
-        'raw arrival times at four receivers, some missing, some wild',
+        'raw arrival times at four receivers, some missing, some outliers',
         MULTISTATIC,
     ),
     'multistatic_fixes': (
@@ -209,6 +211,5 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> DiverScenario:
-    """The scenario called `name` with some values replaced. Raises `ConfigError` naming
-    mistakes."""
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
     return DiverScenario.named(name, SCENARIOS, overrides)

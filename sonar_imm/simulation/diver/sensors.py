@@ -15,8 +15,8 @@ from .scenarios import DiverScenario, RECEIVERS, TRANSMITTER
 
 @frozen(eq=False)
 class Errors:
-    """height (n, divers) z of the divers at n times; misplaced (receivers, 2) m, clock (receivers,)
-    s and sound_speed m/s of the whole scene; fix_bias (n, 2) m."""
+    """height (n, divers) z of the divers at n times; misplaced (receivers, 2) m, clock
+    (receivers,) s and sound_speed m/s of the whole scene; fix_bias (n, 2) m."""
 
     height: FloatArray
     misplaced: FloatArray
@@ -56,12 +56,12 @@ def _sense_polar(
 ) -> list[Fix]:
     """Range and bearing from the origin, converted without bias; clutter uniform in the square."""
     seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
-    wild = rng.uniform(size=len(seen)) < config.outlier_probability
+    outlier = rng.uniform(size=len(seen)) < config.outlier_probability
     false = rng.poisson(config.clutter)
     half = config.clutter_range
     points = np.vstack(
         [
-            np.where(wild[:, None], rng.uniform(-half, half, seen.shape), seen),
+            np.where(outlier[:, None], rng.uniform(-half, half, seen.shape), seen),
             rng.uniform(-half, half, (false, 2)),
         ]
     )
@@ -140,8 +140,8 @@ def _paths(
     path = np.linalg.norm(present - tx, axis=1) + np.linalg.norm(present - there, axis=1)
     path = path[rng.uniform(size=len(path)) < config.detection_probability]
     path = path + config.sound_speed * config.toa_std * rng.normal(size=len(path))
-    wild = rng.uniform(size=len(path)) < config.outlier_probability
-    path = path + wild * rng.uniform(5.0, 50.0, len(path))
+    outlier = rng.uniform(size=len(path)) < config.outlier_probability
+    path = path + outlier * rng.uniform(5.0, 50.0, len(path))
     direct = float(np.linalg.norm(rx - tx))
     false = rng.uniform(direct, direct + 2.0 * config.clutter_range, rng.poisson(config.clutter))
     return np.concatenate([path, false])
@@ -175,7 +175,7 @@ def _sense_multistatic_fixes(
     present: FloatArray,
     rng: np.random.Generator,
 ) -> list[Fix]:
-    """A fix a ping for each diver, from its own echoes; none where the geometry gives none."""
+    """One fix per ping and diver, from its own echoes; none where the geometry gives none."""
     fixes = []
     for position in present:
         for ping in _sense_arrivals(config, errors, stamp_ns, position[None], rng):

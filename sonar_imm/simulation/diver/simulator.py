@@ -1,9 +1,9 @@
-"""Divers that swim as divers do, seen by a polar sonar or by a multistatic one.
+"""Swimming divers, observed by a polar or a multistatic sonar.
 
-How a diver moves is a `motion`, what the sensors see of it a `sensor`; a scenario is a choice of
-both with a name (`SCENARIOS`). The paper's Table 1 gives start, speed, sampling and accuracy but
-not the path; `table1` swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
-one: zigzag with general consistent direction, as the paper puts it.
+A scenario (`SCENARIOS`) is a named choice of `motion`, how the divers move, and `sensor`, how they
+are observed. The paper's Table 1 gives start, speed, sampling and accuracy, but not the path. In
+`table1` the diver swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
+heading ("zigzag with general consistent direction" in the paper).
 """
 
 from __future__ import annotations

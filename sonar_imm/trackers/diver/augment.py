@@ -28,7 +28,7 @@ def with_depth(base: ModelSet, config: DiverConfig) -> ModelSet:
     M, n, heights = len(base.names), base.n, heights_of(config)
     copies = len(heights)
     width = (config.depth_max - config.depth_min) / copies
-    E = np.zeros((copies * M, 6, n + 2))
+    E = np.zeros((M, 6, n + 2))
     E[:, :2, :n], E[:, 3:5, :n] = base.E[:, :2], base.E[:, 2:]
     E[:, 2, n] = E[:, 5, n + 1] = 1.0
     rate = config.vertical_speed_std**2
@@ -40,7 +40,7 @@ def with_depth(base: ModelSet, config: DiverConfig) -> ModelSet:
 
     return evolve(
         base,
-        E=np.tile(E[:M], (copies, 1, 1)),
+        E=np.tile(E, (copies, 1, 1)),
         start_mean=np.append(base.start_mean, [heights[0], 0.0]),
         start_variance=np.append(
             base.start_variance, [max(COPY_SPREAD * width**2 / 12.0, 1e-4), rate]

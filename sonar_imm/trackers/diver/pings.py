@@ -209,9 +209,9 @@ def begin_from_ping(
     config: DiverConfig,
     layout: Layout,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """States x (K, n + q), P (K, n + q, n + q) with nothing known of the position, and log-evidence
-    (K,), of a new diver near `position` (2,), of which the arrivals tell all they can: also how the
-    errors of position, depth and instruments go together."""
+    """A new diver near `position` (2,): x (K, n + q), P (K, n + q, n + q), of which nothing is
+    known of the position, updated by all the arrivals tell, also how the errors of position,
+    depth and instruments go together; and the log-evidence (K,)."""
     n, mask = x.shape[-1], layout.mask
     if ping.passive:
         uniform = np.full(len(x), 1.0 / len(x))

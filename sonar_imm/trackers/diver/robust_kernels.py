@@ -1,8 +1,8 @@
 """The update of one diver by many arrivals at once, with heavy tails, compiled.
 
-The mathematics is that of `estimation.student_t`, for the numbers of a ping (`ping_kernels`). Every
-model starts from its own prediction and from the positions that the ping suggests by itself, so
-that many good arrivals outvote any prior and no prior gates a ping away.
+The mathematics is that of `estimation.student_t`, for the numbers of a ping (`ping_kernels`).
+Every model starts from its own prediction and from the positions that the ping suggests by
+itself, so that many good arrivals outvote any prior and no prior gates a ping away.
 """
 
 from __future__ import annotations

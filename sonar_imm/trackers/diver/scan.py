@@ -1,34 +1,32 @@
-"""One scan of the diver tracker: what is known before it, the updates in the middle, what is known
-after it."""
+"""One scan of the diver tracker: the state before it, the updates in between, the state after."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 import math
-from typing import NamedTuple
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
 from ...acoustics.multistatic import difference_projection
 from ...estimation import imm, imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
+from ...estimation.association import (
+    assign,
+    assign_by_rank,
+    association_cost,
+    gate_threshold,
+    TrackStatus,
+)
 from ...estimation.consider import consider_models
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .expectation_kernels import fit_numbers
-from .instruments import Instruments
-from .model_set import ModelSet, Motion
+from .model_set import ModelSet
 from .pings import Ping, ping_numbers, PingUpdate, residuals, update_by_ping
 from .sensing import Positions
-
-SCALE_PRIOR = 20.0
-"""Numbers measured that the stated covariances are worth when their scale is being learnt."""
-
-MOST_STEPS = 300
-"""A gap is crossed in no more steps than this, however long it is."""
+from .state import cross, DiverState
 
 FIXES, ARRIVALS = 0, 1
 """Rows of the learnt scale."""
@@ -50,124 +48,16 @@ SCALE_MEMORY = 400.0
 """Numbers measured over which the learnt scale forgets."""
 
 
-@frozen(eq=False, kw_only=True)
-class Divers:
-    """All that is known after a scan: T tracks with M models of n states, the errors of the
-    `instruments` heard so far among them.
-
-    x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
-    (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
-    track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
-    for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite.
-    """
-
-    stamp_ns: int
-    life: Tracks
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    learnt: FloatArray
-    nis: FloatArray
-    nis_dof: np.ndarray
-    score: FloatArray
-    scale: FloatArray
-    broken: int = 0
-    instruments: Instruments = Instruments()
-
-    def factor(self) -> FloatArray:
-        """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
-        return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
-
-
-class Step(NamedTuple):
-    """Tracks after a step of dt seconds without a measurement, and the transitions (T or 1, M, M)
-    of that step."""
-
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    transition: FloatArray
-    dt: float
-
-    def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-        """The step as one track took it."""
-        shared = len(self.transition) == 1
-        transition = self.transition[0 if shared else track]
-        return self.x[track], self.P[track], self.mu[track], transition, self.dt
-
-
-def cross(
-    models: ModelSet, chain: AdaptiveChain, before: Divers, dt: float, longest: float
-) -> Iterator[Step]:
-    """Mix and predict over dt seconds, in equal steps of at most `longest`.
-
-    A model holds for a whole step, so one step over a long gap says that the diver swam straight
-    all the while: the prediction is a ring, and the diver, who turned, is inside it.
-    """
-    count = min(max(math.ceil(dt / longest), 1), MOST_STEPS)
-    transition, motion = chain.transition(before.learnt, dt / count), models.motion(dt / count)
-    x, P, mu = before.x, before.P, before.mu
-    for _ in range(count):
-        x, P, mu = _mix(x, P, mu, transition, models.copies)
-        x, P = _predict(x, P, motion, models.copies)
-        yield Step(x, P, mu, transition, dt / count)
-
-
-def _mix(
-    x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray, copies: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mix the models of each copy among each other."""
-    if copies == 1:
-        return imm_kernels.mix(x, P, mu, transition)
-    T, n = len(mu), x.shape[-1]
-    M = mu.shape[1] // copies
-    weight = mu.reshape(T * copies, M)
-    total = weight.sum(axis=1, keepdims=True)
-    weight = np.where(total > 0.0, weight / np.where(total > 0.0, total, 1.0), 1.0 / M)
-    if len(transition) > 1:
-        transition = np.repeat(transition, copies, axis=0)
-    x, P, c = imm_kernels.mix(
-        x.reshape(T * copies, M, n), P.reshape(T * copies, M, n, n), weight, transition
-    )
-    whole = T, copies * M, n
-    return x.reshape(whole), P.reshape(*whole, n), (c * total).reshape(T, copies * M)
-
-
-def _predict(
-    x: FloatArray, P: FloatArray, motion: Motion, copies: int
-) -> tuple[FloatArray, FloatArray]:
-    """Predict the states of motion; constants behind them stay as they are."""
-    M, n = motion.B.shape
-    T, size = len(x), x.shape[-1]
-    if copies == 1 and size == n:
-        return imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-    x_all, P_all = x.reshape(T * copies, M, size), P.reshape(T * copies, M, size, size)
-    moved = imm_kernels.predict(
-        np.ascontiguousarray(x_all[..., :n]),
-        np.ascontiguousarray(P_all[..., :n, :n]),
-        motion.F,
-        motion.Q,
-        motion.B,
-    )
-    x1, P1 = x_all.copy(), P_all.copy()
-    x1[..., :n], P1[..., :n, :n] = moved
-    if size > n:
-        P1[..., :n, n:] = motion.F @ P_all[..., :n, n:]
-        P1[..., n:, :n] = np.swapaxes(P1[..., :n, n:], -1, -2)
-    return x1.reshape(x.shape), P1.reshape(P.shape)
-
-
 class Scan:
-    """The tracks in the middle of a scan: predicted when made, updated by `take_fixes` and
-    `take_ping`, done with `result`."""
+    """The tracks in the middle of a scan: predicted when made, then `associate_and_update` for
+    the fixes, `update_by_ping` for each ping, and `learn` at the end."""
 
     def __init__(
         self,
         config: DiverConfig,
         models: ModelSet,
         chain: AdaptiveChain,
-        before: Divers,
+        before: DiverState,
         stamp_ns: int,
     ):
         self.config, self.models, self.chain, self.before = config, models, chain, before
@@ -184,7 +74,7 @@ class Scan:
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
 
-    def result(self) -> Divers:
+    def learn(self) -> DiverState:
         """What is known now; the transitions have learnt from the tracks that were hit."""
         hit = np.flatnonzero(self.nis_dof > 0)
         learnt = self.before.learnt.copy()
@@ -217,7 +107,7 @@ class Scan:
 
     # -- fixes ---------------------------------------------------------------------------------
 
-    def take_fixes(self, group: Positions) -> BoolArray:
+    def associate_and_update(self, group: Positions) -> BoolArray:
         """Associate and update; True (D,) where a fix was taken. Confirmed tracks choose first."""
         H = self._fix_matrix()
         h = np.einsum('jma,tja->tjm', H[0], self.x)
@@ -241,16 +131,9 @@ class Scan:
 
     def _associate(self, fit: FloatArray, rank: IntArray, clutter: float) -> IntArray:
         """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
-        chosen = np.full(len(fit), -1)
-        free = np.ones(fit.shape[1], bool)
         target, detection = imm.pairs_inside(fit)
         cost = association_cost(fit[target, detection], self.config.detection_probability, clutter)
-        for now in np.unique(rank[rank != EXCLUDED]):
-            pairs = (rank == now)[target] & free[detection]
-            found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
-            chosen = np.where(found >= 0, found, chosen)
-            free[found[found >= 0]] = False
-        return chosen
+        return assign_by_rank(target, detection, cost, rank, fit.shape[1])
 
     def _keep_score(self, fit: FloatArray, chosen: IntArray, clutter: float) -> None:
         """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""

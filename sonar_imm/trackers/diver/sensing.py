@@ -1,5 +1,5 @@
-"""From measurements to numbers a filter can use: fixes as one group of detections, a ping located by
-itself, variances where the sender states none."""
+"""From measurements to numbers a filter can use: fixes as one group of detections, a ping located
+by itself, variances where the sender states none."""
 
 from __future__ import annotations
 

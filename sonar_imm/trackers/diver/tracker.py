@@ -4,17 +4,16 @@ A diver swims slowly and turns often. The tracker runs one motion model for each
 headings (`models`) in an interacting multiple model filter, and lets the data correct the
 probabilities of turning. A scan of the world goes through
 
-    predict -> for each group of detections: gate, associate, update -> learn -> end, begin tracks
+    predict -> fixes: gate, associate, update; pings: explain -> learn -> prune -> spawn
 
-and the whole of what is known after it is one value, `Divers`, so that a late measurement is put
-in its place by computing the scans after it again (`estimation.history`).
+and the whole of what is known after it is one value, `DiverState`, so that a late measurement is
+put in its place by computing the scans after it again (`trackers.stream`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 
 from attrs import evolve
@@ -25,19 +24,19 @@ from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
-from ...estimation.history import ReplayHistory, StampGate
-from ...measurements import Arrivals, Fix, Measurement, nanoseconds
-from ...measurements.diver import OPTIONAL_ARRIVALS
+from ...measurements import Arrivals, Fix, Measurement
 from ..model_checks import track_rules
+from ..stream import ReplayStream, StreamRules
 from .births import Birth, births_from_fixes, births_from_ping
 from .config import DiverConfig
 from .instruments import Instruments
 from .models import build_models
 from .pings import begin_from_ping, FAR, ping_numbers
-from .scan import Divers, Scan
+from .scan import Scan
 from .sensing import positions
+from .state import DiverState
 
-__all__ = ['DiverConfig', 'Divers', 'DiverTracker']
+__all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
 
 class DiverTracker:
@@ -55,14 +54,14 @@ class DiverTracker:
         self.reset()
 
     def reset(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self._frame_id = ''
-        self._gate: StampGate[Measurement] = StampGate(
-            nanoseconds(self.config.history),
-            nanoseconds(self.config.max_gap),
-            self.config.restart_after,
+        self._stream = ReplayStream(
+            (Fix, Arrivals),
+            StreamRules.of(self.config),
+            step=self._scan,
+            initial=self._nobody(Tracks.none(track_rules(self.config))),
+            survivor=lambda state: self._nobody(state.life.none_left()),
         )
-        self._history = self._new_history(Tracks.none(track_rules(self.config)))
+        self.counts = self._stream.counts
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
@@ -79,7 +78,7 @@ class DiverTracker:
                 tracker.process(fix)
 
     def health(self) -> dict[str, float]:
-        now = self._history.state
+        now = self._stream.state
         hit = now.nis_dof > 0
         return {
             'tracks': len(now.life),
@@ -93,36 +92,16 @@ class DiverTracker:
         }
 
     def process(self, measurement: Measurement) -> list[Estimate]:
-        if not isinstance(measurement, (Fix, Arrivals)):
-            self.counts['unknown_type'] += 1
-            return []
-        if not self._frame_id:
-            self._frame_id = measurement.frame_id
-        elif measurement.frame_id != self._frame_id:
-            self.counts['other_frame'] += 1
-            return []
-        judgement = self._gate.judge(measurement.stamp_ns, measurement)
-        judgement.count_in(self.counts)
-        if judgement.verdict == 'restart':
-            life = self._history.state.life
-            self._history = self._new_history(life.only(np.zeros(len(life), bool)))
-        revised: dict[int, Divers] = {}
-        for item in judgement.released:
-            revised.update(self._revise(item))
-        return [self._estimate(revised[stamp_ns]) for stamp_ns in sorted(revised)]
+        return [self._estimate(state) for _, state in self._revise(measurement)]
 
-    def _revise(self, item: Measurement) -> list[tuple[int, Divers]]:
-        """Put an item in its place in time; the states of its scan and of the later ones."""
-        newest = self._history.newest_ns
-        inserted = self._history.insert(item.stamp_ns, _key(item), item, self._scan)
-        self.counts[inserted.verdict] += 1
-        if inserted.revised and newest is not None and item.stamp_ns < newest:
-            self.counts['late'] += 1
-        return inserted.revised
+    def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
+        """The stamps and states that are new or changed, oldest first."""
+        return self._stream.revise(measurement)
 
-    def _new_history(self, life: Tracks) -> ReplayHistory[Divers, Measurement]:
+    def _nobody(self, life: Tracks) -> DiverState:
+        """The state without a track; `life` has none, but the next identity."""
         M, n = self.models.copies * len(self.models.names), self.models.n
-        nobody = Divers(
+        return DiverState(
             stamp_ns=0,
             life=life,
             x=np.empty((0, M, n)),
@@ -134,32 +113,35 @@ class DiverTracker:
             score=np.empty(0),
             scale=np.zeros((2, 2)),
         )
-        return ReplayHistory(nobody, nanoseconds(self.config.history))
 
     # -- one scan ------------------------------------------------------------------------------
 
-    def _scan(self, before: Divers, stamp_ns: int, items: Sequence[Measurement]) -> Divers:
+    def _scan(self, before: DiverState, stamp_ns: int, items: Sequence[Measurement]) -> DiverState:
         """The state after all measurements of one stamp. Pure."""
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
-        scan = Scan(self.config, self.models, self._chain, before, stamp_ns)
+        scan = self._predict(before, stamp_ns)
         births: list[Birth] = []
         fixes = [item for item in items if isinstance(item, Fix)]
         if fixes:
             group = positions(fixes, self.config, self.config.covariance_scale * factor[0])
-            births += births_from_fixes(group, ~scan.take_fixes(group))
+            births += births_from_fixes(group, ~scan.associate_and_update(group))
         for ping in (item for item in items if isinstance(item, Arrivals)):
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
-        return self._census(scan.result(), births)
+        now = self._prune(scan.learn())
+        return self._spawn(now, births)
 
-    def _census(self, now: Divers, births: list[Birth]) -> Divers:
-        """End the tracks that are over and begin new ones."""
-        config, rules = self.config, track_rules(self.config)
+    def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
+        return Scan(self.config, self.models, self._chain, before, stamp_ns)
+
+    def _prune(self, now: DiverState) -> DiverState:
+        """End the tracks that are over, broken, or too many."""
+        config = self.config
         sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
         life, kept = now.life.scan(
             now.nis_dof > 0,
             now.stamp_ns,
-            rules,
+            track_rules(config),
             looked=np.full(len(sound), config.fixes_are_scans),
         )
         life, kept = life.only(sound[kept]), kept & sound
@@ -170,24 +152,27 @@ class DiverTracker:
             room[confirmed[best]] = True
             kept[kept] = room
             life = life.only(room)
-        births = births[: max(0, 10 + 5 * config.max_tracks - len(life))]
-        if not births and kept.all():
-            return evolve(now, life=life)
+        broken = now.broken + int((~sound).sum())
+        return evolve(now.rows(kept), life=life, broken=broken)
+
+    def _spawn(self, now: DiverState, births: list[Birth]) -> DiverState:
+        """Begin a tentative track at each birth, as long as there is room."""
+        config = self.config
+        births = births[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
+        if not births:
+            return now
         new = [self._new_track(birth, now.instruments) for birth in births]
         M, n, count = now.x.shape[1], now.x.shape[2], len(new)
-        return Divers(
-            stamp_ns=now.stamp_ns,
-            life=life.born(count, now.stamp_ns, rules),
-            x=np.concatenate([now.x[kept], np.reshape([one[0] for one in new], (count, M, n))]),
-            P=np.concatenate([now.P[kept], np.reshape([one[1] for one in new], (count, M, n, n))]),
-            mu=np.concatenate([now.mu[kept], np.reshape([one[2] for one in new], (count, M))]),
-            learnt=np.concatenate([now.learnt[kept], self._chain.fresh(count)]),
-            nis=np.append(now.nis[kept], np.full(count, np.nan)),
-            nis_dof=np.append(now.nis_dof[kept], np.zeros(count, np.uint16)),
-            score=np.append(now.score[kept], np.zeros(count)),
-            scale=now.scale,
-            broken=now.broken + int((~sound).sum()),
-            instruments=now.instruments,
+        return evolve(
+            now,
+            life=now.life.born(count, now.stamp_ns, track_rules(config)),
+            x=np.concatenate([now.x, np.reshape([one[0] for one in new], (count, M, n))]),
+            P=np.concatenate([now.P, np.reshape([one[1] for one in new], (count, M, n, n))]),
+            mu=np.concatenate([now.mu, np.reshape([one[2] for one in new], (count, M))]),
+            learnt=np.concatenate([now.learnt, self._chain.fresh(count)]),
+            nis=np.append(now.nis, np.full(count, np.nan)),
+            nis_dof=np.append(now.nis_dof, np.zeros(count, np.uint16)),
+            score=np.append(now.score, np.zeros(count)),
         )
 
     def _new_track(
@@ -196,7 +181,7 @@ class DiverTracker:
         """x, P and mu of a track that begins."""
         layout = instruments.layout(self.config, self.models.n)
         plain = self.models.height < 0 and layout.size == self.models.n
-        if birth.ping is None or plain:
+        if birth.ping is None or birth.rows is None or plain:
             x, P, mu = self.models.new_track(birth.position, birth.covariance, birth.ping is None)
             return *layout.widened(x, P), mu
         x, P, mu = self.models.new_track(birth.position, np.eye(2) * FAR**2, False)
@@ -210,7 +195,7 @@ class DiverTracker:
         mu = mu * np.repeat(share / share.sum() * len(share), M)
         return np.repeat(first[0], M, axis=0), np.repeat(first[1], M, axis=0), mu
 
-    def _estimate(self, state: Divers) -> Estimate:
+    def _estimate(self, state: DiverState) -> Estimate:
         n = self.models.n
         x, P = state.x, state.P
         if x.shape[-1] > n:
@@ -224,7 +209,7 @@ class DiverTracker:
             mu = mu.reshape(len(mu), self.models.copies, -1).sum(axis=1)
         return Estimate(
             stamp_ns=state.stamp_ns,
-            frame_id=self._frame_id,
+            frame_id=self._stream.frame_id,
             xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
             state_names=self.models.outputs,
             state=mean,
@@ -238,13 +223,3 @@ class DiverTracker:
                 'nis_dof': state.nis_dof,
             },
         )
-
-
-def _key(measurement: Measurement) -> bytes:
-    """The content of a measurement: it orders those of one stamp and tells duplicates."""
-    if isinstance(measurement, Fix):
-        covariance = b'' if measurement.covariance is None else measurement.covariance.tobytes()
-        return b'fix' + measurement.position.tobytes() + covariance
-    names = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
-    names += OPTIONAL_ARRIVALS
-    return b'arrivals' + b''.join(getattr(measurement, name).tobytes() for name in names)
