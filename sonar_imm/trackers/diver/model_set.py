@@ -57,6 +57,12 @@ class ModelSet:
     def copies(self) -> int:
         return len(self.heights)
 
+    def by_model(self, mu: FloatArray) -> FloatArray:
+        """Model probabilities (T, M) of mu (T, K M), whatever the copy."""
+        if self.copies == 1:
+            return mu
+        return np.asarray(mu.reshape(len(mu), self.copies, len(self.names)).sum(axis=1))
+
     @property
     def fix(self) -> FloatArray:
         """(M, 2, n): what a fix measures of the state."""

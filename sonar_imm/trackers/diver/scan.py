@@ -82,8 +82,8 @@ class Scan:
         learnt[hit] = self.chain.learn(
             learnt[hit],
             self.transition if shared else self.transition[hit],
-            self._by_heading(self.before.mu)[hit],
-            self._by_heading(self.mu)[hit],
+            self.models.by_model(self.before.mu)[hit],
+            self.models.by_model(self.mu)[hit],
             self.dt,
         )
         return evolve(
@@ -99,11 +99,6 @@ class Scan:
             scale=self.scale,
             instruments=self.instruments,
         )
-
-    def _by_heading(self, mu: FloatArray) -> FloatArray:
-        """Model probabilities (T, M), whatever the copy of the models."""
-        copies = self.models.copies
-        return mu if copies == 1 else mu.reshape(len(mu), copies, -1).sum(axis=1)
 
     # -- fixes ---------------------------------------------------------------------------------
 

@@ -204,9 +204,6 @@ class DiverTracker:
         depth = np.full(len(mean), self.config.target_z)
         if self.models.height >= 0:
             depth = mean[:, 2]
-        mu = state.mu
-        if self.models.copies > 1:
-            mu = mu.reshape(len(mu), self.models.copies, -1).sum(axis=1)
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._stream.frame_id,
@@ -215,7 +212,7 @@ class DiverTracker:
             state=mean,
             covariance=covariance,
             model_names=self.models.names,
-            probabilities=mu,
+            probabilities=self.models.by_model(state.mu),
             extras={
                 'track_id': state.life.track_id,
                 'track_state': state.life.status,
