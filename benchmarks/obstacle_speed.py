@@ -40,7 +40,11 @@ def field(obstacles: int, pings: int, clutter: int, seed: int = 0) -> list[tuple
         azimuth = azimuth + np.radians(0.25) * rng.normal(size=obstacles)
         azimuth = np.append(azimuth, rng.uniform(-0.39, 0.39, clutter))
         q = np.array([np.sin(0.5 * roll), 0.0, 0.0, np.cos(0.5 * roll)])
-        pose = Navigation(stamp_ns=stamp, position=position + [0, 0, 30], orientation=q)
+        pose = Navigation(
+            stamp_ns=stamp,
+            position=geometry.flip_world(position + [0, 0, 30]),
+            orientation=geometry.flip_quaternion(q),
+        )
         out.append((pose, Detections(stamp_ns=stamp, range=d, bearing=-azimuth)))
     return out
 
@@ -74,8 +78,7 @@ def main() -> None:
     parser.add_argument('--pings', type=int, default=110)
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
-    # NED, so that the places above can be written down as they are.
-    base = {'world_frame_convention': 'ned', 'depth_is_absolute': False}
+    base = {'depth_is_absolute': False}
     cases = {
         'gaussian_sum': ({}, 0),
         'gaussian_sum, 5 clutter': ({}, 5),

@@ -1,5 +1,6 @@
 """The obstacle tracker on approaches computed elsewhere, with the exact posterior beside them."""
 
+from attrs import evolve
 from helpers.obstacle_runs import (
     approach,
     FAITHFUL,
@@ -16,8 +17,10 @@ from numpy.testing import assert_allclose
 import pytest
 from scipy.spatial.transform import Rotation
 
+from msg_adapters.navigation import read_navigation, write_navigation
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.recordings.messages import ros_message
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 NOISY = ('approach_dst+3_noisy', 'approach_level_mirror_noisy')
@@ -100,8 +103,10 @@ def test_estimates_are_where_the_obstacle_is():
         )
 
 
-def mistaken(measurement, change):
-    """Navigation with its roll, pitch and yaw (NED) changed by a function."""
+def mistaken(measurement, change, side=1.0):
+    """Navigation with its roll, pitch and yaw (NED) changed by a function, bearings by a sign."""
+    if isinstance(measurement, Detections):
+        return evolve(measurement, bearing=side * measurement.bearing)
     if not isinstance(measurement, Navigation):
         return measurement
     R = geometry.flip_rotation(geometry.rotation_of_quaternion(measurement.orientation))
@@ -126,28 +131,26 @@ def test_a_wrong_roll_sign_turns_the_answer_over_and_nis_does_not_see_it():
 
 
 MISTAKES = {
-    'yaw of ENU': ({}, lambda r, p, y: (r, p, 0.5 * np.pi - y)),
-    'yaw sign': ({}, lambda r, p, y: (r, p, -y)),
-    'azimuth sign': ({'bearing_positive': 'starboard'}, lambda r, p, y: (r, p, y)),
+    'yaw of ENU': (1.0, lambda r, p, y: (r, p, 0.5 * np.pi - y)),
+    'yaw sign': (1.0, lambda r, p, y: (r, p, -y)),
+    'azimuth sign': (-1.0, lambda r, p, y: (r, p, y)),
 }
 
 
 @pytest.mark.parametrize('mistake', MISTAKES)
 def test_a_wrong_direction_shows_in_the_innovations(mistake):
-    values, change = MISTAKES[mistake]
+    side, change = MISTAKES[mistake]
     name = 'approach_dst+3_noisy'
-    wrong = [mistaken(one, change) for one in approach(name)]
-    assert follow(wrong, ObstacleConfig(sonar_lever=lever(name), **values))[0].mean() > 30.0
-    right = follow(approach(name), ObstacleConfig(sonar_lever=lever(name)))[0]
+    config = ObstacleConfig(sonar_lever=lever(name))
+    wrong = [mistaken(one, change, side) for one in approach(name)]
+    assert follow(wrong, config)[0].mean() > 30.0
+    right = follow(approach(name), config)[0]
     assert 1.5 < right.mean() < 2.3
     # In the tracker nothing is followed for long: tracks come and go.
     tracks, lasting = (
         {int(i) for one in run(ObstacleTracker(config), measurements).values()
          for i in one.extras['track_id']}
-        for config, measurements in (
-            (ObstacleConfig(sonar_lever=lever(name), **values), wrong),
-            (ObstacleConfig(sonar_lever=lever(name)), approach(name)),
-        )
+        for measurements in (wrong, approach(name))
     )  # fmt: skip
     assert len(tracks) > 5 > len(lasting)
 
@@ -185,14 +188,17 @@ def test_navigation_in_ned_gives_the_same_track():
     truth = rows(name)
     measurements = approach(name)
     for i, row in enumerate(truth):
-        measurements[3 * i + 1] = Navigation(
+        stated = Navigation(
             stamp_ns=SECOND + round(row['t'] * SECOND),
             position=[row['n'], row['e'], row['d']],
             orientation=Rotation.from_matrix(sonar_rotation(row)).as_quat(),
-            frame_id='odom',
+            frame_id='odom_ned',
         )
-    config = ObstacleConfig(sonar_lever=lever(name), world_frame_convention='ned', **FAITHFUL)
+        message = write_navigation(stated, ros_message)
+        measurements[3 * i + 1] = read_navigation(message, world_frame='ned')
+    config = ObstacleConfig(sonar_lever=lever(name), **FAITHFUL)
     ned = list(run(ObstacleTracker(config), measurements).values())
     enu = track_approach(name, **FAITHFUL)
+    assert ned[60].frame_id == 'odom'
     assert_allclose(ned[60].state, enu[60].state, atol=1e-6)
-    assert_allclose(ned[60].xyz[:, [1, 0, 2]] * [1, 1, -1], enu[60].xyz, atol=1e-3)
+    assert_allclose(ned[60].xyz, enu[60].xyz, atol=1e-3)
