@@ -43,7 +43,8 @@ import numpy as np
 
 from . import imm
 from .arrays import FloatArray
-from .kalman import apply, symmetrise, transpose
+from .covariance import symmetrise, transpose
+from .kalman import apply
 from .unscented import sigma_offsets
 
 # Eigenvalues of a correlation matrix below this are rounding.

@@ -84,6 +84,7 @@ class DiverTracker:
             if hit.any()
             else float('nan'),
             'broken_tracks': now.broken,
+            'covariance_repairs': now.repairs,
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
@@ -196,6 +197,7 @@ class DiverTracker:
             score=np.append(now.score[kept], np.zeros(count)),
             scale=now.scale,
             broken=now.broken + int((~sound).sum()),
+            repairs=now.repairs,
         )
 
     def _estimate(self, state: Divers) -> Estimate:

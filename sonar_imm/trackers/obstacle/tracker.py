@@ -48,13 +48,15 @@ nothing."""
 
 @frozen(eq=False, kw_only=True)
 class Ping:
-    """What is known after a ping of T obstacles: nis (T,), NaN without a hit."""
+    """What is known after a ping of T obstacles: nis (T,), NaN without a hit; repairs: covariances
+    repaired so far."""
 
     stamp_ns: int
     sonar: Sonar
     life: Tracks
     known: Mixture
     nis: FloatArray
+    repairs: int = 0
 
 
 @frozen(eq=False, kw_only=True)
@@ -121,6 +123,7 @@ class ObstacleTracker:
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
             'broken_tracks': state.broken,
+            'covariance_repairs': state.last.repairs if state.last else 0,
         }
 
     def process(self, measurement: Measurement) -> list[Estimate]:
@@ -228,7 +231,8 @@ class ObstacleTracker:
         if before is None:
             before = self._nobody(sonar, ping.stamp_ns)
         dt = (ping.stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        known = self.filter.advance(before.known, before.sonar, sonar, dt)
+        known, repairs = self.filter.advance(before.known, before.sonar, sonar, dt)
+        before = evolve(before, repairs=before.repairs + repairs)
         sound = np.isfinite(known.x).all(axis=(1, 2)) & np.isfinite(known.P).all(axis=(1, 2, 3))
         now = self._only(evolve(before, stamp_ns=ping.stamp_ns, sonar=sonar, known=known), sound)
         chosen, h = self._associate(now, z, R)
@@ -280,13 +284,13 @@ class ObstacleTracker:
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
             return evolve(now, nis=nis)
-        after, nis[hit] = self.filter.update(
+        after, nis[hit], repairs = self.filter.update(
             now.known.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
         )
         known = Mixture(*(part.copy() for part in now.known))
         for part, new in zip(known, after):
             part[hit] = new
-        return evolve(now, known=known, nis=nis)
+        return evolve(now, known=known, nis=nis, repairs=now.repairs + repairs)
 
     def _census(self, now: Ping, hit: np.ndarray, z: FloatArray, R: FloatArray) -> Ping:
         """End the tracks that are over or passed, begin one at each detection left."""
