@@ -5,19 +5,20 @@ one direction than its components are one by one, the covariance cannot hold bot
 formulas give a matrix with negative eigenvalues. Joseph's form is no cure: it squares what
 rounding did to the gain.
 
-So every covariance keeps to one stated limit. It is *sound* when each component, given the ones
-before it, keeps more than `LIMIT` of its own variance: the pivots of Cholesky's method compared
-with the diagonal. A component without variance is sound when it has no covariance either.
-`propagate` and `correct` compute in covariance form, which is the fastest, and look at the pivots
-of what they get. Where the limit is passed they repair, which is told, so that callers can count:
+So every covariance keeps to one stated limit. It is *sound* when no eigenvalue of its correlation
+matrix is below `LIMIT`: then Cholesky's method finds a factor in whatever order it rounds. (A
+component without variance is sound when it has no covariance either.)
+`propagate` and `correct` compute in covariance form, which is the fastest, and try Cholesky's
+method on what they get. Where the limit is passed they repair, which is told, so that callers can count:
 
 1. The step is computed again in square-root form, from ``P = L L'``. The result is a sum of
    squares whose rounding is small beside its *own* diagonal, however small that has become.
 2. The diagonal is lifted by the share `LIFT`, more if need be. Nothing is thereby claimed to be
    known better than before.
 
-The innovation covariance ``S = H P H' + R`` obeys the same limit: where R is nothing beside
-``H P H'`` and that is singular, R is lifted by `LIFT` of S's diagonal.
+The innovation covariance ``S = H P H' + R`` obeys the same limit, and no measured value has less
+than `LIMIT` of it as its own noise: there R is lifted by `LIFT` of S's diagonal, so that a perfect
+measurement leaves a variance, and can be repeated.
 
 `small_matrices` compiles the same rules. Reference: Bierman, *Factorization Methods for Discrete
 Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation* (2000), ch. 12.
@@ -32,8 +33,8 @@ import numpy as np
 from .arrays import BoolArray, FloatArray
 
 LIMIT = 1e-14
-"""Least share of its variance that a component keeps when the components before it are given. The
-rounding of a pivot is about 1e-15 of the diagonal."""
+"""Least eigenvalue of a correlation matrix. Cholesky's method is sure of n (n + 1) / 2^53 of it, 2e-15
+for four states, so that up to eight states a sound covariance has a factor."""
 
 LIFT = 1e-13
 """What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
@@ -72,6 +73,10 @@ def symmetrise(P: FloatArray) -> FloatArray:
     return 0.5 * (P + transpose(P))
 
 
+def _diagonal(matrix: FloatArray) -> FloatArray:
+    return np.diagonal(matrix, axis1=-2, axis2=-1)
+
+
 def solve(matrix: FloatArray, columns: FloatArray) -> FloatArray:
     """``matrix^-1 columns``, (..., m, m) and (..., m, q), broadcast over the leading axes."""
     # numpy before 2.0 takes a second argument with one axis less for a stack of vectors.
@@ -93,9 +98,9 @@ def sound(P: FloatArray) -> BoolArray:
                 good &= (pivot > 0.0) | (P[..., a, b] == 0.0)
                 root[..., a, b] = np.where(pivot > 0.0, value / pivot, 0.0)
             own = P[..., a, a]
-            rest = own - np.sum(np.square(root[..., a, :a]), axis=-1)
+            rest = own - LIMIT * own - np.sum(np.square(root[..., a, :a]), axis=-1)
             empty = (own == 0.0) & (rest == 0.0)
-            good &= empty | ((own > 0.0) & (rest > LIMIT * own))
+            good &= empty | (rest > 0.0)
             root[..., a, a] = np.sqrt(np.where(rest > 0.0, rest, 0.0))
     return np.asarray(good)
 
@@ -107,7 +112,7 @@ def lift(P: FloatArray) -> tuple[FloatArray, BoolArray]:
     """
     bad = ~sound(P)
     lifted = np.array(P)
-    own = np.eye(P.shape[-1]) * P
+    own = np.where(np.eye(P.shape[-1], dtype=bool), P, 0.0)
     left, share = bad.copy(), LIFT
     while left.any() and share < 2.0 * P.shape[-1]:
         lifted[left] = P[left] + share * own[left]
@@ -120,7 +125,7 @@ def lift(P: FloatArray) -> tuple[FloatArray, BoolArray]:
 def semidefinite_root(P: FloatArray) -> FloatArray:
     """A square root L (..., n, n) of `P`, ``L L' = P``, of which negative eigenvalues count as
     zero. The components' units do not matter."""
-    own = np.diagonal(P, axis1=-2, axis2=-1)
+    own = _diagonal(P)
     scale = np.sqrt(np.where(own > 0.0, own, 1.0))
     values, vectors = np.linalg.eigh(symmetrise(P) / (scale[..., :, None] * scale[..., None, :]))
     return np.asarray(scale[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
@@ -133,7 +138,7 @@ def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, 
     if bad.any():
         F, P, Q = (np.broadcast_to(each, moved.shape)[bad] for each in (F, P, Q))
         root = F @ semidefinite_root(P)
-        moved[bad] = lift(root @ transpose(root) + symmetrise(Q))[0]
+        moved[bad] = lift(symmetrise(root @ transpose(root) + Q))[0]
     return moved, bad
 
 
@@ -144,7 +149,7 @@ def correct(P: FloatArray, H: FloatArray, R: FloatArray) -> Corrected:
     """
     cross = H @ P
     S = symmetrise(cross @ transpose(H) + R)
-    trusted = sound(S) & (np.diagonal(S, axis1=-2, axis2=-1) > 0.0).all(axis=-1)
+    trusted = sound(S) & (_diagonal(R) > LIMIT * _diagonal(S)).all(axis=-1)
     factor = np.linalg.cholesky(np.where(trusted[..., None, None], S, np.eye(S.shape[-1])))
     gain = transpose(solve(transpose(factor), solve(factor, cross)))
     kept = np.eye(P.shape[-1]) - gain @ H
@@ -174,13 +179,14 @@ def _correct_root(
     seen = safe[1] @ root
     own = np.square(seen).sum(axis=-1) + np.square(noise).sum(axis=-1)
     usable = finite & (own > 0.0).all(axis=-1)
-    after = _triangular(noise, seen, root, np.zeros_like(own))
-    singular = (np.square(np.diagonal(after, axis1=1, axis2=2)[:, :m]) <= LIMIT * own).any(axis=1)
+    floor = np.where(_diagonal(safe[2]) > LIMIT * own, 0.0, LIFT * own)
+    after = _triangular(noise, seen, root, floor)
+    singular = (np.square(_diagonal(after)[:, :m]) <= LIMIT * own).any(axis=1)
     if singular.any():
-        after = _triangular(noise, seen, root, np.where(singular[:, None], LIFT * own, 0.0))
+        after = _triangular(noise, seen, root, np.where(singular[:, None], LIFT * own, floor))
     factor = np.where(usable[:, None, None], after[:, :m, :m], np.eye(m))
     gain = transpose(solve(transpose(factor), transpose(after[:, m:, :m])))
-    updated, _ = lift(after[:, m:, m:] @ transpose(after[:, m:, m:]))
+    updated, _ = lift(symmetrise(after[:, m:, m:] @ transpose(after[:, m:, m:])))
     return (
         np.where(usable[:, None, None], updated, P),
         np.where(usable[:, None, None], gain, 0.0),
@@ -199,4 +205,4 @@ def _triangular(
     A[:, :m, :m], A[:, :m, m : m + n], A[:, m:, m : m + n] = noise, seen, root
     A[:, range(m), range(m + n, m + n + m)] = np.sqrt(lifted)
     T = transpose(np.linalg.qr(transpose(A), 'r'))
-    return np.asarray(T * np.where(np.diagonal(T, axis1=1, axis2=2) < 0.0, -1.0, 1.0)[:, None])
+    return np.asarray(T * np.where(_diagonal(T) < 0.0, -1.0, 1.0)[:, None])

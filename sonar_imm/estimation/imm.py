@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import BoolArray, FloatArray
-from .covariance import correct, lift, propagate, symmetrise
+from .covariance import correct, lift, propagate, sound, symmetrise
 from .kalman import log_density
 
 DEAD = 1e-200
@@ -217,6 +217,5 @@ def _mixture_nis(c: FloatArray, innovation: FloatArray, S: FloatArray) -> FloatA
     spread = innovation - mean[:, None, :]
     total = np.einsum('tj,tjmk->tmk', c, S) + np.einsum('tj,tjm,tjk->tmk', c, spread, spread)
     total, _ = lift(symmetrise(total))
-    known = np.linalg.slogdet(total)[0] > 0.0
-    safe = np.where(known[:, None, None], total, np.nan)
-    return np.asarray(np.einsum('tm,tm->t', mean, np.linalg.solve(safe, mean[..., None])[..., 0]))
+    total = np.where(sound(total)[:, None, None], total, np.nan)
+    return np.asarray(np.einsum('tm,tm->t', mean, np.linalg.solve(total, mean[..., None])[..., 0]))

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
+from .covariance import LIMIT
 from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import (
@@ -182,6 +183,8 @@ def update(
                 for s in range(m):
                     S_mix[r, s] += c[t, j] * (S[r, s] + (v_j[r] - mean[r]) * (v_j[s] - mean[s]))
             trusted = cholesky(S, L)
+            for r in range(m):
+                trusted = trusted and R_t[r, r] > LIMIT * S[r, r]
             if trusted:
                 gain(PHt, L, K)
                 joseph(P_j, K, H_j, R_t, A, AP, KR, P1_j)

@@ -51,10 +51,10 @@ def sound(P: FloatArray, L: FloatArray) -> bool:
                 L[a, b] = 0.0
             else:
                 return False
-        value = P[a, a]
+        value = P[a, a] - LIMIT * P[a, a]
         for k in range(a):
             value -= L[a, k] * L[a, k]
-        if value > LIMIT * P[a, a] and value < np.inf:
+        if value > 0.0 and value < np.inf:
             L[a, a] = math.sqrt(value)
         elif P[a, a] == 0.0 and value == 0.0:
             L[a, a] = 0.0
@@ -86,11 +86,15 @@ def lift(P: FloatArray, L: FloatArray) -> bool:
 
 @kernel
 def cholesky_lifted(S: FloatArray, L: FloatArray) -> bool:
-    """`cholesky`, after lifting S in place where that makes it positive definite."""
-    if cholesky(S, L):
-        return True
-    lift(S, L)
-    return cholesky(S, L)
+    """`cholesky`, after lifting the diagonal of S in place until there is a factor."""
+    share = LIFT
+    while not cholesky(S, L):
+        if not share < 2.0 * len(S):
+            return False
+        for r in range(len(S)):
+            S[r, r] += share * S[r, r]
+        share *= 10.0
+    return True
 
 
 @kernel
@@ -208,8 +212,8 @@ def careful_update(
         A[:m, :m] = noise
         A[:m, m : m + n] = seen
         A[m:, m : m + n] = root
-        if attempt == 1:
-            for r in range(m):
+        for r in range(m):
+            if attempt == 1 or not R[r, r] > LIMIT * own[r]:
                 A[r, m + n + r] = math.sqrt(LIFT * own[r])
         triangularise(A)
         clear = True

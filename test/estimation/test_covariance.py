@@ -23,13 +23,12 @@ def least_eigenvalue(P):
 
 
 def is_covariance(P):
-    """Finite, symmetric to the last bit, positive definite wherever there is a variance."""
-    return (
-        np.isfinite(P).all()
-        and (P == np.swapaxes(P, -1, -2)).all()
-        and sound(P).all()
-        and (least_eigenvalue(P) > -ROUNDING).all()
-    )
+    """Finite, symmetric to the last bit, and with a Cholesky factor."""
+    assert np.isfinite(P).all()
+    np.testing.assert_array_equal(P, np.swapaxes(P, -1, -2))
+    np.linalg.cholesky(P)  # LAPACK's, which raises
+    assert (least_eigenvalue(P) > -ROUNDING).all()
+    return True
 
 
 def ill_conditioned(rng, count, n, m):
@@ -69,12 +68,12 @@ def test_ten_thousand_ill_conditioned_cases_stay_positive_definite(n, m, seed):
     rng = np.random.default_rng(seed)
     count = 2500
     P, F, Q, H, R = ill_conditioned(rng, count, n, m)
-    x, c, v = np.zeros((1, count, n)), np.full((1, count), 1.0 / count), np.zeros((1, count, m))
+    x, v = np.zeros((1, count, n)), np.zeros((1, count, m))
     B = np.zeros((count, n))
     for engine in (imm, imm_kernels):
         now = P[None].copy()
         repairs = 0
-        for _ in range(10):
+        for _ in range(10):  # the numpy form stops at 1e-308 after some more perfect measurements
             _, now, repaired = engine.predict(x, now, F, Q, B)
             assert is_covariance(now)
             repairs += repaired.sum()
@@ -90,7 +89,6 @@ def test_ten_thousand_ill_conditioned_cases_stay_positive_definite(n, m, seed):
         assert 0 < repairs < 20 * count
     for case in range(0, count, 50):
         assert is_covariance(correct(P[case], H[case], R[case]).P)
-    del c
 
 
 def exact_posterior(P, H, R):
@@ -125,20 +123,16 @@ def test_a_measurement_much_better_than_the_state(engine):
 @settings(deadline=None, max_examples=300)
 @given(st.integers(2, 4), st.integers(0, 2**32 - 1))
 def test_an_update_is_as_good_as_the_limit_says(n, seed):
-    """Against exact arithmetic, one measured value: every entry within the rounding of the prior
-    that the limit stands for."""
+    """Against exact arithmetic, one measured value. Rounding the prior alone changes the result by
+    the rounding over the prior's least eigenvalue."""
     rng = np.random.default_rng(seed)
     P, _, _, H, R = (each[0] for each in ill_conditioned(rng, 1, n, 1))
     exact = np.array(exact_posterior(P, H[0], R[0, 0]), dtype=float)
-    got = correct(P, H[None][0], R)
-    if not got.usable.all():
-        assert float(H[0] @ P @ H[0] + R[0, 0]) == pytest.approx(0.0, abs=1e-290)
-        return
-    # In square-root form the error of a nearly dependent prior is that of its own rounding.
+    got = correct(P, H, R)
+    assert got.usable
     scale = np.sqrt(np.diagonal(P))
-    weakest = max(float(least_eigenvalue(P)), LIMIT)
     error = np.abs(got.P - exact) / np.outer(scale, scale)
-    assert error.max() <= max(1e-8, 1e-14 / weakest) or error.max() <= 1.0
+    assert error.max() <= 10.0 * LIFT + 1e-14 / max(float(least_eigenvalue(P)), LIMIT)
 
 
 @pytest.mark.parametrize('engine', [imm, imm_kernels])
@@ -245,7 +239,8 @@ def test_a_diver_seen_far_better_than_known_keeps_a_covariance(ratio):
             np.zeros((1, 1, 4)), P, np.ones((1, 1)), np.ones((1, 1, 2)) * 1e-9, H, R
         )
         assert is_covariance(out[1])
-        np.testing.assert_allclose(out[1][0, 0, :2, :2], R[0], rtol=max(1e-3, 10.0 / ratio))
+        floor = 3.0 * LIFT * P[0, 0, 0, 0]
+        np.testing.assert_allclose(out[1][0, 0, :2, :2], R[0], rtol=1e-4, atol=floor)
 
 
 def test_the_obstacle_update_stays_positive_definite():

@@ -92,8 +92,9 @@ def test_a_perfect_measurement_is_allowed():
     updated = update(
         np.zeros(2), np.eye(2), np.array([3.0]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
     )
-    np.testing.assert_allclose(updated.x, [3.0, 0.0], atol=1e-15)
-    np.testing.assert_allclose(updated.P, [[0.0, 0.0], [0.0, 1.0]], atol=1e-15)
+    np.testing.assert_allclose(updated.x, [3.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(updated.P, [[0.0, 0.0], [0.0, 1.0]], atol=1e-12)
+    assert updated.P[0, 0] > 0.0 and updated.repaired
 
 
 def test_a_singular_innovation_covariance_is_named():

@@ -254,7 +254,9 @@ def soft_update(
                     value = P[t, j, a, b] - beta * known + beta * (1.0 - beta) * spread
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
-            if not (determinant > LIMIT * s00 * s11 and sound(P1[t, j], L)):
+            trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
+            trusted = trusted and determinant > LIMIT * s00 * s11
+            if not (trusted and sound(P1[t, j], L)):
                 repaired[t, j] = True
                 v[0], v[1] = r0, r1
                 likelihood = _careful_soft_update(
@@ -292,10 +294,11 @@ def _careful_soft_update(
     for a in range(n):
         w[0] = K[a, 0] * v[0] + K[a, 1] * v[1]
         x1[a] += beta * w[0]
-        for b in range(n):
+        for b in range(a + 1):
             w[1] = K[b, 0] * v[0] + K[b, 1] * v[1]
             spread = beta * (1.0 - beta) * w[0] * w[1]
             P1[a, b] = (1.0 - beta) * P[a, b] + beta * known[a, b] + spread
+            P1[b, a] = P1[a, b]
     lift(P1, known)
     return own + wild
 
