@@ -31,19 +31,19 @@ SHARP = {'range_std': 0.01, 'bearing_std_deg': 0.01, 'range_step': 0.0, 'bearing
 @pytest.mark.parametrize('name', NOISY)
 def test_posterior_is_the_exact_one(name):
     estimates = track_approach(name, **FAITHFUL)
-    for known in meta(name)['oracle_posterior_flat_prior_pm12']:
-        estimate = estimates[known['ping']]
+    for exact in meta(name)['oracle_posterior_flat_prior_pm12']:
+        estimate = estimates[exact['ping']]
         assert len(estimate) == 1
-        assert estimate.state[0, 2] == pytest.approx(known['mean_dst'], abs=0.05)
-        assert np.sqrt(estimate.covariance[0, 2, 2]) == pytest.approx(known['sd'], abs=0.05)
-        assert estimate.probabilities[0, 0] == pytest.approx(known['p_above'], abs=0.02)
+        assert estimate.state[0, 2] == pytest.approx(exact['mean_dst'], abs=0.05)
+        assert np.sqrt(estimate.covariance[0, 2, 2]) == pytest.approx(exact['sd'], abs=0.05)
+        assert estimate.probabilities[0, 0] == pytest.approx(exact['p_above'], abs=0.02)
 
 
 def test_nine_slices_do_as_well():
     name = NOISY[0]
     estimates = track_approach(name, **{**FAITHFUL, 'components': 9})
-    for known in meta(name)['oracle_posterior_flat_prior_pm12']:
-        assert estimates[known['ping']].state[0, 2] == pytest.approx(known['mean_dst'], abs=0.1)
+    for exact in meta(name)['oracle_posterior_flat_prior_pm12']:
+        assert estimates[exact['ping']].state[0, 2] == pytest.approx(exact['mean_dst'], abs=0.1)
 
 
 @pytest.mark.parametrize('name', NOISE_FREE)
@@ -156,7 +156,7 @@ def test_a_wrong_direction_shows_in_the_innovations(mistake):
 
 
 def test_outliers_are_taken_for_what_they_are():
-    """One echo in eight is wild by up to 8 m and 6 degrees, and no gate keeps them out."""
+    """One echo in eight is off by up to 8 m and 6 degrees, and no gate keeps them out."""
     name = 'approach_dst+3_noisy'
     true = rows(name)['true_dst'][-1]
 
