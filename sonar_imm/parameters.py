@@ -263,8 +263,12 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
         return {str(key): value for key, value in tree.items()}
     values: dict[str, Any] = {}
     for key, section in sections.items():
-        if key in ('/**', '/*') or not node_name or key.strip('/').split('/')[-1] == node_name:
-            values.update(section or {})
+        if not isinstance(section, (dict, type(None))):
+            kind = type(section).__name__
+            raise ConfigError(f'ros__parameters of {key} must hold a mapping, it holds a {kind}')
+        name = str(key).strip('/').split('/')[-1]
+        if key in ('/**', '/*') or not node_name or name == node_name:
+            values.update((str(one), value) for one, value in (section or {}).items())
     return values
 
 

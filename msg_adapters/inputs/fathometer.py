@@ -42,7 +42,7 @@ TOPICS = (
     ),
     InputTopic(
         'array_depth',
-        'depth of the deepest phone, from a companion instrument',
+        'depth of the deepest hydrophone, from a companion instrument',
         measurement=ArrayDepth,
         readers={
             'geometry_msgs/msg/PointStamped': read_array_depth,

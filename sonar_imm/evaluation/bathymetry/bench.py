@@ -1,8 +1,8 @@
 """How fast the bathymetry tracker is, against other filters on the same pings in the same run.
 
-All see the complex64 snapshots of the paper's scene and are timed in turn, round after round; the
-best round counts, as the one least disturbed. What is timed of the tracker is `process`, the whole
-of it: variances, filter and estimate.
+All filters take the complex64 snapshots of the paper's scene and are timed in turn, round after
+round. The best round counts, because it is the least disturbed one. Of the tracker the whole of
+`process` is timed: variances, filter and estimate.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def a_ping(**values: Any) -> Snapshot:
 
 
 def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
-    """Bins a second of each method, the best of `rounds` rounds in turn; `methods` maps a name to
-    what to call and how many bins that does."""
+    """Bins per second of each method in the best of `rounds` rounds. `methods` maps a name to a
+    function and the number of bins that it processes."""
     best = dict.fromkeys(methods, math.inf)
     for run, _ in methods.values():
         run()
@@ -51,7 +51,7 @@ def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
 
 
 def engines(ping: Snapshot) -> dict[str, Timed]:
-    """The tracker as the peers have it, with its coherence gate, and with the exact grid."""
+    """The tracker with the settings of the peers, with its coherence gate, and with the grid."""
     variants: dict[str, dict[str, Any]] = {
         'particles': {'shadow_gate': False},
         'gated': {},
@@ -65,8 +65,8 @@ def engines(ping: Snapshot) -> dict[str, Timed]:
 
 
 def bench_numpy(rounds: int = 7) -> dict[str, Any]:
-    """Bins a second of the tracker and of the same filter in plain numpy; and how far their
-    estimates are apart, which has to be as little as Monte Carlo noise."""
+    """Bins per second of the tracker and of the same filter in plain numpy. Their estimates may
+    differ by no more than Monte Carlo noise."""
     ping = a_ping()
     short = cut(ping, PEER_BINS)
     peer: Timed = (lambda: numpy_filter(short), PEER_BINS)
@@ -84,7 +84,7 @@ def bench_numpy(rounds: int = 7) -> dict[str, Any]:
 
 
 def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
-    """Bins a second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
+    """Bins per second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
     short = cut(a_ping(), PEER_BINS)
     peer: Timed = (lambda: stone_soup_filter(short), PEER_BINS)
     speed = rates({'particles': engines(short)['particles'], 'stone_soup': peer}, min(rounds, 3))

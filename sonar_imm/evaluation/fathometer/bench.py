@@ -1,8 +1,8 @@
 """How fast the reflector filter is, against the likelihood by least squares over the whole trace.
 
-What makes a particle cheap is that its likelihood needs the responses at its reflectors alone,
-O(m^2). The textbook way fits the pulses to all N samples of the trace, O(N m^2) in numpy. Both
-are timed in turn, and their values have to agree.
+A particle is cheap because its likelihood needs the response at its reflectors only, O(m^2). The
+textbook way fits the pulses to all N samples of the trace, O(N m^2). Both are timed in turn, and
+their values have to agree.
 """
 
 from __future__ import annotations
@@ -118,8 +118,9 @@ def bench_array(
 
 
 def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
-    """Microseconds of the log likelihood ratio of one set of eight: from G and b at its places,
-    in plain numpy, and by least squares over the trace; and of a whole particle of the tracker."""
+    """Microseconds of the log likelihood ratio of one set of eight reflectors, in plain numpy:
+    from G and b at their depths, and by least squares over the trace. Also those of a whole
+    particle of the tracker."""
     rng = np.random.default_rng(1)
     lattice = STEP * np.arange(SAMPLES)
     pulse = band_pulse(50.0, 4000.0, 1500.0)
@@ -151,8 +152,9 @@ def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
 
 
 def whitened_pulses(pulse: Any, lattice: FloatArray) -> FloatArray:
-    """What each depth leaves on the data before they are correlated with the pulse, one column a
-    depth: an orthonormal basis of the band, so that the Gram matrix is that of the pulse."""
+    """Signature of each depth in the data before they are correlated with the pulse, one column
+    per depth: the square root of the pulse's spectrum, so that the Gram matrix is that of the
+    pulse."""
     length, step = len(lattice), float(lattice[1] - lattice[0])
     size = length + 200  # a circle with some room between its ends
     lags = step * np.minimum(np.arange(size), size - np.arange(size))
@@ -171,7 +173,7 @@ def _by_gram(b: FloatArray, gram: FloatArray, places: np.ndarray) -> FloatArray:
 
 
 def _by_least_squares(x: FloatArray, shapes: FloatArray, places: np.ndarray) -> FloatArray:
-    """Half of what the residual sum of squares loses by fitting each set to all samples."""
+    """Half of the decrease of the residual sum of squares by fitting each set to all samples."""
     values = np.empty(len(places))
     for k, z in enumerate(places):
         A = shapes[:, z]

@@ -19,12 +19,12 @@ STEP_NS = 500_000_000
 
 
 VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
-    'with 5 false echoes a ping': (5, {}),
+    '5 false echoes per ping': (5, {}),
     '5 slices instead of 9': (0, {'components': 5}),
     'two_way timing': (0, {'ping_timing': 'two_way', 'max_extrapolation': 0.2}),
     'landmark': (0, {'method': 'landmark'}),
 }
-"""False echoes a ping and parameters of what is measured beside the default."""
+"""False echoes per ping and parameters of what is measured beside the default."""
 
 
 def bench_ping(
@@ -34,7 +34,7 @@ def bench_ping(
     clutter: int = 0,
     **parameters: Any,
 ) -> dict[str, Any]:
-    """Milliseconds of a ping of `obstacles` that are all tracked: median over all rounds."""
+    """Milliseconds per ping with `obstacles` tracked obstacles: median over all rounds."""
     times, tracked = [], []
     for _ in range(rounds):
         spent, followed = _approach(pings, obstacles, clutter, ObstacleConfig(**parameters))
@@ -53,7 +53,7 @@ def bench_ping(
 
 
 def bench_variants(rounds: int = 7, pings: int = 40) -> dict[str, Any]:
-    """Milliseconds of a ping as in `bench_ping`, for what costs more or less than the default."""
+    """Milliseconds per ping as in `bench_ping`, for what costs more or less than the default."""
     return {
         'median_ms': {
             name: bench_ping(min(rounds, 3), pings, clutter=clutter, **values)['median_ms']
@@ -65,12 +65,12 @@ def bench_variants(rounds: int = 7, pings: int = 40) -> dict[str, Any]:
 def _approach(
     pings: int, obstacles: int, clutter: int, config: ObstacleConfig
 ) -> tuple[list[float], int]:
-    """Fly at a wall of obstacles: milliseconds of each ping after confirmation, tracks at the
-    end."""
+    """Approach a wall of obstacles. Gives the milliseconds of each ping after confirmation, and
+    the number of tracks at the end."""
     rng = np.random.default_rng(0)
     tracker = ObstacleTracker(config)
     tracker.warm()
-    # A lattice in front, far enough apart for the sonar to tell one from another.
+    # A lattice ahead, with spacings that the sonar resolves.
     ahead = 60.0 + 5.0 * (np.arange(obstacles) // 5)
     aside = 5.0 * (np.arange(obstacles) % 5 - 2.0)
     down = rng.uniform(-2.0, 2.0, obstacles)
@@ -104,7 +104,7 @@ def _approach(
 
 def _sentence(result: Mapping[str, Any]) -> str:
     return (
-        f'{result["obstacles"]} obstacles a ping, association included: '
+        f'{result["obstacles"]} obstacles per ping, association included: '
         f'{result["median_ms"]:.2f} ms, p99 {result["p99_ms"]:.2f} ms '
         f'(wanted {result["wanted_ms"]:.0f}), {result["tracked"]:.0f} of them tracked'
     )

@@ -1,7 +1,7 @@
-"""A bag with images of a forward-looking sonar as a bag with detections, for the obstacle tracker.
+"""From images of a forward-looking sonar to detections for the obstacle tracker, bag to bag.
 
-Every image becomes one message on ``/detections``, also when nothing is found in it. Navigation
-and altitudes, which the tracker needs too, come along as ``/nav`` and ``/altitude``.
+Every image gives one message on ``/detections``, also when nothing is found in it. Navigation and
+altitudes, which the tracker needs too, are copied to ``/nav`` and ``/altitude``.
 """
 
 from __future__ import annotations

@@ -176,6 +176,6 @@ def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
         noises = models.scale[models.scale > 0.0]
         step = min(noises.min(initial=np.inf), ANGLE_STEP if angle else HEIGHT_STEP)
     extent = math.pi if angle else config.grid_extent
-    count = min(math.ceil(extent / step), MOST_CELLS)
+    count = math.ceil(min(extent / step, MOST_CELLS))
     cells = models.mean[0] + extent * np.arange(-count, count + 1) / count
     return cells[np.abs(cells) <= 0.5 * math.pi] if angle else cells
