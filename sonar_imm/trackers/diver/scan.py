@@ -47,7 +47,8 @@ class DiverState:
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite.
+    broken: tracks ended so far because their numbers were not finite; repairs: covariances repaired
+    so far (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -61,6 +62,7 @@ class DiverState:
     score: FloatArray
     scale: FloatArray
     broken: int = 0
+    repairs: int = 0
 
     def factor(self) -> FloatArray:
         """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
@@ -75,14 +77,15 @@ class DiverState:
 
 
 class Step(NamedTuple):
-    """Tracks after a step of dt seconds without a measurement, and the transitions (T or 1, M, M)
-    of that step."""
+    """Tracks after a step of dt seconds without a measurement, the transitions (T or 1, M, M) of
+    that step, and how many covariances it had to repair."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
     transition: FloatArray
     dt: float
+    repairs: int
 
     def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
         """The step as one track took it."""
@@ -104,8 +107,8 @@ def cross(
     x, P, mu = before.x, before.P, before.mu
     for _ in range(count):
         x, P, mu = imm_kernels.mix(x, P, mu, transition)
-        x, P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-        yield Step(x, P, mu, transition, dt / count)
+        x, P, repaired = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        yield Step(x, P, mu, transition, dt / count, int(repaired.sum()))
 
 
 class Scan:
@@ -124,7 +127,8 @@ class Scan:
         self.stamp_ns = stamp_ns
         self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
         steps = list(cross(models, chain, before, self.dt, config.longest_step))
-        self.x, self.P, self.mu, transition, _ = steps[-1]
+        self.x, self.P, self.mu, transition, *_ = steps[-1]
+        self.repairs = sum(step.repairs for step in steps)
         self.transition = np.linalg.matrix_power(transition, len(steps))
         self.nis = np.zeros(len(self.x))
         self.nis_dof = np.zeros(len(self.x), np.uint16)
@@ -197,6 +201,7 @@ class Scan:
             nis_dof=self.nis_dof,
             score=self.score,
             scale=self.scale,
+            repairs=self.before.repairs + self.repairs,
         )
 
     def _fit(self, group: Group) -> FloatArray:
@@ -246,9 +251,10 @@ class Scan:
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
         h, H = group.linearise(x, self.models.E)
         R = np.ascontiguousarray(group.R[detection])
-        x, P, mu, _, nis, ok = imm_kernels.update(
+        x, P, mu, _, nis, ok, repaired = imm_kernels.update(
             x, P, mu, group.innovation(h, detection), np.ascontiguousarray(H), R
         )
+        self.repairs += int(repaired.sum())
         self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
         self.nis[tracks] += np.where(ok, nis, 0.0)
         self.nis_dof[tracks] += np.where(ok, group.z.shape[1], 0).astype(np.uint16)

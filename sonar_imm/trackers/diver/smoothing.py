@@ -50,6 +50,12 @@ class SmoothingDiverTracker(DiverTracker):
     def reset(self) -> None:
         super().reset()
         self._passed: dict[int, DiverState] = {}
+        self._smoothed_repairs = 0
+
+    def health(self) -> dict[str, float]:
+        health = super().health()
+        health['covariance_repairs'] += self._smoothed_repairs
+        return health
 
     def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
         revised = super()._revise(measurement)
@@ -67,6 +73,7 @@ class SmoothingDiverTracker(DiverTracker):
         ]
         for track_id, one in self._passes(scans):
             result = imm_smooth(*self._arrays(one))
+            self._smoothed_repairs += int(result.repaired.sum())
             for scan, x, P, mu in zip(one.scans, result.x, result.P, result.mu):
                 if scan is not None:
                     row = np.flatnonzero(scans[scan].life.track_id == track_id)[0]
