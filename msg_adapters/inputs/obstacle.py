@@ -1,4 +1,4 @@
-"""What the obstacle tracker hears."""
+"""Input topics of the obstacle tracker."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ A scan gives D detections; T targets are expected. Three steps, each a pure func
 
    and pairs whose cost is not negative stay unassigned. Targets that share no detection do not
    influence each other, so the problem splits into clusters, almost all of them tiny.
+   `assign_by_rank` lets some targets choose before others, confirmed ones before tentative ones.
 3. `Tracks` counts hits and misses: a tentative track is confirmed by M hits in N scans, a
    confirmed one coasts through misses until it has missed too often or too long. Identities are
    never used again.
@@ -146,6 +147,22 @@ def assign(
         pairs = order[start : start + size]
         for t, d in _solve_cluster(target[pairs], detection[pairs], cost[pairs]):
             chosen[t] = d
+    return chosen
+
+
+def assign_by_rank(
+    target: IntArray, detection: IntArray, cost: FloatArray, rank: IntArray, detections: int
+) -> IntArray:
+    """`assign` in turns: targets of the lowest rank choose first, others among what is left.
+
+    rank: (T,) of each target; one with a negative rank gets nothing. The rest as in `assign`.
+    """
+    chosen, free = np.full(len(rank), -1, np.int64), np.ones(detections, np.bool_)
+    for turn in np.unique(rank[rank >= 0]):
+        pairs = (rank == turn)[target] & free[detection]
+        found = assign(target[pairs], detection[pairs], cost[pairs], len(rank), detections)
+        chosen = np.where(found >= 0, found, chosen)
+        free[found[found >= 0]] = False
     return chosen
 
 
@@ -291,6 +308,10 @@ class Tracks:
             last_hit_ns[kept],
             self.next_id,
         ), kept
+
+    def none_left(self) -> Tracks:
+        """No tracks any more; identities go on."""
+        return self.only(np.zeros(len(self), np.bool_))
 
     def only(self, kept: BoolArray) -> Tracks:
         """The tracks where `kept` (T,) is True. For callers that end tracks by rules of their

@@ -33,6 +33,7 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
+from ..recordings.truth import TRUTH_TOPIC
 from ..recordings.writer import BagWriter, naming, ros_message
 from ..trackers import SYSTEMS
 
@@ -43,7 +44,6 @@ BAG, CSV, RUN, METRICS, REPORT = (
     'metrics.json',
     'report.html',
 )
-TRUTH_TOPIC = '/truth/estimate'
 
 
 class RunFolder:

@@ -15,10 +15,8 @@ from typing import Any
 from attrs import asdict, define, frozen
 import numpy as np
 
-from msg_adapters.frames import FrameGuard
-
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import FrameGuard, Rejection
 from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
@@ -172,8 +170,11 @@ class OfflineRun:
         entry.count += 1
 
     def outcomes(self) -> dict[str, int]:
-        """What happened to the messages: counts of the tracker, and those refused before it."""
+        """What happened to the messages: counts of the tracker, covariances it had to repair, and
+        messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
+        if repairs := self.tracker.health().get('covariance_repairs'):
+            counts['covariance_repairs'] = int(repairs)
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 

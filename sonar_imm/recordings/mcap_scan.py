@@ -205,8 +205,8 @@ def unpack(packed: bytes, compression: str) -> bytes:
 
 
 def oversized_chunk(path: Path) -> str:
-    """What is wrong with an MCAP file a chunk of which unpacks to more than `MAX_UNPACKED` bytes;
-    empty for a good file. The heads of the chunks tell, as a rule without unpacking any."""
+    """A sentence about the first chunk that unpacks to more than `MAX_UNPACKED` bytes, empty when
+    there is none. The sizes are in the chunk heads, so usually no chunk is unpacked."""
     with path.open('rb') as file:
         size = path.stat().st_size
         position = len(MAGIC)
@@ -222,7 +222,7 @@ def oversized_chunk(path: Path) -> str:
 
 
 def _unpacks_to_too_much(chunk: bytes) -> bool:
-    """Damage of any other kind is left to the reader."""
+    """Whether a chunk is too large. Other damage is left to the reader."""
     try:
         stated = _CHUNK_HEAD.unpack_from(chunk)[2]
         compression, at = _text(chunk, _CHUNK_HEAD.size)

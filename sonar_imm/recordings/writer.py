@@ -41,8 +41,7 @@ _RELIABLE = Qos(
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Say of which file an error of the operating system is, such as a full disk, where the system
-    itself does not."""
+    """Add the file name to an error of the operating system that lacks it, e.g. a full disk."""
     try:
         yield
     except OSError as error:

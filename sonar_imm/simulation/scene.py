@@ -164,9 +164,7 @@ class TrueReflectors:
 @frozen(eq=False)
 class Scene:
     """Measurements in the order in which they were received, and the truth, e.g. one track per
-    target or one profile per ping.
-
-    """
+    target or one profile per ping."""
 
     measurements: tuple[Received, ...]
     truth: tuple[Truth, ...]

@@ -8,7 +8,10 @@ round. The best round counts, because it is the least disturbed one. Of the trac
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 import math
+import os
 import time
 from typing import Any
 
@@ -16,9 +19,9 @@ import numpy as np
 
 from ...measurements import Snapshot
 from ...simulation.bathymetry.simulator import scenario, simulate
-from ...trackers.bathymetry.tracker import BathymetryTracker
+from ...trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from ..benches import Bench
-from .peers import config, cut, numpy_filter, stone_soup_filter
+from .peers import config, cut, numpy_filter, SIGMAS, stone_soup_filter
 
 PEER_BINS = 400
 GOAL, GOAL_RATIO = 80_000, 30
@@ -88,6 +91,48 @@ def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
     return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
 
 
+def bench_scaling(rounds: int = 7) -> dict[str, Any]:
+    """Bins a second with more models (M), more particles of each (N), more staves (P)."""
+    ping = a_ping()
+    variants: dict[str, tuple[dict[str, Any], Snapshot]] = {}
+    for M in (1, 2, 4, 8):
+        sigmas = tuple(np.geomspace(0.01, 1.0, M).tolist())
+        variants[f'M = {M}'] = {'model_set': 'height_bank', 'sigmas': sigmas}, ping
+    for N in (50, 100, 300, 1000):
+        variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
+    for P in (2, 4, 8, 16, 32):
+        variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
+    methods = {
+        name: (
+            partial(BathymetryTracker(BathymetryConfig(shadow_gate=False, **values)).process, one),
+            len(one),
+        )
+        for name, (values, one) in variants.items()
+    }
+    return {'bins_per_second': rates(methods, rounds)}
+
+
+def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
+    """Bins a second of one tracker, and of one in each of several threads: the kernels release
+    Python's lock. The best of `rounds` rounds in turn."""
+    ping = a_ping()
+
+    def together(trackers: list[BathymetryTracker]) -> None:
+        with ThreadPoolExecutor(len(trackers)) as pool:
+            list(pool.map(lambda one: [one.process(ping) for _ in range(pings)], trackers))
+
+    most = min(4, os.cpu_count() or 1)
+    groups = {
+        n: [BathymetryTracker(config(shadow_gate=False)) for _ in range(n)]
+        for n in sorted({1, most})
+    }
+    methods = {
+        str(n): (partial(together, trackers), n * pings * len(ping))
+        for n, trackers in groups.items()
+    }
+    return {'bins_per_second': rates(methods, min(rounds, 3))}
+
+
 def _heights(ping: Snapshot) -> np.ndarray:
     tracker = BathymetryTracker(config(shadow_gate=False))
     return tracker.process(ping)[0].state[:, 0]
@@ -111,7 +156,18 @@ def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
     )
 
 
+def _rates_sentence(result: Mapping[str, Any], what: str) -> str:
+    each = ', '.join(f'{name} {speed:,.0f}' for name, speed in result['bins_per_second'].items())
+    return f'{what}: {each} bins/s'
+
+
 BENCHES = (
     Bench('numpy', bench_numpy, _numpy_sentence),
     Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
+    Bench(
+        'scaling',
+        bench_scaling,
+        partial(_rates_sentence, what='models (M), particles of each (N), staves (P)'),
+    ),
+    Bench('threads', bench_threads, partial(_rates_sentence, what='trackers in so many threads')),
 )

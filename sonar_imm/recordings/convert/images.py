@@ -77,5 +77,5 @@ def _converted(name: str, item: Any, config: DetectorConfig) -> Any:
         image = read_sonar_image(item.message, **config.reading())
         return write_detections(detect(image, config), ros_message)
     entry = FURTHER[name]
-    # Conventions of the axes stay what they are: whoever tracks the new bag states them.
+    # The axes stay as recorded; who tracks the new bag states them.
     return entry.write(entry.readers[item.type_name](item.message, world_frame='ned'), ros_message)

@@ -299,7 +299,7 @@ def test_a_long_gap_is_no_straight_line():
     config = DiverConfig(hover=False, adaptation='fixed', speed_noise=0.0, lateral_noise=0.0)
     tracker = DiverTracker(config)
     tracker.process(fix(1, 0.0, 0.0, 1e-6 * np.eye(2)))
-    before, dt = tracker._history.state, 30.0
+    before, dt = tracker._stream.state, 30.0
     P = tracker.models.chain.matrix
     mode = rng.integers(16, size=4000)
     speed = rng.normal(config.speed_mean, config.speed_std, size=4000)
