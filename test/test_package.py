@@ -53,6 +53,9 @@ LONG_FILES: dict[str, str] = {
     'test/estimation/test_imm.py': 'every closed form of one filter, to be read together',
     'test/estimation/test_smoothing.py': 'holds its oracle, the enumeration of all mode sequences',
 }
+MOST_ARGUMENTS = 12
+# Function, as module:name: why it takes more positional arguments.
+MANY_ARGUMENTS: dict[str, str] = {}
 
 
 @pytest.fixture(scope='module')
@@ -127,6 +130,25 @@ def test_no_file_is_too_long() -> None:
     }
     too_long = {name for name, lines in lengths.items() if lines > 400}
     assert too_long == set(LONG_FILES), 'over 400 lines, or listed without need'
+
+
+def test_no_function_takes_many_positional_arguments() -> None:
+    """Two of many arguments are swapped without a word: kernels take named tuples instead."""
+    found = {
+        f'{module_name(path)}:{name}'
+        for path in MODULES
+        for name, count in positional_arguments(path.read_text(encoding='utf-8'))
+        if count > MOST_ARGUMENTS
+    }
+    assert found == set(MANY_ARGUMENTS), 'too many arguments, or listed without need'
+
+
+def test_the_argument_check_sees_every_kind_of_function() -> None:
+    source = (
+        'def f(a, /, b, *c, d=1):\n    return lambda x, y, z: 0\n'
+        'class C:\n    async def g(self, a, b, c):\n        pass\n'
+    )
+    assert sorted(positional_arguments(source)) == [('<lambda>', 3), ('f', 2), ('g', 4)]
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -255,3 +277,13 @@ def texts(manifest: ElementTree.Element, tag: str) -> set[str]:
 
 def distribution(requirement: str) -> str:
     return re.match(r'[A-Za-z0-9_.-]+', requirement).group()
+
+
+def positional_arguments(source: str) -> list[tuple[str, int]]:
+    """Name of every function in the source, and how many arguments it takes by position."""
+    kinds = ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda
+    return [
+        (getattr(node, 'name', '<lambda>'), len(node.args.posonlyargs) + len(node.args.args))
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, kinds)
+    ]

@@ -23,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .kalman import factorise, log_density, solve
+from .covariance import solve
+from .kalman import factorise, log_density
 
 
 def rmse(error: FloatArray) -> float:

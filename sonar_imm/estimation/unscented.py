@@ -30,18 +30,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .angles import wrap_angle
-from .arrays import FloatArray
-from .kalman import (
-    apply,
-    BoolArray,
-    CovarianceError,
-    factorise,
-    log_density,
-    solve,
-    symmetrise,
-    transpose,
-    Updated,
-)
+from .arrays import BoolArray, FloatArray
+from .covariance import CovarianceError, lift, solve, symmetrise, transpose
+from .kalman import apply, factorise, log_density, Predicted, Updated
 
 Function = Callable[[FloatArray], FloatArray]
 
@@ -105,10 +96,10 @@ def unscented_transform(
 
 def predict(
     x: FloatArray, P: FloatArray, f: Function, Q: FloatArray, *, angles: BoolArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+) -> Predicted:
     """Time update ``x <- f(x) + w``, ``w ~ N(0, Q)``; `angles` (n,) marks angles of the state."""
     moved = unscented_transform(f, x, P, angles=angles)
-    return moved.mean, symmetrise(moved.covariance + Q)
+    return Predicted(moved.mean, *lift(symmetrise(moved.covariance + Q)))
 
 
 def update(
@@ -126,26 +117,28 @@ def update(
     z: (..., m); h: (..., s, n) to (..., s, m); R: (..., m, m); angles: (m,), angles of the
     measurement; state_angles: (n,), angles of the state, which are wrapped into [-pi, pi].
 
-    The covariance is ``sum w (dx - K dz)(.)' + K R K'``, a sum of squares, equal to ``P - K S K'``
-    in exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or the innovation
-    covariance is not positive definite.
+    The covariance is ``sum w (dx - K dz)(.)' + K R K'``: squares only, equal to ``P - K S K'`` in
+    exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or a component of the
+    innovation has no variance.
     """
     cloud = _transform(h, x, P, angles)
     weighted = cloud.after * cloud.weights[:, None]
-    S = symmetrise(transpose(weighted) @ cloud.after + R)
+    S, singular = lift(symmetrise(transpose(weighted) @ cloud.after + R))
     factor = factorise(S, 'innovation covariance')
     cross = transpose(weighted) @ cloud.before
     gain = transpose(solve(transpose(factor), solve(factor, cross)))
     innovation = _wrap(z - cloud.mean, angles)
     rest = cloud.before - cloud.after @ transpose(gain)
     covariance = transpose(rest * cloud.weights[:, None]) @ rest + gain @ R @ transpose(gain)
+    covariance, repaired = lift(symmetrise(covariance))
     nis, log_likelihood = log_density(innovation, factor)
     return Updated(
         _wrap(x + apply(gain, innovation), state_angles),
-        symmetrise(covariance),
+        covariance,
         S,
         nis,
         log_likelihood,
+        repaired | singular,
     )
 
 

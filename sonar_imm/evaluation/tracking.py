@@ -170,8 +170,11 @@ class OfflineRun:
         entry.count += 1
 
     def outcomes(self) -> dict[str, int]:
-        """What happened to the messages: counts of the tracker, and those refused before it."""
+        """What happened to the messages: counts of the tracker, covariances it had to repair, and
+        messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
+        if repairs := self.tracker.health().get('covariance_repairs'):
+            counts['covariance_repairs'] = int(repairs)
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 

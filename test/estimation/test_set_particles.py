@@ -94,7 +94,7 @@ def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch)
 
         def unpaid(*arguments):
             fill(*arguments)
-            ratio = arguments[-1]
+            ratio = arguments[-1].move_ratio
             ratio[np.isfinite(ratio)] = 0.0
 
         monkeypatch.setattr(set_filter.kernels, 'fill_moves', unpaid)
@@ -258,6 +258,31 @@ def test_what_came_later_corrects_what_was_known(model, exact):
             right_later.append(tracker.summary(earlier, w, earlier.sets)[0][true])
             right_then.append(pmfs[name - 3][true])
     assert np.mean(right_later) > np.mean(right_then) + 0.01
+
+
+def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):
+    """Resampling costs variety: below half of the sample it is worth it, above it is not, and the
+    weights are carried on instead."""
+    tracker, N = SetFilter(model, 400), 400
+    known, kept, drawn = None, 0, 0
+    for name, b in enumerate(np.concatenate([0.3 * exact['B'], exact['B']])):
+        step = tracker.step(known, b, (6, name))
+        assert step.effective == pytest.approx(1.0 / np.sum(step.w**2))
+        if step.effective >= 0.5 * N:
+            kept += 1
+            assert np.array_equal(step.source, np.arange(N))
+            carried = np.exp(step.after.log_weight - step.after.log_weight.max())
+            assert carried / carried.sum() == pytest.approx(step.w)
+            assert np.ptp(step.after.log_weight) > 0.0
+        else:
+            drawn += 1
+            assert (step.after.log_weight == 0.0).all()
+            counts = np.bincount(step.source, minlength=N)
+            # Systematic: each set as often as its weight says, to the next whole number.
+            assert (np.abs(counts - N * step.w) < 1.0 + 1e-9).all()
+            assert np.array_equal(step.after.sets.cell, step.sets.cell[step.source])
+        known = step.after
+    assert kept >= 5 and drawn >= 5
 
 
 def test_a_record_nothing_explains_is_said_so(model):

@@ -206,7 +206,7 @@ def test_filterpy_agrees_where_angles_do_not_matter():
         np.diag([0.3, 0.01]),
     )
     theirs.predict()
-    x, P = unscented.predict(
+    x, P, _ = unscented.predict(
         np.array([30.0, 10.0]), np.diag([4.0, 2.0]), lambda p: p + 0.01 * p**2, theirs.Q
     )
     np.testing.assert_allclose(x, theirs.x, rtol=1e-12)

@@ -154,7 +154,7 @@ def _scan(
     targets = len(x)
     H = np.tile(p.H, (1, MODELS, 1, 1))
     x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
-    x, P = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
+    x, P, _ = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
     expected = np.ascontiguousarray(x[:, :, :2])
     fit = imm_kernels.gate(
         expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2)

@@ -64,7 +64,8 @@ class Scan:
         self.stamp_ns = stamp_ns
         self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
         steps = list(cross(models, chain, before, self.dt, config.longest_step))
-        self.x, self.P, self.mu, transition, _ = steps[-1]
+        self.x, self.P, self.mu, transition, *_ = steps[-1]
+        self.repairs = sum(step.repairs for step in steps)
         self.transition = np.linalg.matrix_power(transition, len(steps))
         self.nis = np.zeros(len(self.x))
         self.nis_dof = np.zeros(len(self.x), np.uint16)
@@ -98,6 +99,7 @@ class Scan:
             score=self.score,
             scale=self.scale,
             instruments=self.instruments,
+            repairs=self.before.repairs + self.repairs,
         )
 
     # -- fixes ---------------------------------------------------------------------------------
@@ -152,7 +154,8 @@ class Scan:
         innovation = group.z[detection][:, None, :] - h
         mask = self.layout.mask
         if mask.all():
-            x, P, mu, _, nis, ok = imm_kernels.update(x, P, mu, innovation, H, R)
+            x, P, mu, _, nis, ok, repaired = imm_kernels.update(x, P, mu, innovation, H, R)
+            self.repairs += int(repaired.sum())
         else:
             x, P, mu, nis, ok = consider_models(x, P, mu, innovation, H[0], R, mask)
         self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu

@@ -32,7 +32,8 @@ class DiverState:
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite.
+    broken: tracks ended so far because their numbers were not finite; repairs: covariances
+    repaired so far (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -46,6 +47,7 @@ class DiverState:
     score: FloatArray
     scale: FloatArray
     broken: int = 0
+    repairs: int = 0
     instruments: Instruments = Instruments()
 
     def factor(self) -> FloatArray:
@@ -61,14 +63,15 @@ class DiverState:
 
 
 class Step(NamedTuple):
-    """Tracks after a step of dt seconds without a measurement, and the transitions (T or 1, M, M)
-    of that step."""
+    """Tracks after a step of dt seconds without a measurement, the transitions (T or 1, M, M) of
+    that step, and how many covariances it had to repair."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
     transition: FloatArray
     dt: float
+    repairs: int
 
     def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
         """The step as one track took it."""
@@ -90,8 +93,8 @@ def cross(
     x, P, mu = before.x, before.P, before.mu
     for _ in range(count):
         x, P, mu = _mix(x, P, mu, transition, models.copies)
-        x, P = _predict(x, P, motion, models.copies)
-        yield Step(x, P, mu, transition, dt / count)
+        x, P, repairs = _predict(x, P, motion, models.copies)
+        yield Step(x, P, mu, transition, dt / count, repairs)
 
 
 def _mix(
@@ -116,14 +119,16 @@ def _mix(
 
 def _predict(
     x: FloatArray, P: FloatArray, motion: Motion, copies: int
-) -> tuple[FloatArray, FloatArray]:
-    """Predict the states of motion; constants behind them stay as they are."""
+) -> tuple[FloatArray, FloatArray, int]:
+    """Predict the states of motion; constants behind them stay as they are. Gives x, P and how
+    many covariances were repaired."""
     M, n = motion.B.shape
     T, size = len(x), x.shape[-1]
     if copies == 1 and size == n:
-        return imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        x, P, repaired = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        return x, P, int(repaired.sum())
     x_all, P_all = x.reshape(T * copies, M, size), P.reshape(T * copies, M, size, size)
-    moved = imm_kernels.predict(
+    x_n, P_n, repaired = imm_kernels.predict(
         np.ascontiguousarray(x_all[..., :n]),
         np.ascontiguousarray(P_all[..., :n, :n]),
         motion.F,
@@ -131,8 +136,8 @@ def _predict(
         motion.B,
     )
     x1, P1 = x_all.copy(), P_all.copy()
-    x1[..., :n], P1[..., :n, :n] = moved
+    x1[..., :n], P1[..., :n, :n] = x_n, P_n
     if size > n:
         P1[..., :n, n:] = motion.F @ P_all[..., :n, n:]
         P1[..., n:, :n] = np.swapaxes(P1[..., :n, n:], -1, -2)
-    return x1.reshape(x.shape), P1.reshape(P.shape)
+    return x1.reshape(x.shape), P1.reshape(P.shape), int(repaired.sum())

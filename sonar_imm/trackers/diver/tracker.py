@@ -87,6 +87,7 @@ class DiverTracker:
             if hit.any()
             else float('nan'),
             'broken_tracks': now.broken,
+            'covariance_repairs': now.repairs,
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }

@@ -53,13 +53,14 @@ nothing."""
 
 @frozen(eq=False, kw_only=True)
 class PingState:
-    """T obstacles after a ping: nis (T,), NaN without a hit."""
+    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired."""
 
     stamp_ns: int
     sonar: Sonar
     life: Tracks
     mixture: Mixture
     nis: FloatArray
+    repairs: int = 0
 
     def rows(self, kept: np.ndarray) -> PingState:
         """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
@@ -137,6 +138,7 @@ class ObstacleTracker:
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
             'broken_tracks': state.broken,
+            'covariance_repairs': state.last.repairs if state.last else 0,
         }
 
     def process(self, measurement: Measurement) -> list[Estimate]:
@@ -226,18 +228,23 @@ class ObstacleTracker:
     def _predict(self, before: PingState, stamp_ns: int, sonar: Sonar) -> tuple[PingState, int]:
         """The tracks as this ping should show them, and how many had numbers not finite."""
         dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        mixture = self.filter.advance(before.mixture, before.sonar, sonar, dt)
+        mixture, repairs = self.filter.advance(before.mixture, before.sonar, sonar, dt)
         sound = np.isfinite(mixture.x).all(axis=(1, 2))
         sound &= np.isfinite(mixture.P).all(axis=(1, 2, 3))
-        now = evolve(before, stamp_ns=stamp_ns, sonar=sonar, mixture=mixture)
+        now = evolve(
+            before,
+            stamp_ns=stamp_ns,
+            sonar=sonar,
+            mixture=mixture,
+            repairs=before.repairs + repairs,
+        )
         return now.only(sound), int((~sound).sum())
 
     def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray]:
         """z (D, 2) and R (D, 2, 2) of the rows that are echoes, azimuth positive to starboard. A
         row that is as uncertain as it is far says nothing and is left out."""
         config = self.config
-        side = -1.0 if config.bearing_positive == 'port' else 1.0
-        z = np.column_stack([ping.range, side * ping.bearing])
+        z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         stated = np.column_stack([ping.var_range, ping.var_bearing])
         own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
         own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
@@ -272,13 +279,13 @@ class ObstacleTracker:
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
             return evolve(now, nis=nis)
-        after, nis[hit] = self.filter.update(
+        after, nis[hit], repairs = self.filter.update(
             now.mixture.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
         )
         mixture = Mixture(*(part.copy() for part in now.mixture))
         for part, new in zip(mixture, after):
             part[hit] = new
-        return evolve(now, mixture=mixture, nis=nis)
+        return evolve(now, mixture=mixture, nis=nis, repairs=now.repairs + repairs)
 
     def _prune(self, now: PingState, hit: np.ndarray) -> PingState:
         """End the tracks that are over or passed; `hit` (T,): those that got a detection."""
@@ -312,7 +319,7 @@ class ObstacleTracker:
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
-        place, place_covariance = self.mount.to_navigation(view.place, view.place_covariance)
+        place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
             'track_id': ping.life.track_id,
             'track_state': ping.life.status,
