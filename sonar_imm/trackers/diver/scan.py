@@ -71,6 +71,8 @@ class Scan:
         self.nis_dof = np.zeros(len(self.x), np.uint16)
         self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
+        self.white = before.white.copy()
+        self.fixes = before.fixes
         self.tentative = before.life.status == TrackStatus.TENTATIVE
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
@@ -98,6 +100,8 @@ class Scan:
             nis_dof=self.nis_dof,
             score=self.score,
             scale=self.scale,
+            white=self.white,
+            fixes=self.fixes,
             instruments=self.instruments,
             repairs=self.before.repairs + self.repairs,
         )
@@ -152,6 +156,7 @@ class Scan:
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
         R = np.ascontiguousarray(group.R[detection])
         innovation = group.z[detection][:, None, :] - h
+        self._watch(x, P, mu, group.z[detection], H, R, tracks)
         mask = self.layout.mask
         if mask.all():
             x, P, mu, _, nis, ok, repaired = imm_kernels.update(x, P, mu, innovation, H, R)
@@ -166,6 +171,31 @@ class Scan:
             residual = group.z[detection] - mean
             stated = group.R[detection] / group.factor
             self._learn_scale(FIXES, residual, covariance, stated)
+
+    def _watch(
+        self,
+        x: FloatArray,
+        P: FloatArray,
+        mu: FloatArray,
+        z: FloatArray,
+        H: FloatArray,
+        R: FloatArray,
+        tracks: IndexArray,
+    ) -> None:
+        """Keep account of whitened innovations, of the mixture as it was predicted."""
+        mean, covariance = imm_kernels.combine(x, P, mu, np.ascontiguousarray(H[0]))
+        nu, S = z - mean, covariance + R
+        # The inverse of the Cholesky factor of 2 x 2, written out: this runs at every fix.
+        with np.errstate(invalid='ignore', divide='ignore'):
+            a = np.sqrt(S[:, 0, 0])
+            b = S[:, 1, 0] / a
+            first = nu[:, 0] / a
+            second = (nu[:, 1] - b * first) / np.sqrt(S[:, 1, 1] - b * b)
+        white = np.column_stack([first, second])
+        counted = ~self.tentative[tracks] & np.isfinite(white).all(axis=1)
+        if counted.any():
+            self.fixes = self.fixes.after(self.white[tracks][counted], white[counted])
+        self.white[tracks] = white
 
     def _learn_scale(
         self, kind: int, residual: FloatArray, covariance: FloatArray, stated: FloatArray

@@ -13,6 +13,7 @@ from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.association import Tracks
+from .fix_consistency import FixConsistency
 from .instruments import Instruments
 from .model_set import ModelSet, Motion
 
@@ -32,7 +33,8 @@ class DiverState:
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite; repairs: covariances
+    white (T, 2): whitened innovation of the last fix, NaN for none; fixes: what innovations say of
+    the stated covariances; broken: tracks ended so far because their numbers were not finite; repairs: covariances
     repaired so far (`estimation.covariance`).
     """
 
@@ -46,6 +48,8 @@ class DiverState:
     nis_dof: np.ndarray
     score: FloatArray
     scale: FloatArray
+    white: FloatArray
+    fixes: FixConsistency
     broken: int = 0
     repairs: int = 0
     instruments: Instruments = Instruments()
@@ -58,7 +62,7 @@ class DiverState:
         """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
         if kept.all():
             return self
-        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score')
+        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', 'white')
         return evolve(self, **{name: getattr(self, name)[kept] for name in names})
 
 

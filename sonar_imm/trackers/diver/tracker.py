@@ -29,6 +29,7 @@ from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
 from .births import Birth, births_from_fixes, births_from_ping
 from .config import DiverConfig
+from .fix_consistency import FixConsistency
 from .instruments import Instruments
 from .models import build_models
 from .pings import begin_from_ping, FAR, ping_numbers
@@ -88,9 +89,15 @@ class DiverTracker:
             else float('nan'),
             'broken_tracks': now.broken,
             'covariance_repairs': now.repairs,
+            'fixes_mean_nis': now.fixes.mean_nis,
+            'fixes_lag_1': now.fixes.lag_1,
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
+
+    def warnings(self) -> list[str]:
+        """What of the input cannot be true, in sentences for the user."""
+        return self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -112,6 +119,8 @@ class DiverTracker:
             nis=np.empty(0),
             nis_dof=np.empty(0, np.uint16),
             score=np.empty(0),
+            white=np.empty((0, 2)),
+            fixes=FixConsistency(),
             scale=np.zeros((2, 2)),
         )
 
@@ -174,6 +183,7 @@ class DiverTracker:
             nis=np.append(now.nis, np.full(count, np.nan)),
             nis_dof=np.append(now.nis_dof, np.zeros(count, np.uint16)),
             score=np.append(now.score, np.zeros(count)),
+            white=np.concatenate([now.white, np.full((count, 2), np.nan)]),
         )
 
     def _new_track(
