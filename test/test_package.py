@@ -58,6 +58,7 @@ ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_pytho
 # A room may import from its own floor and from lower ones.
 FLOORS = {
     'sonar_imm.resources': 0,
+    'sonar_imm.threads': 0,
     'sonar_imm.estimation': 0,
     'sonar_imm.acoustics': 1,
     'sonar_imm.parameters': 2,

@@ -14,6 +14,7 @@ import sys
 import click
 
 from .. import __version__
+from ..threads import one_blas_thread
 from .lazy import LazyGroup, READER_GONE
 
 PROGRAM = 'sonar-imm'
@@ -51,6 +52,7 @@ def command(ctx: click.Context) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that turns errors into words."""
+    one_blas_thread()
     try:
         status = command.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
         if status == READER_GONE:
