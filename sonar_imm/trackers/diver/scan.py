@@ -282,7 +282,7 @@ class Scan:
         """Compare residuals with the stated covariance: E[r r' + H P H'] = R after the update,
         where R is right."""
         mean, covariance = self._expected(group, tracks)
-        residual = group.z[detection] - mean
+        residual = group.innovation(mean[:, None], detection)[:, 0]
         spread = residual[:, :, None] * residual[:, None, :] + covariance
         stated = group.R[detection] / group.factor
         total = float(np.trace(np.linalg.solve(stated, spread), axis1=-2, axis2=-1).sum())

@@ -92,14 +92,19 @@ class RangeSums(Group):
 
 @frozen(eq=False, kw_only=True)
 class Bearings(Group):
-    """Bearings at one receiver (3,), radians."""
+    """Bearings at one receiver (3,), radians.
+
+    Those expected by the models of a track may exceed pi, so that they lie side by side and have a
+    mean and a spread.
+    """
 
     rx: FloatArray
 
     def linearise(self, x: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         position = np.einsum('jma,tja->tjm', E[:, :2], x)
+        bearing = multistatic.bearing(position, self.rx[None])
         return (
-            multistatic.bearing(position, self.rx[None]),
+            bearing[:, :1] + wrap_angle(bearing - bearing[:, :1]),
             multistatic.bearing_jacobian(position, self.rx[None]) @ E[:, :2],
         )
 
