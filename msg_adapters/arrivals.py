@@ -3,8 +3,8 @@
 Columns: ``tx_id``, ``rx_id`` u2; ``tx_x tx_y tx_z rx_x rx_y rx_z`` f8 [m]; ``toa`` f8 [s after the
 header stamp, which is the transmission]; optional ``var_toa`` f4 [s^2], ``bearing`` f8 [rad at the
 receiver, counter-clockwise from +x], ``var_bearing`` f4 [rad^2], ``elevation`` f8 [rad at the
-receiver, up positive], ``var_elevation`` f4 [rad^2], ``depth`` f8 [m, down positive, what the diver
-reports of itself], ``var_depth`` f4 [m^2]; NaN where not measured.
+receiver, up positive], ``var_elevation`` f4 [rad^2], ``depth`` f8 [m, down positive, what the
+diver reports of itself], ``var_depth`` f4 [m^2]; NaN where not measured.
 
 Extension for acoustic tags: with NaN in ``tx_x tx_y tx_z`` of every row the target itself emits,
 at an unknown time near the stamp, and only the differences between receivers carry information.

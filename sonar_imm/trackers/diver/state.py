@@ -34,8 +34,8 @@ class DiverState:
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
     white (T, 2): whitened innovation of the last fix, NaN for none; fixes: what innovations say of
-    the stated covariances; broken: tracks ended so far because their numbers were not finite; repairs: covariances
-    repaired so far (`estimation.covariance`).
+    the stated covariances; broken: tracks ended so far because their numbers were not finite;
+    repairs: covariances repaired so far (`estimation.covariance`).
     """
 
     stamp_ns: int
