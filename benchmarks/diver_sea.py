@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from pathlib import Path
 import time
 from typing import Any
 
@@ -163,7 +164,7 @@ def main() -> None:
     parser.add_argument('--runs', type=int, default=30)
     parser.add_argument('--table', choices=[*TABLES], action='append')
     parser.add_argument('--only', help='columns or rows whose name holds this')
-    parser.add_argument('--out')
+    parser.add_argument('--out', type=Path)
     options = parser.parse_args()
     results: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
     for name in options.table or TABLES:

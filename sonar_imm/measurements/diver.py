@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,6 +54,19 @@ class Fix:
 
 OPTIONAL_ARRIVALS = ('elevation', 'var_elevation', 'depth', 'var_depth')
 """Columns of `Arrivals` that may be left out."""
+
+ARRIVAL_COLUMNS = (
+    'tx_id',
+    'rx_id',
+    'toa',
+    'var_toa',
+    'tx',
+    'rx',
+    'bearing',
+    'var_bearing',
+    *OPTIONAL_ARRIVALS,
+)
+"""Columns of `Arrivals`, in the order in which they sort its rows."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -106,10 +119,17 @@ class Arrivals:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        where = (self.tx_id, self.rx_id, self.tx, self.rx)
-        heard = (self.toa, self.var_toa, self.bearing, self.var_bearing)
-        more = (getattr(self, name) for name in OPTIONAL_ARRIVALS)
-        return content_key('arrivals', *where, *heard, *more)
+        one = self.in_order()
+        return content_key('arrivals', *(getattr(one, name) for name in ARRIVAL_COLUMNS))
+
+    def in_order(self) -> Arrivals:
+        """The same ping with its rows in the order of their content."""
+        keys = [getattr(self, name) for name in reversed(ARRIVAL_COLUMNS)]
+        columns = [column for key in keys for column in np.atleast_2d(key.T)[::-1]]
+        order = np.lexsort(columns) if len(self) else np.arange(0)
+        if (np.diff(order) == 1).all():
+            return self
+        return evolve(self, **{name: getattr(self, name)[order] for name in ARRIVAL_COLUMNS})
 
     @property
     def passive(self) -> bool:

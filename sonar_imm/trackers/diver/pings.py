@@ -6,7 +6,8 @@ arrivals of a tag, however few: its time of emission is unknown, so that among t
 receivers no subset is refuted by the others, and what decides is whether the whole lies where the
 ping by itself would put it.
 
-Rows are sorted by content first: the order in which the arrivals of a ping come changes no bit.
+Rows come in the order of their content (`Arrivals.in_order`): the order in which the arrivals of a
+ping were sent changes no bit.
 """
 
 from __future__ import annotations
@@ -99,12 +100,13 @@ def ping_numbers(
     models: ModelSet,
     layout: Layout,
 ) -> Ping:
-    """The usable `rows` of a ping as numbers; factor: on the variances of arrival times."""
+    """The usable `rows` of a ping in order as numbers; factor: on the variances of arrival
+    times."""
     usable = rows[np.isfinite(ping.toa[rows])]
     if not ping.passive:
         usable = usable[np.isfinite(ping.tx[usable]).all(axis=1)]
-    keys = [ping.rx[usable, 0], ping.var_toa[usable], ping.bearing[usable], ping.toa[usable]]
-    usable = usable[np.lexsort((*keys, ping.rx_id[usable], ping.tx_id[usable]))]
+    if ping.passive:
+        usable = usable[np.argsort(ping.rx_id[usable], kind='stable')]
     speed = config.sound_speed
     first = ping.toa[usable].min(initial=np.inf) if ping.passive else 0.0
     variance = toa_variance(ping, config, factor)[usable] * speed**2

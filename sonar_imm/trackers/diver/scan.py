@@ -301,28 +301,30 @@ class Scan:
         """Which numbers (C,) were taken of a tag's ping, all of it by one track.
 
         A single diver known to be there is given every ping. Otherwise it is the track that
-        explains the ping best of those that need not jump for it, a confirmed one before others.
+        explains the ping best of those that need not jump for it. Confirmed tracks come first;
+        others are asked where less than half of the arrivals fit the one chosen.
         """
-        single = self.config.max_tracks == 1
-        tracks = np.arange(len(self.x))
-        if single and not self.tentative.all():
-            tracks = tracks[~self.tentative]
         self.score += np.log1p(-self.config.detection_probability)
-        best: tuple[tuple[bool, float], int, PingUpdate] | None = None
+        for turn in (~self.tentative, self.tentative):
+            chosen = self._best_for_tag(ping, np.flatnonzero(turn))
+            if chosen is not None:
+                track, after = chosen
+                good = self._accept(track, ping, factor, after)
+                self.score[track] += float(good.sum())
+                if 2 * good.sum() >= len(good):
+                    return np.ones(len(good), bool)
+        return np.zeros(len(ping.row), bool)
+
+    def _best_for_tag(self, ping: Ping, tracks: IndexArray) -> tuple[int, PingUpdate] | None:
+        """Which of `tracks` explains a tag's ping best, and what becomes of it."""
+        best: tuple[int, PingUpdate] | None = None
         for track in tracks.tolist():
-            one = self.x[track], self.P[track], self.mu[track]
-            after = update_by_ping(*one, ping, self.config, self.layout)
-            if after is None or not (single or self._near(track, after)):
+            after = update_by_ping(*self._one(track), ping, self.config, self.layout)
+            if after is None or not (self.config.max_tracks == 1 or self._near(track, after)):
                 continue
-            value = (not self.tentative[track], after.log_evidence)
-            if best is None or value > best[0]:
-                best = value, track, after
-        if best is None:
-            return np.zeros(len(ping.row), bool)
-        _, track, after = best
-        good = self._accept(track, ping, factor, after)
-        self.score[track] += float(good.sum())
-        return np.ones(len(good), bool)
+            if best is None or after.log_evidence > best[1].log_evidence:
+                best = track, after
+        return best
 
     def _near(self, track: int, after: PingUpdate) -> bool:
         """Whether the diver after a ping is where the prediction allows it to be."""

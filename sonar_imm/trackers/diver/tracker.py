@@ -135,7 +135,7 @@ class DiverTracker:
         if fixes:
             group = positions(fixes, self.config, self.config.covariance_scale * factor[0])
             births += births_from_fixes(group, ~scan.associate_and_update(group))
-        for ping in (item for item in items if isinstance(item, Arrivals)):
+        for ping in (item.in_order() for item in items if isinstance(item, Arrivals)):
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
         now = self._prune(scan.learn())
