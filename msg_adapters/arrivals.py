@@ -27,7 +27,16 @@ from .table import decode_table, encode_table, require_columns, scalar_column
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
 REQUIRED = ('tx_id', 'rx_id', *_TX, *_RX, 'toa')
-COLUMNS = (*REQUIRED, 'var_toa', 'bearing', 'var_bearing')
+COLUMNS = (
+    *REQUIRED,
+    'var_toa',
+    'bearing',
+    'var_bearing',
+    'elevation',
+    'var_elevation',
+    'depth',
+    'var_depth',
+)
 
 MAX_PAIRS = 10_000
 FARTHEST = 1e8

@@ -70,13 +70,28 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
-        # A contested scan and a ping, in which nothing is left to be loaded at the first real one.
+        # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
+        rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+        leg = np.linalg.norm(rx - [20.0, 30.0, -5.0], axis=1)
         for second in (1, 2):
             for x in (0.0, 0.1):
                 position = np.array([x, 0.0, 0.0])
                 fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
                 tracker.process(fix)
+            for tx in (rx[0], np.full(3, np.nan)):
+                ping = Arrivals(
+                    stamp_ns=second * 10**9,
+                    tx_id=np.zeros(4),
+                    rx_id=np.arange(4),
+                    tx=np.tile(tx, (4, 1)),
+                    rx=rx,
+                    toa=(leg + leg[0]) / self.config.sound_speed,
+                    var_toa=np.full(4, 1e-8),
+                    bearing=np.full(4, np.nan),
+                    var_bearing=np.full(4, np.nan),
+                )
+                tracker.process(ping)
 
     def health(self) -> dict[str, float]:
         now = self._stream.state

@@ -3,7 +3,6 @@
 from attrs import evolve
 from helpers.diver_runs import fix
 from helpers.estimates import same
-from helpers.sea_vectors import vectors
 import numpy as np
 import pytest
 
