@@ -32,7 +32,7 @@ from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
-from ...measurements import ArrayDepth, CrossSpectra, nanoseconds, Pressure, Rejection, Trace
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
 from .pressure import PressureStream
@@ -74,7 +74,7 @@ class FathometerTracker:
         self.reset()
 
     def reset(self) -> None:
-        rules = StreamRules(0, nanoseconds(self.config.max_gap), self.config.restart_after)
+        rules = StreamRules.of(self.config)
         self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
         self.counts = self._stream.counts
         self.response: Response | None = None

@@ -115,7 +115,7 @@ def test_rules_may_change_while_running():
 @pytest.mark.parametrize('method', ['gaussian_sum', 'seafloor', 'landmark'])
 @pytest.mark.filterwarnings('error')
 def test_nonsense_gives_finite_numbers(method, model, timing):
-    """A vehicle that tumbles and leaps, wild ranges, bearings and variances."""
+    """A vehicle that tumbles and leaps, absurd ranges, bearings and variances."""
     rng = np.random.default_rng(1)
     tracker = ObstacleTracker(
         ObstacleConfig(
