@@ -25,3 +25,10 @@ def test_a_scan_hits_its_targets():
     result = bench.bench_scan(targets=40, scans=3)
     assert result['assigned'] > 0.9
     assert 0.0 < result['median_ms'] <= result['worst_ms']
+
+
+def test_both_kinds_of_stamps_are_tracked():
+    result = bench.bench_stamps(rounds=1, fixes=30)
+    assert result['regular_cpu_ms'] > 0.0 and result['irregular_cpu_ms'] > 0.0
+    fixes = bench._fixes(np.array([1.0, 0.6, 1.4]))
+    np.testing.assert_array_equal(np.diff([fix.stamp_ns for fix in fixes]), [6e8, 14e8])
