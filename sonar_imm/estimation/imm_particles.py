@@ -7,8 +7,8 @@ One set of weighted particles for each model, and the four verbs of every multip
     step = update(log_likelihood, c)                    # each particle meets the measurement
     mean, covariance = combine(x, step.w, step.mu)      # one answer, before anything is resampled
 
-Shapes: M models, n states, N particles a model, k noises. ``x (M, n, N)``, ``w (M, N)`` with rows
-summing to one, ``mu (M,)``, ``transition (M, M)`` with ``transition[i, j] = Pr(j at t | i at
+Shapes: M models, n states, N particles per model, k noises. ``x (M, n, N)``, ``w (M, N)`` with
+rows summing to one, ``mu (M,)``, ``transition (M, M)`` with ``transition[i, j] = Pr(j at t | i at
 t-1)``, ``F (M, n, n)``, ``G (M, n, k)``, ``log_likelihood (M, N)``. Particles come last so that
 loops over them run along memory.
 

@@ -38,17 +38,17 @@ The record
 
     A set that needs an amplitude that is not positive is impossible.
 
-Proposals look at the record first
+Data-driven proposals
     A move is drawn from ``share * K(z' - z) exp(g(z')) / Z(z) + (1 - share) * K(z' - z)``, with
     ``g = max(b, 0)^2 / 2`` (what one thing alone would be worth); of the births a share is drawn
     in proportion to ``exp(min(g, cap))`` and the rest uniformly, at the places that those already
     there leave free. The cap lets a weak peak have births beside a strong one; the uniform rest
-    bounds the weight of a birth nobody looked for. Each draw is paid for by the exact ratio of
-    model to proposal, so proposals change how many particles are needed and nothing else. Shares
-    of zero make the bootstrap filter: with eight sharp peaks in a record, all but a handful of its
-    particles are lost at every step.
+    bounds the weight of a birth where the record shows nothing. Each draw is weighted by the exact
+    ratio of model to proposal, so proposals change how many particles are needed and nothing else.
+    Shares of zero make the bootstrap filter: with eight sharp peaks in a record, all but a handful
+    of its particles are lost at every step.
 
-The random numbers, uniform in [0, 1), are given, one row a particle: ``uniform (N, 1 + c + J)``
+The random numbers, uniform in [0, 1), are given, one row per particle: ``uniform (N, 1 + c + J)``
 for the order, the c things that can come or go at once, and the J things that can move. Row i is
 all that particle i uses, so that particles may be worked on in any order, by any number of
 threads.
