@@ -78,7 +78,7 @@ def subset_update(
         grown = []
         for one in left:
             expected, gradient = measure(one.x)
-            S = gradient @ one.P @ gradient + variance
+            S = float(gradient @ one.P @ gradient) + variance
             innovation = value - expected
             fit = -0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
             row, noise = gradient[None], np.array([[variance]])
