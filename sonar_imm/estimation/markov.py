@@ -8,9 +8,10 @@ generator once, ``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so
 0.1 s equal one of 1 s. `adaptation` lets the data correct it.
 
 ``P(dt)`` is computed by uniformisation: with the largest rate q, ``U = I + G / q`` is itself a
-transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` a mixture of its powers, which are kept.
-No term is negative, so there is nothing to cancel, and no eigenvector is asked for, so a defective
-generator is nothing special. A long step is halved until ``q h <= 1`` and the result squared.
+transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` is a mixture of its powers, which are
+kept. No term is negative, so there is nothing to cancel, and no eigenvector is asked for, so a
+defective generator is nothing special. A long step is halved until ``q h <= 1`` and the result
+squared.
 
 Reference: Stewart, *Introduction to the Numerical Solution of Markov Chains* (1994), ch. 8.
 """

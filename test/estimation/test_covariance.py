@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation import imm, imm_kernels, kalman, small_matrices
-from sonar_imm.estimation.covariance import correct, LIFT, LIMIT, lift, propagate, sound
+from sonar_imm.estimation.covariance import correct, LIFT, lift, LIMIT, propagate, sound
 from sonar_imm.trackers.obstacle import kernels as obstacle_kernels
 
 ROUNDING = 1e-14

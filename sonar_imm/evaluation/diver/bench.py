@@ -178,7 +178,10 @@ def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
     stamps that never have the same distance twice, and their ratio in paired rounds. CPU time,
     because threads that nobody asked for show in nothing else."""
     DiverTracker(DiverConfig()).warm()
-    regular, irregular = _fixes(np.ones(fixes)), _fixes(np.random.default_rng(2).uniform(0.5, 1.5, fixes))
+    regular, irregular = (
+        _fixes(np.ones(fixes)),
+        _fixes(np.random.default_rng(2).uniform(0.5, 1.5, fixes)),
+    )
     pairs = np.array(
         [[_cpu_of_tracking(regular), _cpu_of_tracking(irregular)] for _ in range(rounds)]
     )

@@ -42,8 +42,8 @@ class Divers:
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite; repairs: covariances repaired
-    so far (`estimation.covariance`).
+    broken: tracks ended so far because their numbers were not finite; repairs: covariances
+    repaired so far (`estimation.covariance`).
     """
 
     stamp_ns: int

@@ -208,8 +208,8 @@ def soft_update(
 
     h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). With probability beta the detection is
     the target's, else it says nothing; both cases together are matched in mean and covariance.
-    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where P
-    (T, K) was repaired (`estimation.covariance`).
+    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where
+    P (T, K) was repaired (`estimation.covariance`).
     """
     T, K, n = x.shape
     x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
