@@ -9,8 +9,8 @@ PACKAGE = 'sonar_imm'
 # Resolved, because `colcon build --symlink-install` runs a link to this file.
 ROOT = Path(__file__).resolve().parent
 
-# As in sonar_imm/trackers/__init__.py, which cannot be imported before its dependencies are here.
-SYSTEMS = ['bathymetry', 'diver', 'fathometer', 'obstacle']
+# By their folders, because sonar_imm.trackers cannot be imported before its dependencies are here.
+SYSTEMS = sorted(path.parent.name for path in (ROOT / PACKAGE / 'trackers').glob('*/tracker.py'))
 
 REQUIRES = [
     'attrs>=23.1',
@@ -88,8 +88,8 @@ setup(
     entry_points={
         'console_scripts': [
             'sonar-imm = sonar_imm.cli:main',
-            'fls_detector_node = sonar_imm.nodes.commands:fls_detector',
-            *(f'{system}_node = sonar_imm.nodes.commands:{system}' for system in SYSTEMS),
+            'fls_detector_node = sonar_imm.nodes.commands:main',
+            *(f'{system}_node = sonar_imm.nodes.commands:main' for system in SYSTEMS),
         ],
     },
 )

@@ -1,4 +1,4 @@
-"""Arrival times of one ping as a table, one row a transmitter-receiver pair.
+"""Arrival times of one ping as a table, one row per transmitter-receiver pair.
 
 Columns: ``tx_id``, ``rx_id`` u2; ``tx_x tx_y tx_z rx_x rx_y rx_z`` f8 [m]; ``toa`` f8 [s after the
 header stamp, which is the transmission]; optional ``var_toa`` f4 [s^2], ``bearing`` f8 [rad at the
@@ -13,16 +13,19 @@ from __future__ import annotations
 
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_imm.estimation.angles import wrap_angle
 from sonar_imm.measurements import Arrivals, Rejection
 
-from .headers import Make, stamp_ns, to_enu, wrap
+from .headers import Make, stamp_ns, swap_axes, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
 REQUIRED = ('tx_id', 'rx_id', *_TX, *_RX, 'toa')
+COLUMNS = (*REQUIRED, 'var_toa', 'bearing', 'var_bearing')
 
 MAX_PAIRS = 10_000
 FARTHEST = 1e8
@@ -41,12 +44,10 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
     and finite become NaN (unknown). Raises `Rejection` when the table does not fit or no row is
     left.
     """
-    columns = decode_table(message)
+    columns = decode_table(message, COLUMNS, most_rows=MAX_PAIRS)
     require_columns(columns, REQUIRED, 'arrivals')
     values = {name: scalar_column(columns, name) for name in REQUIRED}
     rows = len(values['toa'])
-    if rows > MAX_PAIRS:
-        raise Rejection('too_large', f'arrivals of {rows} pairs; at most {MAX_PAIRS} are read')
     if not rows:
         raise Rejection('empty', 'the ping has no arrivals')
     tx = np.column_stack([values[name] for name in _TX])
@@ -66,7 +67,17 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
         bearing=_bearings(columns, rows)[keep],
         var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep],
     )
-    return to_enu(arrivals, world_frame)
+    return to_enu(arrivals, world_frame, _turned)
+
+
+def _turned(arrivals: Arrivals) -> Arrivals:
+    """The same ping in ENU, of one in NED, whose bearings go clockwise from north."""
+    return evolve(
+        arrivals,
+        tx=swap_axes(arrivals.tx),
+        rx=swap_axes(arrivals.rx),
+        bearing=wrap_angle(np.pi / 2 - arrivals.bearing),
+    )
 
 
 def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
@@ -111,7 +122,7 @@ def _variances(columns: dict[str, NDArray], name: str, rows: int, least: float) 
 
 
 def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
-    """Bearings (rows,) wrapped into [-pi, pi), NaN where missing. Degrees are refused."""
+    """Bearings (rows,) wrapped into [-pi, pi], NaN where missing. Degrees are refused."""
     if 'bearing' not in columns:
         return np.full(rows, np.nan)
     values = scalar_column(columns, 'bearing')
@@ -122,4 +133,4 @@ def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
             f'arrivals: a bearing of {np.nanmax(np.abs(values)):g} is '
             'beyond 2 pi; bearings are in radians',
         )
-    return np.where(np.abs(values) < np.pi, values, wrap(values))
+    return wrap_angle(values)

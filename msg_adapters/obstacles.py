@@ -1,9 +1,8 @@
-"""Displays of obstacles: a PoseArray, and markers that show what the vertical band is.
+"""Displays of obstacles: a PoseArray, and markers that show the band of the vertical offset.
 
-A point in a display claims to know the height. So each obstacle is drawn as a bar that reaches as
-far up and down as the 90 % band of its vertical offset, with a ball at the mean and a label.
-Markers have the track's number as their id and a lifetime: they follow the obstacle, and vanish
-when nothing is heard of it any more.
+A point in a display would suggest that the height is known. So each obstacle is drawn as a bar
+over the 90 % band of its vertical offset, with a ball at the mean and a label. The id of a marker
+is the track id. Markers have a lifetime: they vanish when the obstacle is no longer published.
 """
 
 from __future__ import annotations
@@ -36,11 +35,9 @@ def write_poses(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
     )
 
 
-def write_markers(
-    estimate: Estimate, rows: Iterable[int], make: Make, *, down: bool = False
-) -> Any:
-    """Write a MarkerArray of bars, balls and labels; `down`: z of the frame points down."""
-    markers = [marker for row in rows for marker in _obstacle(estimate, row, make, down)]
+def write_markers(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
+    """Write a MarkerArray of bars, balls and labels."""
+    markers = [marker for row in rows for marker in _obstacle(estimate, row, make)]
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
 
 
@@ -58,17 +55,17 @@ def write_no_markers(frame_id: str, make: Make) -> Any:
     )
 
 
-def band(estimate: Estimate, row: int, *, down: bool = False) -> tuple[float, float]:
+def band(estimate: Estimate, row: int) -> tuple[float, float]:
     """Smallest and largest z of the 90 % band of one obstacle, metres in the frame."""
     z, offset = float(estimate.xyz[row, 2]), float(estimate.state[row, 2])
     low, high = (float(estimate.extras[f'vertical_offset_{end}'][row]) for end in ('lo', 'hi'))
     # The offset counts down from the sonar: its largest value is the deepest.
-    return (z + low - offset, z + high - offset) if down else (z + offset - high, z + offset - low)
+    return z + offset - high, z + offset - low
 
 
-def _obstacle(estimate: Estimate, row: int, make: Make, down: bool) -> list[Any]:
+def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
     x, y, z = (float(value) for value in estimate.xyz[row])
-    bottom, top = band(estimate, row, down=down)
+    bottom, top = band(estimate, row)
     track_id = int(estimate.extras['track_id'][row])
     colour = _colour(float(estimate.probabilities[row, estimate.model_names.index('above')]))
     label = (
@@ -103,7 +100,7 @@ def _obstacle(estimate: Estimate, row: int, make: Make, down: bool) -> list[Any]
         marker(
             'label',
             _TEXT,
-            (bottom - 1.0) if down else (top + 1.0),
+            top + 1.0,
             (0.0, 0.0, 1.0),
             1.0,
             text=label,

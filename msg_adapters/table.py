@@ -1,14 +1,14 @@
-"""PointCloud2 as a table: one row a point, one named column a field.
+"""PointCloud2 as a table: one row per point, one named column per field.
 
 PointCloud2 is the only message of common_interfaces that has a header, describes its own layout
 and is not deprecated, so it carries every bulk input and output here. A field with ``count > 1``
-is a vector column. Decoding believes nothing: every size is checked against the bytes that are
-really there before a byte is touched.
+is a vector column. Decoding trusts no header: every size is checked against the bytes that are
+really there before any is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import lru_cache
 import math
 from typing import Any
@@ -25,20 +25,31 @@ DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: '
 _CODES = {name: code for code, name in DATATYPES.items()}
 
 MAX_FIELDS = 1024
+MAX_ROWS = 1 << 24
 MAX_BYTES = 1 << 28
 """Most bytes of decoded columns: fields may overlap and unfold a small message hugely."""
 
 
-def decode_table(message: Any) -> dict[str, NDArray]:
+def decode_table(
+    message: Any, names: Collection[str] | None = None, *, most_rows: int = MAX_ROWS
+) -> dict[str, NDArray]:
     """Decode a PointCloud2 into columns, in the order of its fields.
 
+    names: the columns to decode; the others are checked, cost nothing and are left out. None for
+    all. most_rows: more rows than this are refused before a column is made.
     Each column is a fresh array in native byte order: (rows,), or (rows, count) for a vector
     field; rows = height * width, row-major. Raises `Rejection` for anything that does not fit.
     """
     height, width = int(message.height), int(message.width)
     point_step, row_step = int(message.point_step), int(message.row_step)
+    if height * width > most_rows:
+        raise Rejection(
+            'too_large', f'the table has {height * width} rows; at most {most_rows} are read'
+        )
     data = _bytes_of(message.data)
     fields = _checked_fields(message.fields, point_step)
+    if names is not None:
+        fields = [field for field in fields if field[0] in names]
     if row_step < width * point_step:
         raise Rejection(
             'bad_layout',
@@ -142,7 +153,7 @@ def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float
     column = columns[name]
     if column.ndim != 1:
         raise Rejection(
-            'bad_field', f"column '{name}' holds {column.shape[1]} values a row, one is needed"
+            'bad_field', f"column '{name}' holds {column.shape[1]} values per row, one is needed"
         )
     return column.astype(np.float64)
 

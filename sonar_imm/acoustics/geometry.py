@@ -64,6 +64,13 @@ def flip_rotation(R: ArrayLike) -> FloatArray:
     return np.asarray(_WORLD @ np.asarray(R, np.float64) * _BODY)
 
 
+def flip_quaternion(q: ArrayLike) -> FloatArray:
+    """NED-from-FRD of the quaternion (..., 4) x, y, z, w that is ENU-from-FLU, and the other way
+    round: half a turn around the bisector of x and y, then q, then half a turn around x."""
+    x, y, z, w = np.moveaxis(np.asarray(q, np.float64), -1, 0)
+    return np.sqrt(0.5) * np.stack([x + y, x - y, w - z, w + z], axis=-1)
+
+
 def flip_pose(pose: Pose) -> Pose:
     """A pose in NED and FRD given in ENU and FLU, and the other way round."""
     return Pose(flip_world(pose.position), flip_rotation(pose.R))

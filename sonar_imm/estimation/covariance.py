@@ -175,7 +175,7 @@ def _correct_root(
     [[R^1/2, H L], [0, L]] is turned into [[S^1/2, 0], [K S^1/2, L']] by an orthogonal matrix.
     """
     m, n = H.shape[-2:]
-    finite = np.ones(len(P), bool)
+    finite: BoolArray = np.ones(len(P), np.bool_)
     for each in (P, H, R):
         finite &= np.isfinite(each).all(axis=(1, 2))
     safe = [np.where(finite[:, None, None], each, 0.0) for each in (P, H, R)]
@@ -208,5 +208,5 @@ def _triangular(
     A = np.zeros((len(root), m + n, m + n + m))
     A[:, :m, :m], A[:, :m, m : m + n], A[:, m:, m : m + n] = noise, seen, root
     A[:, range(m), range(m + n, m + n + m)] = np.sqrt(lifted)
-    T = transpose(np.asarray(np.linalg.qr(transpose(A), 'r'), dtype=np.float64))
+    T = transpose(np.asarray(np.linalg.qr(transpose(A), 'r')))
     return np.asarray(T * np.where(_diagonal(T) < 0.0, -1.0, 1.0)[:, None])

@@ -1,6 +1,6 @@
 """Point masses: the exact filter and smoother for a jump Markov system of one state.
 
-With one state the densities need no approximation but a fine ruler. Probability sits on the cells
+With one state the densities need no approximation but a fine grid. Probability sits on the cells
 x_g = x_0 + g step; ``p (M, G)`` is the joint probability of model j and cell g, all models
 together summing to one. A cycle is that of every multiple-model filter, with sums for integrals::
 

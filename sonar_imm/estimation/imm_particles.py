@@ -7,8 +7,8 @@ One set of weighted particles for each model, and the four verbs of every multip
     step = update(log_likelihood, c)                    # each particle meets the measurement
     mean, covariance = combine(x, step.w, step.mu)      # one answer, before anything is resampled
 
-Shapes: M models, n states, N particles a model, k noises. ``x (M, n, N)``, ``w (M, N)`` with rows
-summing to one, ``mu (M,)``, ``transition (M, M)`` with ``transition[i, j] = Pr(j at t | i at
+Shapes: M models, n states, N particles per model, k noises. ``x (M, n, N)``, ``w (M, N)`` with
+rows summing to one, ``mu (M,)``, ``transition (M, M)`` with ``transition[i, j] = Pr(j at t | i at
 t-1)``, ``F (M, n, n)``, ``G (M, n, k)``, ``log_likelihood (M, N)``. Particles come last so that
 loops over them run along memory.
 
@@ -43,8 +43,12 @@ import numpy as np
 from .arrays import FloatArray
 from .elementary import exponentials
 
+LEAST_CHANCE = 1e-290
+"""A model less probable than this before a measurement counts as one that nothing can become: the
+reciprocal of its probability could not be held."""
 
-class Updated(NamedTuple):
+
+class WeightUpdate(NamedTuple):
     """w (M, N) and mu (M,) after the measurement; log_likelihood of the measurement given those
     before; ok False when no particle could explain it and the prediction was kept."""
 
@@ -59,8 +63,8 @@ def mix(
 ) -> tuple[FloatArray, FloatArray]:
     """Equally weighted x (M, n, N) for each model, and its predicted probability c (M,).
 
-    A model that nothing can become (c_j = 0) draws from the mixture of all, so that it stays
-    finite and can come back when the chain allows. uniform (M,) in [0, 1).
+    A model that nothing can become (c_j below `LEAST_CHANCE`) draws from the mixture of all, so
+    that it stays finite and can come back when the chain allows. uniform (M,) in [0, 1).
     """
     M, n, N = x.shape
     union = np.moveaxis(x, 1, 0).reshape(n, M * N)
@@ -69,7 +73,7 @@ def mix(
     for j in range(M):
         shares = transition[:, j] * mu
         c[j] = _total(shares)
-        if c[j] <= 0.0:
+        if not c[j] > LEAST_CHANCE:
             shares = mu
         # How many of the points (k + u) / N lie below each particle's share of the whole.
         totals = np.cumsum(np.append(0.0, shares * running[:, -1]))
@@ -93,7 +97,7 @@ def predict(x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray) -> F
     return moved
 
 
-def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None) -> Updated:
+def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None) -> WeightUpdate:
     """w_n <- w_n q_n / L_j, mu_j <- c_j L_j / sum, L_j = sum_n w_n q_n.
 
     w (M, N): weights before, equal when not given. A model whose particles are all impossible, or
@@ -103,7 +107,7 @@ def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = Non
     prior = np.full((M, N), 1.0 / N) if w is None else w
     best = float(np.max(log_likelihood, initial=-math.inf, where=~np.isnan(log_likelihood)))
     if not math.isfinite(best):
-        return Updated(prior, c, -math.inf, False)
+        return WeightUpdate(prior, c, -math.inf, False)
     q = np.empty((M, N))
     for j in range(M):
         exponentials(log_likelihood[j] - best, np.empty(N), q[j])
@@ -112,10 +116,10 @@ def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = Non
     joint = c * L
     total = _total(joint)
     if not total > 0.0:
-        return Updated(prior, c, -math.inf, False)
+        return WeightUpdate(prior, c, -math.inf, False)
     alive = L > 0.0
     weight = np.where(alive[:, None], weight / np.where(alive, L, 1.0)[:, None], prior)
-    return Updated(weight, joint / total, best + math.log(total), True)
+    return WeightUpdate(weight, joint / total, best + math.log(total), True)
 
 
 def combine(x: FloatArray, w: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,10 +7,20 @@ no running sum, one array written. What cannot be is kept apart.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from .arrays import FloatArray, IntArray
 from .elementary import exponentials, ROUND
+from .imm_particles import LEAST_CHANCE
 from .jit import kernel
+
+
+class MixScratch(NamedTuple):
+    """What `mix` needs room for: running (M, N), points (N,) and origin (N + 1,)."""
+
+    running: FloatArray
+    points: FloatArray
+    origin: IntArray
 
 
 @kernel
@@ -20,20 +30,19 @@ def mix(
     mu: FloatArray,
     transition: FloatArray,
     uniform: FloatArray,
-    running: FloatArray,
-    points: FloatArray,
-    origin: IntArray,
+    scratch: MixScratch,
     mixed: FloatArray,
     c: FloatArray,
 ) -> None:
-    """See `imm_particles.mix`, into mixed (M, n, N) and c (M,); running (M, N), points (N,) and
-    origin (N + 1,) are scratch.
+    """See `imm_particles.mix`, into mixed (M, n, N) and c (M,).
 
     The obvious walk along the cumulative weights has a branch that no processor can predict.
     Instead every particle writes its number where its copies begin, the last one to write at a
     place being the one that has copies there, and a running maximum fills the places between.
+    Weights that are not finite give meaningless particles, but no index outside of the arrays.
     """
     M, n, N = x.shape
+    running, points, origin = scratch
     for i in range(M):
         total = 0.0
         for s in range(N):
@@ -43,14 +52,15 @@ def mix(
         c[j], total = 0.0, 0.0
         for i in range(M):
             c[j] += transition[i, j] * mu[i]
+        possible = c[j] > LEAST_CHANCE
         for i in range(M):
-            share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
+            share = transition[i, j] * mu[i] if possible else mu[i]
             total += share * running[i, N - 1]
         for k in range(N + 1):
             origin[k] = 0
         begin, before, scale = 0, 0.0, N / total
         for i in range(M):
-            share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
+            share = transition[i, j] * mu[i] if possible else mu[i]
             row = running[i]
             for s in range(N):
                 point = (before + share * row[s]) * scale - uniform[j]
@@ -59,7 +69,7 @@ def mix(
             before += share * running[i, N - 1]
             for s in range(N):
                 origin[begin] = i * N + s
-                begin = min(int(points[s]), N)
+                begin = int(points[s]) if points[s] < N else N
         source = 0
         for k in range(N):
             source = max(source, origin[k])

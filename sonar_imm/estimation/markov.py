@@ -1,11 +1,10 @@
-"""Markov chains over models: checks, stationary law, irregular time steps, persistence, learning
-from data.
+"""Markov chains over models: checks, stationary distribution, irregular time steps, persistence.
 
 Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
 
-A chain is stated at a reference step, but sonar is irregular. `RateChain` turns the matrix into a
-generator once, ``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of
-0.1 s equal one of 1 s. `adaptation` lets the data correct it.
+A chain is stated at a reference step, but measurements of a sonar come at irregular times.
+`RateChain` turns the matrix into a generator once, ``P(step) = expm(G step)``, and gives ``P(dt)``
+for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation` corrects a chain by data.
 
 ``P(dt)`` is computed by uniformisation: with the largest rate q, ``U = I + G / q`` is itself a
 transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` is a mixture of its powers, which are
@@ -31,23 +30,25 @@ _TERMS = 24
 """Of the series for at most one event a step, whose tail is then below 1e-24."""
 
 
-def check_transition_matrix(matrix: ArrayLike, *, atol: float = 1e-6) -> FloatArray:
-    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError when it is not a
-    transition matrix."""
+def check_transition_matrix(
+    matrix: ArrayLike, *, atol: float = 1e-6, name: str = 'the transition matrix'
+) -> FloatArray:
+    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError, which calls it
+    `name`, when it is not a transition matrix."""
     P = np.array(matrix, dtype=np.float64)
     if P.ndim != 2 or P.shape[0] != P.shape[1] or not len(P):
-        raise ValueError(f'a transition matrix is square, this one has shape {P.shape}')
+        raise ValueError(f'{name} has to be square, its shape is {P.shape}')
     if not np.isfinite(P).all() or (P < 0.0).any() or (P > 1.0 + atol).any():
-        raise ValueError('a transition matrix holds probabilities between 0 and 1')
+        raise ValueError(f'{name} has to hold probabilities between 0 and 1')
     sums = P.sum(axis=1)
     worst = int(np.argmax(np.abs(sums - 1.0)))
     if abs(sums[worst] - 1.0) > atol:
-        raise ValueError(f'row {worst} of the transition matrix sums to {sums[worst]:.6g}, not 1')
+        raise ValueError(f'row {worst} of {name} sums to {sums[worst]:.6g}, not 1')
     return P / sums[:, None]
 
 
 def stationary_law(P: FloatArray) -> FloatArray:
-    """The law (M,) that the chain keeps: pi P = pi. ValueError when there is more than one."""
+    """The stationary distribution (M,): pi P = pi. ValueError when there is more than one."""
     M = len(P)
     system = np.vstack([P.T - np.eye(M), np.ones(M)])
     if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
@@ -62,9 +63,9 @@ def stationary_law(P: FloatArray) -> FloatArray:
 class RateChain:
     """A chain stated at `step` seconds, usable at any step.
 
-    The generator is the matrix logarithm. Some matrices have no valid one (negative rates); those
-    rates are set to zero, and `residual` says how far ``P(step)`` then is from the matrix given (0
-    when it is embeddable).
+    The generator is the matrix logarithm. For some matrices it has negative rates and is not
+    valid. Those rates are set to zero, and `residual` says how far ``P(step)`` then is from the
+    matrix given (0 when the matrix is embeddable).
     """
 
     def __init__(self, matrix: ArrayLike, step: float):
@@ -134,8 +135,8 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
     from scipy.linalg import logm
 
     # A zero eigenvalue (identical rows) has no logarithm: the chain forgets everything at once.
-    # Mixing in a sliver of
-    # the identity stands for a very fast, finite rate; the residual tells how little that changes.
+    # Mixing in a little of the identity stands for a very fast, finite rate; the residual tells
+    # how little that changes.
     singular = np.abs(np.linalg.eigvals(P)).min() < 1e-9
     base = (1.0 - 1e-8) * P + 1e-8 * np.eye(len(P)) if singular else P
     G = np.real(np.asarray(logm(base), dtype=np.complex128)) / step
@@ -145,9 +146,16 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
     return G
 
 
+def persistent(models: int, stay: float) -> FloatArray:
+    """(M, M): a model is kept with probability `stay`, else each other one is as probable."""
+    P = np.full((models, models), (1.0 - stay) / max(models - 1, 1))
+    np.fill_diagonal(P, stay if models > 1 else 1.0)
+    return P
+
+
 def persistent_headings(directions: int, stay: float, concentration: float) -> FloatArray:
-    """Headings at 2 pi j / directions: stay with probability `stay`, else turn by a with weight
-    exp(kappa cos a)."""
+    """Transition matrix of headings at 2 pi j / directions: stay with probability `stay`, else
+    turn by an angle a with weight exp(kappa cos a), kappa = `concentration`."""
     turns = 2.0 * np.pi * np.arange(1, directions) / directions
     weights = np.exp(concentration * (np.cos(turns) - 1.0))
     row = np.concatenate([[stay], (1.0 - stay) * weights / weights.sum()])
@@ -156,8 +164,8 @@ def persistent_headings(directions: int, stay: float, concentration: float) -> F
 
 
 def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
-    """Append a model that each other turns into with probability `enter`, that is kept with `stay`
-    and left uniformly. What `enter` takes comes from every entry of a row alike."""
+    """Append a model that every other model enters with probability `enter`. It is kept with
+    probability `stay` and left uniformly. `enter` scales down all entries of a row alike."""
     M = len(P)
     out = np.empty((M + 1, M + 1))
     out[:M, :M] = (1.0 - enter) * P
@@ -168,12 +176,12 @@ def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
 
 
 class EventChain:
-    """Models that are events rather than states: each step draws anew from one law, whatever came
-    before.
+    """Models that are events rather than states: each step draws from the same distribution,
+    whatever came before.
 
-    law (M,): of a reference step; its first model is 'nothing happens', which gets likelier as the
-    step shrinks: Pr(nothing in dt) = law_0 ** (dt / step). The matrices have identical rows (the
-    filter is then a GPB1).
+    law (M,): probabilities in one reference step. Its first model is 'nothing happens', which gets
+    likelier as the step shrinks: Pr(nothing in dt) = law_0 ** (dt / step). The matrices have
+    identical rows (the filter is then a GPB1).
     """
 
     def __init__(self, law: ArrayLike, step: float):

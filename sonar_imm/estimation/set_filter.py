@@ -1,8 +1,8 @@
 """The filter of `set_particles`, run: one record after the other, on any number of threads.
 
-`SetFilter.step` is pure: it takes what was known before a record and gives what is known after,
-so that a record can be tried without being committed to (a preview), and what is known at one
-record can be looked at again when later ones are in (`LagSmoother`).
+`SetFilter.step` is pure: it takes the weighted sets before a record and gives those after it. A
+record can therefore be tried without being taken in (a preview), and the sets at one record can be
+weighted again when later records are in (`LagSmoother`).
 
 Random numbers are counter based: those of a record come from a Philox generator whose key is the
 seed and the record's own name (its stamp), and each particle has its row of them. The result is
@@ -24,20 +24,20 @@ from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
-from .set_particles import gain, propose_births, SetModel, Sets
+from .set_particles import gain, Proposals, propose_births, SetModel, Sets
 
 _STEP, _START, _RESAMPLE = range(3)
 
 
 class Weighted(NamedTuple):
-    """Sets with log weights (N,) that need not be normalised: what is known between records."""
+    """Sets with log weights (N,) that need not be normalised: the state between records."""
 
     sets: Sets
     log_weight: FloatArray
 
 
 @frozen(eq=False)
-class Step:
+class SetStep:
     """One record taken in.
 
     sets: weighted by w (N,), summing to one; amplitude (N, J) given each set, in units of the
@@ -64,9 +64,21 @@ class SetFilter:
         self.particles = particles
         self.threads = threads
         n, width = model.cells, len(model.move)
-        self._cumulative = np.empty((n, width))
-        self._ratio = np.empty((n, width))
-        self._transition = np.cumsum(model.transition, axis=1)
+        self._move, self._move_ratio = np.empty((n, width)), np.empty((n, width))
+        self._motion = kernels.SetMotion(
+            order_min=model.order_min,
+            separation=model.separation,
+            most_changes=model.most_changes,
+            cumulative=np.cumsum(model.transition, axis=1),
+        )
+        self._amplitudes = kernels.AmplitudeModel(
+            gram=model.gram,
+            ridge=float(model.ridge),
+            penalty=float(model.penalty),
+            marginal=model.amplitude_prior == 'marginal',
+            memory=float(model.amplitude_memory),
+            variance=float(model.amplitude_std**2),
+        )
         self._charge = np.array(
             [
                 math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(n)
@@ -75,7 +87,7 @@ class SetFilter:
         )
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> Step:
+    def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> SetStep:
         """Take in the record b (n,), in units of its noise. before: None before the first record.
         key: seed and name of the record, each in 0 .. 2^64 - 1."""
         if before is None:
@@ -93,7 +105,7 @@ class SetFilter:
             log_weight = np.zeros(self.particles)
         after = self._remembered(sets.take(source), amplitude[source])
         evidence = float(log_sum - log_before)
-        return Step(
+        return SetStep(
             sets, w, amplitude, Weighted(after, log_weight), source, evidence, effective, ok
         )
 
@@ -103,40 +115,21 @@ class SetFilter:
         step = SetFilter(self.model, 8).step(None, b, (0, 0))
         self.summary(step, step.w, step.sets)
 
-    def summary(self, step: Step, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
+    def summary(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
         """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
         pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
-        kernels.moments(
-            w,
-            sets.order,
-            sets.cell,
-            step.amplitude,
-            sets.prior_variance,
-            self.model.order_min,
-            pmf,
-            sums,
-        )
+        kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
         return pmf, sums
 
     def _start(self, b: FloatArray, key: tuple[int, int]) -> Weighted:
         model, sets = self.model, Sets.empty(self.model, self.particles)
         uniform = _uniform(key, _START).random((self.particles, 1 + model.order_max))
         log_ratio = np.zeros(self.particles)
-        births = propose_births(model, b)
+        proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
         self._split(
             lambda first, last: kernels.start(
-                first,
-                last,
-                model.order_min,
-                len(model.transition),
-                model.separation,
-                self._charge,
-                *births,
-                uniform,
-                sets.order,
-                sets.cell,
-                log_ratio,
+                first, last, self._motion, self._charge, proposals, uniform, sets, log_ratio
             )
         )
         # An impossible set has members that mean nothing; it must not be moved.
@@ -151,71 +144,37 @@ class SetFilter:
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
         filled = np.zeros(model.cells, np.bool_)
-        tables = self._cumulative, self._ratio
-        kernels.fill_moves(
-            old.order, old.cell, gain(b), model.move, model.move_share, filled, *tables
-        )
-        births = propose_births(model, b)
+        proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
+        kernels.fill_moves(old, gain(b), model.move, model.move_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first,
                 last,
-                model.order_min,
-                model.separation,
-                model.most_changes,
-                model.amplitude_memory > 0.0,
-                model.amplitude_std**2,
-                self._transition,
-                *tables,
-                *births,
+                self._motion,
+                self._amplitudes,
+                proposals,
                 uniform,
-                old.order,
-                old.cell,
-                old.prior_mean,
-                old.prior_variance,
-                new.order,
-                new.cell,
-                new.prior_mean,
-                new.prior_variance,
+                old,
+                new,
                 log_ratio,
             )
         )
         return new, log_ratio
 
     def _weigh(self, sets: Sets, b: FloatArray, log_weight: FloatArray) -> FloatArray:
-        model, amplitude = self.model, np.zeros(sets.cell.shape)
+        amplitude = np.zeros(sets.cell.shape)
         self._split(
             lambda first, last: kernels.weigh(
-                first,
-                last,
-                b,
-                model.gram,
-                model.ridge,
-                model.fine,
-                model.amplitude_prior == 'marginal',
-                model.amplitude_memory > 0.0,
-                *sets,
-                log_weight,
-                amplitude,
+                first, last, b, self._amplitudes, sets, log_weight, amplitude
             )
         )
         return amplitude
 
     def _remembered(self, sets: Sets, amplitude: FloatArray) -> Sets:
-        model = self.model
-        if model.amplitude_memory > 0.0:
+        if self.model.amplitude_memory > 0.0:
             self._split(
                 lambda first, last: kernels.remember(
-                    first,
-                    last,
-                    model.gram,
-                    model.amplitude_memory,
-                    model.amplitude_std**2,
-                    sets.order,
-                    sets.cell,
-                    amplitude,
-                    sets.prior_mean,
-                    sets.prior_variance,
+                    first, last, self._amplitudes, amplitude, sets
                 )
             )
         return sets
@@ -230,14 +189,14 @@ class SetFilter:
 
 
 class LagSmoother:
-    """What was known `lag` records ago, seen with all that came since: each particle of today is
-    traced to its ancestor of then (fixed-lag smoothing by surviving lines)."""
+    """Fixed-lag smoothing by surviving lines: each of the newest particles is traced to its
+    ancestor `lag` records ago, which gets its weight."""
 
     def __init__(self, lag: int):
         self.lag = lag
-        self._steps: deque[Step] = deque(maxlen=lag + 1)
+        self._steps: deque[SetStep] = deque(maxlen=lag + 1)
 
-    def push(self, step: Step) -> tuple[Step, FloatArray] | None:
+    def push(self, step: SetStep) -> tuple[SetStep, FloatArray] | None:
         """The step `lag` records before this one and the weights (N,) its sets now have; None
         while there is none, and after a record that nothing explained."""
         if not step.ok:

@@ -1,21 +1,19 @@
-"""The unscented transform: a Gaussian through a curved function, by a handful of points.
+"""The unscented transform: the moments of a Gaussian after a nonlinear function.
 
-A Gaussian is replaced by points on its principal axes, the points go through the function, and
-mean and covariance are read off the other side. Exact for linear functions, and for quadratic ones
-in the mean.
+A Gaussian is replaced by sigma points on its principal axes. The points go through the function,
+and their weighted mean and covariance are those of the result. Exact for linear functions; for
+quadratic ones the mean is exact.
 
-Three choices make it safe:
+Three choices make it robust:
 
-- **No negative weights.** ``kappa = max(0, 3 - n)``: up to three dimensions the fourth moment of
-the Gaussian is matched, above
-  that the centre has no weight and the rule is the cubature rule. Every covariance is a sum of
-  squares with weights that are not negative, so it cannot lose its definiteness, and the
-  measurement update is in the matching (Joseph) form.
+- **No negative weights.** ``kappa = max(0, 3 - n)``. Up to three dimensions the fourth moment of
+  the Gaussian is matched; above that the centre has no weight and the rule is the cubature rule.
+  Every covariance is a sum of squares with non-negative weights, so it cannot lose its
+  definiteness. The measurement update has the matching (Joseph) form.
 - **Angles are averaged as offsets.** Components marked as angles are compared with the image of
-the centre point, wrapped
-  once into [-pi, pi] by rounding (never by a loop), averaged, and added back. Turning the scene
-  turns the answer and changes nothing else, because the points lie on principal axes, which turn
-  with the scene, and singular covariances need no special care.
+  the centre point. The differences are wrapped once into [-pi, pi], averaged and added back.
+  Turning the scene turns the answer and changes nothing else, because the points lie on principal
+  axes, which turn with the scene. Singular covariances need no special care.
 - **What is not finite is refused** by `CovarianceError`, at the step where it appears.
 
 Functions are vectorised: they take points (..., s, n) and give (..., s, m).
@@ -31,17 +29,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .angles import wrap_angle
 from .arrays import BoolArray, FloatArray
 from .covariance import CovarianceError, lift, solve, symmetrise, transpose
 from .kalman import apply, factorise, log_density, Predicted, Updated
 
 Function = Callable[[FloatArray], FloatArray]
-TWO_PI = 2.0 * np.pi
-
-
-def wrap_angle(angle: FloatArray) -> FloatArray:
-    """The same direction in [-pi, pi]; angles already inside keep their bits."""
-    return angle - TWO_PI * np.round(angle / TWO_PI)
 
 
 class Transformed(NamedTuple):
@@ -54,8 +47,8 @@ class Transformed(NamedTuple):
 
 
 class _Cloud(NamedTuple):
-    """Offsets from the mean before (..., s, n) and after (..., s, m) the function, weights (s,),
-    mean after (..., m)."""
+    """Sigma points: offsets from the mean before (..., s, n) and after (..., s, m) the function,
+    weights (s,), mean after (..., m)."""
 
     before: FloatArray
     after: FloatArray

@@ -1,10 +1,10 @@
-"""Judges: what is said of a finished run, each system in its own terms.
+"""Judges: scores and summaries of finished runs, one judge per system.
 
-How far a diver's track lies from the diver is one question, how well a sea floor was drawn is
-another. So each system has a module that judges its runs, named in `JUDGES`, which provides
+The metrics of a diver track and of a sea floor differ. So each system has a module that judges its
+runs, `System.judge`, which provides
 
-- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores, finds the words;
-- ``LIMIT``: the `Limit` that the error of a shipped recording has to stay within.
+- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores them and summarises;
+- ``LIMIT``: the `Limit` of the error for the shipped recordings.
 
 Everything else is the same for all of them: the folder of a run, the page, the commands.
 """
@@ -18,24 +18,18 @@ from typing import Any, Protocol, TYPE_CHECKING
 
 from attrs import frozen
 
-if TYPE_CHECKING:
+from ..trackers import SYSTEMS
+from .run_folder import RunFolder
+
+if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
     from .page import Part
-    from .run_folder import RunFolder
 
 TRUTH_GAP = 60.0
-
-JUDGES = {
-    'bathymetry': 'sonar_imm.evaluation.bathymetry',
-    'diver': 'sonar_imm.evaluation.diver',
-    'fathometer': 'sonar_imm.evaluation.fathometer',
-    'obstacle': 'sonar_imm.evaluation.obstacle',
-}
-"""Module by system. A new system adds its line here."""
 
 
 @frozen
 class Check:
-    """One thing that was checked: what came out, and what was wanted."""
+    """One check: its result, and what was wanted."""
 
     name: str
     result: str
@@ -80,12 +74,12 @@ class JudgeOptions:
 
 @frozen(eq=False, kw_only=True)
 class Judgement:
-    """What is said of one run.
+    """Scores and summary of one run.
 
-    metrics: the content of ``metrics.json``. summary: the result in plain words. lines: title and
-    value of the numbers a person wants to see first. part: the run as a part of the report, made
-    only when asked for, with checks that were made besides. accuracy: the error against a limit
-    (None for `LIMIT` of the system); gives None where there is no truth.
+    metrics: the content of ``metrics.json``. summary: the result in a few sentences. lines: title
+    and value of the most important numbers. part: makes the part of the report for the run, with
+    further checks. accuracy: compares the error with a limit (None for `LIMIT` of the system);
+    None without truth.
     """
 
     metrics: dict[str, Any]
@@ -96,7 +90,7 @@ class Judgement:
 
 
 class Judge(Protocol):
-    """What a module in `JUDGES` provides."""
+    """What the module `System.judge` provides."""
 
     LIMIT: Limit
 
@@ -107,5 +101,5 @@ class Judge(Protocol):
 
 def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
     """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
-    one: Judge = import_module(JUDGES[folder.read_run()['system']])
+    one: Judge = import_module(SYSTEMS[folder.read_run()['system']].judge)
     return one.judge(folder, options or JudgeOptions())

@@ -11,17 +11,22 @@ from .bathymetry import MAX_BINS, Snapshot
 from .checks import check_covariance, check_stamp, nanoseconds, Rejection
 from .diver import Arrivals, Fix
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
-from .obstacle import Altitude, Detections, Navigation
+from .frames import frame_role, FrameGuard
+from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
 
 __all__ = [
     'Altitude',
     'ArrayDepth',
     'Arrivals',
+    'BEAM_AXES',
     'check_covariance',
     'check_stamp',
     'CrossSpectra',
     'Detections',
     'Fix',
+    'frame_role',
+    'FrameGuard',
+    'IMAGE_ORDERS',
     'MAX_BINS',
     'Measurement',
     'nanoseconds',
@@ -29,6 +34,7 @@ __all__ = [
     'Pressure',
     'Rejection',
     'Snapshot',
+    'SonarImage',
     'Trace',
 ]
 

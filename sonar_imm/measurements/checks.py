@@ -69,6 +69,11 @@ def complexes(value: Any) -> NDArray[np.complexfloating]:
     return array
 
 
+def content_key(kind: str, *parts: FloatArray | NDArray | None) -> bytes:
+    """The content of a measurement as bytes: it orders those of one stamp and tells duplicates."""
+    return kind.encode() + b''.join(part.tobytes() for part in parts if part is not None)
+
+
 def check_covariance(covariance: FloatArray, what: str) -> None:
     """Raise `Rejection` unless `covariance` (n, n) is finite, symmetric and positive definite."""
     if not np.isfinite(covariance).all():

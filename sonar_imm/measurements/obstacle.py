@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, floats, Rejection
+from .checks import check_stamp, content_key, floats, Rejection
+
+BEAM_AXES = ('marine', 'rep103', 'auto')
+"""What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
+which of the two the beams point along."""
+IMAGE_ORDERS = ('range_major', 'beam_major')
+"""How the samples of an image may lie: all beams of a range together, or all ranges of a beam."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -18,6 +26,8 @@ class Detections:
     intensity: (n,), NaN where unknown. Columns left out are unknown. A row without a finite range
     and bearing is no echo.
     """
+
+    FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
     range: FloatArray = field(converter=floats(None))
@@ -43,15 +53,34 @@ class Detections:
     def __len__(self) -> int:
         return len(self.range)
 
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key(
+            'detections', self.range, self.bearing, self.var_range, self.var_bearing
+        )
+
+
+@frozen(eq=False, kw_only=True)
+class SonarImage:
+    """A ping of a forward-looking sonar before detection; no tracker takes it in.
+
+    range (R,) m and bearing (B,) rad, positive to port, of the magnitudes amplitude (R, B).
+    """
+
+    stamp_ns: int
+    range: FloatArray
+    bearing: FloatArray
+    amplitude: FloatArray
+    frame_id: str = ''
+
 
 @frozen(eq=False, kw_only=True)
 class Navigation:
     """Where the vehicle was: its pose in the world and its velocity in its own frame.
 
     position: (3,) metres and orientation: (4,) quaternion x, y, z, w, world from body; velocity:
-    (3,) m/s and turn_rate: (3,) rad/s of the body, NaN where unknown. ENU and FLU unless the
-    sender keeps another convention. pose_covariance, twist_covariance: (6, 6) or None when
-    unknown.
+    (3,) m/s and turn_rate: (3,) rad/s of the body, NaN where unknown. World ENU, body FLU.
+    pose_covariance, twist_covariance: (6, 6) or None when unknown.
     """
 
     stamp_ns: int
@@ -82,10 +111,16 @@ class Navigation:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, floats(6, 6)(getattr(self, name)))
 
+    def key(self) -> bytes:
+        """See `content_key`; velocities are not used."""
+        return content_key('navigation', self.position, self.orientation)
+
 
 @frozen(eq=False, kw_only=True)
 class Altitude:
     """How high above the sea floor the vehicle was, metres; variance m^2, NaN when unknown."""
+
+    FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
     altitude: float
@@ -98,3 +133,7 @@ class Altitude:
             raise Rejection('nan', 'the altitude is not finite')
         if self.altitude < 0.0:
             raise Rejection('out_of_range', f'the altitude is {self.altitude:g} m, below zero')
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('altitude', np.float64(self.altitude))

@@ -35,12 +35,11 @@ from rclpy.qos import InvalidQoSProfileException
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
-from msg_adapters.frames import FrameGuard
-from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import FrameGuard, Rejection
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
@@ -62,9 +61,9 @@ class TrackerNode(Node):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(system, **options)
-        self._topics = INPUTS[system]
+        self._topics = inputs_of(system)
         config_type = SYSTEMS[system].config_type()
-        self._node_config_type = node_config_type(system)
+        self._node_config_type = node_config_type(SYSTEMS[system])
         self._settings = NodeParameters(
             self, (config_type, self._node_config_type), type_specs(system)
         )
@@ -73,7 +72,7 @@ class TrackerNode(Node):
         self._warm()
 
         self._enabled = True
-        self._ignored = self._published = 0
+        self._ignored = self._published = self._withheld = 0
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
@@ -208,10 +207,18 @@ class TrackerNode(Node):
     def _publish(self, estimates: list[Estimate]) -> None:
         if not estimates:
             return
-        for estimate in estimates if self._node_config.publish_revisions else estimates[-1:]:
+        for estimate in self._wanted(estimates):
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1
         self.show(estimates[-1])
+
+    def _wanted(self, estimates: list[Estimate]) -> list[Estimate]:
+        """The newest estimate, and before it the newest revised ones, as many as are wanted."""
+        if not self._node_config.publish_revisions:
+            return estimates[-1:]
+        limit = self._node_config.max_revisions or len(estimates)
+        self._withheld += max(0, len(estimates) - 1 - limit)
+        return estimates[-limit - 1 :]
 
     def _doubt(self, topic: InputTopic, reason: str) -> None:
         if reason not in self._meter.doubted:
@@ -281,6 +288,8 @@ class TrackerNode(Node):
 
     def _report(self) -> None:
         counts = Counter(self.tracker.counts) + self._errors
+        if self._withheld:
+            counts['revisions_withheld'] = self._withheld
         if self._ignored:
             counts['ignored_while_disabled'] = self._ignored
         self._diagnostics.publish(

@@ -1,38 +1,17 @@
-"""What ``ros2 run sonar_imm <name>_node`` starts: the ``main`` of a node, in a process that does
-algebra in one thread."""
+"""What ``ros2 run sonar_imm NAME_node`` starts: the ``main`` of ``sonar_imm/nodes/NAME.py``, in a
+process that does algebra in one thread."""
 
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
+import sys
 
 from ..threads import one_blas_thread
 
 
-def _run(module: str) -> int:
+def main() -> int:
+    """Start the node that this program is called after, e.g. ``diver_node``."""
     one_blas_thread()  # before the node's module imports numpy
-    return int(import_module(f'{__package__}.{module}').main())
-
-
-def bathymetry() -> int:
-    """``bathymetry_node``."""
-    return _run('bathymetry')
-
-
-def diver() -> int:
-    """``diver_node``."""
-    return _run('diver')
-
-
-def fathometer() -> int:
-    """``fathometer_node``."""
-    return _run('fathometer')
-
-
-def obstacle() -> int:
-    """``obstacle_node``."""
-    return _run('obstacle')
-
-
-def fls_detector() -> int:
-    """``fls_detector_node``."""
-    return _run('fls_detector')
+    name = Path(sys.argv[0]).stem.removesuffix('_node')
+    return int(import_module(f'{__package__}.{name}').main())

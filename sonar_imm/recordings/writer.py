@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+import contextlib
 from pathlib import Path
+import sqlite3
 from typing import Any
 
 from rosbags.interfaces import (
@@ -20,7 +22,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from .messages import ros_message, typestore
 from .sources import BagError
 
-__all__ = ['BagWriter', 'ros_message', 'STORAGES']
+__all__ = ['BagWriter', 'naming', 'ros_message', 'STORAGES']
 
 STORAGES = ('mcap', 'sqlite3')
 
@@ -37,12 +39,25 @@ _RELIABLE = Qos(
 )
 
 
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Add the file name to an error of the operating system that lacks it, e.g. a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+    except sqlite3.OperationalError as error:
+        raise BagError(f'{path} cannot be written: {error}') from None
+
+
 class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
-    custom_data: notes kept in the bag's metadata, e.g. where the data come from. When an exception
-    leaves the ``with`` block, what was written so far is still a whole bag.
-    Raises `BagError` when the bag cannot be made.
+    custom_data: notes kept in the metadata of the bag, e.g. where the data come from. What was
+    written before an exception is still a whole bag. Raises `BagError` when the bag cannot be
+    made.
     """
 
     def __init__(
@@ -77,7 +92,8 @@ class BagWriter:
 
     def close(self) -> None:
         """Finish the bag: index and metadata."""
-        self._writer.close()
+        with naming(self.path):
+            self._writer.close()
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""
@@ -88,11 +104,15 @@ class BagWriter:
         """Append a message that is CDR already. Raises ValueError for a log time before 1970."""
         if log_ns < 0:
             raise ValueError(f'a recording cannot hold the log time {log_ns} ns')
+        with naming(self.path):
+            self._writer.write(self._link(topic, type_name), log_ns, raw)
+        self.count += 1
+
+    def _link(self, topic: str, type_name: str) -> Connection:
         link = self._links.get((topic, type_name))
         if link is None:
             link = self._writer.add_connection(
                 topic, type_name, typestore=typestore(), offered_qos_profiles=[_RELIABLE]
             )
             self._links[topic, type_name] = link
-        self._writer.write(link, log_ns, raw)
-        self.count += 1
+        return link

@@ -26,8 +26,10 @@ class Kernels:
     def mix(x, w, mu, transition, uniform):
         M, n, N = x.shape
         mixed, c = np.empty_like(x), np.empty(M)
-        scratch = np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64)
-        imm_particles_kernels.mix(x, w, mu, transition, uniform, *scratch, mixed, c)
+        scratch = imm_particles_kernels.MixScratch(
+            np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64)
+        )
+        imm_particles_kernels.mix(x, w, mu, transition, uniform, scratch, mixed, c)
         return mixed, c
 
     @staticmethod
@@ -43,7 +45,7 @@ class Kernels:
         w = np.full((M, N), 1.0 / N) if w is None else w.copy()
         mu, work = np.empty(M), np.empty((2, N))
         log_sum = imm_particles_kernels.update(log_likelihood.copy(), c, w, mu, work)
-        return imm_particles.Updated(w, mu, log_sum, log_sum > -np.inf)
+        return imm_particles.WeightUpdate(w, mu, log_sum, log_sum > -np.inf)
 
     @staticmethod
     def combine(x, w, mu):
@@ -96,6 +98,32 @@ def test_a_model_that_nothing_can_become_stays_finite(engine):
     closed = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
     mixed, c = engine.mix(x, w, mu, closed, rng.random(3))
     assert c[2] == 0.0 and np.isfinite(mixed).all()
+
+
+@pytest.mark.parametrize('tiny', [5e-324, 1e-310, 1e-300, 1e-280])
+def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
+    """The reciprocal of its probability overflows, and numbers particles outside of the set."""
+    rng = np.random.default_rng(4)
+    x, w, _ = random_set(rng)
+    mu, uniform = np.array([0.4, 0.6, tiny]), rng.random(3)
+    results = [engine.mix(x, w, mu, np.eye(3), uniform) for engine in (imm_particles, Kernels)]
+    for mixed, c in results:
+        assert c[2] == tiny
+        # Copies of particles that were there: of the model's own, or of any model's.
+        assert np.isin(mixed[2, 0], x[2 if tiny > 1e-290 else slice(None), 0]).all()
+    assert np.array_equal(results[0][0], results[1][0])
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_mixing_weights_that_are_not_finite_stays_in_its_arrays(value):
+    rng = np.random.default_rng(5)
+    x, w, mu = random_set(rng)
+    w[1, 7] = value
+    guarded = np.full(50 + 1 + 8, -7)
+    scratch = imm_particles_kernels.MixScratch(np.empty((3, 50)), np.empty(50), guarded[:51])
+    mixed, c = np.empty_like(x), np.empty(3)
+    imm_particles_kernels.mix(x, w, mu, ASYMMETRIC, rng.random(3), scratch, mixed, c)
+    assert (guarded[51:] == -7).all() and np.isin(mixed, x).all()
 
 
 @engines

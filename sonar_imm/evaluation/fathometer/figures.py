@@ -1,12 +1,9 @@
-"""Figures of a run of reflectors: the response with the tracks over it, the number of reflectors,
-amplitudes, distance from the truth."""
+"""Figures of a run of reflectors: response and tracks, number of reflectors, amplitudes, OSPA."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
-from attrs import frozen
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
@@ -14,26 +11,14 @@ from plotly.subplots import make_subplots
 from ...estimation.arrays import FloatArray
 from .. import SECOND
 from ..plotting import COLOURS, INK, styled
-from .records import Record
-
-if TYPE_CHECKING:
-    from .fixed_order import FixedOrder
+from .fixed_order import FixedOrder
+from .records import Image, Record
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
 
 
-@frozen(eq=False)
-class Image:
-    """Depth responses side by side, in units of their noise: value (depths, records); depth
-    (depths,) m; stamp_ns (records,)."""
-
-    value: FloatArray
-    depth: FloatArray
-    stamp_ns: np.ndarray
-
-
 def response_figure(image: Image | None, records: Sequence[Record], start_ns: int) -> go.Figure:
-    """The response as an image, the truth as dots and the tracks as lines over it."""
+    """The response as an image, with the truth as dots and the tracks as lines."""
     figure = go.Figure()
     if image is not None:
         image = _thinned(image)
@@ -98,8 +83,7 @@ def order_figure(records: Sequence[Record], start_ns: int) -> go.Figure:
 def amplitude_figure(
     records: Sequence[Record], start_ns: int, factor: float | None = None
 ) -> go.Figure:
-    """The strength of every track over time, and the true ones brought to its scale by
-    `factor`."""
+    """Amplitude of every track over time, and the true amplitudes times `factor`."""
     figure = go.Figure()
     if factor:
         true = [record for record in records if record.true is not None]
@@ -136,7 +120,7 @@ def distance_figure(records: Sequence[Record], ospa: FloatArray, start_ns: int) 
 def fixed_order_figure(
     fixed: Sequence[FixedOrder], records: Sequence[Record], start_ns: int
 ) -> go.Figure:
-    """Beside each other, what filters of a fixed number of reflectors find, and the truth."""
+    """What filters of a fixed number of reflectors find, and the truth, side by side."""
     titles = [f'{one.order} reflectors' for one in fixed]
     figure = make_subplots(
         cols=len(fixed), shared_yaxes=True, subplot_titles=titles, horizontal_spacing=0.02

@@ -1,5 +1,4 @@
-"""One scan of the diver tracker: what is known before it, the updates in the middle, what is known
-after it."""
+"""One scan of the diver tracker: the state before it, the updates in between, the state after."""
 
 from __future__ import annotations
 
@@ -13,7 +12,13 @@ import numpy as np
 from ...estimation import imm, imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
+from ...estimation.association import (
+    assign_by_rank,
+    association_cost,
+    gate_threshold,
+    Tracks,
+    TrackStatus,
+)
 from .config import DiverConfig
 from .models import ModelSet
 from .sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing
@@ -35,7 +40,7 @@ SCALE_MEMORY = 400.0
 
 
 @frozen(eq=False, kw_only=True)
-class Divers:
+class DiverState:
     """All that is known after a scan: T tracks with M models of n states.
 
     x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
@@ -63,6 +68,13 @@ class Divers:
         """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
         return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
 
+    def rows(self, kept: np.ndarray) -> DiverState:
+        """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
+        if kept.all():
+            return self
+        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score')
+        return evolve(self, **{name: getattr(self, name)[kept] for name in names})
+
 
 class Step(NamedTuple):
     """Tracks after a step of dt seconds without a measurement, the transitions (T or 1, M, M) of
@@ -83,7 +95,7 @@ class Step(NamedTuple):
 
 
 def cross(
-    models: ModelSet, chain: AdaptiveChain, before: Divers, dt: float, longest: float
+    models: ModelSet, chain: AdaptiveChain, before: DiverState, dt: float, longest: float
 ) -> Iterator[Step]:
     """Mix and predict over dt seconds, in equal steps of at most `longest`.
 
@@ -100,15 +112,15 @@ def cross(
 
 
 class Scan:
-    """The tracks in the middle of a scan: predicted when made, updated by `take`, done with
-    `result`."""
+    """The tracks in the middle of a scan: predicted when made, then `associate_and_update` for
+    each message, and `learn` at the end."""
 
     def __init__(
         self,
         config: DiverConfig,
         models: ModelSet,
         chain: AdaptiveChain,
-        before: Divers,
+        before: DiverState,
         stamp_ns: int,
     ):
         self.config, self.models, self.chain, self.before = config, models, chain, before
@@ -124,7 +136,7 @@ class Scan:
         self.scale = before.scale.copy()
         self.rank = np.zeros(len(self.x), np.int64)
 
-    def take(self, groups: Sequence[Group]) -> list[np.ndarray]:
+    def associate_and_update(self, groups: Sequence[Group]) -> list[np.ndarray]:
         """Update the tracks with what one message holds for them, group after group. Gives for
         each group True (D,) where a detection was taken.
 
@@ -166,8 +178,8 @@ class Scan:
                 self._take_bearings(group.bearings(), tracks, chosen[tracks])
         return chosen
 
-    def result(self) -> Divers:
-        """What is known now; the transitions have learnt from the tracks that were hit."""
+    def learn(self) -> DiverState:
+        """The state after the updates; transitions have learnt from the tracks that were hit."""
         hit = np.flatnonzero(self.nis_dof > 0)
         learnt = self.before.learnt.copy()
         shared = len(self.transition) == 1
@@ -202,8 +214,6 @@ class Scan:
 
     def _associate(self, group: Group) -> np.ndarray:
         """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
-        chosen = np.full(len(self.x), -1)
-        free = np.ones(len(group.z), bool)
         fit = self._fit(group)
         target, detection = imm.pairs_inside(fit)
         likelihood = fit[target, detection]
@@ -212,11 +222,7 @@ class Scan:
         else:
             p_detection = self.config.detection_probability
             cost = association_cost(likelihood, p_detection, group.clutter)
-        for rank in np.unique(self.rank[self.rank != EXCLUDED]):
-            pairs = (self.rank == rank)[target] & free[detection]
-            found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
-            chosen = np.where(found >= 0, found, chosen)
-            free[found[found >= 0]] = False
+        chosen = assign_by_rank(target, detection, cost, self.rank, len(group.z))
         self._keep_score(fit, chosen, group)
         return chosen
 
@@ -258,9 +264,9 @@ class Scan:
     def _take_bearings(
         self, bearings: Bearings, tracks: np.ndarray, detection: np.ndarray
     ) -> None:
-        """Bearings belong to the echo they came with; the gate only keeps wild ones out."""
-        known = np.isfinite(bearings.z[detection, 0])
-        tracks, detection = tracks[known], detection[known]
+        """Bearings belong to the echo they came with; the gate only keeps outliers out."""
+        measured = np.isfinite(bearings.z[detection, 0])
+        tracks, detection = tracks[measured], detection[measured]
         if not len(tracks):
             return
         h, H = bearings.linearise(self.x[tracks], self.models.E)
@@ -276,7 +282,7 @@ class Scan:
         """Compare residuals with the stated covariance: E[r r' + H P H'] = R after the update,
         where R is right."""
         mean, covariance = self._expected(group, tracks)
-        residual = group.z[detection] - mean
+        residual = group.innovation(mean[:, None], detection)[:, 0]
         spread = residual[:, :, None] * residual[:, None, :] + covariance
         stated = group.R[detection] / group.factor
         total = float(np.trace(np.linalg.solve(stated, spread), axis1=-2, axis2=-1).sum())

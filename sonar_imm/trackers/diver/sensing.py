@@ -17,6 +17,7 @@ import numpy as np
 
 from ...acoustics import multistatic
 from ...acoustics.localisation import Localisation, localise
+from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray
 from ...measurements import Arrivals, Fix, Measurement
 from .config import DiverConfig
@@ -91,19 +92,24 @@ class RangeSums(Group):
 
 @frozen(eq=False, kw_only=True)
 class Bearings(Group):
-    """Bearings at one receiver (3,), radians."""
+    """Bearings at one receiver (3,), radians.
+
+    Those expected by the models of a track may exceed pi, so that they lie side by side and have a
+    mean and a spread.
+    """
 
     rx: FloatArray
 
     def linearise(self, x: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         position = np.einsum('jma,tja->tjm', E[:, :2], x)
+        bearing = multistatic.bearing(position, self.rx[None])
         return (
-            multistatic.bearing(position, self.rx[None]),
+            bearing[:, :1] + wrap_angle(bearing - bearing[:, :1]),
             multistatic.bearing_jacobian(position, self.rx[None]) @ E[:, :2],
         )
 
     def innovation(self, expected: FloatArray, detection: np.ndarray) -> FloatArray:
-        return multistatic.wrap_angle(super().innovation(expected, detection))
+        return wrap_angle(super().innovation(expected, detection))
 
 
 @frozen(eq=False, kw_only=True)

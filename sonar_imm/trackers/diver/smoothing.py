@@ -12,7 +12,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from .scan import cross, Divers
+from .scan import cross, DiverState
 from .tracker import DiverTracker
 
 LONGEST_GAP = 5
@@ -49,7 +49,7 @@ class SmoothingDiverTracker(DiverTracker):
 
     def reset(self) -> None:
         super().reset()
-        self._passed: dict[int, Divers] = {}
+        self._passed: dict[int, DiverState] = {}
         self._smoothed_repairs = 0
 
     def health(self) -> dict[str, float]:
@@ -57,8 +57,8 @@ class SmoothingDiverTracker(DiverTracker):
         health['covariance_repairs'] += self._smoothed_repairs
         return health
 
-    def _revise(self, item: Measurement) -> list[tuple[int, Divers]]:
-        revised = super()._revise(item)
+    def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
+        revised = super()._revise(measurement)
         self._passed.update(revised)
         return revised
 
@@ -80,7 +80,7 @@ class SmoothingDiverTracker(DiverTracker):
                     smooth[scan].x[row], smooth[scan].P[row], smooth[scan].mu[row] = x, P, mu
         return [self._estimate(scan) for scan in smooth]
 
-    def _passes(self, scans: Sequence[Divers]) -> list[tuple[int, _Pass]]:
+    def _passes(self, scans: Sequence[DiverState]) -> list[tuple[int, _Pass]]:
         """Each track, cut where a gap is too long to look across."""
         passes: list[tuple[int, _Pass]] = []
         newest: dict[int, _Pass] = {}

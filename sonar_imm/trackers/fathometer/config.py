@@ -5,12 +5,13 @@ from __future__ import annotations
 from functools import partial
 
 from attrs import frozen
-import numpy as np
 
 from ...acoustics.fathometer import PROCESSORS
 from ...acoustics.spectra import WINDOWS
 from ...estimation.set_particles import PRIORS
-from ...parameters import Config, parameter
+from ...parameters import inherited, parameter
+from ..model_checks import matrix_problems
+from ..shared_parameters import StampParameters
 
 live = partial(parameter, read_only=False)
 
@@ -19,26 +20,26 @@ PROPOSALS = ('data', 'prior')
 
 
 @frozen(kw_only=True)
-class FathometerConfig(Config):
+class FathometerConfig(StampParameters):
     """Everything the fathometer tracker can be told."""
 
     # -- array and sound --------------------------------------------------------------------------
     phones: int = parameter(
-        32, 'phones of the array; 0: as many as the first record has', low=0, high=256
+        32, 'hydrophones of the array; 0: as many as the first record has', low=0, high=256
     )
     element_spacing: float = parameter(
-        0.18, 'distance between phones', unit='m', low=1e-4, high=100.0
+        0.18, 'distance between hydrophones', unit='m', low=1e-4, high=100.0
     )
     sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
     array_depth: float = parameter(
         0.0,
-        'depth of the deepest phone, where neither the record nor a companion instrument tells; '
-        '0: depths are counted from it',
+        'depth of the deepest hydrophone, where neither the record nor a companion instrument '
+        'tells; 0: depths are counted from it',
         unit='m',
         low=0.0,
         high=12000.0,
     )
-    array_depth_age: float = parameter(
+    array_depth_age: float = live(
         30.0, 'a depth from the companion is used so long', unit='s', low=0.0, high=86400.0
     )
     array_depth_std: float = live(
@@ -70,7 +71,10 @@ class FathometerConfig(Config):
     # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
     loading: float = live(
-        1e-2, 'mvdr: diagonal loading, in units of the mean phone power', low=0.0, high=1e6
+        1e-2,
+        'mvdr: diagonal loading, in units of the mean power of a hydrophone',
+        low=0.0,
+        high=1e6,
     )
     white_noise_gain_db: float = live(
         -3.0,
@@ -156,7 +160,7 @@ class FathometerConfig(Config):
     )
     amplitude_prior: str = parameter(
         'marginal',
-        'amplitudes integrated out, or the best ones with a fine of log(N)/2 or log(N) for each',
+        'amplitudes integrated out, or the best ones with a penalty of log(N)/2 or log(N) each',
         choices=PRIORS,
     )
     amplitude_std_sigmas: float = parameter(
@@ -193,8 +197,12 @@ class FathometerConfig(Config):
         5, 'a reflector not seen for so many records gets a new id', low=0, high=10_000
     )
 
+    # -- time -------------------------------------------------------------------------------------
+    max_gap: float = inherited(StampParameters, 'max_gap', 30.0 * 86_400.0)
+    restart_after: int = inherited(StampParameters, 'restart_after', 3)
+
     def check(self) -> list[str]:
-        problems = []
+        problems = super().check()
         for low, high in (
             ('frequency_min', 'frequency_max'),
             ('noise_depth_min', 'noise_depth_max'),
@@ -205,8 +213,13 @@ class FathometerConfig(Config):
             problems.append('depth_max must exceed depth_min')
         if self.order_max < self.order_min:
             problems.append('order_max cannot be less than order_min')
-        elif self.order_transition_matrix:
-            problems += self._check_matrix()
+        else:
+            problems += matrix_problems(
+                self.order_transition_matrix,
+                self.orders,
+                f'order_min {self.order_min} to order_max {self.order_max}',
+                name='order_transition_matrix',
+            )
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
@@ -216,21 +229,6 @@ class FathometerConfig(Config):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
-
-    def _check_matrix(self) -> list[str]:
-        orders = self.orders
-        if len(self.order_transition_matrix) != orders * orders:
-            return [
-                f'order_transition_matrix needs {orders} x {orders} = {orders * orders} values '
-                f'for order_min {self.order_min} to order_max {self.order_max}, got '
-                f'{len(self.order_transition_matrix)}'
-            ]
-        sums = np.reshape(self.order_transition_matrix, (orders, orders)).sum(axis=1)
-        return [
-            f'row {row} of order_transition_matrix sums to {total:.6g}, not 1'
-            for row, total in enumerate(sums)
-            if abs(total - 1.0) > 1e-6
-        ]
 
     @property
     def orders(self) -> int:

@@ -4,6 +4,7 @@ import math
 
 from attrs import evolve
 from helpers.bathymetry_cases import floor
+from helpers.estimates import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -29,13 +30,6 @@ def run(snapshot, **values):
 def rmse(estimate, height):
     values = estimate.columns()['height']
     return float(np.sqrt(np.mean(np.square(values - height))))
-
-
-def same(one, other):
-    a, b = one.columns(), other.columns()
-    return list(a) == list(b) and all(
-        np.asarray(a[key]).tobytes() == np.asarray(b[key]).tobytes() for key in a
-    )
 
 
 # -- the columns ----------------------------------------------------------------------------------
@@ -92,11 +86,12 @@ def test_angle_and_height_say_the_same():
     assert 15.0 - depth == pytest.approx(table['height'], abs=1e-9)
 
 
-def test_a_label_is_the_likeliest_model():
-    estimate = run(floor(PATCH))
-    label = estimate.extras['label']
-    assert np.array_equal(label, estimate.probabilities.argmax(axis=1))
-    assert np.array_equal(estimate.extras['label_probability'], estimate.probabilities.max(axis=1))
+def test_labels_name_the_model_that_holds_and_how_sure_that_is():
+    """Label 1 is the model `rw_rough`, wherever that is more probable than not."""
+    table = run(floor(PATCH)).columns()
+    label, rough = table['label'], table['prob_rw_rough']
+    assert (label[rough > 0.5] == 1).all() and (label[rough < 0.5] == 0).all()
+    assert table['label_probability'] == pytest.approx(0.5 + np.abs(rough - 0.5), abs=1e-12)
     assert label[125:195].mean() > 0.9 and label[:100].mean() < 0.1
 
 

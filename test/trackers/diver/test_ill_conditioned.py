@@ -54,7 +54,7 @@ def test_covariances_stay_positive_definite(model_set):
                 assert np.isfinite(estimate.state).all()
                 assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
                 np.testing.assert_allclose(estimate.probabilities.sum(axis=1), 1.0, rtol=1e-12)
-            assert sound(tracker._history.state.P).all()
+            assert sound(tracker._stream.state.P).all()
         health = tracker.health()
         assert health['broken_tracks'] == 0
         repairs += health['covariance_repairs']
