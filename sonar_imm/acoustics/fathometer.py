@@ -180,11 +180,6 @@ def noise_sigma(b: FloatArray) -> float:
     return float(np.median(np.abs(finite - np.median(finite)))) / _MAD_OF_UNIT_NORMAL
 
 
-def expected_noise_sigma(snapshots: float, frequencies: int) -> float:
-    """1 / sqrt(2 L F): what `noise_sigma` of the conventional processor should be."""
-    return 1.0 / float(np.sqrt(2.0 * snapshots * frequencies))
-
-
 def _form(left: ComplexArray, R: ComplexArray, right: ComplexArray) -> ComplexArray:
     """left^H R right (F,)."""
     product = np.matmul(R, right[..., None].astype(R.dtype))[..., 0]

@@ -48,7 +48,8 @@ def check_transition_matrix(
 
 
 def stationary_law(P: FloatArray) -> FloatArray:
-    """The stationary distribution (M,): pi P = pi. ValueError when there is more than one."""
+    """Oracle for tests: the stationary distribution (M,), pi P = pi. ValueError when there is more
+    than one."""
     M = len(P)
     system = np.vstack([P.T - np.eye(M), np.ones(M)])
     if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
