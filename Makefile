@@ -19,11 +19,24 @@ TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
     NUMBA_CACHE_DIR=$(abspath $(VENV))/numba ROS_LOG_DIR=$(abspath $(VENV))/log
 JOBS ?= auto
 
+# A kernel type of OpenBLAS to test under, e.g. Prescott, Haswell or SkylakeX; empty: the one that
+# OpenBLAS chooses. `python test/helpers/kernel_types.py` lists those that this processor can run.
+CORETYPE ?=
+ifneq ($(CORETYPE),)
+TEST_ENV += OPENBLAS_CORETYPE=$(CORETYPE)
+endif
+
+# What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
+TESTS ?=
+# Tests that run the compiled kernels.
+KERNEL_TESTS := test/estimation test/acoustics test/trackers \
+    test/cli/test_bathymetry_vectors.py test/cli/test_fathometer_vectors.py
+
 # The environment stands alone: a sourced ROS 2 would mix its libraries with those of the wheels.
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-system lint docs bench clean
+.PHONY: help venv demo test test-core test-bounds test-system lint docs bench clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -47,8 +60,12 @@ demo: venv ## track a shipped bag with the live node and offline, score both, wr
 
 test: test-core test-system ## run every test
 
-test-core: venv ## run the tests that need no processes of their own, side by side (JOBS=...)
-	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' -n $(JOBS)
+test-core: venv ## run the tests that need no processes of their own (JOBS=... CORETYPE=... TESTS=...)
+	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' -n $(JOBS) $(TESTS)
+
+test-bounds: venv ## run the tests of the compiled kernels with every index checked
+	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
+	    $(BIN)/python -m pytest -m 'not system' -n $(JOBS) $(or $(TESTS),$(KERNEL_TESTS))
 
 test-system: venv ## run the tests that start real nodes, one at a time
 	$(TEST_ENV) $(BIN)/python -m pytest -m system

@@ -9,8 +9,8 @@ PACKAGE = 'sonar_imm'
 # Resolved, because `colcon build --symlink-install` runs a link to this file.
 ROOT = Path(__file__).resolve().parent
 
-# As in sonar_imm/trackers/__init__.py, which cannot be imported before its dependencies are here.
-SYSTEMS = ['bathymetry', 'diver', 'fathometer', 'obstacle']
+# By their folders, because sonar_imm.trackers cannot be imported before its dependencies are here.
+SYSTEMS = sorted(path.parent.name for path in (ROOT / PACKAGE / 'trackers').glob('*/tracker.py'))
 
 REQUIRES = [
     'attrs>=23.1',

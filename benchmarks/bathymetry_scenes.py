@@ -17,7 +17,7 @@ from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
 from msg_adapters.estimates import read_estimate
 from sonar_imm.evaluation.bathymetry.profiles import profiles_of
 from sonar_imm.evaluation.bathymetry.scoring import score
-from sonar_imm.recordings.truth import profile_record
+from sonar_imm.recordings.truth import records_of
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
@@ -64,7 +64,8 @@ def run(name: str, pings: int, seed: int) -> dict:
     scene = simulate(scenario(scene_name, {'pings': pings, **changes}), seed)
     tracker = BathymetryTracker(BathymetryConfig(**values))
     estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
-    truth = [read_estimate(profile_record(profile)[2]) for profile in scene.truth]
+    records = [record for true in scene.truth for record in records_of(true, '')]
+    truth = [read_estimate(message) for _, _, message in records]
     return score(profiles_of(estimates, truth))
 
 

@@ -69,7 +69,7 @@ def parameter_file(system: System) -> str:
 def node_specs(system: System) -> tuple[ParameterSpec, ...]:
     """Give what the live node of `system` can be told besides the parameters of its tracker."""
     own = {spec.name for spec in system.config_type().specs()}
-    specs = (*type_specs(system.name), *node_config_type(system.name).specs())
+    specs = (*type_specs(system.name), *node_config_type(system).specs())
     return tuple(spec for spec in specs if spec.name not in own)
 
 

@@ -24,11 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.measurements import CrossSpectra, Pressure, Rejection, Trace
+from sonar_imm.measurements.fathometer import MAX_FREQUENCIES, MAX_SAMPLES
 
 from .headers import Make, stamp_ns
 from .table import constant_column, decode_table, encode_table, require_columns, scalar_column
 
 Columns = Mapping[str, NDArray]
+_DEPTHS = ('array_depth', 'element_depth')
 
 
 def read_csdm(message: Any, *, world_frame: str = 'enu') -> CrossSpectra:
@@ -37,7 +39,8 @@ def read_csdm(message: Any, *, world_frame: str = 'enu') -> CrossSpectra:
     `world_frame` has no meaning here or in the other readers of this module: depths are positive
     downwards in any frame. Raises `Rejection`.
     """
-    columns = decode_table(message)
+    names = ('frequency', 'csdm', 'snapshots', *_DEPTHS)
+    columns = decode_table(message, names, most_rows=MAX_FREQUENCIES)
     require_columns(columns, ('frequency', 'csdm'), 'cross-spectra')
     csdm = _matrices(columns['csdm'])
     return CrossSpectra(
@@ -64,9 +67,9 @@ def write_csdm(record: CrossSpectra, make: Make) -> Any:
 
 def read_pressure(message: Any, *, world_frame: str = 'enu') -> Pressure:
     """Read a PointCloud2 of pressure samples. Raises `Rejection`."""
-    columns = decode_table(message)
+    columns = decode_table(message, ('p', 'scale', 'sample_rate', *_DEPTHS), most_rows=MAX_SAMPLES)
     require_columns(columns, ('p', 'sample_rate'), 'pressure')
-    samples = columns['p'].reshape(len(columns['p']), -1)
+    samples = _two_dimensional(columns['p'])
     if samples.dtype.kind in 'iu':
         require_columns(columns, ('scale',), 'pressure in whole numbers')
         scale = constant_column(columns, 'scale')
@@ -97,7 +100,8 @@ def write_pressure(block: Pressure, make: Make, *, scale: float | None = None) -
 
 def read_trace(message: Any, *, world_frame: str = 'enu') -> Trace:
     """Read a PointCloud2 of one trace. Raises `Rejection`."""
-    columns = decode_table(message)
+    names = ('depth', 'amplitude', 'sigma', 'array_depth')
+    columns = decode_table(message, names, most_rows=MAX_SAMPLES)
     require_columns(columns, ('depth', 'amplitude'), 'traces')
     return Trace(
         stamp_ns=stamp_ns(message),
@@ -156,6 +160,11 @@ def _matrices(values: NDArray) -> NDArray[np.complexfloating]:
     return paired.reshape(len(values), phones, phones)
 
 
+def _two_dimensional(column: NDArray) -> NDArray:
+    """(rows, count), also without a row and for a count of one."""
+    return column[:, None] if column.ndim == 1 else column
+
+
 def _snapshots(columns: Columns) -> int:
     """How many snapshots were averaged; 0: not known."""
     count = constant_column(columns, 'snapshots')
@@ -167,7 +176,7 @@ def _array_depth(columns: Columns, phones: int) -> float | None:
     depth = constant_column(columns, 'array_depth', zero_is_known=True)
     if depth is not None or 'element_depth' not in columns:
         return depth
-    depths = columns['element_depth'].reshape(len(columns['element_depth']), -1)
+    depths = _two_dimensional(columns['element_depth'])
     if depths.shape[1] != phones:
         raise Rejection(
             'bad_field', f'element_depth has {depths.shape[1]} values for {phones} phones'

@@ -13,16 +13,18 @@ from __future__ import annotations
 
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.measurements import Arrivals, Rejection
 
-from .headers import Make, stamp_ns, to_enu, wrap
+from .headers import Make, stamp_ns, swap_axes, to_enu, wrap
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
 REQUIRED = ('tx_id', 'rx_id', *_TX, *_RX, 'toa')
+COLUMNS = (*REQUIRED, 'var_toa', 'bearing', 'var_bearing')
 
 MAX_PAIRS = 10_000
 FARTHEST = 1e8
@@ -41,12 +43,10 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
     and finite become NaN (unknown). Raises `Rejection` when the table does not fit or no row is
     left.
     """
-    columns = decode_table(message)
+    columns = decode_table(message, COLUMNS, most_rows=MAX_PAIRS)
     require_columns(columns, REQUIRED, 'arrivals')
     values = {name: scalar_column(columns, name) for name in REQUIRED}
     rows = len(values['toa'])
-    if rows > MAX_PAIRS:
-        raise Rejection('too_large', f'arrivals of {rows} pairs; at most {MAX_PAIRS} are read')
     if not rows:
         raise Rejection('empty', 'the ping has no arrivals')
     tx = np.column_stack([values[name] for name in _TX])
@@ -66,7 +66,17 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
         bearing=_bearings(columns, rows)[keep],
         var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep],
     )
-    return to_enu(arrivals, world_frame)
+    return to_enu(arrivals, world_frame, _turned)
+
+
+def _turned(arrivals: Arrivals) -> Arrivals:
+    """The same ping in ENU, of one in NED, whose bearings go clockwise from north."""
+    return evolve(
+        arrivals,
+        tx=swap_axes(arrivals.tx),
+        rx=swap_axes(arrivals.rx),
+        bearing=wrap(np.pi / 2 - arrivals.bearing),
+    )
 
 
 def write_arrivals(arrivals: Arrivals, make: Make) -> Any:

@@ -22,19 +22,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Detections, Rejection
+from sonar_imm.measurements import BEAM_AXES, Detections, Rejection
 
 from .headers import Make, stamp_ns
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 MAX_DETECTIONS = 10_000
+COLUMNS = ('x', 'y', 'z', 'range', 'bearing', 'var_range', 'var_bearing', 'intensity')
 SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
 NEAREST, FARTHEST = 0.01, 1e5
 """Metres: no echo comes from nearer or farther."""
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
 """A stated variance outside is a field that was not filled in."""
-BEAM_AXES = ('marine', 'rep103', 'auto')
 
 
 def read_detections(message: Any, **_: Any) -> Detections:
@@ -42,7 +42,7 @@ def read_detections(message: Any, **_: Any) -> Detections:
 
     Raises `Rejection`.
     """
-    columns = decode_table(message)
+    columns = decode_table(message, COLUMNS, most_rows=MAX_DETECTIONS)
     if 'range' in columns or 'bearing' in columns:
         require_columns(columns, ('range', 'bearing'), 'detections')
         distance, bearing = scalar_column(columns, 'range'), scalar_column(columns, 'bearing')

@@ -7,11 +7,9 @@ covariance between position and velocity.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
@@ -29,9 +27,9 @@ def write_estimate(estimate: Estimate, make: Make) -> Any:
 
 
 def read_estimate(message: Any) -> Estimate:
-    """Read what `write_estimate` or `write_truth` wrote.
+    """Read what `write_estimate` wrote, or a table of truth.
 
-    Columns without a covariance, as in a truth table, come back as extras. Raises `Rejection`.
+    Columns without a covariance, as in truth, come back as extras. Raises `Rejection`.
     """
     columns = decode_table(message)
     require_columns(columns, ('x', 'y', 'z'), 'estimates')
@@ -41,72 +39,6 @@ def read_estimate(message: Any) -> Estimate:
         )
     except (ValueError, KeyError) as error:
         raise Rejection('missing_column', f'not an estimate table: {error}') from None
-
-
-def write_truth(
-    position: ArrayLike,
-    velocity: ArrayLike,
-    track_id: ArrayLike,
-    *,
-    stamp_ns: int,
-    frame_id: str,
-    make: Make,
-) -> Any:
-    """Write the truth at one stamp as the table ``x y z px py vx vy track_id``.
-
-    position: (n, 2) or (n, 3) metres; velocity: (n, 2) m/s, NaN where unknown; track_id: (n,).
-    """
-    place = np.asarray(position, np.float64)
-    speed = np.asarray(velocity, np.float64)
-    xyz = np.zeros((len(place), 3), np.float32)
-    xyz[:, : place.shape[1]] = place
-    columns: dict[str, NDArray] = dict(zip('xyz', xyz.T))
-    columns.update(
-        px=place[:, 0],
-        py=place[:, 1],
-        vx=speed[:, 0],
-        vy=speed[:, 1],
-        track_id=np.asarray(track_id, np.uint32),
-    )
-    return encode_table(columns, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
-
-
-def write_true_profile(
-    xyz: ArrayLike, columns: Mapping[str, ArrayLike], *, stamp_ns: int, frame_id: str, make: Make
-) -> Any:
-    """Write the true floor under one ping, one row a range bin: ``x y z``, then `columns`.
-
-    xyz: (n, 3) metres; columns: (n,) each, ``range height angle`` as f8, ``patch valid`` as u1.
-    """
-    table: dict[str, NDArray] = dict(zip('xyz', np.asarray(xyz, np.float32).reshape(-1, 3).T))
-    table.update((name, np.asarray(values)) for name, values in columns.items())
-    return encode_table(table, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
-
-
-def write_true_reflectors(
-    depth: ArrayLike,
-    amplitude: ArrayLike,
-    track_id: ArrayLike,
-    *,
-    stamp_ns: int,
-    frame_id: str,
-    make: Make,
-) -> Any:
-    """Write the true reflectors of one record as the table ``x y z depth amplitude track_id``.
-
-    depth: (K,) metres, down positive; amplitude, track_id: (K,); zero rows are fine.
-    """
-    z = -np.asarray(depth, np.float64)
-    zero = np.zeros(len(z), np.float32)
-    columns = {
-        'x': zero,
-        'y': zero,
-        'z': z.astype(np.float32),
-        'depth': -z,
-        'amplitude': np.asarray(amplitude, np.float64),
-        'track_id': np.asarray(track_id, np.uint32),
-    }
-    return encode_table(columns, stamp_ns=stamp_ns, frame_id=frame_id, make=make)
 
 
 def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.measurements import Fix, Rejection
 
-from .headers import Make, make_header, stamp_ns, to_enu
+from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
 
 UNKNOWN_VARIANCE = 1e6
 """Written for what is not estimated (m^2 or rad^2): zero would claim certainty."""
@@ -40,7 +41,13 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
         frame_id=str(message.header.frame_id),
     )
     check_size(fix)
-    return to_enu(fix, world_frame)
+    return to_enu(fix, world_frame, _turned)
+
+
+def _turned(fix: Fix) -> Fix:
+    """The same place in ENU, of a fix in NED."""
+    covariance = None if fix.covariance is None else fix.covariance[::-1, ::-1]
+    return evolve(fix, position=swap_axes(fix.position), covariance=covariance)
 
 
 def check_size(fix: Fix) -> None:

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sonar_imm.measurements import Altitude, ArrayDepth, Detections, Rejection
-
-ON_BOARD = (Altitude, Detections)
+from sonar_imm.measurements import frame_role, Rejection
 
 
 class FrameGuard:
@@ -26,9 +24,10 @@ class FrameGuard:
 
         One without a frame passes only until a frame is known. A depth is a depth in any frame.
         """
-        if isinstance(measurement, ArrayDepth):
+        role = frame_role(measurement)
+        if role == 'none':
             return
-        if isinstance(measurement, ON_BOARD):
+        if role == 'own':
             guard = self._on_board.setdefault(type(measurement), FrameGuard())
             guard._check(measurement, 'earlier ones')
         else:

@@ -7,14 +7,15 @@ this software is ENU.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from attrs import evolve
 import numpy as np
 
-from sonar_imm.measurements import Arrivals, Fix, Rejection
+from sonar_imm.measurements import Rejection
 
 Make = Callable[..., Any]
+M = TypeVar('M')
 
 WORLD_FRAMES = ('enu', 'ned')
 _NANO = 1_000_000_000
@@ -46,13 +47,15 @@ def make_header(stamp: int, frame_id: str, make: Make) -> Any:
     return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
 
 
-def to_enu(measurement: Any, world_frame: str) -> Any:
+def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:
     """Bring a measurement into ENU; `world_frame` is what it comes in: ``'enu'`` or ``'ned'``.
 
-    Raises `Rejection` when the frame says ``_ned`` but `world_frame` says ENU.
+    `turned` makes one in ENU of one in NED; a suffix ``_ned`` of the frame is dropped then. Raises
+    `Rejection` when the frame says ``_ned`` but `world_frame` says ENU.
     """
     if world_frame == 'ned':
-        return ned_to_enu(measurement)
+        frame_id = measurement.frame_id.removesuffix('_ned')
+        return evolve(turned(measurement), frame_id=frame_id)
     if world_frame != 'enu':
         raise ValueError(
             f"world_frame must be one of {', '.join(WORLD_FRAMES)}, got '{world_frame}'"
@@ -66,37 +69,11 @@ def to_enu(measurement: Any, world_frame: str) -> Any:
     return measurement
 
 
-def ned_to_enu(measurement: Any) -> Any:
-    """Turn a `Fix` or `Arrivals` given in north-east-down into east-north-up.
-
-    x and y change places and z changes sign; a bearing, clockwise from north in NED, becomes
-    counter-clockwise from east. A suffix ``_ned`` of the frame is dropped.
-    """
-    frame_id = measurement.frame_id.removesuffix('_ned')
-    if isinstance(measurement, Fix):
-        covariance = measurement.covariance
-        return evolve(
-            measurement,
-            frame_id=frame_id,
-            position=_swap(measurement.position),
-            covariance=None if covariance is None else covariance[::-1, ::-1],
-        )
-    if isinstance(measurement, Arrivals):
-        return evolve(
-            measurement,
-            frame_id=frame_id,
-            tx=_swap(measurement.tx),
-            rx=_swap(measurement.rx),
-            bearing=wrap(np.pi / 2 - measurement.bearing),
-        )
-    raise TypeError(f'no north-east-down rule for {type(measurement).__name__}')
-
-
 def wrap(angle: Any) -> Any:
     """Wrap an angle in radians into [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _swap(vector: Any) -> Any:
-    """Exchange the first two of three coordinates on the last axis and negate the third."""
+def swap_axes(vector: Any) -> Any:
+    """Turn coordinates (..., 3) of NED into ENU or back: x and y change places, z its sign."""
     return vector[..., [1, 0, 2]] * (1.0, 1.0, -1.0)

@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.measurements import Rejection, Snapshot
+from sonar_imm.measurements.bathymetry import MAX_BINS, MAX_STAVES
 
 from .headers import Make, stamp_ns
 from .table import constant_column, decode_table, encode_table, scalar_column
 
 CONSTANTS = ('sound_speed', 'frequency', 'element_spacing', 'sample_rate')
 VARIANCES = ('noise_variance', 'signal_variance')
+COLUMNS = ('range', 'time', 'iq', 're', 'im', *CONSTANTS, *VARIANCES)
 DEFAULT_SOUND_SPEED = 1500.0
 """m/s, for times without a sound speed, until the tracker says better (`Snapshot.ranges`)."""
 
@@ -34,7 +36,7 @@ def read_snapshot(message: Any, *, world_frame: str = 'enu') -> Snapshot:
     `world_frame` has no meaning here: a snapshot is in the frame of its array. Bins with samples
     that are not finite are kept and marked. Raises `Rejection`.
     """
-    columns = decode_table(message)
+    columns = decode_table(message, COLUMNS, most_rows=MAX_BINS * MAX_STAVES)
     if 're' in columns and 'im' in columns and 'iq' not in columns:
         columns = _organised(columns, int(message.height), int(message.width))
     if 'iq' not in columns:

@@ -8,7 +8,7 @@ really there before a byte is touched.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import lru_cache
 import math
 from typing import Any
@@ -25,20 +25,31 @@ DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: '
 _CODES = {name: code for code, name in DATATYPES.items()}
 
 MAX_FIELDS = 1024
+MAX_ROWS = 1 << 24
 MAX_BYTES = 1 << 28
 """Most bytes of decoded columns: fields may overlap and unfold a small message hugely."""
 
 
-def decode_table(message: Any) -> dict[str, NDArray]:
+def decode_table(
+    message: Any, names: Collection[str] | None = None, *, most_rows: int = MAX_ROWS
+) -> dict[str, NDArray]:
     """Decode a PointCloud2 into columns, in the order of its fields.
 
+    names: the columns to decode; the others are checked, cost nothing and are left out. None for
+    all. most_rows: more rows than this are refused before a column is made.
     Each column is a fresh array in native byte order: (rows,), or (rows, count) for a vector
     field; rows = height * width, row-major. Raises `Rejection` for anything that does not fit.
     """
     height, width = int(message.height), int(message.width)
     point_step, row_step = int(message.point_step), int(message.row_step)
+    if height * width > most_rows:
+        raise Rejection(
+            'too_large', f'the table has {height * width} rows; at most {most_rows} are read'
+        )
     data = _bytes_of(message.data)
     fields = _checked_fields(message.fields, point_step)
+    if names is not None:
+        fields = [field for field in fields if field[0] in names]
     if row_step < width * point_step:
         raise Rejection(
             'bad_layout',

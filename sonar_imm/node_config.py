@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from attrs import frozen
 
-from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic
 
-from .parameters import Config, parameter, ParameterSpec
-
-
-def _max_wait(default: float) -> Any:
-    return parameter(
-        default,
-        'a message that waited longer than this while the tracker was busy is dropped, '
-        'and counted, so that the output does not lag; 0: never',
-        unit='s',
-        low=0.0,
-        high=1e6,
-        read_only=False,
-    )
+from .parameters import Config, inherited, parameter, ParameterSpec
+from .trackers import System
 
 
 @frozen(kw_only=True)
@@ -30,7 +17,15 @@ class NodeConfig(Config):
     queue_depth: int = parameter(
         50, 'messages an input holds while the tracker is busy', low=1, high=100000
     )
-    max_wait: float = _max_wait(0.0)
+    max_wait: float = parameter(
+        0.0,
+        'a message that waited longer than this while the tracker was busy is dropped, '
+        'and counted, so that the output does not lag; 0: never',
+        unit='s',
+        low=0.0,
+        high=1e6,
+        read_only=False,
+    )
     frame_id: str = parameter(
         '', 'frame the input must be in; empty: that of the first message accepted'
     )
@@ -63,20 +58,18 @@ class NodeConfig(Config):
 class BathymetryNodeConfig(NodeConfig):
     """A swath is looked at while it is surveyed, and no ping needs the one before."""
 
-    max_wait: float = _max_wait(0.5)
+    max_wait: float = inherited(NodeConfig, 'max_wait', 0.5)
 
 
-_SPECIAL = {'bathymetry': BathymetryNodeConfig}
-
-
-def node_config_type(system: str) -> type[NodeConfig]:
+def node_config_type(system: System) -> type[NodeConfig]:
     """What the node of `system` can be told besides the parameters of its tracker."""
-    return _SPECIAL.get(system, NodeConfig)
+    found: type[NodeConfig] = globals()[system.node_config]
+    return found
 
 
 def type_specs(system: str) -> tuple[ParameterSpec, ...]:
     """The parameters ``<input>_type`` of the node of `system`."""
-    return tuple(spec for topic in INPUTS[system] if (spec := type_spec(topic)) is not None)
+    return tuple(spec for topic in inputs_of(system) if (spec := type_spec(topic)) is not None)
 
 
 def type_spec(topic: InputTopic) -> ParameterSpec | None:

@@ -8,6 +8,9 @@ A tracker is built from one frozen attrs class that derives from `Config`. Every
     class WalkerConfig(Config):
         speed: float = parameter(0.5, 'speed of the walker', unit='m/s', low=0.0)
 
+Parameters that several classes share stand in a base of theirs, written with ``slots=False`` so
+that a class can have several such bases; `inherited` gives one of them another default.
+
 `Config.from_mapping` builds a config from untrusted keys and reports *every* mistake in one
 sentence each; `Config.specs` lists what a node has to declare; `markdown_table` writes the table
 for the docs.
@@ -129,21 +132,33 @@ def parameter(
 
     `read_only=False` marks what a running node may change without losing its tracks.
     """
-    spec = ParameterSpec(
-        name='',
-        kind=kind or _kind_of(default),
-        default=default,
-        description=description,
-        unit=unit,
-        low=low,
-        high=high,
-        choices=choices,
-        read_only=read_only,
+    return _field(
+        ParameterSpec(
+            name='',
+            kind=kind or _kind_of(default),
+            default=default,
+            description=description,
+            unit=unit,
+            low=low,
+            high=high,
+            choices=choices,
+            read_only=read_only,
+        )
     )
-    return attrs.field(default=default, converter=_convert_quietly(spec), metadata={_KEY: spec})
 
 
-@frozen(kw_only=True)
+def inherited(base: type[Config], name: str, default: Any, **changes: Any) -> Any:
+    """The parameter `name` of `base` with another default, to be assigned to that name in a class
+    that derives from `base`.
+
+    changes: what else differs, e.g. ``unit`` or ``high``. Raises KeyError when `base` has no such
+    parameter.
+    """
+    spec = attrs.fields_dict(base)[name].metadata[_KEY]
+    return _field(attrs.evolve(spec, default=default, **changes))
+
+
+@frozen(kw_only=True, slots=False)
 class Config:
     """Base of every parameter set. Derive with ``@attrs.frozen(kw_only=True)``; override `check`
     for rules across fields."""
@@ -163,10 +178,21 @@ class Config:
 
     @classmethod
     def specs(cls) -> tuple[ParameterSpec, ...]:
+        """The parameters: those of the class itself, then those of each base, where an `inherited`
+        one stays among its neighbours."""
+        fields = attrs.fields_dict(cls)
+        declared = [
+            field.name
+            for owner in cls.__mro__
+            if attrs.has(owner)
+            for field in attrs.fields(owner)
+            if not field.inherited
+        ]
+        last = {name: place for place, name in enumerate(declared)}
         return tuple(
-            attrs.evolve(field.metadata[_KEY], name=field.name)
-            for field in attrs.fields(cls)
-            if _KEY in field.metadata
+            attrs.evolve(fields[name].metadata[_KEY], name=name)
+            for name in sorted(last, key=last.__getitem__)
+            if _KEY in fields[name].metadata
         )
 
     @classmethod
@@ -189,21 +215,6 @@ class Config:
         if problems:
             raise ConfigError(*problems)
         return cls(**known)
-
-    @classmethod
-    def lint(cls, values: Mapping[str, Any]) -> list[str]:
-        """Warnings about values that work offline but that a ROS 2 node refuses: a whole number
-        given to a double."""
-        specs = {spec.name: spec for spec in cls.specs()}
-        return [
-            f"parameter '{key}' is a double: write {float(value)!r} instead of {value!r}, "
-            'or ROS 2 refuses it'
-            for key, value in values.items()
-            if key in specs
-            and specs[key].kind == 'float'
-            and isinstance(value, int)
-            and not isinstance(value, bool)
-        ]
 
     def require_changeable(self, other: Config) -> None:
         """Raise ValueError naming the parameters of `other` that differ and are read-only."""
@@ -252,8 +263,12 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
         return {str(key): value for key, value in tree.items()}
     values: dict[str, Any] = {}
     for key, section in sections.items():
-        if key in ('/**', '/*') or not node_name or key.strip('/').split('/')[-1] == node_name:
-            values.update(section or {})
+        if not isinstance(section, (dict, type(None))):
+            kind = type(section).__name__
+            raise ConfigError(f'ros__parameters of {key} must hold a mapping, it holds a {kind}')
+        name = str(key).strip('/').split('/')[-1]
+        if key in ('/**', '/*') or not node_name or name == node_name:
+            values.update((str(one), value) for one, value in (section or {}).items())
     return values
 
 
@@ -274,6 +289,12 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """``" (did you mean 'x'?)"`` or an empty text."""
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ''
+
+
+def _field(spec: ParameterSpec) -> Any:
+    return attrs.field(
+        default=spec.default, converter=_convert_quietly(spec), metadata={_KEY: spec}
+    )
 
 
 def _kind_of(default: Any) -> str:

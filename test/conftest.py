@@ -4,7 +4,9 @@ import importlib.util
 import os
 import tempfile
 
+from helpers.kernel_types import in_effect
 import hypothesis
+import pytest
 
 # The same examples in every run: what fails here fails everywhere, and nowhere by chance.
 hypothesis.settings.register_profile('same', derandomize=True, deadline=None)
@@ -22,4 +24,17 @@ collect_ignore = [] if importlib.util.find_spec('rclpy') else ['nodes', 'system'
 
 
 def pytest_report_header():
-    return f'not collected, they need rclpy: {collect_ignore}' if collect_ignore else None
+    lines = [f'OpenBLAS kernels: {", ".join(sorted(in_effect())) or "unknown"}']
+    if collect_ignore:
+        lines.append(f'not collected, they need rclpy: {collect_ignore}')
+    return lines
+
+
+def pytest_sessionstart(session):
+    """A run that is asked for under one kernel type must not quietly be a run under another."""
+    wanted = os.environ.get('OPENBLAS_CORETYPE')
+    if wanted and {name.lower() for name in in_effect()} != {wanted.lower()}:
+        raise pytest.UsageError(
+            f'OPENBLAS_CORETYPE={wanted}, but in effect is '
+            f'{", ".join(sorted(in_effect())) or "nothing that can be asked"}'
+        )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterable, Mapping
+from functools import partial
 import importlib
 import importlib.util
 from pathlib import Path
@@ -196,6 +198,23 @@ def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None
     }
 
 
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    """No circle, also none that an import inside a function or for type checking closes."""
+    modules = {module_name(path): path for path in MODULES}
+    graph = {
+        name: {found for found in map(partial(known_module, modules), imports(path)) if found}
+        - {name}
+        for name, path in modules.items()
+    }
+    assert circle_of(graph) is None
+
+
+def test_the_circle_check_sees_circles() -> None:
+    assert circle_of({'a': {'b'}, 'b': {'c'}, 'c': set()}) is None
+    found = circle_of({'a': {'b'}, 'b': {'c'}, 'c': {'d'}, 'd': {'b'}})
+    assert found == ['b', 'c', 'd', 'b']
+
+
 def test_no_file_is_too_long() -> None:
     files = [
         path
@@ -221,20 +240,58 @@ def test_generated_files_are_up_to_date() -> None:
         assert found == text, f'{name} is out of date: run `make docs`'
 
 
-def test_every_system_has_a_node_scenes_inputs_and_recordings(
-    setup_lists: dict[str, list[str]],
-) -> None:
-    from msg_adapters.inputs import INPUTS
+def test_every_system_is_found_by_its_name() -> None:
+    """The record of a system names modules; each has to be there with what it is to provide."""
+    from msg_adapters.inputs import inputs_of
+    from sonar_imm.node_config import node_config_type, NodeConfig
     from sonar_imm.trackers import SYSTEMS
 
-    assert setup_lists['SYSTEMS'] == list(SYSTEMS) == list(INPUTS)
-    for system in SYSTEMS:
-        scenes = importlib.import_module(f'sonar_imm.simulation.{system}')
+    for name, system in SYSTEMS.items():
+        assert name == system.name and inputs_of(name)
+        assert issubclass(node_config_type(system), NodeConfig)
+        scenes = importlib.import_module(system.scenes)
         assert scenes.SCENARIOS and callable(scenes.scenario) and callable(scenes.simulate)
-        node = ROOT / 'sonar_imm' / 'nodes' / f'{system}.py'
+        assert callable(importlib.import_module(system.judge).judge)
+        assert importlib.import_module(system.benches).BENCHES
+        node = ROOT.joinpath(*system.node.split('.')).with_suffix('.py')  # importing needs rclpy
         assert '\ndef main(' in node.read_text(encoding='utf-8')
-        assert list((ROOT / 'bags').glob(f'{system}_*')), f'no recording of {system} is shipped'
-        assert f'## {system}_node' in (ROOT / 'docs' / 'topics.md').read_text(encoding='utf-8')
+        assert list((ROOT / 'bags').glob(f'{name}_*')), f'no recording of {name} is shipped'
+        assert f'## {name}_node' in (ROOT / 'docs' / 'topics.md').read_text(encoding='utf-8')
+
+
+def test_every_folder_of_a_system_is_listed_and_built() -> None:
+    """A folder that `SYSTEMS` does not know would never be used; setup.py goes by the folders."""
+    from sonar_imm.trackers import SYSTEMS
+
+    folders = {
+        room: {path.parent.name for path in (ROOT / room).glob('*/__init__.py')}
+        for room in ('sonar_imm/trackers', 'sonar_imm/simulation', 'sonar_imm/evaluation')
+    }
+    folders['msg_adapters/inputs'] = {
+        path.stem for path in (ROOT / 'msg_adapters' / 'inputs').glob('*.py')
+    } - {'__init__', 'topic'}
+    assert set(map(frozenset, folders.values())) == {frozenset(SYSTEMS)}, folders
+    text = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    (line,) = re.findall(r'^SYSTEMS = (.+)$', text, re.MULTILINE)
+    found = eval(line, {'ROOT': ROOT, 'PACKAGE': 'sonar_imm', 'sorted': sorted})
+    assert found == list(SYSTEMS)
+
+
+def test_only_the_record_lists_the_systems() -> None:
+    """Everything else finds them from `SYSTEMS`, or by the name of a folder."""
+    from sonar_imm.trackers import SYSTEMS
+
+    listing = set()
+    for path in MODULES:
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        words = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+        if len(words & set(SYSTEMS)) > 1:
+            listing.add(module_name(path))
+    assert listing == {'sonar_imm.trackers'}
+
+
+def kinds(value: object) -> object:
+    return [type(one) for one in value] if isinstance(value, list) else type(value)
 
 
 def test_default_parameter_file_holds_the_defaults() -> None:
@@ -245,7 +302,9 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         text = (ROOT / 'config' / f'{system.name}.yaml').read_text(encoding='utf-8')
         values = parameters_from_yaml(text, node_name=system.name)
         config = system.config_type()
-        assert config.lint(values) == []
+        for key, value in config().as_dict().items():
+            # ROS 2 refuses a whole number for a double.
+            assert kinds(values[key]) == kinds(value), key
         assert config.from_mapping(values, ignore_unknown=True) == config()
 
 
@@ -258,11 +317,12 @@ def test_readme_names_every_subcommand() -> None:
 
 
 def test_topics_page_names_every_input() -> None:
-    from msg_adapters.inputs import INPUTS
+    from msg_adapters.inputs import inputs_of
+    from sonar_imm.trackers import SYSTEMS
 
     page = (ROOT / 'docs' / 'topics.md').read_text(encoding='utf-8')
-    for topics in INPUTS.values():
-        for topic in topics:
+    for system in SYSTEMS:
+        for topic in inputs_of(system):
             for type_name in topic.readers:
                 row = rf'^\| `{topic.name}` \| .*{re.escape(type_name.split("/")[-1])}'
                 assert re.search(row, page, re.MULTILINE), f'{topic.name} {type_name}'
@@ -293,6 +353,32 @@ def distribution(requirement: str) -> str:
 def module_name(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix('').parts
     return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def known_module(modules: Iterable[str], name: str) -> str | None:
+    """The module of ours that a dotted name is or is defined in."""
+    while name and name not in modules:
+        name = name.rpartition('.')[0]
+    return name or None
+
+
+def circle_of(graph: Mapping[str, set[str]]) -> list[str] | None:
+    """A way from a module over its imports back to it, or None."""
+    done: set[str] = set()
+    way: list[str] = []
+
+    def visit(name: str) -> list[str] | None:
+        if name in way:
+            return [*way[way.index(name) :], name]
+        if name in done:
+            return None
+        way.append(name)
+        found = next(filter(None, map(visit, sorted(graph[name]))), None)
+        way.pop()
+        done.add(name)
+        return found
+
+    return next(filter(None, map(visit, sorted(graph))), None)
 
 
 def room_of(name: str) -> str | None:

@@ -1,15 +1,19 @@
 """The ``sonar-imm`` command: one small module a subcommand, loaded only when it is called.
 
 Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141
-nobody reads the output. What a user can get wrong ends in one line on standard error; a traceback
-is a bug.
+nobody reads the output, 129 and 143 ended by SIGHUP and SIGTERM. What a user can get wrong ends in
+one line on standard error; a traceback is a bug.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+import contextlib
 import os
+import signal
 import sys
+import threading
+from typing import NoReturn
 
 import click
 
@@ -51,6 +55,35 @@ def command(ctx: click.Context) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that turns errors into words."""
+    with _signals_unwind():
+        return _run(arguments)
+
+
+@contextlib.contextmanager
+def _signals_unwind() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP leave by way of every ``with``, as Ctrl-C does: a node that was
+    started would live on otherwise. A program that handles them itself is left alone."""
+    ours = []
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, _leave)
+                ours.append(number)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _leave(number: int, _frame: object) -> NoReturn:
+    # A second signal must not break off the way out.
+    for one in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(one, signal.SIG_IGN)
+    raise SystemExit(128 + number)
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     try:
         status = command.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
         if status == READER_GONE:

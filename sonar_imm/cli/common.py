@@ -114,7 +114,7 @@ def load_config(
 
     Raises `ConfigError` with one sentence for each mistake.
     """
-    types = (system.config_type(), node_config_type(system.name))
+    types = (system.config_type(), node_config_type(system))
     choices = {spec.name: spec for spec in type_specs(system.name)}
     values = _parameters_of(params, system.name) if params else {}
     specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices

@@ -239,7 +239,7 @@ def images(
     along. --set changes the detector: image_order, beam_axes, sound_speed, guard, training,
     false_alarm, min_range, max_detections.
     """
-    from msg_adapters.sonar_images import DetectorConfig
+    from ..trackers.obstacle.detector import DetectorConfig
 
     _convert(
         'images',

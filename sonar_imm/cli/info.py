@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import shlex
 from typing import Any
 
 import click
@@ -61,8 +62,8 @@ def _scans(scans: dict[str, int] | None) -> str:
 def _track_line(bag: str, system: str, inputs: dict[str, list[str]]) -> str:
     """The command that tracks the recording; topics are named where their names do not fit."""
     named = [
-        f' --topic {name}={topics[0]}'
+        f' --topic {shlex.quote(f"{name}={topics[0]}")}'
         for name, topics in inputs.items()
         if not any(topic.split('/')[-1] == name for topic in topics)
     ]
-    return f'sonar-imm track {bag} OUT_DIR --system {system}{"".join(named)}'
+    return f'sonar-imm track {shlex.quote(bag)} OUT_DIR --system {system}{"".join(named)}'

@@ -44,7 +44,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Write a bag of simulated measurements with their truth to OUT_BAG."""
-    scenes = import_module(f'sonar_imm.simulation.{system}')
+    scenes = import_module(SYSTEMS[system].scenes)
     if list_scenarios:
         _list(scenes, as_json)
         return

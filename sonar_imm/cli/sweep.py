@@ -98,7 +98,7 @@ def command(
     from ..recordings.own_parameters import unusual
     from .track import inputs_by_topic
 
-    scenes = import_module(f'sonar_imm.simulation.{system}')
+    scenes = import_module(SYSTEMS[system].scenes)
     name = scenario or next(iter(scenes.SCENARIOS))
     scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     config, node = load_config(SYSTEMS[system], params, {})

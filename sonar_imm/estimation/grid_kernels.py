@@ -22,12 +22,14 @@ TAIL = 1e-13
 COARSE_SIGMA = 8
 REACH = 7.0
 """A walk goes no further than so many sigma."""
+WIDEST = 1e9
+"""Walks are cut to this sigma in cells, wider than any grid: cell numbers stay integers."""
 
 
 @kernel
 def reach_of(sigma: float) -> int:
     """Cells a walk of `sigma` cells can cross."""
-    return int(math.ceil(REACH * sigma))
+    return int(math.ceil(REACH * (sigma if sigma < WIDEST else WIDEST)))
 
 
 @kernel
@@ -42,7 +44,9 @@ def walk(
     out_high: int,
 ) -> None:
     """Spread source [low, high) by a normal law of `sigma` cells into out [out_low, out_high),
-    which is overwritten. scratch (7, G + 16)."""
+    which is overwritten. scratch (7, max(G, 128) + 16) for a grid of G cells, whatever sigma is.
+    """
+    sigma = sigma if sigma < WIDEST else WIDEST  # NaN too
     for g in range(out_low, out_high):
         out[g] = 0.0
     factor = int(sigma / COARSE_SIGMA)
@@ -51,7 +55,8 @@ def walk(
         return
     inside, outside = scratch[0], scratch[1]
     a, b, c, d = scratch[3], scratch[4], scratch[5], scratch[6]
-    for k in range(factor):
+    # A coarse cell wider than the grid has no more fine cells than the grid.
+    for k in range(min(factor, max(high, out_high))):
         f = k / factor
         a[k] = -f * (f - 1.0) * (f - 2.0) / 6.0
         b[k] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0

@@ -43,6 +43,10 @@ import numpy as np
 from .arrays import FloatArray
 from .elementary import exponentials
 
+LEAST_CHANCE = 1e-290
+"""A model less probable than this before a measurement counts as one that nothing can become: the
+reciprocal of its probability could not be held."""
+
 
 class Updated(NamedTuple):
     """w (M, N) and mu (M,) after the measurement; log_likelihood of the measurement given those
@@ -59,8 +63,8 @@ def mix(
 ) -> tuple[FloatArray, FloatArray]:
     """Equally weighted x (M, n, N) for each model, and its predicted probability c (M,).
 
-    A model that nothing can become (c_j = 0) draws from the mixture of all, so that it stays
-    finite and can come back when the chain allows. uniform (M,) in [0, 1).
+    A model that nothing can become (c_j below `LEAST_CHANCE`) draws from the mixture of all, so
+    that it stays finite and can come back when the chain allows. uniform (M,) in [0, 1).
     """
     M, n, N = x.shape
     union = np.moveaxis(x, 1, 0).reshape(n, M * N)
@@ -69,7 +73,7 @@ def mix(
     for j in range(M):
         shares = transition[:, j] * mu
         c[j] = _total(shares)
-        if c[j] <= 0.0:
+        if not c[j] > LEAST_CHANCE:
             shares = mu
         # How many of the points (k + u) / N lie below each particle's share of the whole.
         totals = np.cumsum(np.append(0.0, shares * running[:, -1]))

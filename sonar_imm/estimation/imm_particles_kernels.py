@@ -10,6 +10,7 @@ import math
 
 from .arrays import FloatArray, IntArray
 from .elementary import exponentials, ROUND
+from .imm_particles import LEAST_CHANCE
 from .jit import kernel
 
 
@@ -32,6 +33,7 @@ def mix(
     The obvious walk along the cumulative weights has a branch that no processor can predict.
     Instead every particle writes its number where its copies begin, the last one to write at a
     place being the one that has copies there, and a running maximum fills the places between.
+    Weights that are not finite give meaningless particles, but no index outside of the arrays.
     """
     M, n, N = x.shape
     for i in range(M):
@@ -43,14 +45,15 @@ def mix(
         c[j], total = 0.0, 0.0
         for i in range(M):
             c[j] += transition[i, j] * mu[i]
+        possible = c[j] > LEAST_CHANCE
         for i in range(M):
-            share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
+            share = transition[i, j] * mu[i] if possible else mu[i]
             total += share * running[i, N - 1]
         for k in range(N + 1):
             origin[k] = 0
         begin, before, scale = 0, 0.0, N / total
         for i in range(M):
-            share = transition[i, j] * mu[i] if c[j] > 0.0 else mu[i]
+            share = transition[i, j] * mu[i] if possible else mu[i]
             row = running[i]
             for s in range(N):
                 point = (before + share * row[s]) * scale - uniform[j]
@@ -59,7 +62,7 @@ def mix(
             before += share * running[i, N - 1]
             for s in range(N):
                 origin[begin] = i * N + s
-                begin = min(int(points[s]), N)
+                begin = int(points[s]) if points[s] < N else N
         source = 0
         for k in range(N):
             source = max(source, origin[k])

@@ -21,18 +21,20 @@ from .arrays import FloatArray
 _CACHED_STEPS = 256
 
 
-def check_transition_matrix(matrix: ArrayLike, *, atol: float = 1e-6) -> FloatArray:
-    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError when it is not a
-    transition matrix."""
+def check_transition_matrix(
+    matrix: ArrayLike, *, atol: float = 1e-6, name: str = 'the transition matrix'
+) -> FloatArray:
+    """Return `matrix` as (M, M) float64 with rows renormalised to one; ValueError, which calls it
+    `name`, when it is not a transition matrix."""
     P = np.array(matrix, dtype=np.float64)
     if P.ndim != 2 or P.shape[0] != P.shape[1] or not len(P):
-        raise ValueError(f'a transition matrix is square, this one has shape {P.shape}')
+        raise ValueError(f'{name} has to be square, its shape is {P.shape}')
     if not np.isfinite(P).all() or (P < 0.0).any() or (P > 1.0 + atol).any():
-        raise ValueError('a transition matrix holds probabilities between 0 and 1')
+        raise ValueError(f'{name} has to hold probabilities between 0 and 1')
     sums = P.sum(axis=1)
     worst = int(np.argmax(np.abs(sums - 1.0)))
     if abs(sums[worst] - 1.0) > atol:
-        raise ValueError(f'row {worst} of the transition matrix sums to {sums[worst]:.6g}, not 1')
+        raise ValueError(f'row {worst} of {name} sums to {sums[worst]:.6g}, not 1')
     return P / sums[:, None]
 
 
@@ -121,6 +123,13 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
     G = np.clip(G, 0.0, None)
     np.fill_diagonal(G, -G.sum(axis=1))
     return G
+
+
+def persistent(models: int, stay: float) -> FloatArray:
+    """(M, M): a model is kept with probability `stay`, else each other one is as probable."""
+    P = np.full((models, models), (1.0 - stay) / max(models - 1, 1))
+    np.fill_diagonal(P, stay if models > 1 else 1.0)
+    return P
 
 
 def persistent_headings(directions: int, stay: float, concentration: float) -> FloatArray:

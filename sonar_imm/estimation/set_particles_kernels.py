@@ -160,7 +160,7 @@ def propagate(
     log_ratio: FloatArray,
 ) -> None:
     """See `set_particles.propagate`; transition (orders, orders) is cumulative along rows."""
-    orders, width = transition.shape[0], move.shape[1]
+    orders, (cells, width) = transition.shape[0], move.shape
     parent = np.empty(cell.shape[1], np.int64)
     for i in range(first, last):
         before, u, here = old_order[i], uniform[i], cell[i]
@@ -179,7 +179,8 @@ def propagate(
             table = move[z]
             step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
             ratio += move_ratio[z, step]
-            z += step - width // 2
+            # What leaves the lattice is impossible already; its number must stay an index.
+            z = min(max(z + step - width // 2, 0), cells - 1)
             j = k
             while j > 0 and here[j - 1] > z:
                 here[j], parent[j] = here[j - 1], parent[j - 1]

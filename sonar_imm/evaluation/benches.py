@@ -1,6 +1,6 @@
 """Benches: what ``sonar-imm bench`` measures, each system its own.
 
-A module named in `BENCHES` provides ``BENCHES``, a tuple of `Bench`. How long a live node takes is
+The module `System.benches` provides ``BENCHES``, a tuple of `Bench`. How long a live node takes is
 measured for every system alike, by the command.
 """
 
@@ -12,13 +12,7 @@ from typing import Any
 
 from attrs import frozen
 
-BENCHES = {
-    'bathymetry': 'sonar_imm.evaluation.bathymetry.bench',
-    'diver': 'sonar_imm.evaluation.diver.bench',
-    'fathometer': 'sonar_imm.evaluation.fathometer.bench',
-    'obstacle': 'sonar_imm.evaluation.obstacle.bench',
-}
-"""Module by system. A new system adds its line here."""
+from ..trackers import SYSTEMS
 
 
 @frozen
@@ -37,4 +31,5 @@ class Bench:
 
 def benches_of(system: str) -> tuple[Bench, ...]:
     """What is measured of one system."""
-    return import_module(BENCHES[system]).BENCHES
+    found: tuple[Bench, ...] = import_module(SYSTEMS[system].benches).BENCHES
+    return found

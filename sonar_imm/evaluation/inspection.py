@@ -11,10 +11,11 @@ from attrs import define, field
 import numpy as np
 
 from msg_adapters.headers import stamp_ns
-from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic
 
 from ..measurements import Rejection
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
+from ..trackers import SYSTEMS
 from . import SECOND
 
 LONG_GAP = 10.0
@@ -93,8 +94,8 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
         return []
     return [
         (system, entry)
-        for system, entries in INPUTS.items()
-        for entry in entries
+        for system in SYSTEMS
+        for entry in inputs_of(system)
         if item.type_name in entry.readers
         and (not entry.companion or item.topic.split('/')[-1] == entry.name)
     ]
@@ -132,7 +133,7 @@ def _holds_scans(heard: _Heard) -> bool:
     return _is_truth(heard.topic.name) or any(
         entry.scans
         for system, name in heard.good
-        for entry in INPUTS[system]
+        for entry in inputs_of(system)
         if entry.name == name
     )
 
@@ -185,8 +186,8 @@ def _systems(topics: list[dict[str, Any]]) -> dict[str, dict[str, list[str]]]:
             systems.setdefault(system, {}).setdefault(name, []).append(topic['name'])
     companions = {
         (system, entry.name)
-        for system, entries in INPUTS.items()
-        for entry in entries
+        for system in SYSTEMS
+        for entry in inputs_of(system)
         if entry.companion
     }
     return {

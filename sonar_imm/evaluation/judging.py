@@ -1,7 +1,7 @@
 """Judges: what is said of a finished run, each system in its own terms.
 
 How far a diver's track lies from the diver is one question, how well a sea floor was drawn is
-another. So each system has a module that judges its runs, named in `JUDGES`, which provides
+another. So each system has a module that judges its runs, `System.judge`, which provides
 
 - ``judge(folder, options) -> Judgement``: reads the run and the truth, scores, finds the words;
 - ``LIMIT``: the `Limit` that the error of a shipped recording has to stay within.
@@ -18,19 +18,13 @@ from typing import Any, Protocol, TYPE_CHECKING
 
 from attrs import frozen
 
-if TYPE_CHECKING:
+from ..trackers import SYSTEMS
+from .run_folder import RunFolder
+
+if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
     from .page import Part
-    from .run_folder import RunFolder
 
 TRUTH_GAP = 60.0
-
-JUDGES = {
-    'bathymetry': 'sonar_imm.evaluation.bathymetry',
-    'diver': 'sonar_imm.evaluation.diver',
-    'fathometer': 'sonar_imm.evaluation.fathometer',
-    'obstacle': 'sonar_imm.evaluation.obstacle',
-}
-"""Module by system. A new system adds its line here."""
 
 
 @frozen
@@ -96,7 +90,7 @@ class Judgement:
 
 
 class Judge(Protocol):
-    """What a module in `JUDGES` provides."""
+    """What the module `System.judge` provides."""
 
     LIMIT: Limit
 
@@ -107,5 +101,5 @@ class Judge(Protocol):
 
 def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
     """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
-    one: Judge = import_module(JUDGES[folder.read_run()['system']])
+    one: Judge = import_module(SYSTEMS[folder.read_run()['system']].judge)
     return one.judge(folder, options or JudgeOptions())

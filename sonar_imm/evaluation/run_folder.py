@@ -33,8 +33,8 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
-from ..recordings.writer import BagWriter, ros_message
-from .judging import JUDGES
+from ..recordings.writer import BagWriter, naming, ros_message
+from ..trackers import SYSTEMS
 
 BAG, CSV, RUN, METRICS, REPORT = (
     'estimate',
@@ -101,7 +101,7 @@ class RunFolder:
             run = json.loads(path.read_text(encoding='utf-8'))
             if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
                 raise ValueError('keys are missing')
-            if run['system'] not in JUDGES:
+            if run['system'] not in SYSTEMS:
                 raise ValueError(f"there is no system '{run['system']}'")
         except (ValueError, AttributeError, TypeError) as error:
             raise BagError(f'{path} cannot be understood: {error}') from None
@@ -116,6 +116,7 @@ class CsvTable:
     """estimate.csv, a row an estimate row; floats as the shortest text that reads back exactly."""
 
     def __init__(self, path: Path):
+        self._path = path
         self._file = path.open('w', encoding='utf-8', newline='')
         self._writer = csv.writer(self._file, lineterminator='\n')
         self._names: list[str] | None = None
@@ -124,7 +125,8 @@ class CsvTable:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        with naming(self._path):
+            self._file.close()
 
     def write(self, estimate: Estimate) -> None:
         """Append the rows of one estimate. Raises ValueError when the columns change."""
@@ -134,8 +136,9 @@ class CsvTable:
             self._writer.writerow(['stamp_ns', *columns])
         elif self._names != list(columns):
             raise ValueError('the columns change from one estimate to another')
-        for row in zip(*(column.tolist() for column in columns.values())):
-            self._writer.writerow([estimate.stamp_ns, *row])
+        with naming(self._path):
+            for row in zip(*(column.tolist() for column in columns.values())):
+                self._writer.writerow([estimate.stamp_ns, *row])
 
 
 def read_truth(

@@ -89,7 +89,7 @@ def run_seed(sweep: Sweep, seed: int, within: str | None = None) -> Outcome:
 def _run(sweep: Sweep, seed: int, place: Path) -> Outcome:
     if sweep.version != __version__:
         raise ConfigError(f'the worker has sonar_imm {__version__}, the sweep {sweep.version}')
-    scenes = import_module(f'sonar_imm.simulation.{sweep.system}')
+    scenes = import_module(SYSTEMS[sweep.system].scenes)
     bag, folder = place / 'scene', RunFolder(place / 'run')
     write_scene(scenes.simulate(sweep.scene, seed), bag, provenance={'seed': str(seed)})
     with BagReader(bag) as reader:

@@ -8,20 +8,23 @@ makes them from messages.
 from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
-from .checks import check_covariance, check_stamp, nanoseconds, Rejection
+from .checks import check_covariance, check_stamp, frame_role, nanoseconds, Rejection
 from .diver import Arrivals, Fix
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
-from .obstacle import Altitude, Detections, Navigation
+from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
 
 __all__ = [
     'Altitude',
     'ArrayDepth',
     'Arrivals',
+    'BEAM_AXES',
     'check_covariance',
     'check_stamp',
     'CrossSpectra',
     'Detections',
     'Fix',
+    'frame_role',
+    'IMAGE_ORDERS',
     'MAX_BINS',
     'Measurement',
     'nanoseconds',
@@ -29,6 +32,7 @@ __all__ = [
     'Pressure',
     'Rejection',
     'Snapshot',
+    'SonarImage',
     'Trace',
 ]
 

@@ -40,6 +40,14 @@ def nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
+def frame_role(measurement: Any) -> str:
+    """Whose frame a measurement is in, as its class says by `FRAME`: ``'world'``, that of the
+    tracks, where it says nothing; ``'own'``, that of its sensor on the vehicle; ``'none'``, when
+    it is the same in any frame."""
+    role: str = getattr(type(measurement), 'FRAME', 'world')
+    return role
+
+
 def check_stamp(stamp_ns: int) -> None:
     """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
     2262."""

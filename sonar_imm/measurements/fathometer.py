@@ -7,7 +7,7 @@ whoever uses the measurement (`alive`), and only when too few are left is the me
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from attrs import field, frozen
 import numpy as np
@@ -49,6 +49,8 @@ def _samples(value: Any) -> NDArray[np.float32]:
 @frozen(eq=False, kw_only=True)
 class ArrayDepth:
     """How deep phone 0, the deepest, was at one instant: depth in m, down positive."""
+
+    FRAME: ClassVar[str] = 'none'
 
     stamp_ns: int
     depth: float

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, floats, Rejection
+
+BEAM_AXES = ('marine', 'rep103', 'auto')
+"""What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
+which of the two the beams point along."""
+IMAGE_ORDERS = ('range_major', 'beam_major')
+"""How the samples of an image may lie: all beams of a range together, or all ranges of a beam."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -18,6 +26,8 @@ class Detections:
     intensity: (n,), NaN where unknown. Columns left out are unknown. A row without a finite range
     and bearing is no echo.
     """
+
+    FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
     range: FloatArray = field(converter=floats(None))
@@ -42,6 +52,20 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.range)
+
+
+@frozen(eq=False, kw_only=True)
+class SonarImage:
+    """A ping of a forward-looking sonar before detection; no tracker takes it in.
+
+    range (R,) m and bearing (B,) rad, positive to port, of the magnitudes amplitude (R, B).
+    """
+
+    stamp_ns: int
+    range: FloatArray
+    bearing: FloatArray
+    amplitude: FloatArray
+    frame_id: str = ''
 
 
 @frozen(eq=False, kw_only=True)
@@ -86,6 +110,8 @@ class Navigation:
 @frozen(eq=False, kw_only=True)
 class Altitude:
     """How high above the sea floor the vehicle was, metres; variance m^2, NaN when unknown."""
+
+    FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
     altitude: float

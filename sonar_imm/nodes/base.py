@@ -36,7 +36,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
 from msg_adapters.frames import FrameGuard
-from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
@@ -62,9 +62,9 @@ class TrackerNode(Node):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(system, **options)
-        self._topics = INPUTS[system]
+        self._topics = inputs_of(system)
         config_type = SYSTEMS[system].config_type()
-        self._node_config_type = node_config_type(system)
+        self._node_config_type = node_config_type(SYSTEMS[system])
         self._settings = NodeParameters(
             self, (config_type, self._node_config_type), type_specs(system)
         )

@@ -14,10 +14,11 @@ from attrs import frozen
 from rclpy.node import Node
 
 from msg_adapters.detections import write_detections
-from msg_adapters.sonar_images import detect, DetectorConfig, IMAGE_TYPES
+from msg_adapters.sonar_images import IMAGE_TYPES, read_sonar_image
 
 from ..measurements import Rejection
 from ..parameters import Config, ConfigError, parameter
+from ..trackers.obstacle.detector import detect, DetectorConfig
 from .base import run
 from .messages import make, message_class
 from .parameters import NodeParameters
@@ -54,7 +55,8 @@ class FlsDetectorNode(Node):
     def receive(self, message: Any) -> None:
         """Detect and publish; an image that cannot be used is refused, said once a reason."""
         try:
-            detections = detect(message, self._config)
+            image = read_sonar_image(message, **self._config.reading())
+            detections = detect(image, self._config)
         except Rejection as rejection:
             if rejection.reason not in self.refused:
                 self.get_logger().warning(f'an image is refused: {rejection.sentence} (said once)')

@@ -25,6 +25,7 @@ from msg_adapters.inputs import InputTopic
 from ..estimates import Estimate
 from ..recordings.measurements import fitting_topics
 from ..recordings.reader import BagReader
+from ..trackers import SYSTEMS
 from .link import Link, LinkError
 from .lockstep import Counts, LockStep, Recorder
 from .player import NAME, Player, PlayOptions
@@ -131,7 +132,7 @@ class NodeProcess:
             [
                 sys.executable,
                 '-m',
-                module or f'sonar_imm.nodes.{system}',
+                module or SYSTEMS[system].node,
                 '--ros-args',
                 '-r',
                 f'__node:={system}',

@@ -30,6 +30,15 @@ _RECORD = struct.Struct('<BQ')
 _CHUNK_HEAD = struct.Struct('<QQQI')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
 _UNCHUNKED = -1
+MAX_UNPACKED = 1 << 27
+"""Most bytes that a chunk or a message may unpack to: a few hundred bytes can claim gigabytes."""
+
+
+_TOO_LARGE = f'unpacks to more than {MAX_UNPACKED >> 20} MiB'
+
+
+class TooLargeError(ValueError):
+    """Packed bytes that would unpack to more than `MAX_UNPACKED`."""
 
 
 class Channel(NamedTuple):
@@ -57,7 +66,7 @@ class McapScan:
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._log, self._channel = array('Q'), array('H')
         self._block, self._start, self._length = array('q'), array('Q'), array('Q')
-        self._chunk = lru_cache(maxsize=8)(self._read_chunk)
+        self._chunk = lru_cache(maxsize=2)(self._read_chunk)
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
                 raise ValueError('it does not start like an MCAP file')
@@ -133,7 +142,10 @@ class McapScan:
             _, _, size, checksum = _CHUNK_HEAD.unpack_from(content)
             compression, at = _text(content, _CHUNK_HEAD.size)
             packed = content[at + 8 :]
-            records = _unpack(packed, compression)
+            records = unpack(packed, compression)
+        except TooLargeError:
+            self._lose(f'has a chunk at byte {position} that {_TOO_LARGE}')
+            return b''
         except (struct.error, UnicodeDecodeError, KeyError, RuntimeError, zstd.ZstdError):
             self._lose(f'has a damaged chunk at byte {position}')
             return b''
@@ -172,15 +184,61 @@ class McapScan:
         self.lost = self.lost or what
 
 
-def _unpack(packed: bytes, compression: str) -> bytes:
-    """Decompress; a streaming decompressor gives what it has when its input ends early."""
+def unpack(packed: bytes, compression: str) -> bytes:
+    """Decompress; a streaming decompressor gives what it has when its input ends early.
+
+    Raises `TooLargeError` as soon as more than `MAX_UNPACKED` bytes come out, KeyError for an
+    unknown compression.
+    """
     if compression == 'zstd':
-        return zstd.ZstdDecompressor().decompress(packed)
-    if compression == 'lz4':
-        return lz4.frame.LZ4FrameDecompressor().decompress(packed)
-    if compression:
+        stream = zstd.ZstdDecompressor()
+    elif compression == 'lz4':
+        stream = lz4.frame.LZ4FrameDecompressor()
+    elif compression:
         raise KeyError(compression)
-    return packed
+    else:
+        return packed
+    content = stream.decompress(packed, MAX_UNPACKED + 1)
+    if len(content) > MAX_UNPACKED:
+        raise TooLargeError(f'it {_TOO_LARGE}')
+    return content
+
+
+def oversized_chunk(path: Path) -> str:
+    """What is wrong with an MCAP file a chunk of which unpacks to more than `MAX_UNPACKED` bytes;
+    empty for a good file. The heads of the chunks tell, as a rule without unpacking any."""
+    with path.open('rb') as file:
+        size = path.stat().st_size
+        position = len(MAGIC)
+        while position + _RECORD.size <= size:
+            file.seek(position)
+            code, length = _RECORD.unpack(file.read(_RECORD.size))
+            if code in (0, _DATA_END, _FOOTER):
+                break
+            if code == _CHUNK and _unpacks_to_too_much(file.read(min(length, size))):
+                return f'a chunk at byte {position} {_TOO_LARGE}'
+            position += _RECORD.size + length
+    return ''
+
+
+def _unpacks_to_too_much(chunk: bytes) -> bool:
+    """Damage of any other kind is left to the reader."""
+    try:
+        stated = _CHUNK_HEAD.unpack_from(chunk)[2]
+        compression, at = _text(chunk, _CHUNK_HEAD.size)
+        packed = chunk[at + 8 :]
+        framed = stated
+        if compression == 'zstd':
+            framed = zstd.get_frame_info(packed).decompressed_size
+        elif compression == 'lz4':
+            framed = lz4.frame.get_frame_info(packed)['content_size'] or None
+        if framed is None:
+            framed = len(unpack(packed, compression))
+    except TooLargeError:
+        return True
+    except (struct.error, UnicodeDecodeError, RuntimeError, zstd.ZstdError):
+        return False
+    return max(stated, framed) > MAX_UNPACKED
 
 
 def _text(content: bytes, at: int) -> tuple[str, int]:

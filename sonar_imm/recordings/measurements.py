@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from msg_adapters.inputs import INPUTS, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic
 
 from ..measurements import Rejection
 from ..parameters import did_you_mean
@@ -42,14 +42,14 @@ def fitting_topics(
     fitting = {
         topic.name: entry
         for topic in bag.topics
-        for entry in INPUTS[system]
+        for entry in inputs_of(system)
         if _can_read(topic, entry)
         and topic.name.split('/')[-1] == entry.name
         and 'truth' not in topic.name.split('/')[:-1]
     }
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
-    for entry in INPUTS[system]:
+    for entry in inputs_of(system):
         names = [name for name, its in fitting.items() if its is entry]
         if entry.one_topic and len(names) > 1:
             raise BagError(
@@ -101,7 +101,7 @@ def measurements_of(
 
 def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
     """Check one entry of a topic map."""
-    entries = {entry.name: entry for entry in INPUTS[system]}
+    entries = {entry.name: entry for entry in inputs_of(system)}
     if wanted not in entries:
         raise BagError(
             f"the {system} tracker has no input '{wanted}'"
@@ -125,14 +125,14 @@ def _can_read(topic: TopicInfo, entry: InputTopic) -> bool:
 
 def _nothing_fits(bag: BagReader, system: str) -> str:
     """Say what was looked for, what is there, and what could be meant."""
-    wanted = ' or '.join(f"'{entry.name}'" for entry in INPUTS[system])
+    wanted = ' or '.join(f"'{entry.name}'" for entry in inputs_of(system))
     if not bag.topics:
         return f'{bag.path} is empty: it has no topics'
     there = ', '.join(f'{topic.name} ({topic.type_name})' for topic in bag.topics)
     maybe = [
         f'{topic.name} as {entry.name}'
         for topic in bag.topics
-        for entry in INPUTS[system]
+        for entry in inputs_of(system)
         if _can_read(topic, entry) and not entry.companion and 'truth' not in topic.name.split('/')
     ]
     hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''

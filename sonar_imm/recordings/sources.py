@@ -14,7 +14,7 @@ from attrs import frozen
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
-from .mcap_scan import McapScan, zstd
+from .mcap_scan import McapScan, oversized_chunk, unpack
 from .messages import decode_cdr, typestore
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
@@ -78,9 +78,16 @@ class RosbagsSource:
     """A bag directory or storage file read by rosbags."""
 
     def __init__(self, path: Path):
+        files = path.glob('*.mcap') if path.is_dir() else [path]
+        for file in files:
+            if file.suffix == '.mcap' and (oversized := oversized_chunk(file)):
+                raise BagError(oversized)
         place = _FolderPath(path) if path.is_dir() else path
         self._reader = AnyReader([place], default_typestore=typestore())
         self._reader.open()
+        if not all(isinstance(link.msgcount, int) for link in self._reader.connections):
+            self._reader.close()
+            raise BagError('metadata.yaml has a message count that is no number')
         # rosbags ignores its default types as soon as the bag defines a single one
         _add_known_types(
             self._reader.typestore, [link.msgtype for link in self._reader.connections]
@@ -259,7 +266,7 @@ def _open_file(file: Path) -> tuple[Source, list[str]]:
 
 def _unpacked(raw: bytes) -> bytes:
     """Undo message compression, which only a missing metadata.yaml would have told about."""
-    return zstd.decompress(raw) if raw[:4] == _ZSTD_MAGIC else bytes(raw)
+    return unpack(raw, 'zstd') if raw[:4] == _ZSTD_MAGIC else bytes(raw)
 
 
 def _leftovers(path: Path) -> list[str]:

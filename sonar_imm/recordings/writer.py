@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+import contextlib
 from pathlib import Path
+import sqlite3
 from typing import Any
 
 from rosbags.interfaces import (
@@ -20,7 +22,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from .messages import ros_message, typestore
 from .sources import BagError
 
-__all__ = ['BagWriter', 'ros_message', 'STORAGES']
+__all__ = ['BagWriter', 'naming', 'ros_message', 'STORAGES']
 
 STORAGES = ('mcap', 'sqlite3')
 
@@ -35,6 +37,20 @@ _RELIABLE = Qos(
     QosTime(0, 0),
     False,
 )
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Say of which file an error of the operating system is, such as a full disk, where the system
+    itself does not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename:
+            raise
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+    except sqlite3.OperationalError as error:
+        raise BagError(f'{path} cannot be written: {error}') from None
 
 
 class BagWriter:
@@ -77,7 +93,8 @@ class BagWriter:
 
     def close(self) -> None:
         """Finish the bag: index and metadata."""
-        self._writer.close()
+        with naming(self.path):
+            self._writer.close()
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""
@@ -88,11 +105,15 @@ class BagWriter:
         """Append a message that is CDR already. Raises ValueError for a log time before 1970."""
         if log_ns < 0:
             raise ValueError(f'a recording cannot hold the log time {log_ns} ns')
+        with naming(self.path):
+            self._writer.write(self._link(topic, type_name), log_ns, raw)
+        self.count += 1
+
+    def _link(self, topic: str, type_name: str) -> Connection:
         link = self._links.get((topic, type_name))
         if link is None:
             link = self._writer.add_connection(
                 topic, type_name, typestore=typestore(), offered_qos_profiles=[_RELIABLE]
             )
             self._links[topic, type_name] = link
-        self._writer.write(link, log_ns, raw)
-        self.count += 1
+        return link

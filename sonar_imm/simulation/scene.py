@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from attrs import frozen
 import numpy as np
@@ -58,13 +58,50 @@ class Received:
 
 
 @frozen(eq=False)
+class TruthTable:
+    """The truth of one stamp as it is recorded: columns (n,) by name, ``x y z`` f4 [m] first.
+
+    namespace: put before its topic when several instruments of one kind are on board.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    columns: Mapping[str, np.ndarray]
+    namespace: str = ''
+
+
+class Truth(Protocol):
+    """What a scene knows of its targets, in tables."""
+
+    def tables(self, frame_id: str) -> Iterable[TruthTable]:
+        """Give the truth of each stamp, in `frame_id` unless it has a frame of its own."""
+        ...
+
+
+@frozen(eq=False)
 class TrueTrack:
-    """Where one target really was: stamp_ns (n,), position (n, 3) m, velocity (n, 2) m/s."""
+    """Where one target really was: stamp_ns (n,), position (n, 2 or 3) m, velocity (n, 2) m/s, NaN
+    where unknown."""
 
     track_id: int
     stamp_ns: np.ndarray
     position: FloatArray
     velocity: FloatArray
+
+    def tables(self, frame_id: str) -> Iterator[TruthTable]:
+        """Give one row per stamp: ``x y z px py vx vy track_id``."""
+        position = np.asarray(self.position, np.float64)
+        xyz = np.zeros((len(position), 3), np.float32)
+        xyz[:, : position.shape[1]] = position
+        columns = {
+            **dict(zip('xyz', xyz.T)),
+            **dict(zip(('px', 'py'), position.T)),
+            **dict(zip(('vx', 'vy'), np.asarray(self.velocity, np.float64).T)),
+            'track_id': np.full(len(xyz), self.track_id, np.uint32),
+        }
+        for k, stamp in enumerate(self.stamp_ns):
+            row = {name: column[k : k + 1] for name, column in columns.items()}
+            yield TruthTable(int(stamp), frame_id, row)
 
 
 @frozen(eq=False)
@@ -86,6 +123,18 @@ class TrueProfile:
     xyz: FloatArray
     namespace: str = ''
 
+    def tables(self, frame_id: str) -> Iterator[TruthTable]:
+        """Give one row per range bin: ``x y z range height angle patch valid``."""
+        columns = {
+            **dict(zip('xyz', np.asarray(self.xyz, np.float32).T)),
+            'range': self.range,
+            'height': self.height,
+            'angle': self.angle,
+            'patch': self.patch,
+            'valid': self.valid,
+        }
+        yield TruthTable(self.stamp_ns, self.frame_id, columns, self.namespace)
+
 
 @frozen(eq=False)
 class TrueReflectors:
@@ -98,15 +147,25 @@ class TrueReflectors:
     depth: FloatArray
     amplitude: FloatArray
 
+    def tables(self, frame_id: str) -> Iterator[TruthTable]:
+        """Give one row per reflector, or none: ``x y z depth amplitude track_id``."""
+        zero = np.zeros(len(self.depth), np.float32)
+        columns = {
+            'x': zero,
+            'y': zero,
+            'z': (-self.depth).astype(np.float32),
+            'depth': self.depth,
+            'amplitude': self.amplitude,
+            'track_id': np.asarray(self.track_id, np.uint32),
+        }
+        yield TruthTable(self.stamp_ns, self.frame_id, columns)
+
 
 @frozen(eq=False)
 class Scene:
     """measurements in the order in which they were received; truth, e.g. one track a target
-    or one profile a ping.
-
-    How a measurement or a truth of some class is recorded: `recordings.scenes`.
-    """
+    or one profile a ping."""
 
     measurements: tuple[Received, ...]
-    truth: tuple[Any, ...]
+    truth: tuple[Truth, ...]
     frame_id: str = 'map'

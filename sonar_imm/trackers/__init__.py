@@ -56,22 +56,51 @@ class SmoothingTracker(Tracker, Protocol):
         ...
 
 
-@frozen
+@frozen(kw_only=True)
 class System:
-    """A tracker by name. Strings name the modules so that listing systems stays fast."""
+    """What there is to know of a system: its name, and what its classes are called.
+
+    On each floor that holds something of every system, a folder or module of that name has it; the
+    properties say which. They are strings, so that listing systems stays fast, and so that no
+    import goes up: whoever stands higher imports what it needs.
+
+    config, tracker, smoother: classes below `sonar_imm.trackers.<name>`, as ``module.Class``;
+    smoother: '' when the tracker cannot look back. node_config: a class of
+    `sonar_imm.node_config`.
+    """
 
     name: str
-    module: str
-    config_class: str
-    tracker_class: str
     summary: str
+    config: str
+    tracker: str
     smoother: str = ''
+    node_config: str = 'NodeConfig'
+
+    @property
+    def scenes(self) -> str:
+        """The module with `SCENARIOS`, `scenario` and `simulate`."""
+        return f'sonar_imm.simulation.{self.name}'
+
+    @property
+    def judge(self) -> str:
+        """The module with `judge` and `LIMIT`, see `evaluation.judging`."""
+        return f'sonar_imm.evaluation.{self.name}'
+
+    @property
+    def benches(self) -> str:
+        """The module with `BENCHES`, see `evaluation.benches`."""
+        return f'{self.judge}.bench'
+
+    @property
+    def node(self) -> str:
+        """The module with `main` of the ROS 2 node."""
+        return f'sonar_imm.nodes.{self.name}'
 
     def config_type(self) -> type[Config]:
-        return getattr(import_module(self.module), self.config_class)
+        return self._own(self.config)
 
     def build(self, config: Config) -> Tracker:
-        return getattr(import_module(self.module), self.tracker_class)(config)
+        return self._own(self.tracker)(config)
 
     def build_smoother(self, config: Config) -> SmoothingTracker:
         """The tracker that can look back at the end of a recording.
@@ -79,39 +108,44 @@ class System:
         Raises `ConfigError` when the system has none."""
         if not self.smoother:
             raise ConfigError(f'the {self.name} tracker has no smoother')
-        module, _, name = self.smoother.rpartition('.')
-        return getattr(import_module(module), name)(config)
+        return self._own(self.smoother)(config)
+
+    def _own(self, dotted: str) -> Any:
+        module, _, name = dotted.rpartition('.')
+        return getattr(import_module(f'{__name__}.{self.name}.{module}'), name)
 
 
 SYSTEMS = {
-    'bathymetry': System(
-        'bathymetry',
-        'sonar_imm.trackers.bathymetry.tracker',
-        'BathymetryConfig',
-        'BathymetryTracker',
-        'sea floor from side-scan array snapshots, IMM particle filter along each ping',
-    ),
-    'diver': System(
-        'diver',
-        'sonar_imm.trackers.diver.tracker',
-        'DiverConfig',
-        'DiverTracker',
-        'divers from multistatic fixes or raw arrival times, 16-direction IMM',
-        smoother='sonar_imm.trackers.diver.smoothing.SmoothingDiverTracker',
-    ),
-    'fathometer': System(
-        'fathometer',
-        'sonar_imm.trackers.fathometer.tracker',
-        'FathometerConfig',
-        'FathometerTracker',
-        'sub-bottom reflectors from array noise or traces, multiple-model particle filter',
-    ),
-    'obstacle': System(
-        'obstacle',
-        'sonar_imm.trackers.obstacle.tracker',
-        'ObstacleConfig',
-        'ObstacleTracker',
-        'obstacles ahead of a vehicle with their height, from a forward-looking sonar and '
-        'navigation, Gaussian sum over depth',
-    ),
+    system.name: system
+    for system in (
+        System(
+            name='bathymetry',
+            summary='sea floor from side-scan array snapshots, IMM particle filter along each '
+            'ping',
+            config='config.BathymetryConfig',
+            tracker='tracker.BathymetryTracker',
+            node_config='BathymetryNodeConfig',
+        ),
+        System(
+            name='diver',
+            summary='divers from multistatic fixes or raw arrival times, 16-direction IMM',
+            config='config.DiverConfig',
+            tracker='tracker.DiverTracker',
+            smoother='smoothing.SmoothingDiverTracker',
+        ),
+        System(
+            name='fathometer',
+            summary='sub-bottom reflectors from array noise or traces, multiple-model particle '
+            'filter',
+            config='config.FathometerConfig',
+            tracker='tracker.FathometerTracker',
+        ),
+        System(
+            name='obstacle',
+            summary='obstacles ahead of a vehicle with their height, from a forward-looking sonar '
+            'and navigation, Gaussian sum over depth',
+            config='config.ObstacleConfig',
+            tracker='tracker.ObstacleTracker',
+        ),
+    )
 }

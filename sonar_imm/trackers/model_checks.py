@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 
 from ..estimation.association import TrackRules
+from ..estimation.markov import check_transition_matrix
 from ..measurements import nanoseconds
+from .shared_parameters import TrackLifeParameters
 
 
-class TrackParameters(Protocol):
-    """The parameters of confirmation and deletion; max_coast in seconds."""
-
-    confirm_hits: int
-    confirm_window: int
-    delete_misses: int
-    max_coast: float
-
-
-def track_rules(config: TrackParameters) -> TrackRules:
+def track_rules(config: TrackLifeParameters) -> TrackRules:
     """The rules of tracks that `config` states."""
     return TrackRules(
         config.confirm_hits,
@@ -30,25 +22,31 @@ def track_rules(config: TrackParameters) -> TrackRules:
     )
 
 
+def matrix_problems(
+    matrix: Sequence[float], models: int, what: str, *, name: str = 'transition_matrix'
+) -> list[str]:
+    """What is wrong with a row-major transition matrix of `models` (of `what`, in words); an empty
+    one was left to the tracker."""
+    if not matrix:
+        return []
+    if len(matrix) != models * models:
+        return [
+            f'{name} needs {models} x {models} = {models * models} values for {what}, got '
+            f'{len(matrix)}'
+        ]
+    try:
+        check_transition_matrix(np.reshape(matrix, (models, models)), name=name)
+    except ValueError as error:
+        return [str(error)]
+    return []
+
+
 def chain_problems(
     matrix: Sequence[float], initial: Sequence[float], models: int, model_set: str
 ) -> list[str]:
     """What is wrong with a row-major transition matrix and the initial probabilities of a set of
     `models`; empty ones were left to the tracker."""
-    problems = []
-    if matrix:
-        if len(matrix) != models * models:
-            problems.append(
-                f'transition_matrix needs {models} x {models} = {models * models} values for '
-                f'model_set {model_set}, got {len(matrix)}'
-            )
-        else:
-            sums = np.reshape(matrix, (models, models)).sum(axis=1)
-            problems += [
-                f'row {row} of transition_matrix sums to {total:.6g}, not 1'
-                for row, total in enumerate(sums)
-                if abs(total - 1.0) > 1e-6
-            ]
+    problems = matrix_problems(matrix, models, f'model_set {model_set}')
     if initial:
         if len(initial) != models:
             problems.append(f'initial_probabilities needs {models} values, got {len(initial)}')

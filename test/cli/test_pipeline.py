@@ -2,11 +2,18 @@
 
 import csv
 import json
+from pathlib import Path
+import resource
+import signal
+import subprocess
+import sys
 
 from helpers.dive_bags import write_dive
 import pytest
 
 from sonar_imm.cli import main
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -213,3 +220,24 @@ def test_the_node_parameters_of_a_file_are_checked_and_ignored(call, dive, tmp_p
     params.write_text('fix_type: geometry_msgs/msg/PointStampd\n')
     assert main(['track', str(dive), str(tmp_path / 'no'), '--params', str(params)]) == 2
     assert "did you mean 'geometry_msgs/msg/PointStamped'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('command', ['simulate', 'track'])
+def test_a_full_disk_is_named(command, tmp_path):
+    def limit_files():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+    out = tmp_path / 'out'
+    arguments = [str(ROOT / 'bags' / 'diver_table1'), str(out)]
+    if command == 'simulate':
+        arguments = ['diver', str(out)]
+    done = subprocess.run(
+        [sys.executable, '-m', 'sonar_imm.cli', command, *arguments],
+        capture_output=True,
+        text=True,
+        preexec_fn=limit_files,
+        cwd=ROOT,
+    )
+    assert done.returncode == 2 and 'Traceback' not in done.stderr
+    assert str(out) in done.stderr and 'File too large' in done.stderr

@@ -74,6 +74,25 @@ def test_the_walk_on_windows_is_the_walk_on_all_cells(sigma, low, high):
     assert np.isnan(out[:out_low]).all() and np.isnan(out[out_high:]).all()
 
 
+@pytest.mark.parametrize('sigma', [150.0, 2000.0, 1e6, 1e15, 1e300, np.inf, np.nan])
+@pytest.mark.parametrize('cells, low, high', [(21, 0, 21), (21, 5, 6), (400, 100, 110)])
+def test_a_walk_wider_than_the_grid_stays_in_its_arrays(sigma, cells, low, high):
+    p = np.zeros(cells)
+    p[low:high] = np.random.default_rng(3).random(high - low)
+    guarded, out = np.full((8, max(cells, 128) + 16), np.nan), np.empty(cells)
+    grid_kernels.walk(p, low, high, sigma, guarded[:7], out, 0, cells)
+    assert np.isnan(guarded[7]).all()
+    assert grid_kernels.reach_of(sigma) > cells
+    widest = min(sigma, grid_kernels.WIDEST) if sigma > 0.0 else grid_kernels.WIDEST
+    exact = p.sum() / (np.sqrt(2.0 * np.pi) * widest)
+    if sigma > 100 * cells:
+        assert out == pytest.approx(exact, rel=1e-3)
+    else:
+        lag = np.abs(np.arange(cells)[:, None] - np.arange(cells))
+        exact = p @ np.exp(-0.5 * np.square(lag / widest)) / (np.sqrt(2.0 * np.pi) * widest)
+        assert np.abs(out - exact).max() < 1e-4 * exact.max()
+
+
 def test_mix_update_and_combine_are_the_dense_ones():
     rng = np.random.default_rng(4)
     z, log_likelihood = measurements(rng, T=1)

@@ -98,6 +98,32 @@ def test_a_model_that_nothing_can_become_stays_finite(engine):
     assert c[2] == 0.0 and np.isfinite(mixed).all()
 
 
+@pytest.mark.parametrize('tiny', [5e-324, 1e-310, 1e-300, 1e-280])
+def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
+    """The reciprocal of its probability overflows, and numbers particles outside of the set."""
+    rng = np.random.default_rng(4)
+    x, w, _ = random_set(rng)
+    mu, uniform = np.array([0.4, 0.6, tiny]), rng.random(3)
+    results = [engine.mix(x, w, mu, np.eye(3), uniform) for engine in (imm_particles, Kernels)]
+    for mixed, c in results:
+        assert c[2] == tiny
+        # Copies of particles that were there: of the model's own, or of any model's.
+        assert np.isin(mixed[2, 0], x[2 if tiny > 1e-290 else slice(None), 0]).all()
+    assert np.array_equal(results[0][0], results[1][0])
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_mixing_weights_that_are_not_finite_stays_in_its_arrays(value):
+    rng = np.random.default_rng(5)
+    x, w, mu = random_set(rng)
+    w[1, 7] = value
+    guarded = np.full(50 + 1 + 8, -7)
+    scratch = np.empty((3, 50)), np.empty(50), guarded[:51]
+    mixed, c = np.empty_like(x), np.empty(3)
+    imm_particles_kernels.mix(x, w, mu, ASYMMETRIC, rng.random(3), *scratch, mixed, c)
+    assert (guarded[51:] == -7).all() and np.isin(mixed, x).all()
+
+
 @engines
 def test_without_likelihood_the_chain_finds_its_stationary_law(engine):
     rng = np.random.default_rng(5)

@@ -2,10 +2,9 @@
 
 import os
 from pathlib import Path
+import shutil
 import subprocess
 import sys
-
-import numba
 
 from sonar_imm.estimation import imm_kernels, jit
 
@@ -14,20 +13,24 @@ ROOT = Path(__file__).parents[2]
 
 def test_without_any_place_for_a_cache_a_kernel_still_works(monkeypatch):
     """What numba does in a container with a read-only installation and no home."""
-    plain = numba.njit
-
-    def refuses_to_cache(*args, cache=False, **options):
-        if cache:
-            raise RuntimeError("cannot cache function 'doubled': no locator available for file")
-        return plain(*args, **options)
-
-    monkeypatch.setattr(jit.numba, 'njit', refuses_to_cache)
+    monkeypatch.setattr(jit.CompileResultCacheImpl, '_locator_classes', [])
 
     @jit.kernel
     def doubled(x):
         return 2.0 * x
 
     assert doubled(2.0) == 4.0
+    assert doubled.stats.cache_path is None
+
+
+def run(code, root, cache):
+    """What `code` prints in a process of its own, with the package at `root`."""
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(cache), 'PYTHONPATH': str(root)}
+    command = [sys.executable, '-c', code]
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout.split()
 
 
 def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
@@ -37,19 +40,87 @@ def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
         'o = np.ones; combine(o((1, 1, 1)), o((1, 1, 1, 1)), o((1, 1)), o((1, 1, 1)));'
         'print(sum(combine.stats.cache_hits.values()))'
     )
-    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path), 'PYTHONPATH': str(ROOT)}
-    hits = [
-        subprocess.run(
-            [sys.executable, '-c', code],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-        for _ in range(2)
-    ]
-    assert hits == ['0', '1']
+    assert [run(code, ROOT, tmp_path) for _ in range(2)] == [['0'], ['1']]
     assert list(tmp_path.rglob('*.nbi'))
+
+
+def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path):
+    root, cache = tmp_path / 'copy', tmp_path / 'cache'
+    for room in ('sonar_imm', 'msg_adapters'):
+        ignore = shutil.ignore_patterns('__pycache__')
+        shutil.copytree(ROOT / room, root / room, ignore=ignore)
+    code = """
+import numpy as np
+from sonar_imm.estimation import imm_particles_kernels as imm
+from sonar_imm.trackers.bathymetry.kernels import sines_of
+out, one = np.empty(1), np.ones((1, 1))
+sines_of(np.zeros(1), 2.0, np.array([1.0, 1.0, 0.0, 0.5]), np.empty((2, 1)), out)
+mixed, c = np.empty((2, 1, 1)), np.empty(2)
+imm.mix(np.array([[[3.0]], [[4.0]]]), np.ones((2, 1)), np.array([1.0, 1e-9]), np.eye(2),
+        np.zeros(2), np.empty((2, 1)), np.empty(1), np.empty(2, np.int64), mixed, c)
+hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.mix))
+print(out[0], mixed[1, 0, 0], hits)
+"""
+    assert run(code, root, cache) == ['0.5', '4.0', '0']
+    assert run(code, root, cache) == ['0.5', '4.0', '2']
+    callee = root / 'sonar_imm/acoustics/likelihood_kernels.py'
+    edit(callee, 'out[i] = ratio * cos_tilt', 'out[i] = 3.0 * ratio * cos_tilt')
+    constant = root / 'sonar_imm/estimation/imm_particles.py'
+    edit(constant, 'LEAST_CHANCE = 1e-290', 'LEAST_CHANCE = 1e-3')
+    assert run(code, root, cache) == ['1.5', '3.0', '0']
+    assert run(code, root, cache) == ['1.5', '3.0', '2']
+
+
+def edit(path, old, new):
+    text = path.read_text(encoding='utf-8')
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding='utf-8')
+
+
+def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypatch):
+    code = """
+import numpy as np
+from sonar_imm.trackers.bathymetry.kernels import sines_of
+try:
+    sines_of(np.zeros(1), 2.0, np.ones(4), np.empty((1, 2)), np.empty(1)[:0])
+    print('unchecked')
+except IndexError:
+    print('checked')
+"""
+    monkeypatch.delenv('NUMBA_BOUNDSCHECK', raising=False)
+    spare = code.replace('np.empty(1)[:0]', 'np.empty(1)')
+    assert run(spare, ROOT, tmp_path) == ['unchecked']
+    monkeypatch.setenv('NUMBA_BOUNDSCHECK', '1')
+    assert run(code, ROOT, tmp_path) == ['checked']
+
+
+def test_a_digest_follows_every_form_of_import(tmp_path):
+    package = tmp_path / 'package'
+    files = {
+        'caller.py': 'from .one import (\n    a,  # why\n    b as c,\n)\nfrom . import two as t\n',
+        'one.py': 'from .deep import four\nfrom os import path\n',
+        'two.py': 'from .caller import loop\n',
+        'deep/__init__.py': '',
+        'deep/four.py': 'from ..five import e\n',
+        'five.py': 'e = 1\n',
+        'apart.py': '',
+    }
+    for name, text in files.items():
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / name).write_text(text)
+
+    def digest():
+        jit.digest_of.cache_clear()
+        jit._read.cache_clear()
+        return jit.digest_of(str(package / 'caller.py'))
+
+    seen = {digest()}
+    for name in files:
+        (package / name).write_text((package / name).read_text() + '# changed\n')
+        assert (digest() in seen) == (name in {'apart.py'}), name
+        seen.add(digest())
+    jit.digest_of.cache_clear()
+    jit._read.cache_clear()
 
 
 def test_warm_leaves_nothing_to_compile():

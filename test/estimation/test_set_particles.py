@@ -267,6 +267,17 @@ def test_a_record_nothing_explains_is_said_so(model):
     assert step.w.sum() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize('value', [1e200, np.inf, np.nan])
+def test_a_record_beyond_numbers_keeps_members_on_the_lattice(model, exact, value):
+    tracker, known = SetFilter(model, 50), None
+    for name, b in enumerate(exact['B'][:6]):
+        b = b.copy()
+        b[[0, 17, 59]] = value if name % 2 else b[[0, 17, 59]]
+        step = tracker.step(known, b, (1, name))
+        known = step.after
+        assert ((step.sets.cell >= 0) & (step.sets.cell < model.cells)).all()
+
+
 def test_models_that_cannot_be_are_refused(model):
     for change in (
         {'amplitude_prior': 'flat'},

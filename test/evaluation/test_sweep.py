@@ -54,7 +54,7 @@ def test_each_system_is_simulated_tracked_and_scored(system):
     first, second, again = sweeps.run_here(sweep_of(system), [3, 4, 3])
     metric = TINY[system][2]
     assert not first.failure and first.versions['sonar_imm']
-    assert first.metrics[metric] >= 0.0
+    assert metric in first.metrics
     assert first == again and first.metrics != second.metrics
 
 

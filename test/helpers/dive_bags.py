@@ -3,10 +3,11 @@
 import numpy as np
 
 from helpers.dive_scenes import legs, stamps
-from msg_adapters.estimates import write_truth
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
+from sonar_imm.recordings.truth import records_of
 from sonar_imm.recordings.writer import BagWriter, ros_message
+from sonar_imm.simulation.scene import TrueTrack
 
 FIX_SIGMA = 1.2
 
@@ -23,19 +24,10 @@ def write_dive(path, *, count=120, seed=4, truth=True, topic='/fix', spoilt=(), 
     with BagWriter(path) as bag:
         if truth:
             dense = np.arange(2 * count) * 0.5
-            for stamp, state in zip(stamps(dense), legs(dense)):
-                bag.write(
-                    '/truth/estimate',
-                    write_truth(
-                        state[None, :2],
-                        state[None, 2:],
-                        [0],
-                        stamp_ns=stamp,
-                        frame_id='map',
-                        make=ros_message,
-                    ),
-                    stamp,
-                )
+            state = legs(dense)
+            true = TrueTrack(0, stamps(dense), state[:, :2], state[:, 2:])
+            for stamp, name, message in records_of(true, 'map'):
+                bag.write(name, message, stamp)
         stamp_ns = stamps(times)
         for arrival, index in enumerate(order):
             fix = Fix(

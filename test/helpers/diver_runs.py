@@ -1,4 +1,4 @@
-"""Helpers of the diver tests: fixes, runs, comparison to the last bit."""
+"""Helpers of the diver tests: fixes, runs, errors."""
 
 import numpy as np
 
@@ -22,20 +22,6 @@ def run(tracker, measurements):
     for measurement in measurements:
         final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(measurement))
     return [final[stamp] for stamp in sorted(final)]
-
-
-def same(one, other):
-    """Equal to the last bit."""
-    ours, theirs = one.columns(), other.columns()
-    return (
-        one.stamp_ns == other.stamp_ns
-        and list(ours) == list(theirs)
-        and all(
-            ours[name].dtype == theirs[name].dtype
-            and ours[name].tobytes() == theirs[name].tobytes()
-            for name in ours
-        )
-    )
 
 
 def errors(estimates, track):

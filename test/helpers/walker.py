@@ -6,7 +6,7 @@ import sys
 import attrs
 import numpy as np
 
-from msg_adapters.inputs import INPUTS
+import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
 from sonar_imm.parameters import Config, parameter
 from sonar_imm.trackers import System, SYSTEMS
@@ -97,8 +97,9 @@ class WalkerSystem(System):
 
 def register(set_item):
     """Make the walker known by ``set_item(mapping, key, value)``; it hears what divers do."""
-    set_item(SYSTEMS, 'walker', WalkerSystem('walker', '', '', '', 'test system'))
-    set_item(INPUTS, 'walker', INPUTS['diver'])
+    walker = WalkerSystem(name='walker', summary='test system', config='', tracker='')
+    set_item(SYSTEMS, 'walker', walker)
+    set_item(sys.modules, 'msg_adapters.inputs.walker', msg_adapters.inputs.diver)
 
 
 def main():

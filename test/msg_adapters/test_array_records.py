@@ -261,3 +261,13 @@ def test_bytes_of_any_kind_are_read_or_refused(data, read):
         read(good)
     except Rejection as rejection:
         assert rejection.sentence
+
+
+@pytest.mark.parametrize('whole_numbers', [False, True])
+def test_pressure_without_a_sample_is_refused(whole_numbers):
+    columns = {'p': np.empty((0, 4), np.float32), 'sample_rate': np.empty(0, np.float32)}
+    if whole_numbers:
+        columns |= {'p': np.empty((0, 4), np.int16), 'scale': np.empty(0, np.float32)}
+    message = encode_table(columns, stamp_ns=STAMP, frame_id='array', make=ros_message)
+    with pytest.raises(Rejection):
+        read_pressure(message)

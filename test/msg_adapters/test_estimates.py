@@ -6,7 +6,6 @@ from msg_adapters.estimates import (
     write_estimate,
     write_model_probabilities,
     write_odometry,
-    write_truth,
 )
 from msg_adapters.fixes import UNKNOWN_VARIANCE
 from msg_adapters.table import encode_table
@@ -94,31 +93,6 @@ def test_a_table_without_a_column_is_refused(gone):
     with pytest.raises(Rejection, match=gone) as caught:
         read_estimate(message)
     assert caught.value.reason == 'missing_column'
-
-
-def test_truth_comes_back_as_extras():
-    message = write_truth(
-        [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]],
-        [[0.1, 0.2], [np.nan, np.nan]],
-        [3, 9],
-        stamp_ns=5,
-        frame_id='map',
-        make=ros_message,
-    )
-    assert [field.name for field in message.fields] == [
-        'x',
-        'y',
-        'z',
-        'px',
-        'py',
-        'vx',
-        'vy',
-        'track_id',
-    ]
-    truth = read_estimate(message)
-    assert truth.extras['py'].tolist() == [2.0, 5.0]
-    assert truth.extras['track_id'].tolist() == [3, 9]
-    assert truth.extras['vx'][0] == 0.1 and truth.xyz[1].tolist() == [4.0, 5.0, 6.0]
 
 
 def test_odometry_shows_one_diver_with_velocity_in_the_world():

@@ -3,7 +3,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from msg_adapters.headers import make_header, ned_to_enu, stamp_ns, to_enu, wrap
+from msg_adapters.arrivals import read_arrivals, write_arrivals
+from msg_adapters.fixes import read_fix, write_fix
+from msg_adapters.headers import make_header, stamp_ns, to_enu, wrap
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.recordings.messages import ros_message
 
@@ -53,8 +55,16 @@ def test_a_nanosecond_field_of_a_second_is_refused():
     assert caught.value.reason == 'bad_stamp'
 
 
+def as_read(measurement, world_frame):
+    """The measurement sent as a message and read again by a reader that is told `world_frame`."""
+    write, read = {Fix: (write_fix, read_fix), Arrivals: (write_arrivals, read_arrivals)}[
+        type(measurement)
+    ]
+    return read(write(measurement, ros_message), world_frame=world_frame)
+
+
 def test_a_fix_turns_from_ned_to_enu_with_its_covariance():
-    turned = ned_to_enu(fix('map_ned'))
+    turned = as_read(fix('map_ned'), 'ned')
     assert turned.position.tolist() == [2.0, 1.0, -3.0]
     assert turned.covariance.tolist() == [[9.0, 0.5], [0.5, 4.0]]
     assert turned.frame_id == 'map'
@@ -63,26 +73,27 @@ def test_a_fix_turns_from_ned_to_enu_with_its_covariance():
 def test_a_bearing_means_the_same_direction_after_turning():
     for bearing in (-3.0, 0.25, 1.0, 3.1):
         north, east = np.cos(bearing), np.sin(bearing)
-        turned = ned_to_enu(arrivals(bearing=[bearing]))
+        turned = as_read(arrivals(bearing=[bearing]), 'ned')
         assert np.cos(turned.bearing[0]) == pytest.approx(east)
         assert np.sin(turned.bearing[0]) == pytest.approx(north)
     assert turned.tx.tolist() == [[2.0, 1.0, -3.0]] and turned.rx.tolist() == [[5.0, 4.0, -6.0]]
 
 
 def test_turning_twice_changes_nothing_but_the_frame():
-    once = ned_to_enu(arrivals())
-    twice = ned_to_enu(once)
+    twice = as_read(as_read(arrivals(), 'ned'), 'ned')
     assert np.allclose(twice.bearing, [0.25]) and (twice.tx == arrivals().tx).all()
+    assert twice.frame_id == 'map'
 
 
 def test_a_ned_frame_is_refused_under_enu_and_read_under_ned():
-    with pytest.raises(Rejection, match='north-east-down') as caught:
-        to_enu(fix('map_ned'), 'enu')
-    assert caught.value.reason == 'frame_ned'
-    assert to_enu(fix('map_ned'), 'ned').frame_id == 'map'
-    assert to_enu(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
+    for measurement in (fix('map_ned'), arrivals()):
+        with pytest.raises(Rejection, match='north-east-down') as caught:
+            as_read(measurement, 'enu')
+        assert caught.value.reason == 'frame_ned'
+        assert as_read(measurement, 'ned').frame_id == 'map'
+    assert as_read(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match='enu, ned'):
-        to_enu(fix(), 'nwu')
+        to_enu(fix(), 'nwu', lambda same: same)
 
 
 def test_wrap_stays_in_its_half_open_interval():

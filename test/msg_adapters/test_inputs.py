@@ -1,19 +1,18 @@
 import subprocess
 import sys
+from typing import get_args
 
-from msg_adapters.inputs import INPUTS
+import pytest
+
+from msg_adapters.inputs import inputs_of
+from sonar_imm.measurements import Measurement, Rejection
 from sonar_imm.recordings.messages import ros_message, typestore
 from sonar_imm.trackers import SYSTEMS
 
 
 def test_every_tracker_has_inputs_whose_readers_say_no_politely():
-    import pytest
-
-    from sonar_imm.measurements import Rejection
-
-    assert set(INPUTS) == set(SYSTEMS)
-    for topics in INPUTS.values():
-        for topic in topics:
+    for system in SYSTEMS:
+        for topic in inputs_of(system):
             assert topic.description and not topic.name.startswith('/')
             for name, read in topic.readers.items():
                 if name.startswith('marine_acoustic_msgs/'):  # see test_detections.py
@@ -26,7 +25,21 @@ def test_every_tracker_has_inputs_whose_readers_say_no_politely():
 
 def test_the_adapters_load_neither_rclpy_nor_rosbags():
     code = (
-        'import sys, msg_adapters.inputs, msg_adapters.estimates; '
+        'import sys, msg_adapters.estimates; from msg_adapters.inputs import inputs_of; '
+        'names = ("bathymetry", "diver", "fathometer", "obstacle"); '
+        'assert all(map(inputs_of, names)); '
         'sys.exit(any(name in sys.modules for name in ("rclpy", "rosbags")))'
     )
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
+
+
+def test_each_class_of_measurements_is_heard_under_one_name():
+    """`write_scene` finds the topic of a measurement by its class."""
+    entries = [entry for system in SYSTEMS for entry in inputs_of(system)]
+    assert len({entry.measurement for entry in entries}) == len(entries)
+    assert {entry.measurement for entry in entries} == set(get_args(Measurement))
+
+
+def test_an_unknown_system_has_no_inputs():
+    with pytest.raises(ModuleNotFoundError):
+        inputs_of('whale')

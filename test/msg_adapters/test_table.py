@@ -1,5 +1,6 @@
 from array import array
 import math
+import tracemalloc
 from types import SimpleNamespace
 
 from hypothesis import given, HealthCheck, settings
@@ -264,3 +265,47 @@ def test_hostile_layouts_are_refused_or_read_within_their_bytes(sizes, count, da
             last = np.frombuffer(raw, dtype)[0]
             got = column.reshape(rows, math.prod(column.shape[1:]))[-1, -1]
             assert got == last or (np.isnan(got) and np.isnan(last))
+
+
+def peak_bytes(work):
+    """The most memory that `work` held at once."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+class TestBounds:
+    """What a message may cost before it is believed."""
+
+    def test_only_named_columns_are_decoded(self):
+        message = encode_table(
+            {
+                'a': np.arange(3.0),
+                'b': np.ones((3, 2), np.float32),
+                'c': np.arange(3, dtype=np.int32),
+            },
+            stamp_ns=10**18,
+            frame_id='',
+            make=ros_message,
+        )
+        columns = decode_table(message, ('c', 'a', 'not_there'))
+        assert list(columns) == ['a', 'c'] and columns['a'].tolist() == [0.0, 1.0, 2.0]
+
+    def test_a_bad_field_is_named_even_where_it_is_not_wanted(self):
+        with pytest.raises(Rejection, match='beyond the point_step'):
+            decode_table(cloud([('a', 0, 8, 1), ('b', 8, 8, 1)], bytes(8), point_step=8), ('a',))
+
+    def test_too_many_rows_are_refused_before_the_data_are_looked_at(self):
+        message = cloud([('a', 0, 8, 1)], None, width=11, point_step=8)
+        with pytest.raises(Rejection, match='11 rows; at most 10') as caught:
+            decode_table(message, most_rows=10)
+        assert caught.value.reason == 'too_large'
+
+    def test_overlapping_fields_nobody_asked_for_cost_nothing(self):
+        rows = 9_000
+        fields = [(f'f{i}', i % 7, 2, 1000) for i in range(1000)] + [('a', 0, 7, 1)]
+        message = cloud(fields, bytes(1010 * rows), width=rows, point_step=1010)
+        assert peak_bytes(lambda: decode_table(message, ('a',))) < 2_000_000

@@ -1,7 +1,12 @@
 from collections import Counter
+import struct
+import subprocess
+import sys
 
+from backports import zstd
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import lz4.frame
 import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -135,3 +140,61 @@ def small(tmp_path_factory):
         for i in range(5):
             writer.write(link, i, typestore().serialize_cdr(ros_message(TEXT, data=str(i)), TEXT))
     return (path / 'bag.mcap').read_bytes(), folder
+
+
+def bomb(path, compression, packed, stated):
+    """An MCAP file with one chunk of `packed` bytes that states to hold `stated` bytes."""
+
+    def text(value):
+        return struct.pack('<I', len(value)) + value
+
+    def framed(code, content):
+        return struct.pack('<BQ', code, len(content)) + content
+
+    head = framed(0x01, text(b'ros2') + text(b''))
+    chunk = framed(
+        0x06,
+        struct.pack('<QQQI', 0, 0, stated, 0)
+        + text(compression)
+        + struct.pack('<Q', len(packed))
+        + packed,
+    )
+    footer = framed(0x02, struct.pack('<QQI', 0, 0, 0))
+    path.write_bytes(mcap_scan.MAGIC + head + chunk + footer + mcap_scan.MAGIC)
+    return path
+
+
+def zeros(compression, size, *, with_size):
+    if compression == b'lz4':
+        return lz4.frame.compress(bytes(size), store_size=with_size)
+    stream = zstd.ZstdCompressor(options={zstd.CompressionParameter.content_size_flag: 1})
+    if with_size:
+        return zstd.compress(bytes(size))
+    block = bytes(1 << 20)
+    return b''.join(stream.compress(block) for _ in range(size >> 20)) + stream.flush()
+
+
+@pytest.mark.parametrize('compression', [b'zstd', b'lz4'])
+@pytest.mark.parametrize('with_size', [True, False])
+@pytest.mark.parametrize('stated', [10, 600 << 20])
+def test_a_chunk_of_a_great_many_zeros_costs_no_memory(tmp_path, compression, with_size, stated):
+    packed = zeros(compression, 600 << 20, with_size=with_size)
+    file = bomb(tmp_path / 'bomb.mcap', compression, packed, stated)
+    code = (
+        'import resource, sys; from sonar_imm.cli import main; '
+        'status = main(["info", sys.argv[1]]); '
+        'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss); sys.exit(status)'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code, str(file)], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1 and 'Traceback' not in done.stderr
+    assert 'unpacks to more than 128 MiB' in done.stdout + done.stderr
+    assert int(done.stdout.split()[-1]) < 800_000  # kB; 600 MiB more would not fit
+
+
+def test_an_honest_size_below_the_limit_is_unpacked():
+    assert mcap_scan.unpack(zstd.compress(bytes(1000)), 'zstd') == bytes(1000)
+    assert mcap_scan.unpack(lz4.frame.compress(bytes(1000)), 'lz4') == bytes(1000)
+    with pytest.raises(mcap_scan.TooLargeError):
+        mcap_scan.unpack(zstd.compress(bytes(mcap_scan.MAX_UNPACKED + 1)), 'zstd')

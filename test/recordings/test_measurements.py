@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 
 from msg_adapters.arrivals import write_arrivals
-from msg_adapters.estimates import write_truth
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.recordings.measurements import fitting_topics, measurements_of
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagError, BagReader
+from sonar_imm.recordings.truth import records_of
 from sonar_imm.recordings.writer import BagWriter
+from sonar_imm.simulation.scene import TrueTrack
 
 POINT = 'geometry_msgs/msg/PointStamped'
 
@@ -45,11 +46,9 @@ def mixed(tmp_path, fix_message):
         bag.write('/arrivals', ping(), 5)
         bag.write('/truth/fix', fix_message(9), 6)
         bag.write('/pose', fix_message(5), 7)
-        bag.write(
-            '/truth/estimate',
-            write_truth([[1, 2]], [[0, 0]], [1], stamp_ns=5, frame_id='m', make=ros_message),
-            8,
-        )
+        true = TrueTrack(1, np.array([5]), np.array([[1, 2]]), np.zeros((1, 2)))
+        for _, topic, message in records_of(true, 'm'):
+            bag.write(topic, message, 8)
         bag.write('/other/fix', ros_message('std_msgs/msg/String', data='no fix'), 9)
     return tmp_path / 'bag'
 

@@ -307,3 +307,12 @@ class TestTypes:
         database.close()
         items, problems = read(tmp_path / 'bag')
         assert [item.topic for item in items] == ['/custom', '/text'] and not problems
+
+
+def test_a_message_count_that_is_no_number_is_told(write_fixes):
+    path = write_fixes(3)
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 3', 'message_count: many'))
+    items, problems = read(path)
+    assert len(items) == 3
+    assert 'a message count that is no number' in problems[0]

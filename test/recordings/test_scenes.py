@@ -2,14 +2,13 @@
 
 from attrs import frozen
 import numpy as np
-import pytest
 
-from msg_adapters.estimates import write_truth
+from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
 from sonar_imm.recordings import scenes
-from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagReader
-from sonar_imm.simulation.scene import Received, Scene, TrueTrack
+from sonar_imm.recordings.truth import records_of
+from sonar_imm.simulation.scene import Received, Scene, TrueReflectors, TrueTrack, TruthTable
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -38,29 +37,46 @@ def test_late_measurements_are_recorded_when_they_were_received(tmp_path):
     ]
 
 
-def test_another_system_adds_a_writer_of_its_truth(tmp_path, monkeypatch):
+def test_a_scene_may_know_other_truth_of_its_own(tmp_path):
     @frozen
     class Buoy:
         stamp_ns: int
 
-    def buoy_records(buoy, frame_id):
-        yield (
-            buoy.stamp_ns,
-            '/truth/buoy',
-            write_truth(
-                [[0.0, 0.0]],
-                [[0.0, 0.0]],
-                [1],
-                stamp_ns=buoy.stamp_ns,
-                frame_id=frame_id,
-                make=ros_message,
-            ),
-        )
+        def tables(self, frame_id):
+            yield TruthTable(self.stamp_ns, frame_id, {'x': np.zeros(1, np.float32)}, 'north')
 
-    scene = Scene((Received(START_NS + 1, fix(0)),), (Buoy(START_NS + 2),))
-    with pytest.raises(KeyError):
-        scenes.write_scene(scene, tmp_path / 'unknown', provenance={})
-    assert not (tmp_path / 'unknown').exists()
-    monkeypatch.setitem(scenes.TRUTHS, Buoy, buoy_records)
+    scene = Scene((Received(START_NS + 1, fix(0), 'south'),), (Buoy(START_NS + 2),))
     scenes.write_scene(scene, tmp_path / 'bag', provenance={})
-    assert logged(tmp_path / 'bag') == [('/fix', 1), ('/truth/buoy', 2)]
+    assert logged(tmp_path / 'bag') == [('/south/fix', 1), ('/truth/north/estimate', 2)]
+
+
+def test_a_true_track_is_a_table_at_each_stamp():
+    true = TrueTrack(
+        9,
+        np.array([5, 8]),
+        np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]),
+        np.array([[0.1, 0.2], [np.nan, np.nan]]),
+    )
+    first, second = records_of(true, 'map')
+    assert [(stamp, topic) for stamp, topic, _ in (first, second)] == [
+        (5, '/truth/estimate'),
+        (8, '/truth/estimate'),
+    ]
+    names = 'x y z px py vx vy track_id'.split()
+    assert [field.name for field in first[2].fields] == names
+    truth = read_estimate(second[2])
+    assert truth.frame_id == 'map' and truth.stamp_ns == 8
+    assert truth.xyz.tolist() == [[4.0, 5.0, 6.0]]
+    assert truth.extras['py'].tolist() == [5.0] and truth.extras['track_id'].tolist() == [9]
+    assert read_estimate(first[2]).extras['vx'].tolist() == [0.1]
+    assert np.isnan(truth.extras['vx']).all()
+
+
+def test_true_reflectors_lie_below_and_may_be_none():
+    true = TrueReflectors(5, 'array', np.array([3, 4]), np.array([10.0, 20.5]), np.ones(2))
+    (record,) = records_of(true, 'elsewhere')
+    truth = read_estimate(record[2])
+    assert truth.frame_id == 'array' and truth.xyz[:, 2].tolist() == [-10.0, -20.5]
+    assert truth.extras['depth'].tolist() == [10.0, 20.5]
+    nothing = TrueReflectors(5, 'array', np.empty(0, int), np.empty(0), np.empty(0))
+    assert len(read_estimate(records_of(nothing, '')[0][2])) == 0

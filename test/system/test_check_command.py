@@ -1,6 +1,11 @@
 """``check`` and ``play`` with a real node."""
 
 import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
 
 import pytest
 
@@ -100,3 +105,25 @@ def test_lockstep_with_nobody_is_one_line_and_exit_code_1(bag, capsys, monkeypat
     assert main(['play', str(bag), '--lockstep', '/nobody']) == 1
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1 and "no answer from a node '/nobody'" in error
+
+
+def children(pid):
+    return [int(one) for one in Path(f'/proc/{pid}/task/{pid}/children').read_text().split()]
+
+
+@pytest.mark.parametrize('how', [signal.SIGTERM, signal.SIGHUP])
+def test_a_check_that_is_ended_takes_its_node_along(bag, how):
+    check = subprocess.Popen(
+        [sys.executable, '-m', 'sonar_imm.cli', 'check', 'diver', '--bag', str(bag)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    limit = time.monotonic() + 30.0
+    while not (nodes := children(check.pid)):
+        assert check.poll() is None and time.monotonic() < limit
+        time.sleep(0.01)
+    check.send_signal(how)
+    _, said = check.communicate(timeout=60.0)
+    assert check.returncode == 128 + how and 'Traceback' not in said
+    assert not any(Path(f'/proc/{node}').exists() for node in nodes)

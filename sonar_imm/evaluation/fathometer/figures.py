@@ -4,9 +4,7 @@ amplitudes, distance from the truth."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
-from attrs import frozen
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
@@ -14,22 +12,10 @@ from plotly.subplots import make_subplots
 from ...estimation.arrays import FloatArray
 from .. import SECOND
 from ..plotting import COLOURS, INK, styled
-from .records import Record
-
-if TYPE_CHECKING:
-    from .fixed_order import FixedOrder
+from .fixed_order import FixedOrder
+from .records import Image, Record
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
-
-
-@frozen(eq=False)
-class Image:
-    """Depth responses side by side, in units of their noise: value (depths, records); depth
-    (depths,) m; stamp_ns (records,)."""
-
-    value: FloatArray
-    depth: FloatArray
-    stamp_ns: np.ndarray
 
 
 def response_figure(image: Image | None, records: Sequence[Record], start_ns: int) -> go.Figure:

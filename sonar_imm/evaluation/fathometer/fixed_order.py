@@ -14,8 +14,7 @@ import numpy as np
 
 from ...measurements import Trace
 from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from .figures import Image
-from .records import Record, records_of
+from .records import Image, Record, records_of
 from .scoring import pair
 
 MOST_PARTICLES = 2000

@@ -50,6 +50,16 @@ class Record:
         return self.order_min + int(np.argmax(self.pmf))
 
 
+@frozen(eq=False)
+class Image:
+    """Depth responses side by side, in units of their noise: value (depths, records); depth
+    (depths,) m; stamp_ns (records,)."""
+
+    value: FloatArray
+    depth: FloatArray
+    stamp_ns: np.ndarray
+
+
 def records_of(
     estimates: Iterable[Estimate],
     truth: Sequence[Estimate] | None = None,

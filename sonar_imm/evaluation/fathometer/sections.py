@@ -15,7 +15,7 @@ from ..report import run_part
 from ..run_folder import read_measurements
 from . import figures
 from .fixed_order import fixed_orders
-from .records import Record
+from .records import Image, Record
 from .scoring import pair
 from .summary import summary_sentence
 
@@ -37,7 +37,7 @@ def fathometer_part(
     )
 
 
-def response_image(run: Mapping[str, Any]) -> figures.Image | None:
+def response_image(run: Mapping[str, Any]) -> Image | None:
     """The depth responses of a run as its tracker saw them; None when its recording is gone.
 
     They are made anew by a tracker with two particles, whose estimates nobody asks for.
@@ -58,7 +58,7 @@ def response_image(run: Mapping[str, Any]) -> figures.Image | None:
     if depths is None:
         return None
     columns.sort(key=lambda column: column[0])
-    return figures.Image(
+    return Image(
         np.array([value for _, value in columns]).T,
         depths,
         np.array([stamp for stamp, _ in columns], np.int64),
@@ -142,7 +142,7 @@ def _sections(
 
 def _fixed_section(
     run: Mapping[str, Any],
-    image: figures.Image,
+    image: Image,
     records: Sequence[Record],
     cutoff: float,
     start_ns: int,

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from msg_adapters.fixes import write_fix
 
 from ...measurements import Fix, Rejection
+from ...simulation.scene import TrueTrack
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import BadRow
 from ..messages import ros_message
 from ..sources import BagError
-from ..truth import track_records
+from ..truth import records_of
 from .truth import difference_velocity
 
 SENSORS = {'lidar': 1, 'radar': 2}
@@ -108,7 +109,7 @@ def _truth_records(path: str | Path, report: ConversionReport, frame_id: str) ->
         stamps = np.array(sorted(track), np.int64)
         position = np.array([track[stamp] for stamp in stamps.tolist()])
         velocity = difference_velocity(stamps, position[:, :2])
-        records += track_records(stamps, position, velocity, track_id, frame_id)
+        records += records_of(TrueTrack(track_id, stamps, position, velocity), frame_id)
     report.notes['truth_velocity'] = 'central differences'
     return records
 

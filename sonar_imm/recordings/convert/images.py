@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters.detections import write_detections
-from msg_adapters.inputs import INPUTS
-from msg_adapters.navigation import write_navigation, write_range
-from msg_adapters.sonar_images import detect, DetectorConfig, IMAGE_TYPES
+from msg_adapters.inputs import inputs_of
+from msg_adapters.sonar_images import IMAGE_TYPES, read_sonar_image
 
 from ...measurements import Rejection
+from ...trackers.obstacle.detector import detect, DetectorConfig
 from ..conversion import ConversionReport, provenance
 from ..messages import ros_message
 from ..reader import BagReader
 from ..sources import BagError
 from ..writer import BagWriter
 
-WRITERS = {'nav': write_navigation, 'altitude': write_range}
+FURTHER = {entry.name: entry for entry in inputs_of('obstacle') if entry.name != 'detections'}
 
 
 def convert_images(
@@ -65,18 +65,17 @@ def _topics(bag: BagReader) -> dict[str, str]:
     if not images:
         raise BagError(f'{bag.path} has no topic with {" or ".join(IMAGE_TYPES)}')
     chosen = {images[0]: 'detections'}
-    for entry in INPUTS['obstacle']:
+    for name, entry in FURTHER.items():
         fitting = [topic.name for topic in bag.topics if topic.type_name in entry.readers]
-        if entry.name in WRITERS and fitting:
-            chosen[fitting[0]] = entry.name
+        if fitting:
+            chosen[fitting[0]] = name
     return chosen
 
 
 def _converted(name: str, item: Any, config: DetectorConfig) -> Any:
     if name == 'detections':
-        return write_detections(detect(item.message, config), ros_message)
-    entry = next(entry for entry in INPUTS['obstacle'] if entry.name == name)
+        image = read_sonar_image(item.message, **config.reading())
+        return write_detections(detect(image, config), ros_message)
+    entry = FURTHER[name]
     # Conventions of the axes stay what they are: whoever tracks the new bag states them.
-    return WRITERS[name](
-        entry.readers[item.type_name](item.message, world_frame='ned'), ros_message
-    )
+    return entry.write(entry.readers[item.type_name](item.message, world_frame='ned'), ros_message)

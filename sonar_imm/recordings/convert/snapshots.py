@@ -24,7 +24,7 @@ from ..conversion import ConversionReport, Record, write_bag
 from ..messages import ros_message
 from ..npz import read_npz
 from ..sources import BagError
-from ..truth import profile_record
+from ..truth import records_of
 
 NAMES: dict[str, tuple[str, ...]] = {
     'iq': ('iq', 'snapshots', 'Y', 'quadrants'),
@@ -83,7 +83,7 @@ def convert_snapshots(
             continue
         records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
         if (profile := _truth(content, ping, snapshot)) is not None:
-            records.append(profile_record(profile))
+            records += records_of(profile, '')
     return write_bag(out, records, report, source=Path(path).name, storage=storage)
 
 

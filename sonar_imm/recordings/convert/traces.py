@@ -18,7 +18,7 @@ from ..csv_table import CsvOptions, CsvTable, Row
 from ..messages import ros_message
 from ..npz import read_npz
 from ..sources import BagError
-from ..truth import reflectors_record
+from ..truth import records_of
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 Arrays = dict[str, NDArray]
@@ -130,7 +130,7 @@ def _truth(arrays: Arrays, path: Path, stamps: list[int], frame_id: str) -> list
             depth=depth[k, there].astype(np.float64),
             amplitude=amplitude[k, there].astype(np.float64),
         )
-        records.append(reflectors_record(true))
+        records += records_of(true, '')
     return records
 
 

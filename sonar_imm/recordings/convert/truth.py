@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...simulation.scene import TrueTrack
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame
-from ..truth import track_records
+from ..truth import records_of
 
 
 def convert_truth(
@@ -66,7 +67,7 @@ def truth_records(
         position, velocity = values[first, :3], values[first, 3:]
         if not with_velocity:
             velocity = difference_velocity(stamps, position[:, :2])
-        records += track_records(stamps, position, velocity, track_id, frame_id)
+        records += records_of(TrueTrack(track_id, stamps, position, velocity), frame_id)
     report.notes.update(frame.notes())
     report.notes['truth_velocity'] = 'stated' if with_velocity else 'central differences'
     return records

@@ -11,7 +11,7 @@ Measurements are in ROS axes, ENU and FLU; inside, all is NED and FRD as in the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from attrs import frozen
@@ -22,7 +22,7 @@ from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...measurements import Altitude, Detections, nanoseconds, Navigation
-from ..scene import Received, Scene
+from ..scene import Received, Scene, TruthTable
 from .scenario import ObstacleScenario, SCENARIOS
 
 __all__ = ['ObstacleScenario', 'SCENARIOS', 'TrueObstacle', 'scenario', 'simulate']
@@ -51,6 +51,20 @@ class TrueObstacle:
     bearing: FloatArray
     vertical_offset: FloatArray
     in_beam: np.ndarray
+
+    def tables(self, frame_id: str) -> Iterator[TruthTable]:
+        """Give one row per ping: ``x y z range bearing vertical_offset in_beam track_id``."""
+        columns = {
+            **dict(zip('xyz', np.tile(self.position, (len(self.range), 1)).astype(np.float32).T)),
+            'range': self.range,
+            'bearing': self.bearing,
+            'vertical_offset': self.vertical_offset,
+            'in_beam': self.in_beam,
+            'track_id': np.full(len(self.range), self.track_id, np.uint32),
+        }
+        for k, stamp in enumerate(self.stamp_ns):
+            row = {name: column[k : k + 1] for name, column in columns.items()}
+            yield TruthTable(int(stamp), frame_id, row)
 
 
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> ObstacleScenario:

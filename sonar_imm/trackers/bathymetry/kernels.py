@@ -34,12 +34,13 @@ def sines_of(
     are angles, else they are heights of the floor. work (2, n) is scratch.
     """
     n = state.shape[0]
+    first = work[0, :n]
     if geometry[0] == geometry[0]:
         for s in range(n):
-            work[0, s] = geometry[0] - state[s]
-        law.direction_sines(work[0], slant_range, geometry[1], geometry[2], out)
+            first[s] = geometry[0] - state[s]
+        law.direction_sines(first, slant_range, geometry[1], geometry[2], out)
     else:
-        phasors(state, _TURNS, work[0], out)
+        phasors(state, _TURNS, first, out)
         for s in range(n):
             if not abs(state[s]) <= _HALF_CIRCLE:
                 out[s] = math.nan

@@ -31,7 +31,7 @@ from scipy.special import ndtri
 
 from ...acoustics.array import angle_of_depth
 from ...estimation.arrays import FloatArray
-from ...estimation.markov import check_transition_matrix
+from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS, DEFAULT_SIGMAS_DEG
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
@@ -155,10 +155,7 @@ def _noises(config: BathymetryConfig, ranges: FloatArray) -> FloatArray:
 def _transition(config: BathymetryConfig, models: int) -> FloatArray:
     if config.transition_matrix:
         return check_transition_matrix(np.reshape(config.transition_matrix, (models, models)))
-    leave = (1.0 - config.stay_probability) / max(models - 1, 1)
-    matrix = np.full((models, models), leave)
-    np.fill_diagonal(matrix, config.stay_probability if models > 1 else 1.0)
-    return matrix
+    return persistent(models, config.stay_probability)
 
 
 def _start(config: BathymetryConfig, first_range: float) -> tuple[float, float]:
@@ -179,6 +176,6 @@ def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
         noises = models.scale[models.scale > 0.0]
         step = min(noises.min(initial=np.inf), ANGLE_STEP if angle else HEIGHT_STEP)
     extent = math.pi if angle else config.grid_extent
-    count = min(math.ceil(extent / step), MOST_CELLS)
+    count = math.ceil(min(extent / step, MOST_CELLS))
     cells = models.mean[0] + extent * np.arange(-count, count + 1) / count
     return cells[np.abs(cells) <= 0.5 * math.pi] if angle else cells

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from attrs import frozen
 
-from ...parameters import Config, parameter
+from ...parameters import inherited, parameter
 from ..model_checks import chain_problems
+from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
 
 MODEL_SETS = (
     'heading_speed',
@@ -23,7 +24,7 @@ ADAPTATIONS = ('counts', 'paper', 'fixed')
 
 
 @frozen(kw_only=True)
-class DiverConfig(Config):
+class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     """Everything the diver tracker can be told. The defaults are the `heading_speed` set of the
     docs."""
 
@@ -214,29 +215,6 @@ class DiverConfig(Config):
         high=12000.0,
         read_only=False,
     )
-    gate_probability: float = parameter(
-        0.999,
-        'chi-square probability inside which a measurement may belong to a track',
-        low=0.5,
-        high=0.9999999,
-        read_only=False,
-    )
-
-    detection_probability: float = parameter(
-        0.9,
-        'probability that a scan holds a diver that is there',
-        low=0.01,
-        high=0.9999,
-        read_only=False,
-    )
-    clutter_density: float = parameter(
-        1e-6,
-        'false fixes expected in a scan, for each square metre',
-        unit='1/m^2',
-        low=1e-12,
-        high=1e3,
-        read_only=False,
-    )
     fixes_are_scans: bool = parameter(
         True,
         'fixes of one stamp are a whole scan: a diver without one was missed. Off for '
@@ -245,60 +223,15 @@ class DiverConfig(Config):
     )
 
     # -- tracks ----------------------------------------------------------------------------------
-    max_tracks: int = parameter(
-        20, 'most divers at once; 1 means a single diver is known to be there', low=1, high=2000
-    )
-    confirm_hits: int = parameter(
-        3, 'hits within confirm_window that confirm a track', low=1, high=100, read_only=False
-    )
-    confirm_window: int = parameter(
-        5, 'scans looked at for confirmation', low=1, high=100, read_only=False
-    )
-    delete_misses: int = parameter(
-        5,
-        'consecutive scans without a hit that end a confirmed track',
-        low=1,
-        high=10000,
-        read_only=False,
-    )
-    max_coast: float = parameter(
-        60.0,
-        'time without a hit that ends any track',
-        unit='s',
-        low=0.01,
-        high=1e6,
-        read_only=False,
-    )
-
-    # -- time ------------------------------------------------------------------------------------
-    history: float = parameter(
-        10.0,
-        'how late a measurement may be and still be used, in its right place',
-        unit='s',
-        low=0.0,
-        high=3600.0,
-    )
-    max_gap: float = parameter(
-        3600.0,
-        'a stamp further ahead than this is doubted until the following ones agree',
-        unit='s',
-        low=1.0,
-        high=1e8,
-    )
-    restart_after: int = parameter(
-        5,
-        'consecutive agreeing stamps outside history and max_gap that count as a restarted clock',
-        low=2,
-        high=1000,
+    max_tracks: int = inherited(
+        TrackLifeParameters,
+        'max_tracks',
+        20,
+        description='most divers at once; 1 means a single diver is known to be there',
     )
 
     def check(self) -> list[str]:
-        problems = []
-        if self.confirm_hits > self.confirm_window:
-            problems.append(
-                f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '
-                f'({self.confirm_window})'
-            )
+        problems = super().check()
         models = self.model_count()
         if self.model_set in BASELINES and len(self.acceleration_noise) not in (0, models):
             problems.append(

@@ -299,9 +299,7 @@ def _single_direction(config: DiverConfig) -> ModelSet:
     M = len(names)
     noise = config.acceleration_noise or BASELINE_NOISE[config.model_set]
     rates = [value**2 * config.reference_step for value in noise]
-    stay = config.baseline_stay_probability
-    P = np.full((M, M), (1.0 - stay) / max(M - 1, 1))
-    np.fill_diagonal(P, stay if M > 1 else 1.0)
+    P = markov.persistent(M, config.baseline_stay_probability)
 
     def motion(dt: float) -> Motion:
         return Motion(

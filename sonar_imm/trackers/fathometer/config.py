@@ -5,12 +5,13 @@ from __future__ import annotations
 from functools import partial
 
 from attrs import frozen
-import numpy as np
 
 from ...acoustics.fathometer import PROCESSORS
 from ...acoustics.spectra import WINDOWS
 from ...estimation.set_particles import PRIORS
-from ...parameters import Config, parameter
+from ...parameters import inherited, parameter
+from ..model_checks import matrix_problems
+from ..shared_parameters import StampParameters
 
 live = partial(parameter, read_only=False)
 
@@ -19,7 +20,7 @@ PROPOSALS = ('data', 'prior')
 
 
 @frozen(kw_only=True)
-class FathometerConfig(Config):
+class FathometerConfig(StampParameters):
     """Everything the fathometer tracker can be told."""
 
     # -- array and sound --------------------------------------------------------------------------
@@ -38,7 +39,7 @@ class FathometerConfig(Config):
         low=0.0,
         high=12000.0,
     )
-    array_depth_age: float = parameter(
+    array_depth_age: float = live(
         30.0, 'a depth from the companion is used so long', unit='s', low=0.0, high=86400.0
     )
     array_depth_std: float = live(
@@ -193,8 +194,12 @@ class FathometerConfig(Config):
         5, 'a reflector not seen for so many records gets a new id', low=0, high=10_000
     )
 
+    # -- time -------------------------------------------------------------------------------------
+    max_gap: float = inherited(StampParameters, 'max_gap', 30.0 * 86_400.0)
+    restart_after: int = inherited(StampParameters, 'restart_after', 3)
+
     def check(self) -> list[str]:
-        problems = []
+        problems = super().check()
         for low, high in (
             ('frequency_min', 'frequency_max'),
             ('noise_depth_min', 'noise_depth_max'),
@@ -205,8 +210,13 @@ class FathometerConfig(Config):
             problems.append('depth_max must exceed depth_min')
         if self.order_max < self.order_min:
             problems.append('order_max cannot be less than order_min')
-        elif self.order_transition_matrix:
-            problems += self._check_matrix()
+        else:
+            problems += matrix_problems(
+                self.order_transition_matrix,
+                self.orders,
+                f'order_min {self.order_min} to order_max {self.order_max}',
+                name='order_transition_matrix',
+            )
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
@@ -216,21 +226,6 @@ class FathometerConfig(Config):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
-
-    def _check_matrix(self) -> list[str]:
-        orders = self.orders
-        if len(self.order_transition_matrix) != orders * orders:
-            return [
-                f'order_transition_matrix needs {orders} x {orders} = {orders * orders} values '
-                f'for order_min {self.order_min} to order_max {self.order_max}, got '
-                f'{len(self.order_transition_matrix)}'
-            ]
-        sums = np.reshape(self.order_transition_matrix, (orders, orders)).sum(axis=1)
-        return [
-            f'row {row} of order_transition_matrix sums to {total:.6g}, not 1'
-            for row, total in enumerate(sums)
-            if abs(total - 1.0) > 1e-6
-        ]
 
     @property
     def orders(self) -> int:

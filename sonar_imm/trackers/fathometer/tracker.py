@@ -33,7 +33,7 @@ from ...estimation.history import StampGate
 from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
-from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from ...measurements import ArrayDepth, CrossSpectra, nanoseconds, Pressure, Rejection, Trace
 from .config import FathometerConfig
 from .pressure import PressureStream
 from .reflectors import Identities, Known, nearest_ids, Reflectors, reflectors_of, write_estimate
@@ -50,8 +50,6 @@ from .response import (
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
 
-_MAX_GAP_NS = 30 * 86_400 * 10**9
-_RESTART_AFTER = 3
 _DEPTHS_KEPT = 10_000
 
 
@@ -79,7 +77,9 @@ class FathometerTracker:
         self.counts: Counter[str] = Counter()
         self.response: Response | None = None
         self._ids = Identities()
-        self._gate: StampGate[Any] = StampGate(0, _MAX_GAP_NS, _RESTART_AFTER)
+        self._gate: StampGate[Any] = StampGate(
+            0, nanoseconds(self.config.max_gap), self.config.restart_after
+        )
         self._array_depths: list[tuple[int, float]] = []
         self._forget()
 

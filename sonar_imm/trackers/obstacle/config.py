@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from attrs import frozen
 
 from ...acoustics.geometry import AZIMUTH_MODELS
-from ...parameters import Config, parameter
+from ...measurements import BEAM_AXES
+from ...parameters import inherited, parameter
+from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+
+live = partial(parameter, read_only=False)
 
 METHODS = ('gaussian_sum', 'seafloor', 'landmark')
 
 
 @frozen(kw_only=True)
-class ObstacleConfig(Config):
+class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     """Everything the obstacle tracker can be told. The defaults fit a Blueview P450 on a survey
     AUV."""
 
@@ -52,7 +58,7 @@ class ObstacleConfig(Config):
         'axes of the beam vectors of SonarRanges and sonar images: marine (z forward, y to '
         'starboard, as their definition says), rep103 (x forward, y to port), or by which of the '
         'two the beams point along',
-        choices=('marine', 'rep103', 'auto'),
+        choices=BEAM_AXES,
     )
     nav_twist_frame: str = parameter(
         'child',
@@ -83,16 +89,16 @@ class ObstacleConfig(Config):
     )
 
     # -- what the sonar measures -----------------------------------------------------------------
-    range_std: float = parameter(
+    range_std: float = live(
         0.15, 'error of a range that comes without variance', unit='m', low=1e-6, high=100.0
     )
-    bearing_std_deg: float = parameter(
+    bearing_std_deg: float = live(
         0.25, 'error of a bearing that comes without variance', unit='deg', low=1e-6, high=45.0
     )
-    range_step: float = parameter(
+    range_step: float = live(
         0.17, 'sampling step of such a range, adds step^2 / 12', unit='m', low=0.0, high=100.0
     )
-    bearing_step_deg: float = parameter(
+    bearing_step_deg: float = live(
         0.18, 'sampling step of such a bearing, adds step^2 / 12', unit='deg', low=0.0, high=45.0
     )
     max_range: float = parameter(
@@ -104,26 +110,18 @@ class ObstacleConfig(Config):
     vertical_fov_deg: float = parameter(
         15.0, 'full height of the beam', unit='deg', low=0.5, high=90.0
     )
-    detection_probability: float = parameter(
-        0.9, 'that a ping shows an obstacle in the beam', low=0.01, high=0.9999
-    )
-    clutter_density: float = parameter(
+    gate_probability: float = inherited(DetectionParameters, 'gate_probability', 0.9995)
+    clutter_density: float = inherited(
+        DetectionParameters,
+        'clutter_density',
         0.05,
-        'false detections of a ping for each metre of range and radian of bearing',
+        description='false detections of a ping for each metre of range and radian of bearing',
         unit='1/(m rad)',
         low=1e-9,
-        high=1e4,
     )
-    outlier_probability: float = parameter(
+    outlier_probability: float = live(
         0.02, 'that a detection inside the gate is not the obstacle', low=0.0, high=0.5
     )
-    gate_probability: float = parameter(
-        0.9995,
-        'chi-square probability inside which a detection may belong to a track',
-        low=0.5,
-        high=0.9999999,
-    )
-
     # -- what is believed of depth and navigation ------------------------------------------------
     max_offset: float = parameter(
         0.0,
@@ -133,10 +131,10 @@ class ObstacleConfig(Config):
         low=0.0,
         high=1000.0,
     )
-    altitude_std: float = parameter(
+    altitude_std: float = live(
         0.1, 'error of an altitude that comes without variance', unit='m', low=1e-6, high=100.0
     )
-    max_altitude_age: float = parameter(
+    max_altitude_age: float = live(
         5.0, 'age to which an altitude is used', unit='s', low=0.0, high=3600.0
     )
     scale_std: float = parameter(
@@ -156,28 +154,10 @@ class ObstacleConfig(Config):
     )
 
     # -- tracks ----------------------------------------------------------------------------------
-    max_tracks: int = parameter(40, 'most obstacles at once', low=1, high=2000)
-    confirm_hits: int = parameter(
-        4, 'hits within confirm_window that confirm a track', low=1, high=100, read_only=False
-    )
-    confirm_window: int = parameter(
-        6, 'pings looked at for confirmation', low=1, high=100, read_only=False
-    )
-    delete_misses: int = parameter(
-        10,
-        'consecutive misses, while the obstacle is in the beam, that end a confirmed track',
-        low=1,
-        high=10000,
-        read_only=False,
-    )
-    max_coast: float = parameter(
-        60.0,
-        'time without a hit that ends any track',
-        unit='s',
-        low=0.01,
-        high=1e6,
-        read_only=False,
-    )
+    max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 40)
+    confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 4)
+    confirm_window: int = inherited(TrackLifeParameters, 'confirm_window', 6)
+    delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 10)
 
     # -- time ------------------------------------------------------------------------------------
     max_navigation_gap: float = parameter(
@@ -195,37 +175,15 @@ class ObstacleConfig(Config):
         low=0.0,
         high=10.0,
     )
-    history: float = parameter(
-        5.0,
-        'how late a measurement may be and still be used, in its right place',
-        unit='s',
-        low=0.0,
-        high=600.0,
-    )
-    max_gap: float = parameter(
-        600.0,
-        'a stamp further ahead than this is doubted until the following ones agree',
-        unit='s',
-        low=1.0,
-        high=1e8,
-    )
-    restart_after: int = parameter(
-        5,
-        'consecutive agreeing stamps outside history and max_gap that count as a restarted clock',
-        low=2,
-        high=1000,
-    )
+    history: float = inherited(StreamParameters, 'history', 5.0)
+    max_gap: float = inherited(StreamParameters, 'max_gap', 600.0)
     seed: int = parameter(0, 'of random numbers; this tracker draws none', low=0, high=2**31 - 1)
 
     def check(self) -> list[str]:
-        problems = [
+        problems = super().check()
+        problems += [
             f'{name} needs three values, got {len(getattr(self, name))}'
             for name in ('sonar_lever', 'sonar_mount_rpy_deg')
             if len(getattr(self, name)) != 3
         ]
-        if self.confirm_hits > self.confirm_window:
-            problems.append(
-                f'confirm_hits ({self.confirm_hits}) cannot exceed confirm_window '
-                f'({self.confirm_window})'
-            )
         return problems

@@ -96,6 +96,7 @@ class ObstacleTracker:
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
         self.config = config
+        self.filter = build_filter(config)
 
     def warm(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.

@@ -18,10 +18,8 @@ def test_both_programs_do_the_same_sums():
     pytest.importorskip('filterpy')
     result = bench.bench_step(rounds=1, steps=30)
     assert result['largest_difference_m'] < 1e-9
-    assert result['ours_us'] > 0 and result['filterpy_us'] > 0
 
 
 def test_a_scan_hits_its_targets():
     result = bench.bench_scan(targets=40, scans=3)
     assert result['assigned'] > 0.9
-    assert 0.0 < result['median_ms'] <= result['worst_ms']

@@ -198,5 +198,4 @@ def test_truth_further_away_than_the_gap_is_none(run):
 def test_both_ways_to_the_likelihood_agree():
     result = bench_likelihood(rounds=1, sets=10)
     assert result['good'] and result['largest_relative_difference'] < 1e-6
-    assert result['least_squares_numpy_us'] > 0.0 and result['gram_numpy_us'] > 0.0
     assert bench_record(2)['reflectors'] == 8

@@ -4,6 +4,7 @@ import math
 
 from attrs import evolve
 from helpers.bathymetry_cases import floor
+from helpers.estimates import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -15,6 +16,7 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.bathymetry.config import MODEL_SETS
+from sonar_imm.trackers.bathymetry.kernels import sines_of
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 RNG = np.random.default_rng(1)
@@ -31,11 +33,41 @@ def rmse(estimate, height):
     return float(np.sqrt(np.mean(np.square(values - height))))
 
 
-def same(one, other):
-    a, b = one.columns(), other.columns()
-    return list(a) == list(b) and all(
-        np.asarray(a[key]).tobytes() == np.asarray(b[key]).tobytes() for key in a
-    )
+# -- memory: these once wrote outside of their arrays; NUMBA_BOUNDSCHECK=1 shows where -----------
+
+
+@pytest.mark.parametrize('smoothing', ['none', 'states'])
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'sigmas': (0.03, 20.0), 'grid_extent': 0.1},
+        {'sigmas': (0.03, 20.0), 'grid_extent': 0.1, 'sigma_reference_bin': 1e-300},
+        {'sigmas': (0.0, 20.0), 'sigma_reference_bin': 1e-320},
+        {'grid_step': 1e-320, 'grid_extent': 0.1},
+    ],
+)
+def test_a_walk_wider_than_the_grid_is_no_harm(values, smoothing):
+    snapshot = floor(0.0, ranges=20.0 + 0.05 * np.arange(30))
+    table = run(snapshot, engine='grid', smoothing=smoothing, **values).columns()
+    assert (np.abs(table['height']) <= 20.0).all()
+    assert table['prob_rw_smooth'] + table['prob_rw_rough'] == pytest.approx(1.0)
+
+
+def test_a_chain_that_never_switches_is_no_harm():
+    """The probability of the wrong model falls below the smallest number with a reciprocal."""
+    snapshot = floor(0.0, ranges=20.0 + 0.05 * np.arange(1500))
+    estimate = run(snapshot, stay_probability=1.0, sigmas=(0.01, 5.0))
+    probability = estimate.columns()['prob_rw_rough']
+    assert ((probability > 0.0) & (probability < 1e-307)).any()
+    assert rmse(estimate, 0.0) < 0.1
+
+
+def test_direction_sines_write_only_those_asked_for():
+    geometry, state = np.array([15.0, 0.8, 0.6, 0.5]), np.linspace(-1.0, 1.0, 5)
+    for geometry[0] in (15.0, math.nan):
+        work, out = np.zeros((2, 9)), np.full(9, -7.0)
+        sines_of(state, 20.0, geometry, work, out[:5])
+        assert (out[5:] == -7.0).all() and np.isfinite(out[:5]).all()
 
 
 # -- the columns ----------------------------------------------------------------------------------
@@ -92,11 +124,12 @@ def test_angle_and_height_say_the_same():
     assert 15.0 - depth == pytest.approx(table['height'], abs=1e-9)
 
 
-def test_a_label_is_the_likeliest_model():
-    estimate = run(floor(PATCH))
-    label = estimate.extras['label']
-    assert np.array_equal(label, estimate.probabilities.argmax(axis=1))
-    assert np.array_equal(estimate.extras['label_probability'], estimate.probabilities.max(axis=1))
+def test_labels_name_the_model_that_holds_and_how_sure_that_is():
+    """Label 1 is the model `rw_rough`, wherever that is more probable than not."""
+    table = run(floor(PATCH)).columns()
+    label, rough = table['label'], table['prob_rw_rough']
+    assert (label[rough > 0.5] == 1).all() and (label[rough < 0.5] == 0).all()
+    assert table['label_probability'] == pytest.approx(0.5 + np.abs(rough - 0.5), abs=1e-12)
     assert label[125:195].mean() > 0.9 and label[:100].mean() < 0.1
 
 

@@ -1,6 +1,7 @@
 """The diver tracker as its users see it: measurements in, estimates out."""
 
-from helpers.diver_runs import errors, fix, run, same, SECOND
+from helpers.diver_runs import errors, fix, run, SECOND
+from helpers.estimates import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np

@@ -1,5 +1,6 @@
 """The obstacle tracker as a whole: life of tracks, time, navigation, bad input."""
 
+from helpers.estimates import same
 from helpers.obstacle_runs import (
     approach,
     followed,
@@ -23,14 +24,6 @@ from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 NAME = 'approach_dst+3_noisy'
-
-
-def same(one, other):
-    """Equal to the last bit."""
-    ours, theirs = one.columns(), other.columns()
-    return list(ours) == list(theirs) and all(
-        ours[name].tobytes() == theirs[name].tobytes() for name in ours
-    )
 
 
 def same_runs(one, other):

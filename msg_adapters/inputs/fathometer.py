@@ -1,0 +1,54 @@
+"""What the fathometer tracker hears."""
+
+from __future__ import annotations
+
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
+
+from ..array_depth import read_array_depth, write_array_depth
+from ..array_records import (
+    read_csdm,
+    read_pressure,
+    read_trace,
+    write_csdm,
+    write_pressure,
+    write_trace,
+)
+from .topic import InputTopic
+
+TOPICS = (
+    InputTopic(
+        'csdm',
+        'cross-spectra of a vertical array, one row per frequency',
+        measurement=CrossSpectra,
+        readers={'sensor_msgs/msg/PointCloud2': read_csdm},
+        write=write_csdm,
+        one_topic=True,
+    ),
+    InputTopic(
+        'pressure',
+        'pressure at the phones of a vertical array, one row per sample',
+        measurement=Pressure,
+        readers={'sensor_msgs/msg/PointCloud2': read_pressure},
+        write=write_pressure,
+        one_topic=True,
+    ),
+    InputTopic(
+        'trace',
+        'ready-made traces, one row per depth',
+        measurement=Trace,
+        readers={'sensor_msgs/msg/PointCloud2': read_trace},
+        write=write_trace,
+        one_topic=True,
+    ),
+    InputTopic(
+        'array_depth',
+        'depth of the deepest phone, from a companion instrument',
+        measurement=ArrayDepth,
+        readers={
+            'geometry_msgs/msg/PointStamped': read_array_depth,
+            'geometry_msgs/msg/PoseWithCovarianceStamped': read_array_depth,
+        },
+        write=write_array_depth,
+        companion=True,
+    ),
+)

@@ -1,0 +1,59 @@
+"""What the obstacle tracker hears."""
+
+from __future__ import annotations
+
+from sonar_imm.measurements import Altitude, Detections, Navigation
+
+from ..detections import (
+    read_detections,
+    read_laser_scan,
+    read_pose_array,
+    read_sonar_detections,
+    read_sonar_ranges,
+    write_detections,
+)
+from ..navigation import (
+    doubt_navigation,
+    read_dvl,
+    read_navigation,
+    read_range,
+    write_navigation,
+    write_range,
+)
+from .topic import InputTopic
+
+TOPICS = (
+    InputTopic(
+        'detections',
+        'echoes of one ping of a forward-looking sonar, also none',
+        measurement=Detections,
+        readers={
+            'sensor_msgs/msg/PointCloud2': read_detections,
+            'sensor_msgs/msg/LaserScan': read_laser_scan,
+            'geometry_msgs/msg/PoseArray': read_pose_array,
+            'marine_acoustic_msgs/msg/SonarDetections': read_sonar_detections,
+            'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
+        },
+        write=write_detections,
+        settings=('beam_axes', 'sound_speed'),
+    ),
+    InputTopic(
+        'nav',
+        'pose of the vehicle',
+        measurement=Navigation,
+        readers={'nav_msgs/msg/Odometry': read_navigation},
+        write=write_navigation,
+        doubt=doubt_navigation,
+        settings=('nav_twist_frame',),
+    ),
+    InputTopic(
+        'altitude',
+        'height above the sea floor',
+        measurement=Altitude,
+        readers={
+            'sensor_msgs/msg/Range': read_range,
+            'marine_acoustic_msgs/msg/Dvl': read_dvl,
+        },
+        write=write_range,
+    ),
+)

@@ -1,0 +1,46 @@
+"""What there is to know of one input of a tracker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from attrs import field, frozen
+
+Reader = Callable[..., Any]
+
+
+@frozen
+class InputTopic:
+    """One input of a tracker.
+
+    name: relative topic name; measurement: the class that its readers make. readers: measurement
+    readers by message type; a reader takes ``(message, *, world_frame='enu')`` and raises
+    `Rejection` for a message it cannot use. write: the message of a measurement,
+    ``(measurement, make) -> message``.
+    doubt: gives a reason code to count when a message can be used but deserves a warning.
+    scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
+    one_topic: several topics are several instruments, each for a tracker of its own.
+    settings: parameters of the tracker that its readers take as keywords, too: how messages are to
+    be understood that do not say it themselves.
+    companion: says something about another input, known by its name and never enough alone.
+    """
+
+    name: str
+    description: str
+    measurement: type = field(kw_only=True)
+    readers: Mapping[str, Reader] = field(kw_only=True)
+    write: Callable[..., Any] = field(kw_only=True)
+    doubt: Callable[[Any], str | None] = field(default=lambda message: None, kw_only=True)
+    scans: bool = field(default=False, kw_only=True)
+    one_topic: bool = field(default=False, kw_only=True)
+    settings: tuple[str, ...] = field(default=(), kw_only=True)
+    companion: bool = field(default=False, kw_only=True)
+
+    def reader(
+        self, type_name: str, world_frame: str, settings: Mapping[str, Any]
+    ) -> Callable[[Any], Any]:
+        """Give the reader of a message type, told everything; `settings` may hold more."""
+        told = {name: settings[name] for name in self.settings if name in settings}
+        return partial(self.readers[type_name], world_frame=world_frame, **told)

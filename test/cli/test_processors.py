@@ -1,0 +1,99 @@
+"""The estimates of the shipped recordings on another processor: the promise of
+docs/architecture.md.
+
+The other processor is played by this one: the oldest OpenBLAS kernels that it can run, and numpy
+without the loops it has for newer instruction sets, against the newest kernels and all loops.
+"""
+
+import csv
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from helpers.kernel_types import left_out, runnable
+import numpy as np
+import pytest
+
+BAGS = sorted((Path(__file__).parents[2] / 'bags').iterdir())
+
+PROMISE = {'bathymetry': 1e-12, 'diver': 1e-10, 'obstacle': 1e-7, 'fathometer': 1e-9}
+"""Largest difference of any number, as a share of the largest magnitude in its column. Measured
+between Prescott and SkylakeX, with numpy's AVX2 and AVX-512 loops off and on: bathymetry 4e-16,
+diver 3e-13, obstacle 2e-9, fathometer 8e-12."""
+
+EXACT = {'stamp_ns', 'track_id', 'track_state', 'valid', 'label', 'nis_dof'}
+"""Columns of counts and names: equal everywhere."""
+
+PROGRAM = """
+import sys
+from helpers.kernel_types import in_effect
+from sonar_imm.cli import main
+code = main(['track', *sys.argv[1:]])
+print(' '.join(sorted(in_effect())))
+sys.exit(code)
+"""
+
+
+def newer_loops():
+    """The instruction sets above the baseline that numpy uses here."""
+    try:
+        from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+    except ImportError:  # numpy 1
+        from numpy.core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+    return [name for name in __cpu_dispatch__ if __cpu_features__.get(name)]
+
+
+def track(bag, out, kernel_type, disabled=()):
+    """The columns of the estimates of `bag`, by name, from a process of that type."""
+    environment = {
+        **os.environ,
+        'OPENBLAS_CORETYPE': kernel_type,
+        'NPY_DISABLE_CPU_FEATURES': ' '.join(disabled),
+        'PYTHONPATH': os.pathsep.join(filter(None, sys.path)),
+    }
+    done = subprocess.run(
+        [sys.executable, '-c', PROGRAM, str(bag), str(out)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == kernel_type
+    with (out / 'estimate.csv').open(newline='') as file:
+        table = list(csv.DictReader(file))
+    return {name: np.array([float(row[name] or 'nan') for row in table]) for name in table[0]}
+
+
+def apart(one, other):
+    """Largest difference of two columns as a share of their largest magnitude."""
+    known = np.isfinite(one)
+    assert np.array_equal(known, np.isfinite(other))
+    difference = np.abs(one - other)[known].max(initial=0.0)
+    return difference / np.abs(one[known]).max(initial=0.0) if difference else 0.0
+
+
+@pytest.mark.parametrize('bag', BAGS, ids=lambda bag: bag.name)
+def test_another_processor_gives_the_same_estimates_to_the_promised_digits(bag, tmp_path):
+    types = runnable()
+    if len(types) < 2:
+        pytest.skip(f'no two kernel types to compare: {left_out()}')
+    old = track(bag, tmp_path / 'old', types[0], newer_loops())
+    new = track(bag, tmp_path / 'new', types[-1])
+    assert list(old) == list(new)
+    assert len(old['stamp_ns']) == len(new['stamp_ns']) > 20
+    differences = {name: apart(old[name], new[name]) for name in old}
+    promise = PROMISE[bag.name.split('_')[0]]
+    wrong = {
+        name: difference
+        for name, difference in differences.items()
+        if difference > (0.0 if name in EXACT else promise)
+    }
+    assert not wrong, f'{types[0]} and {types[-1]} differ by more than {promise:g}: {wrong}'
+
+
+def test_a_difference_is_measured_against_its_column():
+    column = np.array([np.nan, 100.0, -400.0, 1e-9])
+    assert apart(column, column.copy()) == 0.0
+    assert apart(column, column + [0.0, 0.0, 0.4, 2e-9]) == pytest.approx(1e-3)
+    assert apart(column, column + [0.0, 0.0, 0.0, 2e-9]) == pytest.approx(5e-12)

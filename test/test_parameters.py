@@ -1,0 +1,355 @@
+"""Parameters: what is taken, what is refused and in which words."""
+
+import math
+
+import attrs
+from hypothesis import given
+from hypothesis import strategies as st
+import pytest
+
+from sonar_imm.parameters import (
+    Config,
+    ConfigError,
+    did_you_mean,
+    KINDS,
+    markdown_table,
+    parameter,
+    parameters_from_yaml,
+    ParameterSpec,
+)
+from sonar_imm.trackers import SYSTEMS
+
+
+@attrs.frozen(kw_only=True)
+class Walker(Config):
+    speed: float = parameter(0.5, 'how fast', unit='m/s', low=0.0, high=3.0, read_only=False)
+    steps: int = parameter(3, 'how many', low=1)
+    calm: bool = parameter(True, 'whether he rests', read_only=False)
+    gait: str = parameter('walk', 'how he moves', choices=('walk', 'march', 'crawl'))
+    name: str = parameter('', 'of the walker')
+    weights: tuple = parameter((0.25, 0.75), 'of legs', low=0.0, high=1.0)
+    stops: tuple = parameter((), 'where he rests', kind='int[]', high=99)
+    roads: tuple = parameter(('a', 'b'), 'which roads')
+
+    def check(self):
+        return ['speed must exceed steps'] if self.speed == 2.0 and self.steps > 2 else []
+
+
+def problems(**values):
+    with pytest.raises(ConfigError) as caught:
+        Walker.from_mapping(values)
+    return caught.value.problems
+
+
+# -- one value ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'values, sentence',
+    [
+        ({'speed': -0.1}, "parameter 'speed' must be between 0 and 3, got -0.1 m/s"),
+        ({'speed': 3.0000001}, "parameter 'speed' must be between 0 and 3, got 3.0000001 m/s"),
+        ({'steps': 0}, "parameter 'steps' must be at least 1, got 0"),
+        ({'stops': [5, 100]}, "parameter 'stops' must be at most 99, got 100"),
+        ({'weights': [0.5, 1.5]}, "parameter 'weights' must be between 0 and 1, got 1.5"),
+        ({'speed': 'fast'}, "parameter 'speed' must be a number, got 'fast'"),
+        ({'speed': '1.0'}, "parameter 'speed' must be a number, got '1.0'"),
+        ({'speed': None}, "parameter 'speed' must be a number, got None"),
+        ({'speed': True}, "parameter 'speed' must be a number, got True"),
+        ({'speed': [1.0]}, "parameter 'speed' must be a number, got [1.0]"),
+        ({'steps': True}, "parameter 'steps' must be a whole number, got True"),
+        ({'steps': 2.0}, "parameter 'steps' must be a whole number, got 2.0"),
+        ({'calm': 1}, "parameter 'calm' must be true or false, got 1"),
+        ({'calm': 'yes'}, "parameter 'calm' must be true or false, got 'yes'"),
+        ({'name': 7}, "parameter 'name' must be text, got 7"),
+        ({'gait': 'run'}, "parameter 'gait' must be one of walk, march, crawl, got 'run'"),
+        (
+            {'gait': 'mach'},
+            "parameter 'gait' must be one of walk, march, crawl, got 'mach' "
+            "(did you mean 'march'?)",
+        ),
+        ({'weights': 0.5}, "parameter 'weights' must be a list of float, got 0.5"),
+        ({'weights': '0.5'}, "parameter 'weights' must be a list of float, got '0.5'"),
+        ({'weights': [0.5, 'x']}, "parameter 'weights' must be a number, got 'x'"),
+        ({'weights': [[0.5]]}, "parameter 'weights' must be a number, got [0.5]"),
+        ({'weights': [True]}, "parameter 'weights' must be a number, got True"),
+        ({'stops': [1, 2.5]}, "parameter 'stops' must be a whole number, got 2.5"),
+        ({'stops': [False]}, "parameter 'stops' must be a whole number, got False"),
+        ({'roads': ['a', 1]}, "parameter 'roads' must be text, got 1"),
+        ({'roads': b'ab'}, "parameter 'roads' must be a list of str, got b'ab'"),
+    ],
+)
+def test_a_bad_value_gets_one_sentence(values, sentence):
+    assert problems(**values) == (sentence,)
+    with pytest.raises(ConfigError) as caught:
+        Walker(**values)
+    assert caught.value.problems == (sentence,)
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_numbers_have_to_be_finite(value):
+    for name in ('speed', 'weights'):
+        (sentence,) = problems(**{name: [value] if name == 'weights' else value})
+        assert sentence == f"parameter '{name}' must be finite, got {value!r}"
+
+
+def test_the_ends_of_a_range_belong_to_it():
+    for speed in (0.0, 3.0):
+        assert Walker(speed=speed).speed == speed
+    assert Walker(weights=[0.0, 1.0]).weights == (0.0, 1.0)
+
+
+def test_values_become_what_the_kind_says():
+    walker = Walker(speed=1, weights=[1, 0], stops=[3], roads=['x'])
+    assert walker == Walker(speed=1.0, weights=(1.0, 0.0), stops=(3,), roads=('x',))
+    assert type(walker.speed) is float and [type(one) for one in walker.weights] == [float, float]
+    assert (walker.weights, walker.stops, walker.roads) == ((1.0, 0.0), (3,), ('x',))
+    assert hash(walker) == hash(Walker(speed=1.0, weights=(1, 0), stops=(3,), roads=('x',)))
+    assert type(Walker(steps=2).steps) is int
+
+
+def test_a_list_may_be_empty():
+    assert Walker(weights=[], stops=(), roads=[]).weights == ()
+
+
+# -- several values -------------------------------------------------------------------------------
+
+
+def test_every_mistake_is_told_at_once():
+    told = problems(sped=1.0, speed=9.0, steps=0, colour='red')
+    assert told == (
+        "unknown parameter 'sped' (did you mean 'speed'?)",
+        "unknown parameter 'colour'",
+        "parameter 'speed' must be between 0 and 3, got 9.0 m/s",
+        "parameter 'steps' must be at least 1, got 0",
+    )
+    with pytest.raises(ConfigError) as caught:
+        Walker.from_mapping({'sped': 1.0, 'steps': 0})
+    assert str(caught.value) == '; '.join(caught.value.problems)
+
+
+def test_unknown_names_may_be_passed_over_but_not_bad_values():
+    assert Walker.from_mapping({'sped': 1.0, 'steps': 4}, ignore_unknown=True).steps == 4
+    with pytest.raises(ConfigError, match='steps'):
+        Walker.from_mapping({'sped': 1.0, 'steps': 0}, ignore_unknown=True)
+
+
+def test_rules_across_parameters_come_after_those_of_each():
+    assert problems(speed=2.0) == ('speed must exceed steps',)
+    assert problems(speed=2.0, gait='run') == (
+        "parameter 'gait' must be one of walk, march, crawl, got 'run'",
+    )
+    with pytest.raises(ConfigError, match='must exceed'):
+        attrs.evolve(Walker(speed=2.0, steps=2), steps=3)
+    assert Walker(speed=2.0, steps=2).steps == 2
+
+
+def test_an_empty_mapping_gives_the_defaults():
+    assert Walker.from_mapping({}) == Walker()
+
+
+def test_a_config_cannot_be_changed():
+    with pytest.raises(attrs.exceptions.FrozenInstanceError):
+        Walker().speed = 1.0
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+@given(
+    values=st.dictionaries(
+        st.one_of(st.text(max_size=5), st.sampled_from(['seed', 'history', 'gate', 'method'])),
+        st.one_of(
+            st.none(),
+            st.booleans(),
+            st.integers(),
+            st.floats(),
+            st.text(max_size=5),
+            st.lists(st.one_of(st.integers(), st.floats(), st.text(max_size=2)), max_size=3),
+            st.dictionaries(st.text(max_size=2), st.integers(), max_size=2),
+        ),
+        max_size=4,
+    )
+)
+def test_any_mapping_gives_a_config_or_sentences(system, values):
+    try:
+        config = SYSTEMS[system].config_type().from_mapping(values)
+    except ConfigError as error:
+        assert error.problems and all(isinstance(one, str) for one in error.problems)
+    else:
+        assert set(values) <= set(config.as_dict())
+
+
+# -- changes while running ------------------------------------------------------------------------
+
+
+def test_only_what_is_not_read_only_may_change():
+    walker = Walker()
+    walker.require_changeable(Walker(speed=1.0, calm=False))
+    walker.require_changeable(Walker(weights=[0.25, 0.75]))  # the same value again
+    with pytest.raises(ValueError) as caught:
+        walker.require_changeable(Walker(speed=1.0, steps=4, stops=(1,)))
+    assert str(caught.value) == 'these parameters need a new tracker: steps, stops'
+
+
+# -- what is known of them ------------------------------------------------------------------------
+
+
+def test_specs_say_what_was_declared():
+    specs = {spec.name: spec for spec in Walker.specs()}
+    assert list(specs) == [
+        'speed', 'steps', 'calm', 'gait', 'name', 'weights', 'stops', 'roads',
+    ]  # fmt: skip
+    kinds = ['float', 'int', 'bool', 'str', 'str', 'float[]', 'int[]', 'str[]']
+    assert [spec.kind for spec in specs.values()] == kinds and set(kinds) <= set(KINDS)
+    speed = specs['speed']
+    assert (speed.default, speed.unit, speed.low, speed.high) == (0.5, 'm/s', 0.0, 3.0)
+    assert not speed.read_only and specs['steps'].read_only
+    assert specs['gait'].choices == ('walk', 'march', 'crawl')
+
+
+def test_a_derived_class_keeps_the_parameters_of_its_base():
+    @attrs.frozen(kw_only=True)
+    class Runner(Walker):
+        pulse: int = parameter(120, 'beats per minute')
+
+    assert [spec.name for spec in Runner.specs()][-2:] == ['roads', 'pulse']
+    assert Runner(pulse=90, speed=1.0).as_dict()['pulse'] == 90
+
+
+def test_plain_values_come_back():
+    values = Walker(stops=(1, 2)).as_dict()
+    assert values['stops'] == [1, 2] and values['weights'] == [0.25, 0.75]
+    assert list(values) == [spec.name for spec in Walker.specs()]
+    assert Walker.from_mapping(values) == Walker(stops=(1, 2))
+
+
+def test_an_empty_list_needs_its_kind():
+    with pytest.raises(TypeError, match='kind='):
+        parameter((), 'which')
+
+
+@pytest.mark.parametrize(
+    'limits, words',
+    [
+        ({}, ''),
+        ({'low': 0.0}, 'at least 0'),
+        ({'high': 1e6}, 'at most 1e+06'),
+        ({'low': -1.5, 'high': 2}, 'between -1.5 and 2'),
+    ],
+)
+def test_ranges_in_words(limits, words):
+    assert ParameterSpec('x', 'float', 0.0, 'what', **limits).range_text() == words
+
+
+def test_the_table_has_one_row_per_parameter():
+    rows = markdown_table(Walker.specs()).splitlines()
+    assert len(rows) == 2 + len(Walker.specs())
+    assert rows[2] == (
+        '| `speed` | float | `0.5` | m/s | between 0 and 3 | how fast (may change while running) |'
+    )
+    assert rows[5] == ('| `gait` | str | `walk` |  | `walk`, `march`, `crawl` | how he moves |')
+    assert '| `weights` | float[] | `[0.25, 0.75]` |' in rows[7]
+    assert all(row.count('|') == 7 for row in rows)
+
+
+def test_a_near_name_is_suggested_and_a_far_one_is_not():
+    assert did_you_mean('sped', ['steps', 'speed']) == " (did you mean 'speed'?)"
+    assert did_you_mean('colour', ['steps', 'speed']) == ''
+    assert did_you_mean(7, ['steps']) == ''
+    assert did_you_mean('x', []) == ''
+
+
+# -- parameter files ------------------------------------------------------------------------------
+
+
+def test_a_plain_mapping_and_a_ros_file_say_the_same():
+    plain = 'speed: 1.5\nstops: [1, 2]\n'
+    ros = '/**:\n  ros__parameters:\n    speed: 1.5\n    stops: [1, 2]\n'
+    assert parameters_from_yaml(plain) == parameters_from_yaml(ros)
+    assert parameters_from_yaml(ros) == {'speed': 1.5, 'stops': [1, 2]}
+
+
+NODES = """
+/**:
+  ros__parameters: {speed: 1.0, steps: 2}
+/ship/walker_node:
+  ros__parameters: {speed: 2.0}
+other_node:
+  ros__parameters: {steps: 9, calm: false}
+"""
+
+
+def test_a_node_takes_what_all_take_and_what_bears_its_name():
+    assert parameters_from_yaml(NODES, node_name='walker_node') == {'speed': 2.0, 'steps': 2}
+    assert parameters_from_yaml(NODES, node_name='other_node') == {
+        'speed': 1.0, 'steps': 9, 'calm': False,
+    }  # fmt: skip
+    assert parameters_from_yaml(NODES, node_name='nobody') == {'speed': 1.0, 'steps': 2}
+    assert parameters_from_yaml(NODES)['calm'] is False
+
+
+def test_later_sections_win():
+    turned = (
+        'walker_node:\n  ros__parameters: {speed: 2.0}\n/*:\n  ros__parameters: {speed: 1.0}\n'
+    )
+    assert parameters_from_yaml(turned, node_name='walker_node') == {'speed': 1.0}
+
+
+@pytest.mark.parametrize('text', ['', '# nothing\n', '/**:\n  ros__parameters:\n'])
+def test_nothing_is_no_parameter(text):
+    assert parameters_from_yaml(text) == {}
+
+
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('speed: [1, 2', 'not a YAML file'),
+        ('a: b: c', 'not a YAML file'),
+        ('- 1\n- 2\n', 'must hold a mapping, this one holds a list'),
+        ('just words', 'must hold a mapping, this one holds a str'),
+        ('7', 'must hold a mapping, this one holds a int'),
+        ('speed: !!python/object/apply:os.system ["true"]', 'not a YAML file'),
+    ],
+)
+def test_a_file_that_is_none_is_told_in_one_line(text, words):
+    with pytest.raises(ConfigError, match=words) as caught:
+        parameters_from_yaml(text)
+    assert len(caught.value.problems) == 1 and '\n' not in str(caught.value)
+
+
+def test_nan_in_a_file_is_refused_by_name():
+    values = parameters_from_yaml('speed: .nan\nweights: [0.5, .inf]\n')
+    assert problems(**values) == (
+        "parameter 'speed' must be finite, got nan",
+        "parameter 'weights' must be finite, got inf",
+    )
+
+
+@pytest.mark.parametrize('form', ['{}', '5:\n  ros__parameters: {{{}}}'])
+def test_keys_that_are_no_text_are_named(form):
+    text = form.format('7: 1.0, true: 2' if '{{' in form else '7: 1.0\ntrue: 2\n')
+    assert problems(**parameters_from_yaml(text)) == (
+        "unknown parameter '7'",
+        "unknown parameter 'True'",
+    )
+
+
+def test_groups_of_parameters_are_named_not_guessed():
+    nested = 'ship:\n  walker_node:\n    ros__parameters: {speed: 1.0}\n'
+    assert problems(**parameters_from_yaml(nested)) == ("unknown parameter 'ship'",)
+    (sentence,) = problems(**parameters_from_yaml('speed: {mean: 1.0}'))
+    assert sentence == "parameter 'speed' must be a number, got {'mean': 1.0}"
+
+
+@pytest.mark.parametrize('text', ['/**:\n  ros__parameters: 5\n', 'a:\n  ros__parameters: [1]\n'])
+def test_a_section_that_is_no_mapping_is_named(text):
+    with pytest.raises(ConfigError, match='ros__parameters'):
+        parameters_from_yaml(text)
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_a_mapping_or_refused(text):
+    try:
+        values = parameters_from_yaml(text)
+    except ConfigError:
+        return
+    assert all(isinstance(key, str) for key in values)

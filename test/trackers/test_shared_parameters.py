@@ -1,0 +1,153 @@
+"""Parameters that several trackers share: declared once, changeable alike, each effective."""
+
+import attrs
+from attrs import evolve, frozen
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Altitude, Detections, Navigation, Trace
+from sonar_imm.parameters import Config, ConfigError, inherited, parameter
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm.trackers.model_checks import chain_problems, matrix_problems
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm.trackers.shared_parameters import (
+    DetectionParameters,
+    StampParameters,
+    StreamParameters,
+    TrackLifeParameters,
+)
+
+SHARED = (DetectionParameters, TrackLifeParameters, StampParameters, StreamParameters)
+# Sound shapes the lattice of the fathometer and the readers of the obstacle tracker, but arrival
+# times meet it only when they are used.
+APART = {'sound_speed'}
+
+
+@frozen(kw_only=True, slots=False)
+class Left(Config):
+    first: float = parameter(1.0, 'first', low=0.0, high=5.0, read_only=False)
+    second: int = parameter(2, 'second')
+
+    def check(self):
+        return [*super().check(), *(['first is the largest'] if self.first > self.second else [])]
+
+
+@frozen(kw_only=True, slots=False)
+class Right(Config):
+    third: bool = parameter(True, 'third')
+
+    def check(self):
+        return [*super().check(), *([] if self.third else ['third is false'])]
+
+
+@frozen(kw_only=True)
+class Both(Left, Right):
+    own: str = parameter('x', 'own')
+    first: float = inherited(Left, 'first', 0.5, high=9.0)
+
+
+def test_an_inherited_parameter_keeps_its_place_and_what_was_not_changed():
+    specs = {spec.name: spec for spec in Both.specs()}
+    assert list(specs) == ['own', 'first', 'second', 'third']
+    assert specs['first'].default == 0.5 and specs['first'].high == 9.0
+    assert specs['first'].low == 0.0 and not specs['first'].read_only
+    assert Both().as_dict() == {'own': 'x', 'first': 0.5, 'second': 2, 'third': True}
+    assert Both(first=1).first == 1.0 and isinstance(Both(first=1).first, float)
+    assert Left().first == 1.0
+
+
+def test_the_rules_of_all_bases_hold():
+    with pytest.raises(ConfigError) as caught:
+        Both(first=3.0, third=False)
+    assert set(caught.value.problems) == {'first is the largest', 'third is false'}
+    with pytest.raises(ConfigError, match='between 0 and 9'):
+        Both(first=9.5)
+
+
+def test_only_what_a_base_has_can_be_inherited():
+    with pytest.raises(KeyError):
+        inherited(Left, 'third', False)
+
+
+def test_a_parameter_may_change_in_all_systems_or_in_none():
+    """Pings of the bathymetry tracker share no state: everything may change there."""
+    flags: dict[str, set[bool]] = {}
+    for name, system in SYSTEMS.items():
+        specs = system.config_type().specs()
+        if name == 'bathymetry':
+            assert not any(spec.read_only for spec in specs)
+            continue
+        for spec in specs:
+            flags.setdefault(spec.name, set()).add(spec.read_only)
+    assert {name for name, told in flags.items() if len(told) > 1} == APART
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_shared_parameters_come_from_their_base(system):
+    """A parameter of a shared name that a class declares by itself would escape the decision."""
+    config_type = SYSTEMS[system].config_type()
+    for base in SHARED:
+        names = {field.name for field in attrs.fields(base) if not field.inherited}
+        if names & {field.name for field in attrs.fields(config_type)}:
+            assert issubclass(config_type, base)
+
+
+@pytest.mark.parametrize('system', ['diver', 'obstacle'])
+def test_confirmation_cannot_ask_for_more_hits_than_it_looks_at(system):
+    with pytest.raises(ConfigError, match='cannot exceed confirm_window'):
+        SYSTEMS[system].config_type()(confirm_hits=8, confirm_window=7)
+
+
+def test_a_chain_is_checked_once_for_all():
+    assert matrix_problems((), 3, 'three') == []
+    assert matrix_problems((1.0, 0.0, 0.5, 0.5), 2, 'two') == []
+    assert matrix_problems((1.0,), 2, 'two', name='P') == [
+        'P needs 2 x 2 = 4 values for two, got 1'
+    ]
+    assert matrix_problems((0.9, 0.2, 0.5, 0.5), 2, 'two', name='P') == [
+        'row 0 of P sums to 1.1, not 1'
+    ]
+    assert chain_problems((), (0.5, 0.6), 2, 'two') == ['initial_probabilities sum to 1.1, not 1']
+
+
+def echoes_of(tracker, second, offset):
+    """One ping; gives how the first track was hit: its NIS, NaN without a hit."""
+    stamp = second * 10**9
+    tracker.process(Altitude(stamp_ns=stamp, altitude=20.0))
+    tracker.process(
+        Navigation(stamp_ns=stamp, position=[0.0, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0])
+    )
+    ping = Detections(stamp_ns=stamp, range=[50.0 + offset], bearing=[0.0])
+    return tracker.process(ping)[-1].extras['nis'][0]
+
+
+def test_gate_and_outliers_of_a_running_obstacle_tracker_follow_the_parameters():
+    config = ObstacleConfig(gate_probability=0.9999999)
+    near, far = ObstacleTracker(config), ObstacleTracker(config)
+    for tracker in (near, far):
+        for second in (1, 2, 3):
+            echoes_of(tracker, second, 0.0)
+    far.reconfigure(evolve(config, gate_probability=0.5, outlier_probability=0.3))
+    assert np.isfinite(echoes_of(near, 4, 0.7))
+    assert np.isnan(echoes_of(far, 4, 0.7))
+    fresh = ObstacleTracker(far.config)
+    assert far.filter.outlier_density == fresh.filter.outlier_density
+    assert far.filter.outlier_density != near.filter.outlier_density
+
+
+def test_the_fathometer_believes_a_restarted_clock_after_so_many_records():
+    depth = 0.05 * np.arange(200)
+    amplitude = np.exp(-np.square((depth - 5.0) / 0.1)) + 0.01 * np.sin(31.0 * depth)
+
+    def used(**values):
+        tracker = FathometerTracker(
+            FathometerConfig(particles=8, depth_step=0.05, min_separation=0.05, **values)
+        )
+        for second in (1, 1000, 1001, 1002, 1003):
+            tracker.process(Trace(stamp_ns=second * 10**9, depth=depth, amplitude=amplitude))
+        return tracker.counts['used'], tracker.counts['restarts']
+
+    assert used() == (5, 0)
+    assert used(max_gap=60.0) == (5, 1)
+    assert used(max_gap=60.0, restart_after=10) == (1, 0)
