@@ -142,7 +142,7 @@ def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[floa
 
 
 def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
-    """Fewer receivers a ping, and fewer pings."""
+    """Fewer receivers per ping, and fewer pings."""
     rng = np.random.default_rng(seed)
     out = []
     for ping in items:
@@ -266,7 +266,7 @@ def main() -> None:
         tag_table('yaps, raw arrivals, all receivers', pings, truth)
         for receivers in (5, 4, 3):
             tag_table(
-                f'yaps, raw arrivals, {receivers} receivers a ping',
+                f'yaps, raw arrivals, {receivers} receivers per ping',
                 thinned(pings, receivers, 1.0),
                 truth,
             )

@@ -1,7 +1,7 @@
 """ROS messages to measurements and estimates to ROS messages.
 
 The adapters only look at attributes, so that messages of rclpy (live) and of rosbags (recorded)
-take the same road; they import neither library. A message that cannot be used raises
+are read by the same functions. They import neither library. A message that cannot be used raises
 `sonar_imm.measurements.Rejection`. Messages are built through a factory `make(type_name,
 **fields)` that the caller brings, because the two libraries disagree about what the fields hold.
 

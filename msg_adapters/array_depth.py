@@ -1,7 +1,7 @@
-"""How deep the array hangs, from a companion instrument.
+"""Depth of the deepest hydrophone of an array, from a companion instrument.
 
-A depth sensor publishes a position whose z matters alone: up is positive in east-north-up, down in
-north-east-down.
+A depth sensor publishes a position, of which only z is read: positive up in east-north-up,
+positive down in north-east-down.
 """
 
 from __future__ import annotations

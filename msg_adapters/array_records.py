@@ -1,18 +1,18 @@
-"""What the fathometer hears of a vertical array, and ready-made traces, as tables.
+"""Records of a vertical array, and ready-made traces, as tables for the fathometer.
 
-``csdm``, one row a frequency: ``frequency`` f4 [Hz]; ``csdm`` f4 x 2N^2, the matrix of N phones
-row by row, real and imaginary parts in turn, phone 0 the deepest; optional ``snapshots`` u4, the
-same in every row.
+``csdm``, one row per frequency: ``frequency`` f4 [Hz]; ``csdm`` f4 x 2N^2, the matrix of N
+hydrophones row by row, real and imaginary parts in turn, hydrophone 0 the deepest; optional
+``snapshots`` u4, the same in every row.
 
-``pressure``, one row a sample: ``p`` f4 x N, or i2 x N with ``scale`` f4; ``sample_rate`` f4 [Hz].
-The stamp is that of the first sample.
+``pressure``, one row per sample: ``p`` f4 x N, or i2 x N with ``scale`` f4; ``sample_rate`` f4
+[Hz]. The stamp is that of the first sample.
 
-``trace``, one row a depth: ``depth`` f4 [m, down positive]; ``amplitude`` f4; optional ``sigma``
+``trace``, one row per depth: ``depth`` f4 [m, down positive]; ``amplitude`` f4; optional ``sigma``
 f4, the standard deviation of its noise.
 
-Each may say how deep phone 0 was, the same in every row: ``array_depth`` f4 [m, down positive];
-``csdm`` and ``pressure`` also ``element_depth`` f4 x N. Where none does, the companion topic tells
-(`array_depth`).
+Each may state the depth of hydrophone 0, the same in every row: ``array_depth`` f4 [m, down
+positive]; ``csdm`` and ``pressure`` instead ``element_depth`` f4 x N. Where none is stated, the
+companion topic gives it (`array_depth`).
 """
 
 from __future__ import annotations
@@ -146,18 +146,18 @@ def _encode(record: Any, columns: dict[str, NDArray], rows: int, make: Make) -> 
 def _matrices(values: NDArray) -> NDArray[np.complexfloating]:
     """Pair the real and imaginary parts (F, 2 N^2) into (F, N, N)."""
     count = 1 if values.ndim == 1 else values.shape[1]
-    phones = round((count / 2) ** 0.5)
-    if 2 * phones * phones != count:
+    hydrophones = round((count / 2) ** 0.5)
+    if 2 * hydrophones**2 != count:
         raise Rejection(
             'bad_field',
-            f'column csdm holds {count} values a row; N phones need 2 N^2: real and imaginary '
-            'parts of a whole matrix',
+            f'column csdm holds {count} values per row; N hydrophones need 2 N^2: real and '
+            'imaginary parts of a whole matrix',
         )
     if values.dtype.kind != 'f':
         raise Rejection('bad_field', f'column csdm holds {values.dtype}, not floats')
     double = values.dtype == np.float64
     paired = np.ascontiguousarray(values).view(np.complex128 if double else np.complex64)
-    return paired.reshape(len(values), phones, phones)
+    return paired.reshape(len(values), hydrophones, hydrophones)
 
 
 def _two_dimensional(column: NDArray) -> NDArray:
@@ -166,20 +166,21 @@ def _two_dimensional(column: NDArray) -> NDArray:
 
 
 def _snapshots(columns: Columns) -> int:
-    """How many snapshots were averaged; 0: not known."""
+    """How many snapshots were averaged; 0 when not known."""
     count = constant_column(columns, 'snapshots')
     return 0 if count is None else int(min(max(count, 0.0), 2.0**53))
 
 
-def _array_depth(columns: Columns, phones: int) -> float | None:
-    """Depth of phone 0, as ``array_depth`` or ``element_depth`` say; None when neither does."""
+def _array_depth(columns: Columns, hydrophones: int) -> float | None:
+    """Depth of hydrophone 0 from ``array_depth`` or ``element_depth``; None without both."""
     depth = constant_column(columns, 'array_depth', zero_is_known=True)
     if depth is not None or 'element_depth' not in columns:
         return depth
     depths = _two_dimensional(columns['element_depth'])
-    if depths.shape[1] != phones:
+    if depths.shape[1] != hydrophones:
         raise Rejection(
-            'bad_field', f'element_depth has {depths.shape[1]} values for {phones} phones'
+            'bad_field',
+            f'element_depth has {depths.shape[1]} values for {hydrophones} hydrophones',
         )
     first = depths[:, 0].astype(np.float64)
     return float(first[0]) if len(first) and np.isfinite(first[0]) else None

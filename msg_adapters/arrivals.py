@@ -1,4 +1,4 @@
-"""Arrival times of one ping as a table, one row a transmitter-receiver pair.
+"""Arrival times of one ping as a table, one row per transmitter-receiver pair.
 
 Columns: ``tx_id``, ``rx_id`` u2; ``tx_x tx_y tx_z rx_x rx_y rx_z`` f8 [m]; ``toa`` f8 [s after the
 header stamp, which is the transmission]; optional ``var_toa`` f4 [s^2], ``bearing`` f8 [rad at the
@@ -17,9 +17,10 @@ from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_imm.estimation.angles import wrap_angle
 from sonar_imm.measurements import Arrivals, Rejection
 
-from .headers import Make, stamp_ns, swap_axes, to_enu, wrap
+from .headers import Make, stamp_ns, swap_axes, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
@@ -75,7 +76,7 @@ def _turned(arrivals: Arrivals) -> Arrivals:
         arrivals,
         tx=swap_axes(arrivals.tx),
         rx=swap_axes(arrivals.rx),
-        bearing=wrap(np.pi / 2 - arrivals.bearing),
+        bearing=wrap_angle(np.pi / 2 - arrivals.bearing),
     )
 
 
@@ -121,7 +122,7 @@ def _variances(columns: dict[str, NDArray], name: str, rows: int, least: float) 
 
 
 def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
-    """Bearings (rows,) wrapped into [-pi, pi), NaN where missing. Degrees are refused."""
+    """Bearings (rows,) wrapped into [-pi, pi], NaN where missing. Degrees are refused."""
     if 'bearing' not in columns:
         return np.full(rows, np.nan)
     values = scalar_column(columns, 'bearing')
@@ -132,4 +133,4 @@ def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:
             f'arrivals: a bearing of {np.nanmax(np.abs(values)):g} is '
             'beyond 2 pi; bearings are in radians',
         )
-    return np.where(np.abs(values) < np.pi, values, wrap(values))
+    return wrap_angle(values)

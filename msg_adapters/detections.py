@@ -1,11 +1,11 @@
 """What a forward-looking sonar detected in one ping, from every message that says so.
 
-Our own is a table with one row an echo, sent once a ping, also without a row: that nothing was
-seen is evidence too. Columns: ``x y z`` f4 [m, for display]; ``range`` [m], ``bearing`` [rad,
-REP-103: positive to port]; optional ``var_range``, ``var_bearing``, ``intensity``. A table
-without range and bearing is read from x, y, z.
+Our own message is a table with one row per echo and one message per ping. A ping in which nothing
+was seen is a table without rows, because a miss is evidence too. Columns: ``x y z`` f4 [m, for
+display]; ``range`` [m], ``bearing`` [rad, REP-103: positive to port]; optional ``var_range``,
+``var_bearing``, ``intensity``. A table without range and bearing is read from x, y, z.
 
-The other messages disagree about axes, so each rule is written down here. In the messages of
+The other messages use different axes; the rules are these. In the messages of
 marine_acoustic_msgs receive angles count to starboard, and beams point along z with x up and y to
 starboard; some drivers and simulators publish beams with x forward and y to port all the same
 (`beam_axes`).
@@ -154,7 +154,7 @@ def beam_bearings(beams: FloatArray, beam_axes: str) -> FloatArray:
 def _detections(
     message: Any, distance: FloatArray, bearing: FloatArray, **optional: FloatArray
 ) -> Detections:
-    """Put columns (n,) together without the rows that are no echo."""
+    """Put columns (n,) together, without the rows that are no echo."""
     if len(distance) > MAX_DETECTIONS:
         raise Rejection(
             'too_large', f'a ping of {len(distance)} detections; at most {MAX_DETECTIONS} are read'

@@ -20,7 +20,7 @@ from .table import decode_table, encode_table, require_columns
 
 
 def write_estimate(estimate: Estimate, make: Make) -> Any:
-    """Write the PointCloud2 table of ``~/estimate``, one row a target; zero rows are fine."""
+    """Write the PointCloud2 table of ``~/estimate``, one row per target; it may have no rows."""
     return encode_table(
         estimate.columns(), stamp_ns=estimate.stamp_ns, frame_id=estimate.frame_id, make=make
     )
@@ -82,7 +82,7 @@ def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
 def write_model_probabilities(estimate: Estimate, row: int, make: Make) -> Any:
     """Write one row's model probabilities as JointState: name = model, position = probability.
 
-    A borrowed message: it is the one whose values every plotting tool shows by name.
+    JointState is borrowed because every plotting tool shows its values by name.
     """
     return make(
         'sensor_msgs/msg/JointState',

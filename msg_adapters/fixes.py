@@ -1,9 +1,9 @@
 """Position fixes: geometry_msgs PoseWithCovarianceStamped or PointStamped.
 
-Covariances in the wild follow no rule, so these hold here, for the x-y block that is used: a
-negative variance means unknown; all zeros mean that nobody filled it in, also unknown (and worth a
-warning, see `doubt_fix`); anything else has to be finite, symmetric and positive
-definite, or the fix is refused.
+Publishers fill in covariances in different ways. Of the x-y block, which alone is used, a negative
+variance means unknown. All zeros mean that it was not filled in: unknown too, and worth a warning
+(see `doubt_fix`). Anything else has to be finite, symmetric and positive definite, or the fix is
+refused.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sonar_imm.measurements import Fix, Rejection
 from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
 
 UNKNOWN_VARIANCE = 1e6
-"""Written for what is not estimated (m^2 or rad^2): zero would claim certainty."""
+"""Variance written for what is not estimated (m^2 or rad^2); zero would claim certainty."""
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e16
-"""Of a fix, in m^2: a micrometre and 100,000 km."""
+"""Limits of the variance of a fix, m^2: a micrometre and 100,000 km squared."""
 
 
 def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
@@ -64,7 +64,7 @@ def check_size(fix: Fix) -> None:
 
 
 def doubt_fix(message: Any) -> str | None:
-    """Give ``'zero_covariance'`` for a covariance that nobody filled in: all zero in x and y."""
+    """Give ``'zero_covariance'`` for a covariance that was not filled in: all zero in x and y."""
     block = _xy_covariance(message)
     return 'zero_covariance' if block is not None and not block.any() else None
 

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from attrs import evolve
-import numpy as np
 
 from sonar_imm.measurements import Rejection
 
@@ -67,11 +66,6 @@ def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:
             'east-north-up is expected; set the world frame to ned',
         )
     return measurement
-
-
-def wrap(angle: Any) -> Any:
-    """Wrap an angle in radians into [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def swap_axes(vector: Any) -> Any:

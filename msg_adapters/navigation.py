@@ -53,7 +53,7 @@ def read_navigation(
 
 
 def doubt_navigation(message: Any) -> str | None:
-    """Give ``'no_frame'`` for navigation without a frame: nobody can draw its estimates."""
+    """Give ``'no_frame'`` for navigation without a frame: its estimates cannot be displayed."""
     return None if message.header.frame_id else 'no_frame'
 
 

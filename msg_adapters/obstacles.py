@@ -1,9 +1,8 @@
-"""Displays of obstacles: a PoseArray, and markers that show what the vertical band is.
+"""Displays of obstacles: a PoseArray, and markers that show the band of the vertical offset.
 
-A point in a display claims to know the height. So each obstacle is drawn as a bar that reaches as
-far up and down as the 90 % band of its vertical offset, with a ball at the mean and a label.
-Markers have the track's number as their id and a lifetime: they follow the obstacle, and vanish
-when nothing is heard of it any more.
+A point in a display would suggest that the height is known. So each obstacle is drawn as a bar
+over the 90 % band of its vertical offset, with a ball at the mean and a label. The id of a marker
+is the track id. Markers have a lifetime: they vanish when the obstacle is no longer published.
 """
 
 from __future__ import annotations

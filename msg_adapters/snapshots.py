@@ -1,4 +1,4 @@
-"""Array snapshots of one side-scan ping as a table, one row a range bin.
+"""Array snapshots of one side-scan ping as a table, one row per range bin.
 
 Columns: ``range`` f4 [m, one way, middle of the bin] or ``time`` f8 [s, two-way, since the header
 stamp, which is the transmission]; ``iq`` f4 x 2N (real and imaginary parts in turn, stave 0
@@ -6,8 +6,8 @@ first). Optional, the same in every row: ``sound_speed`` [m/s], ``frequency`` [H
 ``element_spacing`` [m], ``sample_rate`` [Hz]. Optional, row by row: ``noise_variance``,
 ``signal_variance`` [squared units of iq, per stave].
 
-An organised cloud, a row of the image a range bin and a column a stave, with ``re`` and ``im``
-instead of ``iq``, is read too; its other columns are then the same along each row.
+An organised cloud is read too: one row of the image per range bin, one column per stave, with
+``re`` and ``im`` instead of ``iq``. Its other columns are the same along each row.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CONSTANTS = ('sound_speed', 'frequency', 'element_spacing', 'sample_rate')
 VARIANCES = ('noise_variance', 'signal_variance')
 COLUMNS = ('range', 'time', 'iq', 're', 'im', *CONSTANTS, *VARIANCES)
 DEFAULT_SOUND_SPEED = 1500.0
-"""m/s, for times without a sound speed, until the tracker says better (`Snapshot.ranges`)."""
+"""m/s, for times without a sound speed, until the tracker replaces it (`Snapshot.ranges`)."""
 
 
 def read_snapshot(message: Any, *, world_frame: str = 'enu') -> Snapshot:
@@ -79,7 +79,7 @@ def _complex(values: NDArray) -> NDArray[np.complexfloating]:
         count = 1 if values.ndim == 1 else values.shape[1]
         raise Rejection(
             'bad_field',
-            f'column iq holds {count} values a row; real and imaginary parts come in pairs',
+            f'column iq holds {count} values per row; real and imaginary parts come in pairs',
         )
     double = values.dtype in (np.dtype(np.float64), np.dtype(np.int32), np.dtype(np.uint32))
     parts = np.ascontiguousarray(values, np.float64 if double else np.float32)
@@ -87,7 +87,7 @@ def _complex(values: NDArray) -> NDArray[np.complexfloating]:
 
 
 def _organised(columns: dict[str, NDArray], bins: int, staves: int) -> dict[str, NDArray]:
-    """Turn an organised cloud into the table of one row a range bin."""
+    """Turn an organised cloud into a table with one row per range bin."""
     if not staves:
         raise Rejection('no_staves', 'the organised cloud of snapshots has no column: no staves')
     parts = [scalar_column(columns, name).reshape(bins, staves) for name in ('re', 'im')]

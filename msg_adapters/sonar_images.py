@@ -63,7 +63,7 @@ def _raw_ranges(message: Any, sound_speed: float) -> FloatArray:
         raise Rejection('out_of_range', f'the sample rate of the image is {rate:g} Hz')
     count = int(message.samples_per_beam)
     if count > 1_000_000:
-        raise Rejection('too_large', f'an image with {count} samples a beam')
+        raise Rejection('too_large', f'an image with {count} samples per beam')
     stated = float(message.ping_info.sound_speed)
     speed = stated if SOUND_SPEEDS[0] <= stated <= SOUND_SPEEDS[1] else sound_speed
     return (int(message.sample0) + np.arange(count)) * speed / (2.0 * rate)

@@ -1,9 +1,9 @@
-"""PointCloud2 as a table: one row a point, one named column a field.
+"""PointCloud2 as a table: one row per point, one named column per field.
 
 PointCloud2 is the only message of common_interfaces that has a header, describes its own layout
 and is not deprecated, so it carries every bulk input and output here. A field with ``count > 1``
-is a vector column. Decoding believes nothing: every size is checked against the bytes that are
-really there before a byte is touched.
+is a vector column. Decoding trusts no header: every size is checked against the bytes that are
+really there before any is read.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float
     column = columns[name]
     if column.ndim != 1:
         raise Rejection(
-            'bad_field', f"column '{name}' holds {column.shape[1]} values a row, one is needed"
+            'bad_field', f"column '{name}' holds {column.shape[1]} values per row, one is needed"
         )
     return column.astype(np.float64)
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Mapping
-from functools import partial
 import importlib
 import importlib.util
-from pathlib import Path
 import re
 import sys
 import xml.etree.ElementTree as ElementTree
 
+from helpers.source import COME_WITH_RCLPY, COMMON_INTERFACES, imports, module_name, MODULES, ROOT
 import pytest
 
 import msg_adapters
 import sonar_imm
 
-ROOT = Path(__file__).resolve().parents[1]
 if not (ROOT / 'setup.py').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
 
@@ -42,43 +39,6 @@ PYPI_OF_KEY = {
 }
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
-COMMON_INTERFACES = {
-    'actionlib_msgs',
-    'diagnostic_msgs',
-    'geometry_msgs',
-    'nav_msgs',
-    'sensor_msgs',
-    'shape_msgs',
-    'std_msgs',
-    'std_srvs',
-    'stereo_msgs',
-    'trajectory_msgs',
-    'visualization_msgs',
-}
-COME_WITH_RCLPY = {'builtin_interfaces', 'rcl_interfaces', 'rosgraph_msgs'}
-ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_python'}
-
-# A room may import from its own floor and from lower ones.
-FLOORS = {
-    'sonar_imm.resources': 0,
-    'sonar_imm.estimation': 0,
-    'sonar_imm.acoustics': 1,
-    'sonar_imm.parameters': 2,
-    'sonar_imm.measurements': 2,
-    'sonar_imm.estimates': 2,
-    'sonar_imm.soundings': 2,
-    'msg_adapters': 3,
-    'sonar_imm.trackers': 3,
-    'sonar_imm.simulation': 4,
-    'sonar_imm.node_config': 4,
-    'sonar_imm.recordings': 5,
-    'sonar_imm.evaluation': 6,
-    'sonar_imm.nodes': 7,
-    'sonar_imm.cli': 8,
-}
-SIDE_BY_SIDE = {('msg_adapters', 'sonar_imm.trackers'), ('sonar_imm.trackers', 'msg_adapters')}
-ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
-
 # Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
 # those that some commands need, each with an extra of its own.
 PEERS = {
@@ -96,9 +56,9 @@ LONG_FILES: dict[str, str] = {
     'test/estimation/test_imm.py': 'every closed form of one filter, to be read together',
     'test/estimation/test_smoothing.py': 'holds its oracle, the enumeration of all mode sequences',
 }
-MODULES = sorted(
-    path for room in ('sonar_imm', 'msg_adapters') for path in (ROOT / room).rglob('*.py')
-)
+MOST_ARGUMENTS = 12
+# Function, as module:name: why it takes more positional arguments.
+MANY_ARGUMENTS: dict[str, str] = {}
 
 
 @pytest.fixture(scope='module')
@@ -161,60 +121,6 @@ def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element
     assert texts(manifest, 'depend') <= COMMON_INTERFACES | COME_WITH_RCLPY
 
 
-@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_down_the_floors(path: Path) -> None:
-    here = room_of(module_name(path))
-    if here is None:  # sonar_imm/__init__.py only looks whether msg_adapters is its own
-        assert module_name(path) == 'sonar_imm'
-        assert {room_of(name) for name in imports(path)} <= {None, 'msg_adapters'}
-        return
-    for name in imports(path):
-        there = room_of(name)
-        if there is not None:
-            assert FLOORS[there] <= FLOORS[here], f'{here} must not import {name}'
-            assert (here, there) not in SIDE_BY_SIDE, f'{here} must not import {name}'
-
-
-@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_ros_and_rosbags_stay_in_their_rooms(path: Path) -> None:
-    here = room_of(module_name(path))
-    for name in imports(path):
-        top = name.split('.')[0]
-        rooms = ONLY_IN.get('rclpy' if top in ROS_MODULES else top)
-        assert rooms is None or here in rooms, f'{here} must not import {name}'
-
-
-def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None:
-    file = ROOT / 'sonar_imm' / 'estimation' / 'imagined.py'
-    source = (
-        'from ..nodes import diver\nfrom .. import cli\nfrom . import kalman\n'
-        'def f():\n    import rclpy.node\n'
-    )
-    assert set(imported_names(source, file)) >= {
-        'sonar_imm.nodes.diver',
-        'sonar_imm.cli',
-        'sonar_imm.estimation.kalman',
-        'rclpy.node',
-    }
-
-
-def test_no_module_imports_itself_by_way_of_others() -> None:
-    """No circle, also none that an import inside a function or for type checking closes."""
-    modules = {module_name(path): path for path in MODULES}
-    graph = {
-        name: {found for found in map(partial(known_module, modules), imports(path)) if found}
-        - {name}
-        for name, path in modules.items()
-    }
-    assert circle_of(graph) is None
-
-
-def test_the_circle_check_sees_circles() -> None:
-    assert circle_of({'a': {'b'}, 'b': {'c'}, 'c': set()}) is None
-    found = circle_of({'a': {'b'}, 'b': {'c'}, 'c': {'d'}, 'd': {'b'}})
-    assert found == ['b', 'c', 'd', 'b']
-
-
 def test_no_file_is_too_long() -> None:
     files = [
         path
@@ -227,6 +133,25 @@ def test_no_file_is_too_long() -> None:
     }
     too_long = {name for name, lines in lengths.items() if lines > 400}
     assert too_long == set(LONG_FILES), 'over 400 lines, or listed without need'
+
+
+def test_no_function_takes_many_positional_arguments() -> None:
+    """Two of many arguments are swapped without a word: kernels take named tuples instead."""
+    found = {
+        f'{module_name(path)}:{name}'
+        for path in MODULES
+        for name, count in positional_arguments(path.read_text(encoding='utf-8'))
+        if count > MOST_ARGUMENTS
+    }
+    assert found == set(MANY_ARGUMENTS), 'too many arguments, or listed without need'
+
+
+def test_the_argument_check_sees_every_kind_of_function() -> None:
+    source = (
+        'def f(a, /, b, *c, d=1):\n    return lambda x, y, z: 0\n'
+        'class C:\n    async def g(self, a, b, c):\n        pass\n'
+    )
+    assert sorted(positional_arguments(source)) == [('<lambda>', 3), ('f', 2), ('g', 4)]
 
 
 def test_generated_files_are_up_to_date() -> None:
@@ -316,6 +241,13 @@ def test_readme_names_every_subcommand() -> None:
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)
 
 
+def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+    (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    exec(compile(example, 'README.md', 'exec'), {})
+    assert capsys.readouterr().out
+
+
 def test_topics_page_names_every_input() -> None:
     from msg_adapters.inputs import inputs_of
     from sonar_imm.trackers import SYSTEMS
@@ -350,55 +282,11 @@ def distribution(requirement: str) -> str:
     return re.match(r'[A-Za-z0-9_.-]+', requirement).group()
 
 
-def module_name(path: Path) -> str:
-    parts = path.relative_to(ROOT).with_suffix('').parts
-    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
-
-
-def known_module(modules: Iterable[str], name: str) -> str | None:
-    """The module of ours that a dotted name is or is defined in."""
-    while name and name not in modules:
-        name = name.rpartition('.')[0]
-    return name or None
-
-
-def circle_of(graph: Mapping[str, set[str]]) -> list[str] | None:
-    """A way from a module over its imports back to it, or None."""
-    done: set[str] = set()
-    way: list[str] = []
-
-    def visit(name: str) -> list[str] | None:
-        if name in way:
-            return [*way[way.index(name) :], name]
-        if name in done:
-            return None
-        way.append(name)
-        found = next(filter(None, map(visit, sorted(graph[name]))), None)
-        way.pop()
-        done.add(name)
-        return found
-
-    return next(filter(None, map(visit, sorted(graph))), None)
-
-
-def room_of(name: str) -> str | None:
-    """The room a dotted name lies in, None outside the house."""
-    return next((room for room in FLOORS if name == room or name.startswith(room + '.')), None)
-
-
-def imports(path: Path) -> list[str]:
-    return imported_names(path.read_text(encoding='utf-8'), path)
-
-
-def imported_names(source: str, path: Path) -> list[str]:
-    """Every name the source imports, made absolute, at the top or inside a function."""
-    package = module_name(path) if path.name == '__init__.py' else module_name(path.parent)
-    names = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = package.split('.')[: len(package.split('.')) - node.level + 1]
-            stem = '.'.join([*(base if node.level else []), *filter(None, [node.module])])
-            names += [f'{stem}.{alias.name}' for alias in node.names]
-    return names
+def positional_arguments(source: str) -> list[tuple[str, int]]:
+    """Name of every function in the source, and how many arguments it takes by position."""
+    kinds = ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda
+    return [
+        (getattr(node, 'name', '<lambda>'), len(node.args.posonlyargs) + len(node.args.args))
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, kinds)
+    ]

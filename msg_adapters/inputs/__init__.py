@@ -1,7 +1,7 @@
-"""Which topics each tracker hears: one module per system, with its `TOPICS`.
+"""Which topics each tracker subscribes to: one module per system, with its `TOPICS`.
 
-The nodes subscribe from them, the recordings pick topics by them, and scenes are written by them,
-so that live, recorded and simulated data are read and written by the same functions.
+The nodes subscribe by them, topics of recordings are chosen by them, and scenes are written by
+them, so that live, recorded and simulated data are read and written by the same functions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the bathymetry tracker hears."""
+"""Input topics of the bathymetry tracker."""
 
 from __future__ import annotations
 

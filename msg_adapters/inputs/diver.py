@@ -1,4 +1,4 @@
-"""What the diver tracker hears."""
+"""Input topics of the diver tracker."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the fathometer tracker hears."""
+"""Input topics of the fathometer tracker."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOPICS = (
     ),
     InputTopic(
         'pressure',
-        'pressure at the phones of a vertical array, one row per sample',
+        'pressure at the hydrophones of a vertical array, one row per sample',
         measurement=Pressure,
         readers={'sensor_msgs/msg/PointCloud2': read_pressure},
         write=write_pressure,
@@ -42,7 +42,7 @@ TOPICS = (
     ),
     InputTopic(
         'array_depth',
-        'depth of the deepest phone, from a companion instrument',
+        'depth of the deepest hydrophone, from a companion instrument',
         measurement=ArrayDepth,
         readers={
             'geometry_msgs/msg/PointStamped': read_array_depth,

@@ -1,4 +1,4 @@
-"""What the obstacle tracker hears."""
+"""Input topics of the obstacle tracker."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .topic import InputTopic
 TOPICS = (
     InputTopic(
         'detections',
-        'echoes of one ping of a forward-looking sonar, also none',
+        'echoes of one ping of a forward-looking sonar, also when there are none',
         measurement=Detections,
         readers={
             'sensor_msgs/msg/PointCloud2': read_detections,

@@ -1,4 +1,4 @@
-"""What there is to know of one input of a tracker."""
+"""Description of one input of a tracker."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ Reader = Callable[..., Any]
 class InputTopic:
     """One input of a tracker.
 
-    name: relative topic name; measurement: the class that its readers make. readers: measurement
-    readers by message type; a reader takes ``(message, *, world_frame='enu')`` and raises
-    `Rejection` for a message it cannot use. write: the message of a measurement,
-    ``(measurement, make) -> message``.
+    name: relative topic name. measurement: the class that its readers give. readers: by message
+    type; a reader takes ``(message, *, world_frame='enu')`` and raises `Rejection` for a message
+    that it cannot use. write: ``(measurement, make) -> message``.
     doubt: gives a reason code to count when a message can be used but deserves a warning.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     one_topic: several topics are several instruments, each for a tracker of its own.
-    settings: parameters of the tracker that its readers take as keywords, too: how messages are to
-    be understood that do not say it themselves.
-    companion: says something about another input, known by its name and never enough alone.
+    settings: parameters of the tracker that its readers take as keywords too: what messages do not
+    say themselves.
+    companion: describes another input; found by its topic name, never enough alone.
     """
 
     name: str
@@ -41,6 +40,6 @@ class InputTopic:
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any]
     ) -> Callable[[Any], Any]:
-        """Give the reader of a message type, told everything; `settings` may hold more."""
+        """Give the reader of a message type with its settings; `settings` may hold more."""
         told = {name: settings[name] for name in self.settings if name in settings}
         return partial(self.readers[type_name], world_frame=world_frame, **told)

@@ -17,8 +17,9 @@ from attrs import astuple, frozen
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from ..estimation.angles import wrap_angle
 from ..estimation.arrays import BoolArray, FloatArray, IndexArray
-from .multistatic import bearing, bearing_jacobian, slant_range, wrap_angle
+from .multistatic import bearing, bearing_jacobian, slant_range
 
 ELLIPSES = 4
 ELLIPSE_ANGLES = 96

@@ -1,14 +1,14 @@
-"""The law of one range bin seen by an array: heavy-tailed echoes from one direction, and noise.
+"""What an array hears in one range bin: heavy-tailed echoes from one direction, and noise.
 
 A patch of floor answers with a few strong facets, so the echo of a bin is not Gaussian: its power
 varies. Taking the power as exponentially distributed gives the complex multivariate symmetric
-Laplace law of P staves::
+Laplace distribution of P staves::
 
     y = sqrt(z) g,   z ~ Exp(1),   g ~ CN(0, Gamma),   Gamma = ss2 a a^H + sn2 I
     p(y) = 2 / (pi^P |Gamma|) q^((1-P)/2) K_{P-1}(2 sqrt(q)),   q = y^H Gamma^-1 y
 
 with a the steering vector, ss2 and sn2 the variances of signal and noise at one stave. (T. Eltoft,
-T. Kim, T. Lee, IEEE Signal Processing Letters 13(5), 2006, give the law of 2P real numbers; the
+T. Kim, T. Lee, IEEE Signal Processing Letters 13(5), 2006, give that of 2P real numbers; the
 Bessel order is P - 1 here because a complex number counts twice.) `log_density` is the part of
 log p(y) that depends on q, `log_constant` the rest.
 
@@ -22,7 +22,7 @@ autocorrelation c_k = sum_p y_{p+k} conj(y_p) of the snapshot. `form_coefficient
 this into P complex numbers g with q(u) = Re sum_k g_k exp(-i k w u), w = 2 pi spacing, which
 Horner's rule sums in O(P) for each of thousands of candidate directions.
 
-Compiled loops take the law from a table: see `likelihood_kernels`.
+Compiled loops take the likelihood from a table: see `likelihood_kernels`.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from scipy.special import kve
 
 from ..estimation.arrays import ComplexArray, FloatArray
 
-LAWS = ('laplace', 'gaussian')
+LIKELIHOODS = ('laplace', 'gaussian')
 MAX_STAVES = 64
 
 IMPOSSIBLE = -math.inf
 
 
 def log_density(q: ArrayLike, staves: int) -> FloatArray:
-    """log(q^((1-P)/2) K_{P-1}(2 sqrt(q))): the Laplace law without what does not depend on q.
+    """log(q^((1-P)/2) K_{P-1}(2 sqrt(q))): the Laplace density without what does not depend on q.
 
     Infinite at q = 0, where the density is (but its integral is not). Any P from 1 on.
     """
@@ -74,7 +74,7 @@ def log_constant(staves: int, log_determinant: ArrayLike) -> FloatArray:
 
 
 def gaussian_log_density(q: ArrayLike, staves: int) -> FloatArray:
-    """The same of the complex Gaussian law of P staves: -q. `gaussian_log_constant` is the
+    """The same of the complex Gaussian density of P staves: -q. `gaussian_log_constant` is the
     rest."""
     return -np.asarray(q, np.float64)
 
@@ -125,7 +125,7 @@ def log_likelihood(
     signal_variance: float,
     noise_variance: float,
     step: float,
-    law: str = 'laplace',
+    likelihood: str = 'laplace',
 ) -> FloatArray:
     """Log likelihood of direction sines (...) given one snapshot y (P,), less what does not depend
     on the direction; -inf for NaN. `step` is from `array.phase_step`.
@@ -138,5 +138,7 @@ def log_likelihood(
     kappa = signal_variance / (noise_variance + len(y) * signal_variance)
     beam = np.abs(a.conj() @ y) ** 2
     q = (np.vdot(y, y).real - kappa * beam) / noise_variance
-    density = log_density(q, len(y)) if law == 'laplace' else gaussian_log_density(q, len(y))
+    density = (
+        log_density(q, len(y)) if likelihood == 'laplace' else gaussian_log_density(q, len(y))
+    )
     return np.where(np.isnan(q), IMPOSSIBLE, density)

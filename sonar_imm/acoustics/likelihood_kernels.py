@@ -1,14 +1,15 @@
-"""The observation law for a whole row of directions at a time: what the trackers call.
+"""The likelihood of a whole row of directions at a time: what the trackers call.
 
-`laplace` and `interference` say what the law is. Here the same numbers come from loops that the
-processor runs several directions at a time, which calls of the C library for a cosine, a sine and
-a logarithm would prevent; that makes them nine times faster.
+`laplace` and `interference` say what the likelihood is. Here the same numbers come from loops that
+the processor runs several directions at a time, which calls of the C library for a cosine, a sine
+and a logarithm would prevent; that makes them nine times faster.
 
 * `horner`: Re and Im of a trigonometric polynomial, term after term over the whole row.
-* `law_table` and `log_densities`: a double holds its own logarithm. Its exponent and its first
-  five bits number the cells of a table, 32 to the octave, and the remaining bits say where in the
-  cell it lies, so that cubic interpolation needs no logarithm. From 2^-20 to 2^50; outside, q is
-  put to the nearest end. The relative error is 3e-7 at most. The Gaussian law is a table too.
+* `likelihood_table` and `log_densities`: a double holds its own logarithm. Its exponent and its
+  first five bits number the cells of a table, 32 to the octave. The remaining bits say where in
+  the cell it lies, so that cubic interpolation needs no logarithm. The table reaches from 2^-20 to
+  2^50; outside, q is put to the nearest end. The relative error is 3e-7 at most. The Gaussian
+  likelihood is a table too.
 
 Everything is elementwise: a row gives the same bits however it is cut.
 """
@@ -23,7 +24,7 @@ import numpy as np
 from ..estimation.arrays import ComplexArray, FloatArray
 from ..estimation.elementary import phasors
 from ..estimation.jit import kernel
-from .laplace import LAWS, log_density, log_density_slope, MAX_STAVES
+from .laplace import LIKELIHOODS, log_density, log_density_slope, MAX_STAVES
 
 _CELL_BITS = 5
 _OCTAVES = (-20, 50)
@@ -35,19 +36,21 @@ _ONE = 1023 << 52
 
 
 @lru_cache(maxsize=32)
-def law_table(staves: int, law: str = 'laplace') -> FloatArray:
-    """The table of a law, (4, cells): coefficients of the cubic in each cell. Read-only.
+def likelihood_table(staves: int, likelihood: str = 'laplace') -> FloatArray:
+    """The table of a likelihood, (4, cells): coefficients of the cubic in each cell. Read-only.
 
-    Raises ValueError for a number of staves or a law that is not known.
+    Raises ValueError for a number of staves or a likelihood that there is not.
     """
     if not 1 < staves <= MAX_STAVES:
-        raise ValueError(f'the law is tabulated for 2 to {MAX_STAVES} staves, not {staves}')
-    if law not in LAWS:
-        raise ValueError(f"there is no law '{law}'; there are {' and '.join(LAWS)}")
+        raise ValueError(f'likelihoods are tabulated for 2 to {MAX_STAVES} staves, not {staves}')
+    if likelihood not in LIKELIHOODS:
+        raise ValueError(
+            f"there is no likelihood '{likelihood}'; there are {' and '.join(LIKELIHOODS)}"
+        )
     node = np.arange(((_OCTAVES[1] - _OCTAVES[0]) << _CELL_BITS) + 1)
     cells = 1 << _CELL_BITS
     q = np.ldexp(1.0 + (node % cells) / cells, _OCTAVES[0] + node // cells)
-    laplace = law == 'laplace'
+    laplace = likelihood == 'laplace'
     value = log_density(q, staves) if laplace else -q
     slope = log_density_slope(q, staves) / q if laplace else -np.ones_like(q)
     width, rise = np.diff(q), np.diff(value)
@@ -79,7 +82,7 @@ def horner(
 
 @kernel
 def log_densities(q: FloatArray, t: FloatArray, table: FloatArray, out: FloatArray) -> None:
-    """The tabulated law of q (n,) into out (n,); q and t are left as scratch."""
+    """The tabulated log likelihood of q (n,) into out (n,); q and t are left as scratch."""
     cell, rest = q.view(np.int64), t.view(np.int64)
     for i in range(q.shape[0]):
         value = q[i] if q[i] > _LOWEST else _LOWEST  # NaN goes to the low end too

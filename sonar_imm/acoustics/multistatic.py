@@ -36,11 +36,6 @@ COINCIDENT = 1e-6
 bearing."""
 
 
-def wrap_angle(angle: ArrayLike) -> FloatArray:
-    """The same angle in [-pi, pi]: apply it to every bearing residual."""
-    return np.mod(np.asarray(angle, np.float64) + np.pi, 2.0 * np.pi) - np.pi
-
-
 def slant_range(
     position: ArrayLike, points: ArrayLike, target_z: float
 ) -> tuple[FloatArray, FloatArray]:

@@ -1,8 +1,8 @@
-"""The ``sonar-imm`` command: one small module a subcommand, loaded only when it is called.
+"""The ``sonar-imm`` command: one small module per subcommand, loaded only when it is called.
 
-Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141
-nobody reads the output, 129 and 143 ended by SIGHUP and SIGTERM. What a user can get wrong ends in
-one line on standard error; a traceback is a bug.
+Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141 the
+reader of the output went away, 129 and 143 ended by SIGHUP and SIGTERM. A mistake of the user
+gives one line on standard error; a traceback is a bug.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ PROGRAM = 'sonar-imm'
 COMMANDS = {
     'simulate': 'Write a bag of simulated measurements with truth.',
     'convert': 'Turn other formats (CSV, JSON, ...) into a bag.',
-    'info': 'Say what is in a bag, which tracker fits it and what is wrong with it.',
+    'info': 'Show what is in a bag, which tracker fits it and what is wrong with it.',
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
     'play': 'Publish a bag to live nodes.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
     'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
     'bench': 'Measure speed against other libraries, in one run.',
-    'demo': 'Live node, offline tracker, score and report on a shipped bag.',
+    'demo': 'Live node, offline tracker, scores and one report on the shipped bags.',
 }
 
 
@@ -48,21 +48,21 @@ COMMANDS = {
 @click.version_option(__version__, prog_name=PROGRAM)
 @click.pass_context
 def command(ctx: click.Context) -> None:
-    """Track what sonar sees, with several motion models at once."""
+    """Track targets and terrain with sonar, by several models at once."""
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and give its exit code. The only place that turns errors into words."""
+    """Run the command line and give its exit code. The only place that prints errors."""
     with _signals_unwind():
         return _run(arguments)
 
 
 @contextlib.contextmanager
 def _signals_unwind() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP leave by way of every ``with``, as Ctrl-C does: a node that was
-    started would live on otherwise. A program that handles them itself is left alone."""
+    """Let SIGTERM and SIGHUP unwind every ``with`` block, as Ctrl-C does; otherwise a node that
+    was started would live on. Handlers that a program has set itself are kept."""
     ours = []
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGTERM, signal.SIGHUP):
@@ -77,7 +77,7 @@ def _signals_unwind() -> Iterator[None]:
 
 
 def _leave(number: int, _frame: object) -> NoReturn:
-    # A second signal must not break off the way out.
+    # A second signal must not interrupt the unwinding.
     for one in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(one, signal.SIG_IGN)
     raise SystemExit(128 + number)
@@ -87,7 +87,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         status = command.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
         if status == READER_GONE:
-            # What is still buffered has nowhere to go; Python would complain about it at exit.
+            # The buffered rest cannot be written; Python would report an error at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return status if isinstance(status, int) else 0
     except click.UsageError as error:
@@ -100,20 +100,20 @@ def _run(arguments: Sequence[str] | None) -> int:
     except Exception as error:
         if _replay_failed(error):
             return _complain(str(error), 1)
-        sentence = _what_the_user_can_mend(error)
+        sentence = _user_error(error)
         if sentence is None:
             raise
         return _complain(sentence)
 
 
 def _replay_failed(error: Exception) -> bool:
-    """Whether a live node did not do its part. Only commands that load rclpy can meet it."""
+    """Whether a live node failed. Only commands that load rclpy can have this error."""
     link = sys.modules.get('sonar_imm.nodes.link')
     return link is not None and isinstance(error, link.LinkError)
 
 
-def _what_the_user_can_mend(error: Exception) -> str | None:
-    """The sentence of an error in the input, the configuration or the machine; None for a bug."""
+def _user_error(error: Exception) -> str | None:
+    """Sentence for an error in the input, the configuration or the machine; None for a bug."""
     from ..measurements import Rejection
     from ..parameters import ConfigError
     from ..recordings.reader import BagError
@@ -129,13 +129,13 @@ def _what_the_user_can_mend(error: Exception) -> str | None:
 
 
 def missing_package(name: str) -> str | None:
-    """How to come by a package that only some commands need; None for one that all need."""
+    """How to install a package that only some commands need; None for one that all need."""
     remedies = {
-        'distributed': 'dask.distributed, which shares out the runs, is not here: pip install '
-        "'sonar_imm[sweep]', or say --workers 1",
-        'rclpy': "ROS 2 is not here: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
-        'segyio': "segyio, which reads SEG-Y, is not here: pip install 'sonar_imm[segy]'",
-        'filterpy': "FilterPy is not here: pip install 'sonar_imm[test]'",
+        'distributed': 'dask.distributed, which distributes the runs, is not installed: pip '
+        "install 'sonar_imm[sweep]', or use --workers 1",
+        'rclpy': "ROS 2 is not found: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
+        'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
+        'filterpy': "FilterPy is not installed: pip install 'sonar_imm[test]'",
     }
     return remedies.get(name)
 

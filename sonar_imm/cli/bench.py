@@ -20,9 +20,9 @@ from .common import BAG, example, json_option, print_json, say
     show_default=True,
     help='Paired rounds against other programs.',
 )
-@click.option('--bag', type=BAG, help='What the node is timed with; by default a shipped bag.')
+@click.option('--bag', type=BAG, help='Recording to time the node with; a shipped one by default.')
 @click.option('--skip-node', is_flag=True, help='Leave out the live node (needs ROS 2).')
-@click.option('--strict', is_flag=True, help='Exit with 1 when a figure misses its goal.')
+@click.option('--strict', is_flag=True, help='Exit code 1 when a measurement misses its goal.')
 @json_option
 def command(
     systems: tuple[str, ...],
@@ -32,10 +32,10 @@ def command(
     strict: bool,
     as_json: bool,
 ) -> None:
-    """Measure the filters, beside FilterPy in one run where it does the same, and the live nodes.
+    """Measure the speed of the filters, beside other libraries in the same run, and of the nodes.
 
-    Times depend on the machine and on what else it does; the ratio to another program hardly does.
-    SYSTEMS are all there are unless named.
+    Times depend on the machine and its load; the ratio to another program hardly does. Without
+    SYSTEMS all are measured.
     """
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
@@ -59,7 +59,7 @@ def command(
 
 
 def _measure(system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
-    """The benches of one system, without those whose other program is not installed."""
+    """The benches of one system, without those that need a library that is not installed."""
     from ..evaluation.benches import benches_of
     from . import missing_package
 

@@ -12,7 +12,7 @@ from ..trackers import SYSTEMS
 from .common import BAG, example, json_option, print_json, say
 
 if TYPE_CHECKING:
-    from .checking import Outcome
+    from .checking import CheckedRecording
 
 
 @click.command(
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 @click.option(
     '--params',
     type=click.Path(path_type=Path, dir_okay=False),
-    help='Parameter file, for the node and offline alike.',
+    help='Parameter file for the node and the offline run.',
 )
 @click.option(
     '--limit',
     type=click.FloatRange(min=0.0),
     metavar='ERROR',
-    help='Error to stay within, of the kind and in the unit that the check prints: '
+    help='Largest error allowed, of the kind and in the unit that the check prints, e.g. '
     'position RMSE in metres for the diver.',
 )
 @click.option(
@@ -46,15 +46,15 @@ def command(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Start the real nodes, play recordings to them in lock-step and check what they say.
+    """Start the real nodes, play recordings to them in lock-step and check their estimates.
 
-    The estimates have to equal those of `track`, byte for byte, and to lie near the truth. SYSTEMS
-    are all there are unless named. Exit code 1 when anything falls short.
+    The estimates have to equal those of `track`, byte for byte, and to lie near the truth. Without
+    SYSTEMS all are checked. Exit code 1 when a check fails.
     """
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
     with tempfile.TemporaryDirectory(prefix='sonar_imm_check_') as scratch:
-        outcomes = run_checks(
+        recordings = run_checks(
             systems or tuple(SYSTEMS),
             out or Path(scratch),
             bag=bag,
@@ -63,11 +63,11 @@ def command(
             quiet=as_json,
         )
     if as_json:
-        print_json([outcome.as_dict() for outcome in outcomes])
+        print_json([recording.as_dict() for recording in recordings])
     else:
-        for outcome in outcomes:
-            print_outcome(outcome)
-    if not all(outcome.good for outcome in outcomes):
+        for recording in recordings:
+            print_checks(recording)
+    if not all(recording.good for recording in recordings):
         raise click.exceptions.Exit(1)
 
 
@@ -79,8 +79,8 @@ def run_checks(
     params: Path | None = None,
     limit: float | None = None,
     quiet: bool = False,
-) -> list[Outcome]:
-    """Check `bag`, or all shipped recordings, of each system; runs go below `folder`."""
+) -> list[CheckedRecording]:
+    """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`."""
     from .checking import check_recording, shipped_bags
 
     return [
@@ -90,15 +90,15 @@ def run_checks(
     ]
 
 
-def print_outcome(outcome: Outcome) -> None:
-    """The checks of one recording as a table."""
-    say(f'{outcome.system}: {outcome.bag.name}')
-    for check in outcome.checks:
+def print_checks(recording: CheckedRecording) -> None:
+    """Print the checks of one recording."""
+    say(f'{recording.system}: {recording.bag.name}')
+    for check in recording.checks:
         say(
             f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
             f' (wanted: {check.wanted})'
         )
     say(
-        f'        latency of an estimate: p50 {outcome.latency_ms["p50"]:.1f} ms, '
-        f'p99 {outcome.latency_ms["p99"]:.1f} ms'
+        f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
+        f'p99 {recording.latency_ms["p99"]:.1f} ms'
     )

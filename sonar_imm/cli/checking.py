@@ -1,6 +1,6 @@
 """One recording through the real node and through the offline tracker, compared and scored.
 
-``check`` prints the outcome, ``demo`` makes a report of it.
+``check`` prints the result, ``demo`` makes a report of it.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from .track import track_recording
 
 
 @frozen
-class Outcome:
-    """All checks of one recording, and what is said of the offline run.
+class CheckedRecording:
+    """All checks of one recording, and the judgement of the offline run.
 
     `folder` holds the runs ``offline`` and ``live``.
     """
@@ -40,7 +40,7 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether nothing fell short."""
+        """Whether all checks passed."""
         return all(check.good for check in self.checks)
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,11 +70,11 @@ def check_recording(
     params: Path | None = None,
     limit: float | None = None,
     quiet: bool = False,
-) -> Outcome:
+) -> CheckedRecording:
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
-    params: None for those that the recording brings along, if any. limit: error to stay within, in
-    the unit of the system; None for that of the shipped recordings.
+    params: parameter file; None for the one that comes with the recording, if any. limit: largest
+    error allowed, in the unit of the system; None for the limit of the shipped recordings.
     Raises `BagError`, `ConfigError` and `LinkError`.
     """
     params = params or own_parameters(bag)
@@ -90,11 +90,11 @@ def check_recording(
     checks = [_answered(live, run), _equal(folder), _ended(live)]
     if (accuracy := judgement.accuracy(limit)) is not None:
         checks.append(accuracy)
-    return Outcome(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
+    return CheckedRecording(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
 
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
-    """Write what the node published the way the offline run is written."""
+    """Write the estimates that the node published in the same form as the offline run."""
     folder = RunFolder(path)
     folder.prepare(overwrite=True)
     folder.write_estimates(final_estimates(live.estimates, config), system)

@@ -35,7 +35,7 @@ def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--set name=value``, as often as needed."""
+    """``--set name=value``, may be repeated."""
     return pairs_option(
         '--set',
         'overrides',
@@ -45,7 +45,7 @@ def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
-    """An option of the form NAME=VALUE, as often as needed; the command gets a dict."""
+    """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
 
     def split(
         _ctx: click.Context, _param: click.Parameter, values: Iterable[str]
@@ -62,17 +62,17 @@ def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
 
 
 def topic_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--topic input=topic``, as often as needed; the command gets topics by input."""
+    """``--topic input=topic``, may be repeated; the command gets topics by input."""
     return pairs_option(
         '--topic',
         'topics',
         metavar='INPUT=TOPIC',
-        help='Which topic is which input, e.g. fix=/usbl/pose; may be given several times.',
+        help='Topic of an input, e.g. fix=/usbl/pose; may be given several times.',
     )(function)
 
 
 def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """``--system``: which tracker; not needed while the bag fits one only."""
+    """``--system``: which tracker; not needed when the bag fits only one."""
     return click.option(
         '--system',
         type=click.Choice(list(SYSTEMS)),
@@ -82,7 +82,8 @@ def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
-    """Texts of ``--set`` as the types the parameters want; others stay, for Config to refuse."""
+    """Texts of ``--set`` in the types of the parameters. Others stay texts; Config refuses
+    them."""
     specs = {spec.name: spec for spec in config_type.specs()}
     return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
 
@@ -124,7 +125,7 @@ def load_config(
         for name in values
         if name not in specs
     ]
-    # Which message types a live node subscribes to: checked, though a recording knows its own.
+    # The message types a live node subscribes to are checked too, though a recording has its own.
     problems = unknown + [
         trouble
         for name, spec in choices.items()
@@ -145,7 +146,7 @@ def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
         raise ConfigError(f'{path} is not a text file') from None
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
-    # What every ROS 2 node understands and no tracker needs.
+    # Parameters of every ROS 2 node that no tracker needs.
     return {
         key: value for key, value in values.items() if key not in ('use_sim_time', 'qos_overrides')
     }
@@ -159,14 +160,14 @@ def print_json(result: Any) -> None:
 
 
 def say(text: str = '', *, quiet: bool = False) -> None:
-    """A line for people on standard output; silent when the output is JSON."""
+    """Print a line on standard output, unless the output is JSON (`quiet`)."""
     if not quiet:
         click.echo(text)
 
 
 @contextlib.contextmanager
 def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[Advance]:
-    """Yields ``advance(count)``: a bar on a terminal, a line now and then elsewhere (stderr)."""
+    """Yields ``advance(count)``: a bar on a terminal, else a line every few seconds (stderr)."""
     if quiet or not total:
         yield lambda count: None
     elif sys.stderr.isatty():
@@ -181,7 +182,7 @@ def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[A
 
 
 def _plain_progress(what: str, total: int) -> Advance:
-    """A line every few seconds, so that a log of a short job stays empty."""
+    """Print a line every few seconds, so that the log of a short job stays empty."""
     done, told = 0, time.monotonic()
 
     def advance(count: int) -> None:

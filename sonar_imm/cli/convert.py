@@ -1,4 +1,4 @@
-"""``sonar-imm convert``: one subcommand a kind of input, because each has its own options."""
+"""``sonar-imm convert``: one subcommand per kind of input, because each has its own options."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BAG_OUT = click.Path(path_type=Path)
 def command() -> None:
     """Turn recordings in other formats into a rosbag2 bag.
 
-    Rows that cannot be used are left out, counted and named by line.
+    Rows that cannot be used are left out, counted and listed by line.
     """
 
 
@@ -112,7 +112,7 @@ def fixes(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     '--toa-std',
     type=click.FloatRange(min=0.0, min_open=True),
     metavar='SECONDS',
-    help='Standard deviation of arrival times that state none.',
+    help='Standard deviation of arrival times, for rows that state none.',
 )
 @csv_options()
 @csv_options('receiver', 'the position files')
@@ -121,9 +121,9 @@ def fixes(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
 @storage_option
 @json_option
 def arrivals(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
-    """CSV of arrival times to /arrivals, one message a ping.
+    """CSV of arrival times to /arrivals, one message per ping.
 
-    Columns: receiver and arrival (or toa, with transmitter); ping tells pings apart.
+    Columns: receiver and arrival (or toa and transmitter); ping says which rows belong together.
     """
     _convert(
         'arrivals',
@@ -191,20 +191,20 @@ def autoferry(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None
 @click.argument('source', metavar='IN', type=FILE)
 @click.argument('out_bag', type=BAG_OUT)
 @pairs_option(
-    '--name', 'names', metavar='WHAT=ARRAY', help='What an array is called here, e.g. iq=data.'
+    '--name', 'names', metavar='WHAT=ARRAY', help='Name of an array in this archive, e.g. iq=data.'
 )
 @click.option(
     '--staves',
     callback=staves,
     metavar='CHANNELS',
-    help='Channels, from 0, that make each stave; those joined by + are added up.',
+    help='Channels, from 0, of each stave; those joined by + are summed.',
 )
 @click.option(
     '--ping-rate',
     type=click.FloatRange(min=0.001, max=1000.0),
     default=10.0,
     show_default=True,
-    help='Pings a second, where there are no stamps.',
+    help='Pings per second, when there are no stamps.',
 )
 @click.option('--frame-id', default='sonar', show_default=True, help='Frame of the array.')
 @storage_option
@@ -235,8 +235,8 @@ def images(
 ) -> None:
     """Bag with images of a forward-looking sonar to /detections, for the obstacle tracker.
 
-    Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage; navigation and altitudes come
-    along. --set changes the detector: image_order, beam_axes, sound_speed, guard, training,
+    Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage. Navigation and altitudes are
+    copied. --set changes the detector: image_order, beam_axes, sound_speed, guard, training,
     false_alarm, min_range, max_detections.
     """
     from ..trackers.obstacle.detector import DetectorConfig
@@ -271,22 +271,24 @@ def images(
     type=click.FloatRange(min=1300.0, max=1700.0),
     default=1500.0,
     show_default=True,
-    help='For the sample interval and the recording delay.',
+    help='Speed of sound in m/s, for the sample interval and the recording delay.',
 )
 @click.option(
     '--first-sample',
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help='Leave out what comes before, such as the transmit pulse.',
+    help='Leave out samples before it, e.g. the transmit pulse.',
 )
-@click.option('--samples', type=click.IntRange(min=2), help='How many to take; all by default.')
+@click.option(
+    '--samples', type=click.IntRange(min=2), help='How many samples to take; all by default.'
+)
 @click.option(
     '--stack',
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help='Traces averaged to one.',
+    help='Number of successive traces averaged into one.',
 )
 @click.option(
     '--depth',
@@ -323,7 +325,7 @@ def segy(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     type=click.FloatRange(min=1e-6, max=1e6),
     default=1.0,
     show_default=True,
-    help='Traces a second, where an archive has no stamps.',
+    help='Traces per second, when an archive has no stamps.',
 )
 @click.option('--frame-id', default='array', show_default=True, help='Frame of the traces.')
 @storage_option
@@ -333,6 +335,6 @@ def traces(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
 
     Archive: depth (n,), amplitude (n,) or (traces, n); optional stamp, sigma, reference_depth, and
     as truth reflector_depth and reflector_amplitude (traces, K). CSV: stamp, depth, amplitude and
-    optional std, one row a sample.
+    optional std, one row per sample.
     """
     _convert('traces', source, out_bag, as_json, options=options(values), **values)

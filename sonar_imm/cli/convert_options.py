@@ -47,7 +47,7 @@ def staves(
 
 
 def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]:
-    """The options that describe a CSV file; `prefix` tells several files apart."""
+    """The options that describe a CSV file; with several files each has its `prefix`."""
     dashed, name = (f'{prefix}-', f'{prefix}_') if prefix else ('', '')
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -56,7 +56,7 @@ def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]
                 f'--{dashed}delimiter',
                 f'{name}delimiter',
                 default='',
-                help=f'Between the columns of {what}; found by itself.',
+                help=f'Delimiter between the columns of {what}; found automatically by default.',
             ),
             click.option(
                 f'--{dashed}time-offset',
@@ -72,13 +72,13 @@ def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]
                 default='',
                 type=click.Choice(['', 's', 'ms', 'us', 'ns']),
                 metavar='UNIT',
-                help=f'Of numeric times in {what}: s, ms, us or ns.',
+                help=f'Unit of numeric times in {what}: s, ms, us or ns.',
             ),
             pairs_option(
                 f'--{dashed}column',
                 f'{name}columns',
                 metavar='NAME=HEADER',
-                help=f'Which column of {what} is what, e.g. x=easting.',
+                help=f'Header of a column of {what}, e.g. x=easting.',
             ),
         ):
             function = option(function)
@@ -88,12 +88,12 @@ def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]
 
 
 def place_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Frame and origin, for all that has positions."""
+    """Frame and origin, for every kind with positions."""
     function = click.option(
         '--origin',
         callback=origin,
         metavar='LAT,LON[,HEIGHT]',
-        help='Of local metres; by default the first good row.',
+        help='Origin of local metres; by default the first good row.',
     )(function)
     return frame_option(function)
 
@@ -115,7 +115,7 @@ def storage_option(function: Callable[..., Any]) -> Callable[..., Any]:
         type=click.Choice(['mcap', 'sqlite3']),
         default='mcap',
         show_default=True,
-        help='Kind of bag.',
+        help='Storage of the bag.',
     )(function)
 
 

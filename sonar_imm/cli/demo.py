@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from ..trackers import SYSTEMS
-from .check import print_outcome, run_checks
+from .check import print_checks, run_checks
 from .common import example, say
 
 
@@ -21,13 +21,13 @@ from .common import example, say
 )
 def command(out: Path) -> None:
     """Play the shipped recordings to the real nodes, track them offline too, write one report."""
-    outcomes = run_checks(tuple(SYSTEMS), out)
-    for outcome in outcomes:
-        print_outcome(outcome)
+    recordings = run_checks(tuple(SYSTEMS), out)
+    for recording in recordings:
+        print_checks(recording)
     from ..evaluation.report import write_report
 
     report = out / 'report.html'
-    write_report(report, [outcome.judgement.part(outcome.checks) for outcome in outcomes])
+    write_report(report, [one.judgement.part(one.checks) for one in recordings])
     say(f'report: {report.resolve()}')
-    if not all(outcome.good for outcome in outcomes):
+    if not all(recording.good for recording in recordings):
         raise click.exceptions.Exit(1)

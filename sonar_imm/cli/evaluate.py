@@ -42,8 +42,8 @@ from .common import BAG, example, json_option, print_json, say
     '--cutoff',
     type=click.FloatRange(min=0.0, min_open=True),
     metavar='METRES',
-    help='With several targets, an estimate further away is on none; by default what is '
-    'usual in the system, 10 for divers.',
+    help='An estimate further away from all targets is on none of them; the default depends '
+    'on the system, 10 for divers.',
 )
 @click.option(
     '--report',
@@ -65,7 +65,7 @@ def command(
     """Score the run that `sonar-imm track` left in OUT_DIR.
 
     Writes metrics.json and one self-contained HTML report. Without truth only what needs none is
-    judged: the surprise of the measurements (NIS) and the models.
+    scored: the normalised innovations (NIS) and the model probabilities.
     """
     judgement = evaluate_run(
         out_dir, JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)

@@ -16,7 +16,7 @@ from .common import BAG, example, json_option, print_json, progress
 @click.option('--strict', is_flag=True, help='Stop at the first damage instead of reading on.')
 @json_option
 def command(bag: Path, strict: bool, as_json: bool) -> None:
-    """Say what is in BAG, which tracker fits it and what is wrong with it.
+    """Show what is in BAG, which tracker fits it and what is wrong with it.
 
     BAG is a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 .bag file. Exit code 1 when
     no tracker can use it.
@@ -56,11 +56,11 @@ def _print(found: dict[str, Any]) -> None:
 
 def _scans(scans: dict[str, int] | None) -> str:
     several = scans is not None and scans['most'] > 1
-    return f', {scans["count"]} scans, up to {scans["most"]} a scan' if several else ''
+    return f', {scans["count"]} scans, up to {scans["most"]} per scan' if several else ''
 
 
 def _track_line(bag: str, system: str, inputs: dict[str, list[str]]) -> str:
-    """The command that tracks the recording; topics are named where their names do not fit."""
+    """The command that tracks the recording, with --topic where the names do not fit."""
     named = [
         f' --topic {shlex.quote(f"{name}={topics[0]}")}'
         for name, topics in inputs.items()

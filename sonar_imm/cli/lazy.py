@@ -1,4 +1,4 @@
-"""A click group that knows its subcommands by name and imports a module only to run it."""
+"""A click group that imports the module of a subcommand only to run it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import click
 from ..parameters import did_you_mean
 
 READER_GONE = 141
-"""Exit code when nobody reads the output: that of the signal a shell would see."""
+"""Exit code when the reader of the output went away: that of SIGPIPE in a shell."""
 
 
 class LazyGroup(click.Group):
@@ -38,13 +38,13 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the subcommand. A reader that went away, as in ``... | head``, is not our error."""
+        """Run the subcommand. A reader that went away, as in ``... | head``, is no error."""
         try:
             return super().invoke(ctx)
         except BrokenPipeError:
             raise click.exceptions.Exit(READER_GONE) from None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The help page, from the summaries alone: loading every module would take seconds."""
+        """The help page from the summaries; importing every module would take seconds."""
         with formatter.section('Commands'):
             formatter.write_dl(list(self._summaries.items()))

@@ -31,7 +31,7 @@ from .common import BAG, example, progress, say
     type=click.FloatRange(min=0.0),
     default=0.0,
     metavar='SECONDS',
-    help='Part of the recording to skip.',
+    help='Skip so much of the recording.',
 )
 @click.option(
     '-d',
@@ -51,7 +51,7 @@ from .common import BAG, example, progress, say
     flag_value=40.0,
     default=None,
     metavar='[HZ]',
-    help='Publish /clock, at 40 Hz.',
+    help='Publish /clock, at 40 Hz by default.',
 )
 @click.option(
     '--topics', multiple=True, metavar='TOPIC', help='Only this topic; may be given several times.'
@@ -70,13 +70,13 @@ from .common import BAG, example, progress, say
     flag_value='auto',
     default='',
     metavar='[NODE]',
-    help='Send a message when NODE, or the only node there is, has answered the last.',
+    help='Send the next message only when NODE, by default the only one, has answered.',
 )
 def command(bag: Path, remaps: tuple[str, ...], **options: object) -> None:
     """Publish the recording BAG to live nodes, byte for byte, stamps included.
 
-    The options are spelt as those of `ros2 bag play`. In lock-step nothing is lost, however fast:
-    each message waits until NODE (a node of this package, e.g. /diver) is done with the last.
+    The options have the names of those of `ros2 bag play`. In lock-step no message is lost: each
+    one waits until NODE (a node of this package, e.g. /diver) has processed the one before.
     """
     from ..nodes.player import play, PlayOptions
     from ..recordings.reader import BagReader

@@ -21,17 +21,20 @@ from .common import example, json_option, print_json, say, set_option, typed_ove
 )
 @click.argument('system', type=click.Choice(list(SYSTEMS)))
 @click.argument('out_bag', type=click.Path(path_type=Path), required=False)
-@click.option('--scenario', default=None, help='Which scene; the first one by default.')
+@click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
 @click.option(
     '--seed',
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help='Same scenario and seed, same bag.',
+    help='The same scenario and seed give the same bag.',
 )
 @set_option
 @click.option(
-    '--list', 'list_scenarios', is_flag=True, help='Only list scenarios and what --set can change.'
+    '--list',
+    'list_scenarios',
+    is_flag=True,
+    help='Only list scenarios and what --set can change.',
 )
 @json_option
 def command(
@@ -84,7 +87,7 @@ def command(
     what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
     say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
     if parameters:
-        say(f'  what a tracker has to know of the instruments: {parameters}')
+        say(f'  parameters of the instruments, for the tracker: {parameters}')
 
 
 def _list(scenes: Any, as_json: bool) -> None:

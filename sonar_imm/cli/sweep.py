@@ -38,12 +38,12 @@ from .common import (
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help='Seed of the first scene; each further run takes the next number.',
+    help='Seed of the first run; each further run takes the next number.',
 )
 @click.option(
     '--scenario',
     default=None,
-    help='Which scene; the first one by default. `sonar-imm simulate SYSTEM --list` lists them.',
+    help='Name of the scene; by default the first one of `sonar-imm simulate SYSTEM --list`.',
 )
 @set_option
 @click.option(
@@ -55,8 +55,8 @@ from .common import (
 @click.option(
     '--workers',
     type=click.IntRange(min=1),
-    help='Processes on this machine; by default one a core. With 1 all runs are in this '
-    'process and dask is not needed.',
+    help='Processes on this machine; by default one per core. With 1 all runs are in this '
+    'process, and dask is not needed.',
 )
 @click.option(
     '--scheduler',
@@ -66,7 +66,7 @@ from .common import (
 @click.option(
     '--out',
     type=click.Path(path_type=Path, file_okay=False),
-    help='Folder for sweep.csv, a row a run, and sweep.json.',
+    help='Folder for sweep.csv, one row per run, and sweep.json.',
 )
 @click.option('--overwrite', is_flag=True, help='Replace an earlier sweep in --out.')
 @json_option
@@ -84,12 +84,12 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Simulate, track and score SYSTEM under many seeds, and say what comes out on average.
+    """Simulate, track and score SYSTEM under many seeds, and summarise the scores.
 
-    --set changes the scene, --params the tracker; without --params the tracker is told what the
-    scene says of its instruments. The score of a seed is that of `sonar-imm evaluate`, however
-    many processes there are. A run that fails is named and left out; the exit code is 1 when more
-    than half of them did.
+    --set changes the scene, --params the tracker. Without --params the tracker gets the parameters
+    of the instruments from the scene. The scores of a seed are those of `sonar-imm evaluate` and
+    do not depend on the number of processes. A run that fails is listed and left out; the exit
+    code is 1 when more than half of the runs fail.
     """
     if scheduler is not None and workers is not None:
         raise click.UsageError('--workers and --scheduler exclude each other')
@@ -151,10 +151,10 @@ def _print(content: dict[str, Any], out: Path | None) -> None:
     for name, one in summary.items():
         numbers = ' '.join(f'{one[key]:11.4g}' for key in ('mean', 'std', 'stderr'))
         say(f'  {name:<{width}} {numbers} {one["runs"]:6d}')
-    alike: dict[str, list[str]] = {}
+    seeds_by_reason: dict[str, list[str]] = {}
     for seed, sentence in failures.items():
-        alike.setdefault(sentence, []).append(seed)
-    for sentence, which in alike.items():
+        seeds_by_reason.setdefault(sentence, []).append(seed)
+    for sentence, which in seeds_by_reason.items():
         click.echo(f'failed: seed {", ".join(which)}: {sentence}', err=True)
     if out is not None:
         say(f'written to {out}')

@@ -44,9 +44,9 @@ from .common import (
     type=click.Choice(['recorded', 'stamp']),
     default='recorded',
     show_default=True,
-    help='As the messages arrived, or sorted by their stamps.',
+    help='Messages in the order of arrival, or sorted by their stamps.',
 )
-@click.option('--smooth', is_flag=True, help='Give each estimate what came after it, too.')
+@click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
@@ -66,14 +66,14 @@ def command(
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
     OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
-    same bytes in bag and CSV. Without --params those that BAG brings along are used, if any
-    (`parameters.yaml` in its folder); --set changes single ones.
+    same bytes in bag and CSV. Without --params the file `parameters.yaml` in the folder of BAG is
+    used, if there is one. --set changes single parameters.
     """
     from ..evaluation.tracking import InputOptions
     from ..recordings.own_parameters import own_parameters
 
     if params is None and (params := own_parameters(bag)) and not as_json:
-        say(f'with the parameters of the recording, {params}')
+        say(f'using the parameters of the recording, {params}')
     chosen = choose_system(bag, system, topics)
     config, node = load_config(chosen, params, overrides)
     options = InputOptions(
@@ -90,7 +90,7 @@ def command(
 
 
 def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
-    """What `recordings` wants of ``--topic``: input by topic name, None to choose by name."""
+    """``--topic`` as `recordings` takes it: input by topic name, None to choose by name."""
     return {topic: name for name, topic in topics.items()} or None
 
 
@@ -147,4 +147,4 @@ def _print(run: dict[str, Any], out_dir: Path) -> None:
     for problem in run['problems']:
         say(f'  problem: {problem}')
     if run['rows'] == 0:
-        say('  no track was made; sonar-imm info may tell why')
+        say('  no track was made; sonar-imm info may show why')

@@ -1,14 +1,14 @@
-"""Transition probabilities that the data correct, for each target by itself.
+"""Transition probabilities that are learnt from the data, for each target by itself.
 
-What is learnt never touches the chain: it is a *correction*, a factor for each transition, applied
-to the matrix of whatever step comes next, ``P(dt) = rownorm(P0(dt) * correction)``. So learning
-and irregular steps live together.
+Learning does not change the chain. It gives a *correction*, a factor for each transition, that is
+applied to the matrix of the next step: ``P(dt) = rownorm(P0(dt) * correction)``. So it works at
+irregular steps too.
 
 Three forms (`AdaptiveChain`):
 
 counts
     Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight`
-    transitions a row. At a constant step it is ``P = rownorm(n + weight P0)``. Sound, and the
+    transitions per row. At a constant step it is ``P = rownorm(n + weight P0)``. Sound, and the
     default of the diver tracker.
 paper
     Eq. (1) of the diver paper, ``P_ij <- P_ij mu_j / sum``, guarded by
@@ -29,7 +29,7 @@ Form = Literal['counts', 'paper', 'fixed']
 
 
 class Chain(Protocol):
-    """What decides between models: `markov.RateChain`, `markov.EventChain`."""
+    """A Markov chain over models: `markov.RateChain`, `markov.EventChain`."""
 
     matrix: FloatArray
     step: float
@@ -40,11 +40,11 @@ class Chain(Protocol):
 
 
 class AdaptiveChain:
-    """A chain and the way T targets correct it. What was learnt is a value the caller keeps:
-    `fresh`, `learn`.
+    """A chain and the way the data of T targets correct it. What was learnt is a value that the
+    caller keeps: `fresh` makes it, `learn` updates it.
 
-    weight: counts only, transitions a row the prior is worth; guard: paper only, share of the
-    prior kept each time.
+    weight: counts only, how many transitions per row the prior is worth; guard: paper only, share
+    of the prior that is kept at each step.
     """
 
     def __init__(self, chain: Chain, form: Form, *, weight: float = 2.0, guard: float = 0.7):
@@ -83,9 +83,9 @@ class AdaptiveChain:
         mu_after: FloatArray,
         dt: float,
     ) -> FloatArray:
-        """What is known after a step that used `transition` and took the model probabilities
+        """What is learnt after a step that used `transition` and took the model probabilities
         (targets, M) from `mu_before` to `mu_after`. Only for targets that were measured: a miss
-        teaches nothing."""
+        holds no information on transitions."""
         if self.form == 'fixed':
             return learnt
         if self.form == 'paper':
@@ -97,8 +97,10 @@ class AdaptiveChain:
 
 
 def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatArray) -> FloatArray:
-    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights; (..., M, M) from (...,
-    M, M), (..., M) twice."""
+    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights.
+
+    P: (..., M, M); mu_before, mu_after: (..., M). Gives (..., M, M).
+    """
     joint = P * mu_before[..., :, None]
     c = joint.sum(axis=-2, keepdims=True)
     return np.asarray(joint / np.where(c > 0.0, c, 1.0) * mu_after[..., None, :])
@@ -110,8 +112,8 @@ def adapt_counts(
     posterior: FloatArray,
     nominal: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Dirichlet counts, n_ij += W_ij mu_j, beside what the nominal matrix of the same step would
-    have had us count.
+    """Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal matrix predicts for
+    the same step.
 
     All (..., M, M); gives the new (counts, expected). See `counts_correction`.
     """
@@ -121,12 +123,11 @@ def adapt_counts(
 def counts_correction(
     counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float
 ) -> FloatArray:
-    """Factor for each transition, (n + N0 P0) / (e + N0 P0), `prior` P0 being the matrix of the
-    reference step.
+    """Factor for each transition, (n + N0 P0) / (e + N0 P0). `prior` P0 is the matrix of the
+    reference step, `weight` N0.
 
-    At a constant step e_ij = n_i. P0_ij and the corrected matrix is the Dirichlet posterior mean,
-    rownorm(n + N0 P0); at irregular steps the factor compares like with like, which counting alone
-    would not.
+    At a constant step e_ij = n_i. P0_ij, and the corrected matrix is the Dirichlet posterior mean,
+    rownorm(n + N0 P0). At irregular steps the factor still compares counts of the same steps.
     """
     given = expected + weight * prior
     return np.asarray(
@@ -137,10 +138,10 @@ def counts_correction(
 def adapt_product(
     correction: FloatArray, mu_after: FloatArray, prior: FloatArray, guard: float
 ) -> FloatArray:
-    """Eq. (1) of the diver paper, P_ij <- P_ij mu_j / sum, guarded by P <- (1 - guard) P + guard
-    P0, as a factor on P0.
+    """Eq. (1) of the diver paper as a factor on P0: P_ij <- P_ij mu_j / sum, then the guard
+    P <- (1 - guard) P + guard P0.
 
-    Unguarded the exponent of mu doubles each step and rows become one-hot within five.
+    Without the guard the exponent of mu doubles at each step, and rows become one-hot within five.
     """
     P = corrected(prior, correction) * mu_after[..., None, :]
     total = P.sum(axis=-1, keepdims=True)

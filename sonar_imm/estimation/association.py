@@ -1,23 +1,22 @@
-"""Which detection belongs to which target, and which tracks are to be believed.
+"""Data association and track management.
 
 A scan gives D detections; T targets are expected. Three steps, each a pure function on arrays:
 
-1. `gate` lists the pairs (target, detection) that are close enough to be one thing: those whose
-normalised innovation squared
-   lies below a chi-square quantile. Pairs are looked up in a KD-tree, because a dense table of a
-   million pairs for a thousand targets would cost more than everything else.
+1. `gate` lists the pairs (target, detection) that may belong together: those whose normalised
+   innovation squared lies below a chi-square quantile. Pairs are looked up in a KD-tree, because a
+   dense table of a million pairs for a thousand targets would cost more than everything else.
 2. `assign` picks, among those pairs, the most likely set in which no target and no detection is
-used twice (global nearest
-   neighbour). A pair is worth what it gains over calling the target missed and the detection
-   clutter,
+   used twice (global nearest neighbour). The cost of a pair is compared with calling the target
+   missed and the detection clutter,
 
        cost = -ln( P_D N(nu; 0, S) / clutter density ) + ln(1 - P_D),
 
-   and pairs that gain nothing stay unassigned. Targets that share no detection do not touch each
-   other, so the problem falls apart into clusters, almost all of them tiny.
+   and pairs whose cost is not negative stay unassigned. Targets that share no detection do not
+   influence each other, so the problem splits into clusters, almost all of them tiny.
+   `assign_by_rank` lets some targets choose before others, confirmed ones before tentative ones.
 3. `Tracks` counts hits and misses: a tentative track is confirmed by M hits in N scans, a
-confirmed one coasts through misses
-   until it has missed too often or too long. Identities are never used again.
+   confirmed one coasts through misses until it has missed too often or too long. Identities are
+   never used again.
 
 Reference: Blackman, Popoli, *Design and Analysis of Modern Tracking Systems* (1999), ch. 6.
 """
@@ -40,8 +39,8 @@ from .kalman import BoolArray, factorise, log_density
 
 @lru_cache(maxsize=256)
 def gate_threshold(probability: float, dimension: int) -> float:
-    """Normalised innovation squared inside which a `dimension`-vector of the target itself lies
-    with `probability`."""
+    """Chi-square quantile: the normalised innovation squared of a `dimension`-vector of the target
+    itself lies below it with `probability`."""
     from scipy.special import gammaincinv  # scipy.stats has it too, but takes a second to import
 
     return 2.0 * float(gammaincinv(dimension / 2.0, probability))
@@ -68,8 +67,8 @@ def gate(
 ) -> Pairs:
     """Find the pairs whose normalised innovation squared is at most `threshold`.
 
-    predicted: (T, m) measurements expected of each target; covariance: (T, m, m) of them, ``H P
-    H'``; detections: (D, m); R: (D, m, m) or (m, m), covariance of the detections.
+    predicted: (T, m) predicted measurement of each target; covariance: (T, m, m), ``H P H'``;
+    detections: (D, m); R: (D, m, m) or (m, m), covariance of the detections.
 
     Raises CovarianceError when an innovation covariance ``S = covariance + R`` is not positive
     definite.
@@ -108,12 +107,11 @@ def _near(
 def association_cost(
     log_likelihood: FloatArray, detection_probability: float, clutter_density: float
 ) -> FloatArray:
-    """Cost of each pair against calling the target missed and the detection clutter; negative when
-    the pair is better.
+    """Cost of each pair, relative to calling the target missed and the detection clutter. Negative
+    when the pair is more likely.
 
     log_likelihood: of the innovations, ``ln N(nu; 0, S)``; clutter_density: false detections (and
-    new targets) per unit of the measurement space, > 0; detection_probability: of a target that is
-    there, inside (0, 1).
+    new targets) per unit of the measurement space, > 0; detection_probability: inside (0, 1).
     """
     missed = math.log1p(-detection_probability)
     return missed - math.log(detection_probability) - log_likelihood + math.log(clutter_density)
@@ -152,10 +150,26 @@ def assign(
     return chosen
 
 
+def assign_by_rank(
+    target: IntArray, detection: IntArray, cost: FloatArray, rank: IntArray, detections: int
+) -> IntArray:
+    """`assign` in turns: targets of the lowest rank choose first, others among what is left.
+
+    rank: (T,) of each target; one with a negative rank gets nothing. The rest as in `assign`.
+    """
+    chosen, free = np.full(len(rank), -1, np.int64), np.ones(detections, np.bool_)
+    for turn in np.unique(rank[rank >= 0]):
+        pairs = (rank == turn)[target] & free[detection]
+        found = assign(target[pairs], detection[pairs], cost[pairs], len(rank), detections)
+        chosen = np.where(found >= 0, found, chosen)
+        free[found[found >= 0]] = False
+    return chosen
+
+
 def _solve_cluster(
     target: IntArray, detection: IntArray, cost: FloatArray
 ) -> list[tuple[int, int]]:
-    """Solve one cluster densely. A cell of cost zero stands for 'not assigned', so a full
+    """Solve one cluster as a dense table. A cell of cost zero stands for 'not assigned', so a full
     assignment always exists."""
     from scipy.optimize import linear_sum_assignment
 
@@ -173,7 +187,7 @@ def _solve_cluster(
 
 
 class TrackStatus(IntEnum):
-    """What a track is worth. The numbers are the column ``track_state``."""
+    """State of a track. The numbers are those of the column ``track_state``."""
 
     TENTATIVE = 0
     CONFIRMED = 1
@@ -184,9 +198,10 @@ class TrackStatus(IntEnum):
 class TrackRules:
     """When a track is confirmed and when it ends.
 
-    confirm_hits of confirm_window scans confirm (the first detection counts); delete_misses misses
-    in a row end a confirmed track; max_coast_ns without a hit ends any track. A tentative track
-    ends as soon as the last confirm_window scans hold too many misses to confirm it.
+    A tentative track is confirmed by confirm_hits hits in confirm_window scans; its first
+    detection counts. It ends as soon as these scans hold too many misses to confirm it. A
+    confirmed track ends after delete_misses misses in a row. Any track ends after max_coast_ns
+    without a hit.
     """
 
     confirm_hits: int
@@ -208,11 +223,12 @@ class TrackRules:
 
 @frozen(eq=False)
 class Tracks:
-    """The life of T tracks, as a value: `scan` and `born` return the next one.
+    """Hits, misses and status of T tracks. An immutable value: `scan` and `born` return the next
+    one.
 
-    track_id: (T,) rising, never used again; status: (T,) TrackStatus; seen: (T, confirm_window)
-    True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,); next_id: of the next
-    track.
+    track_id: (T,) increasing, never used again; status: (T,) TrackStatus; age: (T,) scans; seen:
+    (T, confirm_window) True for hits, newest last; misses: (T,) in a row; last_hit_ns: (T,);
+    next_id: of the next track.
     """
 
     track_id: NDArray[np.uint32]
@@ -258,11 +274,11 @@ class Tracks:
     def scan(
         self, hit: BoolArray, stamp_ns: int, rules: TrackRules, *, looked: BoolArray | None = None
     ) -> tuple[Tracks, BoolArray]:
-        """Take in one scan: `hit` (T,) says which tracks got a detection, `looked` (T,) which
-        could have got one (all by default). A track nobody looked for is neither hit nor missed.
+        """Take in one scan. `hit` (T,) says which tracks got a detection, `looked` (T,) which
+        could have got one (all by default). A track outside the view is neither hit nor missed.
 
-        Returns the tracks that live on and ``kept`` (T,), True for those, with which to thin the
-        states kept beside them.
+        Returns the tracks that live on and the mask ``kept`` (T,) of those, to select the states
+        that the caller keeps beside them.
         """
         looked = np.ones(len(self), np.bool_) if looked is None else looked | hit
         age = self.age + looked
@@ -293,8 +309,12 @@ class Tracks:
             self.next_id,
         ), kept
 
+    def none_left(self) -> Tracks:
+        """No tracks any more; identities go on."""
+        return self.only(np.zeros(len(self), np.bool_))
+
     def only(self, kept: BoolArray) -> Tracks:
-        """The tracks where `kept` (T,) is True, for callers that end some for reasons of their
+        """The tracks where `kept` (T,) is True. For callers that end tracks by rules of their
         own."""
         return evolve(
             self,

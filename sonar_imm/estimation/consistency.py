@@ -1,14 +1,13 @@
-"""Is the estimate right, and is it as good as it says?
+"""Accuracy and consistency of estimates.
 
-*Right*: `rmse` for one target; `gospa` and `ospa` for sets of targets, where some are missed, some
-are invented and nobody says which belongs to which; `identity_switches` along time.
+*Accuracy*: `rmse` for one target; `gospa` and `ospa` for sets of targets, where some are missed,
+some are false and the pairing is not known; `identity_switches` along time.
 
-*As good as it says*: an error divided by its own covariance, squared, is chi-square distributed
-when the filter is consistent (`nees` for states, `nis` for innovations). One value says little;
-the average of many has narrow `average_bounds`. Larger: the filter believes too much in itself;
-smaller: it wastes information. `interval_coverage` asks the same of any interval, and
-`innovation_autocorrelation` finds what a model has missed in time: innovations of a good filter
-are white.
+*Consistency*: the squared error, normalised by its own covariance, is chi-square distributed when
+the filter is consistent (`nees` for states, `nis` for innovations). One value says little; the
+average of many has narrow `average_bounds`. An average above them means an overconfident filter,
+one below them a filter that wastes information. `interval_coverage` tests any interval.
+`innovation_autocorrelation` finds unmodelled dynamics: the innovations of a good filter are white.
 
 References: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*
 (2001), sec. 5.4; Schuhmacher, Vo, Vo, *A consistent metric for performance evaluation of
@@ -24,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .kalman import factorise, log_density, solve
+from .covariance import solve
+from .kalman import factorise, log_density
 
 
 def rmse(error: FloatArray) -> float:
@@ -33,8 +33,8 @@ def rmse(error: FloatArray) -> float:
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Normalised estimation error squared ``e' P^-1 e`` (...,), e (..., n), P (..., n, n):
-    chi-square with n degrees of freedom.
+    """Normalised estimation error squared ``e' P^-1 e`` (...,), chi-square with n degrees of
+    freedom. e: (..., n); P: (..., n, n).
 
     Raises CovarianceError when a covariance is not positive definite.
     """
@@ -79,8 +79,8 @@ def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> f
 def coverage_bounds(
     count: int, probability: float, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Two-sided bounds of `interval_coverage` for `count` independent intervals that are what they
-    claim (binomial)."""
+    """Two-sided bounds of `interval_coverage` for `count` independent intervals that each hold the
+    truth with `probability` (binomial)."""
     from scipy.stats import binom
 
     tail = 0.5 * (1.0 - confidence)
@@ -89,8 +89,8 @@ def coverage_bounds(
 
 
 class Whiteness(NamedTuple):
-    """autocorrelation: (lags,) of lag 1, 2, ...; bound: each lies within +-bound with the stated
-    probability if white."""
+    """autocorrelation: (lags,) of lag 1, 2, ...; bound: for white innovations each value lies
+    within +-bound with the stated probability."""
 
     autocorrelation: FloatArray
     bound: float
@@ -99,8 +99,10 @@ class Whiteness(NamedTuple):
 def innovation_autocorrelation(
     innovation: FloatArray, covariance: FloatArray, lags: int = 10, probability: float = 0.95
 ) -> Whiteness:
-    """Autocorrelation along time of the whitened innovations: innovation (K, m), covariance (K, m,
-    m), K > lags."""
+    """Autocorrelation along time of the whitened innovations.
+
+    innovation: (K, m); covariance: (K, m, m). Raises ValueError unless K > lags.
+    """
     from scipy.stats import norm
 
     white = solve(factorise(covariance), innovation[..., None])[..., 0]
@@ -118,8 +120,8 @@ def innovation_autocorrelation(
 
 
 class Gospa(NamedTuple):
-    """distance; and the three parts of ``distance ** order``, which add up to it: localisation,
-    missed, false.
+    """The distance, and the three parts that add up to ``distance ** order``: localisation, missed
+    and false.
 
     estimate_of: (truths,) index of the estimate matched to each truth, -1 for the missed.
     """
@@ -132,8 +134,8 @@ class Gospa(NamedTuple):
 
 
 def gospa(truth: FloatArray, estimate: FloatArray, cutoff: float, order: float = 2.0) -> Gospa:
-    """Generalised OSPA (alpha = 2) between the point sets `truth` (T, n) and `estimate` (D, n),
-    either may be empty.
+    """Generalised OSPA (alpha = 2) between the point sets `truth` (T, n) and `estimate` (D, n).
+    Either may be empty.
 
     ``(min sum over matched d^p + c^p / 2 (missed + false))^(1/p)``; points `cutoff` or more apart
     are not matched.
@@ -179,10 +181,10 @@ def _match(
 
 
 def identity_switches(track_id: IntArray) -> int:
-    """How often a target changes the track that follows it: track_id (K, T) over time, -1 where it
-    is missed.
+    """How often a target is taken over by another track.
 
-    A gap is no switch; coming back under another identity is.
+    track_id: (K, T) id of the track on each target over time, -1 where it is missed. A gap is no
+    switch; coming back under another identity is one.
     """
     switches = 0
     for column in np.asarray(track_id).T:

@@ -1,13 +1,27 @@
-"""Late, shuffled, repeated and wild stamps, and how to get the right answer in spite of them.
+"""Late, shuffled, repeated and outlying stamps, and how to get the right answer in spite of them.
 
 Sonar data carry the instant of transmission and may arrive seconds later, in any order. Two
 objects deal with that.
 
 `StampGate` looks at stamps only and decides whether a measurement belongs to the stream. A stamp
 belongs when it is neither older than the newest one by more than the window, nor ahead of it by
-more than `max_gap_ns`. One that does not belong is held, because it is either wild (then the next
-good stamp abandons it) or the first of a clock that was restarted (then the following ones agree
-with it, and after `restart_after` of them all are handed out again: nothing good is lost).
+more than `max_gap_ns`. One that does not belong is held, because it may be the first of a clock
+that was restarted. Stamps held in a row are a *run*: each follows those before it, and none that
+belongs to the stream came in between. A run is given up as soon as one does. It shows that time
+itself was set anew when nothing else explains it:
+
+1. It lies ahead, or more than `max_late_ns` behind, where no late message can be: `restart_after`
+   distinct stamps are enough.
+2. It repeats stamps from the beginning of the stream, as a looped recording does: `restart_after`
+   such stamps are enough.
+3. The stream has just begun, and all of its stamps are newer. Then those may be the outliers. The
+   run has to outvote them: `restart_after` distinct stamps for each.
+4. Otherwise it may be a burst of late messages. Only a long run is no burst: `PATIENCE` times
+   `restart_after` distinct stamps that span more than the window.
+
+With a restart all held items are handed out: waiting for evidence loses nothing, it only takes
+longer. A clock that was set back by less than what rule 4 asks for reaches its old time again, and
+the stream goes on; what came in between was too late.
 
 `ReplayHistory` keeps what arrived inside the window together with the state after each stamp. A
 late item is put in its place and everything after it is computed again. What it keeps depends on
@@ -33,10 +47,16 @@ Item = TypeVar('Item')
 
 Step = Callable[[State, int, Sequence[Item]], State]
 
+PATIENCE = 20
+"""A run of this many times `restart_after` stamps is longer than a burst of late messages."""
+
+MAX_LATE_NS = 300 * 10**9
+"""Five minutes: nothing that is meant to be tracked online comes later."""
+
 
 @frozen
-class Judgement(Generic[Item]):
-    """What `StampGate.judge` decided.
+class GateDecision(Generic[Item]):
+    """What `StampGate.decide` decided.
 
     verdict: ``use``; ``too_late`` or ``doubtful`` (both are held, in case the clock was
     restarted); ``restart``. released: the items to process now, in order of arrival: the item
@@ -67,16 +87,57 @@ class _Held(Generic[Item]):
     late: bool
 
 
+class _Run(Generic[Item]):
+    """Items in a row that do not belong to the stream. held: the newest `hold` of them; stamps:
+    the distinct stamps of all, rising."""
+
+    def __init__(self, hold: int):
+        self.hold = hold
+        self.held: list[_Held[Item]] = []
+        self.stamps: list[int] = []
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def doubtful(self) -> int:
+        return sum(not one.late for one in self.held)
+
+    @property
+    def full(self) -> bool:
+        return len(self.held) == self.hold
+
+    @property
+    def span_ns(self) -> int:
+        return self.stamps[-1] - self.stamps[0]
+
+    def add(self, stamp_ns: int, item: Item, late: bool) -> int:
+        """Append an item; gives how many ``doubtful`` ones had to go for it."""
+        dropped = [self.held.pop(0)] if self.full else []
+        self.held.append(_Held(stamp_ns, item, late))
+        _insert_distinct(self.stamps, stamp_ns)
+        return sum(not one.late for one in dropped)
+
+
 class StampGate(Generic[Item]):
     """Decides from the stamps alone what belongs to the stream. See the module's text.
 
     window_ns: how much older than the newest stamp is still good; max_gap_ns: how far ahead of it
-    is still believed; restart_after: distinct off-stream stamps in a row, in one stream of their
-    own, that mean the clock was restarted. A scan of many items with one wild stamp is therefore
-    no restart. At most `hold` items are held, the latest ones.
+    is still believed; restart_after: distinct stamps in a row outside the stream that mean the
+    clock was restarted, where nothing else explains them; max_late_ns: no message is later than
+    this. A scan of many items with one outlying stamp is no restart. At most `hold` items are
+    held, the latest ones.
     """
 
-    def __init__(self, window_ns: int, max_gap_ns: int, restart_after: int, *, hold: int = 1000):
+    def __init__(
+        self,
+        window_ns: int,
+        max_gap_ns: int,
+        restart_after: int,
+        *,
+        max_late_ns: int = MAX_LATE_NS,
+        hold: int = 1000,
+    ):
         if window_ns < 0 or max_gap_ns <= 0 or restart_after < 1 or hold < restart_after:
             raise ValueError(
                 'a stamp gate needs window_ns >= 0, max_gap_ns > 0 and 1 <= restart_after <= hold'
@@ -84,49 +145,86 @@ class StampGate(Generic[Item]):
         self.window_ns = window_ns
         self.max_gap_ns = max_gap_ns
         self.restart_after = restart_after
+        self.max_late_ns = max_late_ns
         self.hold = hold
-        self.newest_ns: int | None = None
-        self._held: list[_Held[Item]] = []
+        self._first: list[int] = []
+        self._newest: list[int] = []
+        self._run = _Run[Item](hold)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Newest stamp of the stream, None before the first."""
+        return self._newest[-1] if self._newest else None
 
     @property
     def holding(self) -> int:
         """How many ``doubtful`` items wait for a decision."""
-        return sum(not held.late for held in self._held)
+        return self._run.doubtful
 
-    def judge(self, stamp_ns: int, item: Item) -> Judgement[Item]:
+    def decide(self, stamp_ns: int, item: Item) -> GateDecision[Item]:
         """Decide about one item, in order of arrival."""
-        if self.newest_ns is None or self._follows(self.newest_ns, stamp_ns):
-            self.newest_ns = stamp_ns if self.newest_ns is None else max(self.newest_ns, stamp_ns)
-            return Judgement('use', released=(item,), abandoned=self._abandon())
-        late = stamp_ns < self.newest_ns
+        if not self._newest or self._follows(self._newest[-1], stamp_ns):
+            self._accept(stamp_ns)
+            return GateDecision('use', released=(item,), abandoned=self._abandon())
+        late = stamp_ns < self._newest[-1]
         abandoned = 0
-        if self._held and not self._follows(max(held.stamp_ns for held in self._held), stamp_ns):
+        if len(self._run) and not self._follows(self._run.stamps[-1], stamp_ns):
             abandoned = self._abandon()
-        elif len(self._held) == self.hold:
-            abandoned = int(not self._held.pop(0).late)
-        self._held.append(_Held(stamp_ns, item, late))
-        if len({held.stamp_ns for held in self._held}) < self.restart_after:
-            return Judgement('too_late' if late else 'doubtful', abandoned=abandoned)
-        return self._restart(abandoned)
+        abandoned += self._run.add(stamp_ns, item, late)
+        if self._restarted():
+            return self._restart(abandoned)
+        return GateDecision('too_late' if late else 'doubtful', abandoned=abandoned)
 
     def _follows(self, newest_ns: int, stamp_ns: int) -> bool:
         return newest_ns - self.window_ns <= stamp_ns <= newest_ns + self.max_gap_ns
 
+    def _accept(self, stamp_ns: int) -> None:
+        if len(self._first) < 2 * self.restart_after:  # twice, because some may get lost
+            _insert_distinct(self._first, stamp_ns)
+        _insert_distinct(self._newest, stamp_ns)
+        del self._newest[:-PATIENCE]
+
     def _abandon(self) -> int:
-        abandoned = self.holding
-        self._held = []
+        abandoned = self._run.doubtful
+        if len(self._run):
+            self._run = _Run(self.hold)
         return abandoned
 
-    def _restart(self, abandoned: int) -> Judgement[Item]:
-        held, self._held = self._held, []
-        self.newest_ns = max(one.stamp_ns for one in held)
+    def _restarted(self) -> bool:
+        """Whether the run cannot be explained but by a clock that was restarted."""
+        run, enough = self._run, self.restart_after
+        if len(run) < enough:
+            return False
+        behind_ns = self._newest[-1] - run.stamps[-1]
+        if behind_ns < 0 or behind_ns > self.max_late_ns:
+            return True
+        if len(set(run.stamps).intersection(self._first)) >= enough:
+            return True
+        young = len(self._newest) < PATIENCE and self._newest[0] > run.stamps[-1]
+        if young and len(run) >= enough * len(self._newest):
+            return True
+        long = len(run) >= min(PATIENCE * enough, self.hold)
+        return long and (run.span_ns > self.window_ns or run.full)
+
+    def _restart(self, abandoned: int) -> GateDecision[Item]:
+        held, self._run = self._run.held, _Run(self.hold)
+        self._first, self._newest = [], []
+        for one in held:
+            self._accept(one.stamp_ns)
         # The last one was never reported to anybody, so it cannot be reinstated.
-        return Judgement(
+        return GateDecision(
             'restart',
             released=tuple(one.item for one in held),
             abandoned=abandoned,
             reinstated=sum(one.late for one in held[:-1]),
         )
+
+
+def _insert_distinct(stamps: list[int], stamp_ns: int) -> None:
+    """Put a stamp in its place in a rising list, unless it is there."""
+    place = bisect_left(stamps, stamp_ns)
+    if place == len(stamps) or stamps[place] != stamp_ns:
+        stamps.insert(place, stamp_ns)
 
 
 @frozen
@@ -204,13 +302,13 @@ class ReplayHistory(Generic[State, Item]):
         if self._stamps and stamp_ns < self._stamps[-1] - self.window_ns:
             return Inserted('too_late', [])
         place = bisect_left(self._stamps, stamp_ns)
-        known = place < len(self._stamps) and self._stamps[place] == stamp_ns
-        scan = self._scans[place] if known else _Scan[Item]([], [])
+        merged = place < len(self._stamps) and self._stamps[place] == stamp_ns
+        scan = self._scans[place] if merged else _Scan[Item]([], [])
         if scan.holds(key):
             return Inserted('duplicate', [])
         if len(scan.items) >= self.scan_limit:
             return Inserted('full', [])
-        later = place + 1 if known else place
+        later = place + 1 if merged else place
         scans = [scan.with_item(key, item), *self._scans[later:]]
         stamps = [stamp_ns, *self._stamps[later:]]
         states = self._replay(

@@ -28,7 +28,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import FloatArray
+from .arrays import BoolArray, FloatArray
+from .covariance import correct, lift, propagate, sound, symmetrise
+from .kalman import log_density
 
 DEAD = 1e-200
 """A model that can be reached with no more than this probability counts as unreachable."""
@@ -46,17 +48,26 @@ class Mixed(NamedTuple):
     c: FloatArray
 
 
+class Predicted(NamedTuple):
+    """x (T, M, n), P (T, M, n, n); repaired (T, M) where P was, see `covariance`."""
+
+    x: FloatArray
+    P: FloatArray
+    repaired: BoolArray
+
+
 class Updated(NamedTuple):
     """x (T, M, n), P (T, M, n, n), mu (T, M); log_likelihood (T,) of the measurement; nis (T,) of
     the mixture's moment-matched innovation; ok (T,) False where no model could be updated and the
-    prediction was kept."""
+    prediction was kept; repaired (T, M) where P was, see `covariance`."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
     log_likelihood: FloatArray
     nis: FloatArray
-    ok: NDArray[np.bool_]
+    ok: BoolArray
+    repaired: BoolArray
 
 
 def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray) -> Mixed:
@@ -82,10 +93,9 @@ def predict(
     F: FloatArray,
     Q: FloatArray,
     B: FloatArray | float = 0.0,
-) -> tuple[FloatArray, FloatArray]:
+) -> Predicted:
     """x <- F x + B, P <- F P F^T + Q for each model."""
-    moved = F @ P @ np.swapaxes(F, -1, -2) + Q
-    return np.einsum('jab,tjb->tja', F, x) + B, 0.5 * (moved + np.swapaxes(moved, -1, -2))
+    return Predicted(np.einsum('jab,tjb->tja', F, x) + B, *propagate(F, P, Q))
 
 
 def update(
@@ -100,42 +110,28 @@ def update(
     the log domain.
 
     innovation (T, M, m); H (T or 1, M, m, n), the Jacobian at each model's own prediction for a
-    nonlinear measurement; R (T or 1, m, m). A model whose S is not positive definite keeps its
-    prediction and gets no weight.
+    nonlinear measurement; R (T or 1, m, m). A model whose S is not finite, or has a component
+    without any variance, keeps its prediction and gets no weight.
     """
-    m, n = H.shape[-2:]
-    H = np.broadcast_to(H, (len(x), *H.shape[1:]))
-    PHt = P @ np.swapaxes(H, -1, -2)
-    S = H @ PHt + R[:, None]
-    S = 0.5 * (S + np.swapaxes(S, -1, -2))
-    usable = np.linalg.eigvalsh(S)[..., 0] > 0.0
-    safe = np.where(usable[..., None, None], S, np.eye(m))
-    K = np.swapaxes(np.linalg.solve(safe, np.swapaxes(PHt, -1, -2)), -1, -2)
-    K = np.where(usable[..., None, None], K, 0.0)
-    L = np.linalg.cholesky(safe)
-    whitened = np.linalg.solve(L, innovation[..., None])[..., 0]
-    log_likelihood = -0.5 * (np.sum(whitened**2, -1) + m * np.log(2.0 * np.pi)) - np.sum(
-        np.log(np.diagonal(L, axis1=-2, axis2=-1)), -1
-    )
+    after = correct(P, np.broadcast_to(H, (len(x), *H.shape[1:])), R[:, None])
+    log_likelihood = log_density(innovation, after.factor)[1]
     log_weight = np.log(np.where(c > 0.0, c, 1.0)) + log_likelihood
-    log_weight = np.where((c > 0.0) & usable & np.isfinite(log_weight), log_weight, -np.inf)
+    log_weight = np.where((c > 0.0) & after.usable & np.isfinite(log_weight), log_weight, -np.inf)
     best = log_weight.max(axis=1)
     ok = np.isfinite(best)
     weight = np.exp(log_weight - np.where(ok, best, 0.0)[:, None])
     total = weight.sum(axis=1)
     mu = np.where(ok[:, None], weight / np.where(ok, total, 1.0)[:, None], c)
-    I_KH = np.eye(n) - K @ H
-    P_new = I_KH @ P @ np.swapaxes(I_KH, -1, -2) + K @ R[:, None] @ np.swapaxes(K, -1, -2)
-    P_new = 0.5 * (P_new + np.swapaxes(P_new, -1, -2))
-    x_new = x + np.einsum('tjam,tjm->tja', K, innovation)
-    nis = _mixture_nis(c, innovation, S)
+    x_new = x + np.einsum('tjam,tjm->tja', after.gain, innovation)
+    nis = _mixture_nis(c, innovation, after.S)
     return Updated(
         np.where(ok[:, None, None], x_new, x),
-        np.where(ok[:, None, None, None], P_new, P),
+        np.where(ok[:, None, None, None], after.P, P),
         mu,
         np.where(ok, best + np.log(np.where(ok, total, 1.0)), -np.inf),
         np.where(ok, nis, np.nan),
         ok,
+        after.repaired,
     )
 
 
@@ -170,7 +166,7 @@ def gate(
     sensor that is accurate in one direction, and loses the track there.
     """
     possible = c >= MIN_GATE_PROBABILITY
-    S = (H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None]
+    S, _ = lift((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
     v = z[None, :, None] - h[:, None]
     nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
     log_density = -0.5 * (nis + h.shape[-1] * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1])
@@ -220,8 +216,6 @@ def _mixture_nis(c: FloatArray, innovation: FloatArray, S: FloatArray) -> FloatA
     mean = np.einsum('tj,tjm->tm', c, innovation)
     spread = innovation - mean[:, None, :]
     total = np.einsum('tj,tjmk->tmk', c, S) + np.einsum('tj,tjm,tjk->tmk', c, spread, spread)
-    scale = np.trace(total, axis1=-2, axis2=-1)
-    total = np.where(
-        (np.linalg.eigvalsh(total)[:, 0] > 1e-14 * scale)[:, None, None], total, np.nan
-    )
+    total, _ = lift(symmetrise(total))
+    total = np.where(sound(total)[:, None, None], total, np.nan)
     return np.asarray(np.einsum('tm,tm->t', mean, np.linalg.solve(total, mean[..., None])[..., 0]))

@@ -11,14 +11,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .arrays import FloatArray
+from .arrays import BoolArray, FloatArray
+from .covariance import LIMIT
 from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
-from .small_matrices import cholesky, gain, innovation_covariance, joseph, whitened_square
+from .small_matrices import (
+    careful_predict,
+    careful_update,
+    cholesky,
+    cholesky_lifted,
+    gain,
+    innovation_covariance,
+    joseph,
+    sound,
+    whitened_square,
+)
 
 LOG_2PI = math.log(2.0 * math.pi)
+
+MOST_CANCELLED = 1e8
+"""A second moment this much larger than the variance it leaves has lost half of its digits."""
 
 
 @kernel
@@ -28,12 +41,14 @@ def mix(
     """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M).
 
     The second moment is summed about the mean of all models, which makes the work of a pair (i, j)
-    one multiplication an entry: sum_i W_ij (P_i + d_i d_i') - e_j e_j', d_i = x_i - centre.
+    one multiplication an entry: sum_i W_ij (P_i + d_i d_i') - e_j e_j', d_i = x_i - centre. Where
+    that difference has lost its digits, models far apart and sharp, it is summed about x0_j.
     """
     T, M, n = x.shape
     x0, P0, c = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
     centre, e = np.empty(n), np.empty(n)
     d, W, total, moment = np.empty((M, n)), np.empty(M), np.empty(n * n), np.empty((M, n * n))
+    L = np.empty((n, n))
     for t in range(T):
         p = t % transition.shape[0]
         for a in range(n):
@@ -62,22 +77,47 @@ def mix(
                     e[a] += w * d[i, a]
                 for k in range(n * n):
                     total[k] += w * moment[i, k]
+            exact = True
             for a in range(n):
                 x0[t, j, a] = centre[a] + e[a]
                 for b in range(n):
                     P0[t, j, a, b] = total[a * n + b] - e[a] * e[b]
+                exact = exact and total[a * n + a] <= MOST_CANCELLED * P0[t, j, a, a]
+            if not (exact and sound(P0[t, j], L)):
+                _mix_directly(x[t], P[t], W, mu[t], reach, x0[t, j], P0[t, j])
     return x0, P0, c
+
+
+@kernel
+def _mix_directly(
+    x: FloatArray,
+    P: FloatArray,
+    W: FloatArray,
+    mu: FloatArray,
+    reach: float,
+    x0: FloatArray,
+    P0: FloatArray,
+) -> None:
+    """The mixed covariance of one model into P0 (n, n) as a sum of squares about x0 (n,)."""
+    M, n = x.shape
+    P0[:] = 0.0
+    for i in range(M):
+        w = W[i] / reach if reach > DEAD else mu[i]
+        for a in range(n):
+            for b in range(n):
+                P0[a, b] += w * (P[i, a, b] + (x[i, a] - x0[a]) * (x[i, b] - x0[b]))
 
 
 @kernel
 def predict(
     x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """See `imm.predict`."""
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """See `imm.predict`: x, P, repaired."""
     T, M, n = x.shape
     x1 = np.empty((T, M, n))
     P1 = np.empty((T, M, n, n))
-    FP = np.empty((n, n))
+    repaired = np.zeros((T, M), dtype=np.bool_)
+    FP, L = np.empty((n, n)), np.empty((n, n))
     for t in range(T):
         for j in range(M):
             for a in range(n):
@@ -96,7 +136,10 @@ def predict(
                         value += FP[a, k] * F[j, b, k]
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
-    return x1, P1
+            if not sound(P1[t, j], L) and np.isfinite(P1[t, j]).all():
+                careful_predict(P[t, j], F[j], Q[j], P1[t, j])
+                repaired[t, j] = True
+    return x1, P1, repaired
 
 
 @kernel
@@ -107,14 +150,15 @@ def update(
     innovation: FloatArray,
     H: FloatArray,
     R: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """See `imm.update`: x, P, mu, log_likelihood, nis, ok."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray]:
+    """See `imm.update`: x, P, mu, log_likelihood, nis, ok, repaired."""
     T, M, n = x.shape
     m = innovation.shape[2]
     x1, P1, mu = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
     log_likelihood, nis, ok = np.empty(T), np.empty(T), np.zeros(T, dtype=np.bool_)
+    repaired = np.zeros((T, M), dtype=np.bool_)
     PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
-    A, AP = np.empty((n, n)), np.empty((n, n))
+    A, AP, root = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     S, L, S_mix = np.empty((m, m)), np.zeros((m, m)), np.empty((m, m))
     scratch, mean = np.empty(m), np.empty(m)
     log_weight = np.empty(M)
@@ -134,15 +178,24 @@ def update(
             P_j, H_j, v_j, P1_j = P[t, j], H[h_t, j], innovation[t, j], P1[t, j]
             for a in range(n):
                 x1[t, j, a] = x[t, j, a]
-                for b in range(n):
-                    P1_j[a, b] = P_j[a, b]
             innovation_covariance(P_j, H_j, R_t, PHt, S)
             for r in range(m):
                 for s in range(m):
                     S_mix[r, s] += c[t, j] * (S[r, s] + (v_j[r] - mean[r]) * (v_j[s] - mean[s]))
-            if not cholesky(S, L):
-                continue
-            gain(PHt, L, K)
+            trusted = cholesky(S, L)
+            for r in range(m):
+                trusted = trusted and R_t[r, r] > LIMIT * S[r, r]
+            if trusted:
+                gain(PHt, L, K)
+                joseph(P_j, K, H_j, R_t, A, AP, KR, P1_j)
+                trusted = sound(P1_j, root)
+            if not trusted:
+                if not careful_update(P_j, H_j, R_t, L, K, P1_j):
+                    for a in range(n):
+                        for b in range(n):
+                            P1_j[a, b] = P_j[a, b]
+                    continue
+                repaired[t, j] = True
             value = -0.5 * (whitened_square(L, v_j, scratch) + m * LOG_2PI)
             for r in range(m):
                 value -= math.log(L[r, r])
@@ -152,7 +205,6 @@ def update(
             for a in range(n):
                 for r in range(m):
                     x1[t, j, a] += K[a, r] * v_j[r]
-            joseph(P_j, K, H_j, R_t, A, AP, KR, P1_j)
         if not math.isfinite(best):
             for j in range(M):
                 for a in range(n):
@@ -168,9 +220,9 @@ def update(
         for j in range(M):
             mu[t, j] /= total
         log_likelihood[t] = best + math.log(total)
-        if cholesky(S_mix, L):
+        if cholesky_lifted(S_mix, L):
             nis[t] = whitened_square(L, mean, scratch)
-    return x1, P1, mu, log_likelihood, nis, ok
+    return x1, P1, mu, log_likelihood, nis, ok, repaired
 
 
 @kernel
@@ -218,7 +270,7 @@ def gate(
                     v[r] = z[d, r] - h[t, j, r]
                     for s in range(m):
                         S[r, s] = S0[j, r, s] + R[d, r, s]
-                if cholesky(S, L):
+                if cholesky_lifted(S, L):
                     nis = whitened_square(L, v, w)
                     inside = inside or nis <= threshold
                     value = -0.5 * (nis + m * LOG_2PI)
@@ -291,7 +343,7 @@ def linear_cycle(
     FloatArray,
     FloatArray,
     FloatArray,
-    NDArray[np.bool_],
+    BoolArray,
 ]:
     """A whole cycle for targets whose measurements are already assigned: z (T, m), NaN where
     missed; H (M, m, n).
@@ -301,7 +353,7 @@ def linear_cycle(
     T, M, n = x.shape
     m = z.shape[1]
     x0, P0, c = mix(x, P, mu, transition)
-    x1, P1 = predict(x0, P0, F, Q, B)
+    x1, P1, _ = predict(x0, P0, F, Q, B)
     innovation = np.empty((T, M, m))
     for t in range(T):
         for j in range(M):
@@ -310,7 +362,9 @@ def linear_cycle(
                 for k in range(n):
                     value -= H[j, r, k] * x1[t, j, k]
                 innovation[t, j, r] = value
-    x2, P2, mu2, log_likelihood, nis, ok = update(x1, P1, c, innovation, H.reshape(1, M, m, n), R)
+    x2, P2, mu2, log_likelihood, nis, ok, _ = update(
+        x1, P1, c, innovation, H.reshape(1, M, m, n), R
+    )
     mean, covariance = combine(x2, P2, mu2, E)
     return x2, P2, mu2, mean, covariance, log_likelihood, nis, ok
 

@@ -48,7 +48,7 @@ LEAST_CHANCE = 1e-290
 reciprocal of its probability could not be held."""
 
 
-class Updated(NamedTuple):
+class WeightUpdate(NamedTuple):
     """w (M, N) and mu (M,) after the measurement; log_likelihood of the measurement given those
     before; ok False when no particle could explain it and the prediction was kept."""
 
@@ -97,7 +97,7 @@ def predict(x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray) -> F
     return moved
 
 
-def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None) -> Updated:
+def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None) -> WeightUpdate:
     """w_n <- w_n q_n / L_j, mu_j <- c_j L_j / sum, L_j = sum_n w_n q_n.
 
     w (M, N): weights before, equal when not given. A model whose particles are all impossible, or
@@ -107,7 +107,7 @@ def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = Non
     prior = np.full((M, N), 1.0 / N) if w is None else w
     best = float(np.max(log_likelihood, initial=-math.inf, where=~np.isnan(log_likelihood)))
     if not math.isfinite(best):
-        return Updated(prior, c, -math.inf, False)
+        return WeightUpdate(prior, c, -math.inf, False)
     q = np.empty((M, N))
     for j in range(M):
         exponentials(log_likelihood[j] - best, np.empty(N), q[j])
@@ -116,10 +116,10 @@ def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = Non
     joint = c * L
     total = _total(joint)
     if not total > 0.0:
-        return Updated(prior, c, -math.inf, False)
+        return WeightUpdate(prior, c, -math.inf, False)
     alive = L > 0.0
     weight = np.where(alive[:, None], weight / np.where(alive, L, 1.0)[:, None], prior)
-    return Updated(weight, joint / total, best + math.log(total), True)
+    return WeightUpdate(weight, joint / total, best + math.log(total), True)
 
 
 def combine(x: FloatArray, w: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:

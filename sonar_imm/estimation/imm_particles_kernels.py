@@ -7,11 +7,20 @@ no running sum, one array written. What cannot be is kept apart.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from .arrays import FloatArray, IntArray
 from .elementary import exponentials, ROUND
 from .imm_particles import LEAST_CHANCE
 from .jit import kernel
+
+
+class MixScratch(NamedTuple):
+    """What `mix` needs room for: running (M, N), points (N,) and origin (N + 1,)."""
+
+    running: FloatArray
+    points: FloatArray
+    origin: IntArray
 
 
 @kernel
@@ -21,14 +30,11 @@ def mix(
     mu: FloatArray,
     transition: FloatArray,
     uniform: FloatArray,
-    running: FloatArray,
-    points: FloatArray,
-    origin: IntArray,
+    scratch: MixScratch,
     mixed: FloatArray,
     c: FloatArray,
 ) -> None:
-    """See `imm_particles.mix`, into mixed (M, n, N) and c (M,); running (M, N), points (N,) and
-    origin (N + 1,) are scratch.
+    """See `imm_particles.mix`, into mixed (M, n, N) and c (M,).
 
     The obvious walk along the cumulative weights has a branch that no processor can predict.
     Instead every particle writes its number where its copies begin, the last one to write at a
@@ -36,6 +42,7 @@ def mix(
     Weights that are not finite give meaningless particles, but no index outside of the arrays.
     """
     M, n, N = x.shape
+    running, points, origin = scratch
     for i in range(M):
         total = 0.0
         for s in range(N):

@@ -9,11 +9,10 @@ The extended filter is the same code: linearise about the mean, pass the Jacobia
 ``b = f(x) - F x``, and as innovation ``z - h(x)`` (wrapped, when it is an angle: only the caller
 knows).
 
-Two habits keep covariances healthy. The update is in Joseph form, a sum of two positive
-semidefinite terms, which stays positive semidefinite under rounding where ``P - K S K'`` does not;
-and nothing is ever inverted: ``S = L L'`` is factorised and triangular systems are solved. A
-covariance that is broken nevertheless raises `CovarianceError`, which says which of the batch it
-was; `repair_covariance` mends what rounding can explain and tells, so that callers can count it.
+Covariances are kept healthy by `covariance`: the update is in Joseph form, nothing is ever inverted
+(``S = L L'`` is factorised and triangular systems are solved), and what rounding would make
+indefinite all the same is repaired and reported in `repaired`, so that callers can count it. Input
+from which nothing can be computed raises `CovarianceError`, which says which of the batch it was.
 
 Reference: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*
 (2001), ch. 5 and 10.
@@ -26,18 +25,18 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
+from .covariance import correct, CovarianceError, propagate, solve
 
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-class CovarianceError(ValueError):
-    """A covariance that is not finite or not positive definite. `where` (...) is True for the bad
-    ones of the batch."""
+class Predicted(NamedTuple):
+    """x (..., n) and P (..., n, n) after a time update; repaired (...,): where P was, see
+    `covariance`."""
 
-    def __init__(self, what: str, where: BoolArray):
-        self.where = where
-        many = f'{int(where.sum())} of {where.size}: ' if where.size > 1 else ''
-        super().__init__(f'{many}{what}')
+    x: FloatArray
+    P: FloatArray
+    repaired: BoolArray
 
 
 class Updated(NamedTuple):
@@ -45,7 +44,7 @@ class Updated(NamedTuple):
 
     x: (..., n); P: (..., n, n); innovation_covariance: (..., m, m); nis: (...,) normalised
     innovation squared, chi-square with m degrees of freedom; log_likelihood: (...,) of the
-    innovation, natural logarithm.
+    innovation, natural logarithm; repaired: (...,) where P was, see `covariance`.
     """
 
     x: FloatArray
@@ -53,16 +52,7 @@ class Updated(NamedTuple):
     innovation_covariance: FloatArray
     nis: FloatArray
     log_likelihood: FloatArray
-
-
-def transpose(matrix: FloatArray) -> FloatArray:
-    """Matrix transpose of the last two axes."""
-    return np.swapaxes(matrix, -1, -2)
-
-
-def symmetrise(P: FloatArray) -> FloatArray:
-    """The symmetric part of `P` (..., n, n), equal to the last bit on both sides."""
-    return 0.5 * (P + transpose(P))
+    repaired: BoolArray
 
 
 def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
@@ -72,10 +62,10 @@ def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 
 def predict(
     x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, b: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Time update: ``F x + b`` (..., n) and ``F P F' + Q`` (..., n, n), symmetrised."""
+) -> Predicted:
+    """Time update: ``F x + b`` (..., n) and ``F P F' + Q`` (..., n, n)."""
     moved = apply(F, x)
-    return moved if b is None else moved + b, symmetrise(F @ P @ transpose(F) + Q)
+    return Predicted(moved if b is None else moved + b, *propagate(F, P, Q))
 
 
 def update(
@@ -84,24 +74,20 @@ def update(
     """Measurement update in Joseph form.
 
     x: (..., n); P: (..., n, n); innovation: (..., m), measurement minus prediction; H: (..., m,
-    n); R: (..., m, m). R may be singular (a perfect component) as long as ``S = H P H' + R`` is
-    not.
+    n); R: (..., m, m), which may be singular (a perfect component).
 
-    Raises CovarianceError when an innovation covariance S is not finite or not positive definite.
+    Raises CovarianceError when an innovation covariance ``S = H P H' + R`` is not finite, or has a
+    component without any variance.
     """
-    cross = H @ P
-    S = symmetrise(cross @ transpose(H) + R)
-    factor = factorise(S, 'innovation covariance')
-    gain = transpose(solve(transpose(factor), solve(factor, cross)))
-    kept = np.eye(x.shape[-1]) - gain @ H
-    nis, log_likelihood = log_density(innovation, factor)
-    return Updated(
-        x + apply(gain, innovation),
-        symmetrise(kept @ P @ transpose(kept) + gain @ R @ transpose(gain)),
-        S,
-        nis,
-        log_likelihood,
-    )
+    after = correct(P, H, R)
+    if not after.usable.all():
+        finite = np.isfinite(after.S).all(axis=(-1, -2))
+        if not finite.all():
+            raise CovarianceError('innovation covariance is not finite', np.asarray(~finite))
+        raise CovarianceError('innovation covariance is not positive definite', ~after.usable)
+    nis, log_likelihood = log_density(innovation, after.factor)
+    x = x + apply(after.gain, innovation)
+    return Updated(x, after.P, after.S, nis, log_likelihood, after.repaired)
 
 
 def factorise(S: FloatArray, what: str = 'covariance') -> FloatArray:
@@ -118,14 +104,6 @@ def factorise(S: FloatArray, what: str = 'covariance') -> FloatArray:
         raise CovarianceError(f'{what} is not positive definite', np.asarray(indefinite)) from None
 
 
-def solve(matrix: FloatArray, columns: FloatArray) -> FloatArray:
-    """``matrix^-1 columns``, (..., m, m) and (..., m, q), broadcast over the leading axes."""
-    # numpy before 2.0 takes a second argument with one axis less for a stack of vectors.
-    missing = max(matrix.ndim - columns.ndim, 0)
-    stack = columns.reshape((1,) * missing + columns.shape)
-    return np.asarray(np.linalg.solve(matrix, stack), dtype=np.float64)
-
-
 def log_density(deviation: FloatArray, factor: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Squared Mahalanobis distance (...,) and log density (...,) of `deviation` (..., m) under
     ``N(0, factor factor')``."""
@@ -133,33 +111,3 @@ def log_density(deviation: FloatArray, factor: FloatArray) -> tuple[FloatArray, 
     distance = np.einsum('...i,...i->...', white, white)
     log_root_determinant = np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(axis=-1)
     return distance, -0.5 * (distance + deviation.shape[-1] * LOG_2PI) - log_root_determinant
-
-
-def repair_covariance(
-    P: FloatArray, *, tolerance: float = 1e-12, limit: float = 1e-3
-) -> tuple[FloatArray, BoolArray]:
-    """Symmetrise `P` (..., n, n) and lift negative eigenvalues to zero, within bounds.
-
-    Returns the covariances and ``repaired`` (...,), True where an eigenvalue was below
-    ``-tolerance`` times the largest magnitude. Healthy members keep their bits (they are only
-    symmetrised), and singular ones are healthy.
-
-    Raises CovarianceError when a member is not finite, or has an eigenvalue below ``-limit`` times
-    the largest magnitude: rounding does not do that, so it must not be painted over.
-    """
-    P = symmetrise(P)
-    finite = np.isfinite(P).all(axis=(-1, -2))
-    if not finite.all():
-        raise CovarianceError('covariance is not finite', np.asarray(~finite))
-    values, vectors = np.linalg.eigh(P)
-    largest = np.abs(values).max(axis=-1)
-    broken = np.asarray(values[..., 0] < -limit * largest)
-    if broken.any():
-        raise CovarianceError(
-            'covariance is further from positive semidefinite than rounding explains', broken
-        )
-    repaired = np.asarray(values[..., 0] < -tolerance * largest)
-    if not repaired.any():
-        return P, repaired
-    lifted = symmetrise((vectors * np.maximum(values, 0.0)[..., None, :]) @ transpose(vectors))
-    return np.where(repaired[..., None, None], lifted, P), repaired

@@ -1,11 +1,10 @@
-"""Markov chains over models: checks, stationary law, irregular time steps, persistence, learning
-from data.
+"""Markov chains over models: checks, stationary distribution, irregular time steps, persistence.
 
 Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
 
-A chain is stated at a reference step, but sonar is irregular. `RateChain` turns the matrix into a
-generator once, ``P(step) = expm(G step)``, and gives ``P(dt)`` for any step, so that ten steps of
-0.1 s equal one of 1 s. `adaptation` lets the data correct it.
+A chain is stated at a reference step, but measurements of a sonar come at irregular times.
+`RateChain` turns the matrix into a generator once, ``P(step) = expm(G step)``, and gives ``P(dt)``
+for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation` corrects a chain by data.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ def check_transition_matrix(
 
 
 def stationary_law(P: FloatArray) -> FloatArray:
-    """The law (M,) that the chain keeps: pi P = pi. ValueError when there is more than one."""
+    """The stationary distribution (M,): pi P = pi. ValueError when there is more than one."""
     M = len(P)
     system = np.vstack([P.T - np.eye(M), np.ones(M)])
     if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
@@ -54,9 +53,9 @@ def stationary_law(P: FloatArray) -> FloatArray:
 class RateChain:
     """A chain stated at `step` seconds, usable at any step.
 
-    The generator is the matrix logarithm. Some matrices have no valid one (negative rates); those
-    rates are set to zero, and `residual` says how far ``P(step)`` then is from the matrix given (0
-    when it is embeddable).
+    The generator is the matrix logarithm. For some matrices it has negative rates and is not
+    valid. Those rates are set to zero, and `residual` says how far ``P(step)`` then is from the
+    matrix given (0 when the matrix is embeddable).
     """
 
     def __init__(self, matrix: ArrayLike, step: float):
@@ -85,8 +84,8 @@ class RateChain:
     def _compute(self, dt: float) -> FloatArray:
         if dt == self.step and self.residual < 1e-9:
             return self.matrix.copy()
-        # The exponential of a short step is safe for any rates; squaring it gets there, and rows
-        # that are kept at one cannot drift.
+        # The exponential of a short step is accurate for any rates. Squaring it leads to the full
+        # step; rows are kept at a sum of one so that they cannot drift.
         rate = float(np.abs(self.generator).max()) * dt
         halvings = max(0, math.ceil(math.log2(rate))) if rate > 1.0 else 0
         P = _stochastic(_expm(self.generator * (dt / 2.0**halvings)))
@@ -101,9 +100,8 @@ def _stochastic(P: FloatArray) -> FloatArray:
 
 
 def _expm(matrix: FloatArray) -> FloatArray:
-    from scipy.linalg import (
-        expm,
-    )  # late: scipy.linalg costs start-up time that fixed steps do not need
+    # Imported late: scipy.linalg costs start-up time that fixed steps do not need.
+    from scipy.linalg import expm
 
     return np.asarray(expm(matrix), dtype=np.float64)
 
@@ -114,8 +112,8 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
     from scipy.linalg import logm
 
     # A zero eigenvalue (identical rows) has no logarithm: the chain forgets everything at once.
-    # Mixing in a sliver of
-    # the identity stands for a very fast, finite rate; the residual tells how little that changes.
+    # Mixing in a little of the identity stands for a very fast, finite rate; the residual tells
+    # how little that changes.
     singular = np.abs(np.linalg.eigvals(P)).min() < 1e-9
     base = (1.0 - 1e-8) * P + 1e-8 * np.eye(len(P)) if singular else P
     G = np.real(np.asarray(logm(base), dtype=np.complex128)) / step
@@ -133,8 +131,8 @@ def persistent(models: int, stay: float) -> FloatArray:
 
 
 def persistent_headings(directions: int, stay: float, concentration: float) -> FloatArray:
-    """Headings at 2 pi j / directions: stay with probability `stay`, else turn by a with weight
-    exp(kappa cos a)."""
+    """Transition matrix of headings at 2 pi j / directions: stay with probability `stay`, else
+    turn by an angle a with weight exp(kappa cos a), kappa = `concentration`."""
     turns = 2.0 * np.pi * np.arange(1, directions) / directions
     weights = np.exp(concentration * (np.cos(turns) - 1.0))
     row = np.concatenate([[stay], (1.0 - stay) * weights / weights.sum()])
@@ -143,8 +141,8 @@ def persistent_headings(directions: int, stay: float, concentration: float) -> F
 
 
 def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
-    """Append a model that each other turns into with probability `enter`, that is kept with `stay`
-    and left uniformly. What `enter` takes comes from every entry of a row alike."""
+    """Append a model that every other model enters with probability `enter`. It is kept with
+    probability `stay` and left uniformly. `enter` scales down all entries of a row alike."""
     M = len(P)
     out = np.empty((M + 1, M + 1))
     out[:M, :M] = (1.0 - enter) * P
@@ -155,12 +153,12 @@ def with_hover(P: FloatArray, enter: float, stay: float) -> FloatArray:
 
 
 class EventChain:
-    """Models that are events rather than states: each step draws anew from one law, whatever came
-    before.
+    """Models that are events rather than states: each step draws from the same distribution,
+    whatever came before.
 
-    law (M,): of a reference step; its first model is 'nothing happens', which gets likelier as the
-    step shrinks: Pr(nothing in dt) = law_0 ** (dt / step). The matrices have identical rows (the
-    filter is then a GPB1).
+    law (M,): probabilities in one reference step. Its first model is 'nothing happens', which gets
+    likelier as the step shrinks: Pr(nothing in dt) = law_0 ** (dt / step). The matrices have
+    identical rows (the filter is then a GPB1).
     """
 
     def __init__(self, law: ArrayLike, step: float):

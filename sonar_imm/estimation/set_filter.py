@@ -24,7 +24,7 @@ from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
-from .set_particles import gain, propose_births, SetModel, Sets
+from .set_particles import gain, Proposals, propose_births, SetModel, Sets
 
 _STEP, _START, _RESAMPLE = range(3)
 
@@ -64,9 +64,21 @@ class SetFilter:
         self.particles = particles
         self.threads = threads
         n, width = model.cells, len(model.move)
-        self._cumulative = np.empty((n, width))
-        self._ratio = np.empty((n, width))
-        self._transition = np.cumsum(model.transition, axis=1)
+        self._move, self._move_ratio = np.empty((n, width)), np.empty((n, width))
+        self._motion = kernels.SetMotion(
+            order_min=model.order_min,
+            separation=model.separation,
+            most_changes=model.most_changes,
+            cumulative=np.cumsum(model.transition, axis=1),
+        )
+        self._amplitudes = kernels.AmplitudeModel(
+            gram=model.gram,
+            ridge=float(model.ridge),
+            penalty=float(model.penalty),
+            marginal=model.amplitude_prior == 'marginal',
+            memory=float(model.amplitude_memory),
+            variance=float(model.amplitude_std**2),
+        )
         self._charge = np.array(
             [
                 math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(n)
@@ -107,36 +119,17 @@ class SetFilter:
         """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
         pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
-        kernels.moments(
-            w,
-            sets.order,
-            sets.cell,
-            step.amplitude,
-            sets.prior_variance,
-            self.model.order_min,
-            pmf,
-            sums,
-        )
+        kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
         return pmf, sums
 
     def _start(self, b: FloatArray, key: tuple[int, int]) -> Weighted:
         model, sets = self.model, Sets.empty(self.model, self.particles)
         uniform = _uniform(key, _START).random((self.particles, 1 + model.order_max))
         log_ratio = np.zeros(self.particles)
-        births = propose_births(model, b)
+        proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
         self._split(
             lambda first, last: kernels.start(
-                first,
-                last,
-                model.order_min,
-                len(model.transition),
-                model.separation,
-                self._charge,
-                *births,
-                uniform,
-                sets.order,
-                sets.cell,
-                log_ratio,
+                first, last, self._motion, self._charge, proposals, uniform, sets, log_ratio
             )
         )
         # An impossible set has members that mean nothing; it must not be moved.
@@ -151,71 +144,37 @@ class SetFilter:
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
         filled = np.zeros(model.cells, np.bool_)
-        tables = self._cumulative, self._ratio
-        kernels.fill_moves(
-            old.order, old.cell, gain(b), model.move, model.move_share, filled, *tables
-        )
-        births = propose_births(model, b)
+        proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
+        kernels.fill_moves(old, gain(b), model.move, model.move_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first,
                 last,
-                model.order_min,
-                model.separation,
-                model.most_changes,
-                model.amplitude_memory > 0.0,
-                model.amplitude_std**2,
-                self._transition,
-                *tables,
-                *births,
+                self._motion,
+                self._amplitudes,
+                proposals,
                 uniform,
-                old.order,
-                old.cell,
-                old.prior_mean,
-                old.prior_variance,
-                new.order,
-                new.cell,
-                new.prior_mean,
-                new.prior_variance,
+                old,
+                new,
                 log_ratio,
             )
         )
         return new, log_ratio
 
     def _weigh(self, sets: Sets, b: FloatArray, log_weight: FloatArray) -> FloatArray:
-        model, amplitude = self.model, np.zeros(sets.cell.shape)
+        amplitude = np.zeros(sets.cell.shape)
         self._split(
             lambda first, last: kernels.weigh(
-                first,
-                last,
-                b,
-                model.gram,
-                model.ridge,
-                model.fine,
-                model.amplitude_prior == 'marginal',
-                model.amplitude_memory > 0.0,
-                *sets,
-                log_weight,
-                amplitude,
+                first, last, b, self._amplitudes, sets, log_weight, amplitude
             )
         )
         return amplitude
 
     def _remembered(self, sets: Sets, amplitude: FloatArray) -> Sets:
-        model = self.model
-        if model.amplitude_memory > 0.0:
+        if self.model.amplitude_memory > 0.0:
             self._split(
                 lambda first, last: kernels.remember(
-                    first,
-                    last,
-                    model.gram,
-                    model.amplitude_memory,
-                    model.amplitude_std**2,
-                    sets.order,
-                    sets.cell,
-                    amplitude,
-                    sets.prior_mean,
-                    sets.prior_variance,
+                    first, last, self._amplitudes, amplitude, sets
                 )
             )
         return sets

@@ -32,9 +32,9 @@ The record
 
     ``marginal``   a ~ N(0, s^2) is integrated out:
                    b' (G + I/s^2)^-1 b / 2 - log det(I + s^2 G) / 2
-    ``bic_half``   the best a, and a fine of log(N) / 2 for each thing, N independent samples;
-    ``paper``      the best a, and a fine of log(N) for each. The prior of births already charges
-                   for the place, so this charges twice: too much.
+    ``bic_half``   the best a, and a penalty of log(N) / 2 for each thing, N independent samples;
+    ``paper``      the best a, and a penalty of log(N) for each. The prior of births already
+                   charges for the place, so this charges twice: too much.
 
     A set that needs an amplitude that is not positive is impossible.
 
@@ -149,7 +149,7 @@ class SetModel:
         return self.amplitude_std**-2 if self.amplitude_prior == 'marginal' else 0.0
 
     @property
-    def fine(self) -> float:
+    def penalty(self) -> float:
         """What each member costs in log likelihood besides the determinant."""
         if self.amplitude_prior == 'marginal':
             return math.log(self.amplitude_std)
@@ -213,8 +213,8 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     there = (to >= 0) & (to < n)
     K = np.where(there, model.move, 0.0)
     g = np.where(there, gain(b)[np.clip(to, 0, n - 1)], -np.inf)
-    looking = K * np.exp(g - g.max(axis=1, keepdims=True))
-    q = model.move_share * looking / looking.sum(axis=1, keepdims=True)
+    data_driven = K * np.exp(g - g.max(axis=1, keepdims=True))
+    q = model.move_share * data_driven / data_driven.sum(axis=1, keepdims=True)
     q += (1.0 - model.move_share) * K / K.sum(axis=1, keepdims=True)
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.where(q > 0.0, np.log(K / q), IMPOSSIBLE)
@@ -223,8 +223,11 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
 
 def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """birth (n + 1,) and birth_ratio (n,) of `Proposals`."""
-    looking = np.exp(np.minimum(gain(b), model.birth_cap))
-    weight = model.birth_share * looking / looking.sum() + (1.0 - model.birth_share) / model.cells
+    data_driven = np.exp(np.minimum(gain(b), model.birth_cap))
+    weight = (
+        model.birth_share * data_driven / data_driven.sum()
+        + (1.0 - model.birth_share) / model.cells
+    )
     return np.append(0.0, np.cumsum(weight)), -np.log(model.cells * weight)
 
 
@@ -332,12 +335,12 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
         h = b[z] + precision * sets.prior_mean[at, :m]
         A = A + precision[:, :, None] * np.eye(m)
         a = np.linalg.solve(A, h[..., None])[..., 0]
-        value = 0.5 * np.einsum('im,im->i', h, a) - m * model.fine
+        value = 0.5 * np.einsum('im,im->i', h, a) - m * model.penalty
         if model.amplitude_prior == 'marginal':
             value -= 0.5 * np.linalg.slogdet(A)[1]
         if model.amplitude_memory:
             value -= 0.5 * np.sum(precision * np.square(sets.prior_mean[at, :m]), axis=1)
-            value += m * model.fine + 0.5 * np.sum(np.log(precision), axis=1)
+            value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
         amplitude[at, :m] = a
         log_likelihood[at] = np.where((a > 0.0).all(axis=1), value, IMPOSSIBLE)
     return log_likelihood, amplitude

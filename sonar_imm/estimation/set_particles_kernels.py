@@ -7,32 +7,56 @@ threads may share the work. `moments` alone adds up over particles; it is run by
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .arrays import FloatArray, IntArray
+from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
+from .set_particles import Proposals, Sets
+
+
+class SetMotion(NamedTuple):
+    """How sets change from record to record: order_min; separation in cells; most_changes, how
+    many members can come or go at once; cumulative (orders, orders), the running sums of the rows
+    of the transition matrix."""
+
+    order_min: int
+    separation: int
+    most_changes: int
+    cumulative: FloatArray
+
+
+class AmplitudeModel(NamedTuple):
+    """How members answer: gram (n,) by lag; ridge, added to its diagonal; penalty in log
+    likelihood for each member; marginal: amplitudes are integrated out; memory: phi of a' = phi a
+    + noise, 0 for amplitudes drawn anew; variance of the amplitude of a new member."""
+
+    gram: FloatArray
+    ridge: float
+    penalty: float
+    marginal: bool
+    memory: float
+    variance: float
 
 
 @kernel
 def fill_moves(
-    order: IntArray,
-    cell: IntArray,
+    sets: Sets,
     g: FloatArray,
     move: FloatArray,
     share: float,
-    filled: NDArray[np.bool_],
-    cumulative: FloatArray,
-    ratio: FloatArray,
+    filled: BoolArray,
+    proposals: Proposals,
 ) -> None:
-    """The rows of `set_particles.propose` from which some particle moves, into cumulative and
-    ratio (n, 2 r + 1); filled (n,) is False throughout before, and says which rows after."""
-    n, width = cumulative.shape
+    """The rows of `set_particles.propose` from which some particle moves, into move and
+    move_ratio of `proposals`; filled (n,) is False throughout before, and says which rows after.
+    """
+    n, width = proposals.move.shape
     radius = width // 2
-    for i in range(order.shape[0]):
-        for k in range(order[i]):
-            z = cell[i, k]
+    for i in range(sets.order.shape[0]):
+        for k in range(sets.order[i]):
+            z = sets.cell[i, k]
             if filled[z]:
                 continue
             filled[z] = True
@@ -41,18 +65,18 @@ def fill_moves(
             for step in range(low, high):
                 best = max(best, g[z + step - radius])
                 inside += move[step]
-            looking = 0.0
+            data_driven = 0.0
             for step in range(low, high):
-                looking += move[step] * math.exp(g[z + step - radius] - best)
+                data_driven += move[step] * math.exp(g[z + step - radius] - best)
             total = 0.0
             for step in range(width):
                 q = 0.0
                 if low <= step < high:
-                    q = share * move[step] * math.exp(g[z + step - radius] - best) / looking
+                    q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
                     q += (1.0 - share) * move[step] / inside
                 total += q
-                cumulative[z, step] = total
-                ratio[z, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
+                proposals.move[z, step] = total
+                proposals.move_ratio[z, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
 
 
 @kernel
@@ -72,12 +96,12 @@ def _birth(
     cells: IntArray,
     m: int,
     separation: int,
-    birth: FloatArray,
-    birth_ratio: FloatArray,
+    proposals: Proposals,
     uniform: float,
 ) -> tuple[int, int, float]:
     """(position in cells, cell, log ratio) of one more member of cells[:m]; position -1 when
     there is no room."""
+    birth = proposals.birth
     n = birth.shape[0] - 1
     total, last = 0.0, -1
     for k in range(m + 1):
@@ -97,7 +121,7 @@ def _birth(
             if left < weight or k == last:
                 place = _search(birth, low, high, birth[low] + left) - 1
                 place = max(low, min(place, high - 1))
-                return k, place, birth_ratio[place] + math.log(total)
+                return k, place, proposals.birth_ratio[place] + math.log(total)
             left -= weight
     return -1, 0, -math.inf
 
@@ -106,31 +130,29 @@ def _birth(
 def start(
     first: int,
     last: int,
-    order_min: int,
-    orders: int,
-    separation: int,
+    motion: SetMotion,
     charge: FloatArray,
-    birth: FloatArray,
-    birth_ratio: FloatArray,
+    proposals: Proposals,
     uniform: FloatArray,
-    order: IntArray,
-    cell: IntArray,
+    sets: Sets,
     log_ratio: FloatArray,
 ) -> None:
-    """See `set_particles.start`; charge (orders,): what sets of each size cost in log ratio."""
+    """See `set_particles.start`; charge (orders,): what sets of each size cost in log ratio. Of
+    `proposals` only births are used."""
+    orders, separation = motion.cumulative.shape[0], motion.separation
     for i in range(first, last):
         chosen = min(int(uniform[i, 0] * orders), orders - 1)
-        m = order_min + chosen
-        ratio, here = 0.0, cell[i]
+        m = motion.order_min + chosen
+        ratio, here = 0.0, sets.cell[i]
         for k in range(m):
-            at, place, paid = _birth(here, k, separation, birth, birth_ratio, uniform[i, 1 + k])
+            at, place, paid = _birth(here, k, separation, proposals, uniform[i, 1 + k])
             ratio += paid
             if at < 0:
                 break
             for j in range(k, at, -1):
                 here[j] = here[j - 1]
             here[at] = place
-        order[i] = m
+        sets.order[i] = m
         log_ratio[i] = ratio - charge[chosen]
 
 
@@ -138,33 +160,21 @@ def start(
 def propagate(
     first: int,
     last: int,
-    order_min: int,
-    separation: int,
-    changes: int,
-    memory: bool,
-    new_variance: float,
-    transition: FloatArray,
-    move: FloatArray,
-    move_ratio: FloatArray,
-    birth: FloatArray,
-    birth_ratio: FloatArray,
+    motion: SetMotion,
+    amplitudes: AmplitudeModel,
+    proposals: Proposals,
     uniform: FloatArray,
-    old_order: IntArray,
-    old_cell: IntArray,
-    old_mean: FloatArray,
-    old_variance: FloatArray,
-    order: IntArray,
-    cell: IntArray,
-    mean: FloatArray,
-    variance: FloatArray,
+    old: Sets,
+    new: Sets,
     log_ratio: FloatArray,
 ) -> None:
-    """See `set_particles.propagate`; transition (orders, orders) is cumulative along rows."""
-    orders, (cells, width) = transition.shape[0], move.shape
-    parent = np.empty(cell.shape[1], np.int64)
+    """See `set_particles.propagate`: from the sets `old` to `new` and log_ratio (N,)."""
+    order_min, separation, changes, cumulative = motion
+    orders, (cells, width) = cumulative.shape[0], proposals.move.shape
+    parent = np.empty(new.cell.shape[1], np.int64)
     for i in range(first, last):
-        before, u, here = old_order[i], uniform[i], cell[i]
-        m = order_min + min(_search(transition[before - order_min], 0, orders, u[0]), orders - 1)
+        before, u, here = old.order[i], uniform[i], new.cell[i]
+        m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
         left, ratio = before, 0.0
         for k in range(before):
             parent[k] = k
@@ -175,10 +185,10 @@ def propagate(
                 parent[j] = parent[j + 1]
         for k in range(left):
             source = parent[k]
-            z = old_cell[i, source]
-            table = move[z]
+            z = old.cell[i, source]
+            table = proposals.move[z]
             step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
-            ratio += move_ratio[z, step]
+            ratio += proposals.move_ratio[z, step]
             # What leaves the lattice is impossible already; its number must stay an index.
             z = min(max(z + step - width // 2, 0), cells - 1)
             j = k
@@ -192,18 +202,19 @@ def propagate(
         for k in range(m - left):
             if ratio > -math.inf:
                 count = left + k
-                at, place, paid = _birth(here, count, separation, birth, birth_ratio, u[1 + k])
+                at, place, paid = _birth(here, count, separation, proposals, u[1 + k])
                 ratio += paid
                 if at >= 0:
                     for j in range(count, at, -1):
                         here[j], parent[j] = here[j - 1], parent[j - 1]
                     here[at], parent[at] = place, -1
-        order[i], log_ratio[i] = m, ratio
-        if memory and ratio > -math.inf:
+        new.order[i], log_ratio[i] = m, ratio
+        if amplitudes.memory > 0.0 and ratio > -math.inf:
             for k in range(m):
-                born = parent[k] < 0
-                mean[i, k] = 0.0 if born else old_mean[i, parent[k]]
-                variance[i, k] = new_variance if born else old_variance[i, parent[k]]
+                born, j = parent[k] < 0, parent[k]
+                new.prior_mean[i, k] = 0.0 if born else old.prior_mean[i, j]
+                variance = amplitudes.variance if born else old.prior_variance[i, j]
+                new.prior_variance[i, k] = variance
 
 
 @kernel
@@ -211,20 +222,15 @@ def weigh(
     first: int,
     last: int,
     b: FloatArray,
-    gram: FloatArray,
-    ridge: float,
-    fine: float,
-    marginal: bool,
-    memory: bool,
-    order: IntArray,
-    cell: IntArray,
-    mean: FloatArray,
-    variance: FloatArray,
+    amplitudes: AmplitudeModel,
+    sets: Sets,
     log_weight: FloatArray,
     amplitude: FloatArray,
 ) -> None:
     """See `set_particles.weigh`: adds the log likelihood to log_weight (N,), whose -inf are left
     alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
+    order, cell, mean, variance = sets
+    gram, memory = amplitudes.gram, amplitudes.memory > 0.0
     J = cell.shape[1]
     L, y = np.empty((J, J)), np.empty(J)
     for i in range(first, last):
@@ -233,7 +239,7 @@ def weigh(
             continue
         value = 0.0
         for r in range(m):
-            z, h, precision = cell[i, r], b[cell[i, r]], ridge
+            z, h, precision = cell[i, r], b[cell[i, r]], amplitudes.ridge
             if memory:
                 precision = 1.0 / variance[i, r]
                 h += precision * mean[i, r]
@@ -257,10 +263,10 @@ def weigh(
             row[r] = 1.0 / math.sqrt(pivot)
             y[r] = h * row[r]
             value += 0.5 * y[r] * y[r]
-            if marginal:
+            if amplitudes.marginal:
                 value -= 0.5 * math.log(pivot)
             if not memory:
-                value -= fine
+                value -= amplitudes.penalty
         if value > -math.inf:
             a = amplitude[i]
             for r in range(m - 1, -1, -1):
@@ -278,33 +284,28 @@ def weigh(
 def remember(
     first: int,
     last: int,
-    gram: FloatArray,
-    phi: float,
-    stationary: float,
-    order: IntArray,
-    cell: IntArray,
+    amplitudes: AmplitudeModel,
     amplitude: FloatArray,
-    mean: FloatArray,
-    variance: FloatArray,
+    sets: Sets,
 ) -> None:
-    """Amplitudes after a record become those expected before the next, a' = phi a + noise: mean
-    and variance (N, J) in place. Each is kept for itself, given the others: in place of their full
-    covariance that costs less than 0.1 % of accuracy while neighbouring pulses overlap by less
-    than 0.3 (band pulses at the default separation: 0.06), and 2 to 6 % at 0.7."""
+    """Amplitudes (N, J) after a record become those expected before the next, a' = phi a + noise:
+    prior_mean and prior_variance of `sets`, in place. Each is kept for itself, given the others:
+    in place of their full covariance that costs less than 0.1 % of accuracy while neighbouring
+    pulses overlap by less than 0.3 (band pulses at the default separation: 0.06), and 2 to 6 % at
+    0.7."""
+    phi, stationary = amplitudes.memory, amplitudes.variance
     for i in range(first, last):
-        for k in range(order[i]):
-            after = 1.0 / (gram[0] + 1.0 / variance[i, k])
-            mean[i, k] = phi * amplitude[i, k]
-            variance[i, k] = phi * phi * after + (1.0 - phi * phi) * stationary
+        for k in range(sets.order[i]):
+            after = 1.0 / (amplitudes.gram[0] + 1.0 / sets.prior_variance[i, k])
+            sets.prior_mean[i, k] = phi * amplitude[i, k]
+            sets.prior_variance[i, k] = phi * phi * after + (1.0 - phi * phi) * stationary
 
 
 @kernel
 def moments(
     w: FloatArray,
-    order: IntArray,
-    cell: IntArray,
+    sets: Sets,
     amplitude: FloatArray,
-    prior_variance: FloatArray,
     order_min: int,
     pmf: FloatArray,
     sums: FloatArray,
@@ -314,10 +315,10 @@ def moments(
     before."""
     for i in range(w.shape[0]):
         if w[i] > 0.0:
-            pmf[order[i] - order_min] += w[i]
-            for k in range(order[i]):
-                z, a = cell[i, k], amplitude[i, k]
+            pmf[sets.order[i] - order_min] += w[i]
+            for k in range(sets.order[i]):
+                z, a = sets.cell[i, k], amplitude[i, k]
                 sums[0, z] += w[i]
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
-                sums[3, z] += w[i] * prior_variance[i, k]
+                sums[3, z] += w[i] * sets.prior_variance[i, k]

@@ -1,20 +1,26 @@
 """Linear algebra of small matrices, compiled: the pieces of a Kalman update as plain loops.
 
 For matrices of a few rows the call of a library costs more than the arithmetic. Every function
-writes into arrays the caller owns, so that nothing is allocated in a loop over models and targets.
+writes into arrays the caller owns, so that nothing is allocated in a loop over models and targets;
+only the repairs, which are rare, allocate. `sound`, `lift` and the ``careful_`` functions are the
+rules of `covariance`, which explains them.
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from .arrays import FloatArray
+from .covariance import LIFT, LIMIT
 from .jit import kernel
 
 
 @kernel
 def cholesky(S: FloatArray, L: FloatArray) -> bool:
-    """Lower Cholesky factor of S into L; False when S is not positive definite (or not finite)."""
+    """Lower Cholesky factor of S into L; False when S is not positive definite by a clear margin
+    (`covariance.LIMIT`), or not finite."""
     m = S.shape[0]
     for a in range(m):
         for b in range(a + 1):
@@ -22,11 +28,215 @@ def cholesky(S: FloatArray, L: FloatArray) -> bool:
             for k in range(b):
                 value -= L[a, k] * L[b, k]
             if a == b:
-                if not value > 0.0:
+                if not (value > LIMIT * S[a, a] and value < np.inf):
                     return False
                 L[a, a] = math.sqrt(value)
             else:
                 L[a, b] = value / L[b, b]
+    return True
+
+
+@kernel
+def sound(P: FloatArray, L: FloatArray) -> bool:
+    """`covariance.sound` of one P (n, n); L (n, n) is scratch."""
+    n = P.shape[0]
+    for a in range(n):
+        for b in range(a):
+            value = P[a, b]
+            for k in range(b):
+                value -= L[a, k] * L[b, k]
+            if L[b, b] > 0.0:
+                L[a, b] = value / L[b, b]
+            elif P[a, b] == 0.0:
+                L[a, b] = 0.0
+            else:
+                return False
+        value = P[a, a] - LIMIT * P[a, a]
+        for k in range(a):
+            value -= L[a, k] * L[a, k]
+        if value > 0.0 and value < np.inf:
+            L[a, a] = math.sqrt(value)
+        elif P[a, a] == 0.0 and value == 0.0:
+            L[a, a] = 0.0
+        else:
+            return False
+    return True
+
+
+@kernel
+def lift(P: FloatArray, L: FloatArray) -> bool:
+    """`covariance.lift` of one P (n, n), in place; whether it was needed. L (n, n) is scratch."""
+    if sound(P, L):
+        return False
+    n = P.shape[0]
+    own = np.empty(n)
+    for a in range(n):
+        own[a] = P[a, a]
+    share = LIFT
+    while share < 2.0 * n:
+        for a in range(n):
+            P[a, a] = own[a] + share * own[a]
+        if sound(P, L):
+            return True
+        share *= 10.0
+    for a in range(n):
+        P[a, a] = own[a]
+    return True
+
+
+@kernel
+def cholesky_lifted(S: FloatArray, L: FloatArray) -> bool:
+    """`cholesky`, after lifting the diagonal of S in place until there is a factor."""
+    share = LIFT
+    while not cholesky(S, L):
+        if not share < 2.0 * len(S):
+            return False
+        for r in range(len(S)):
+            S[r, r] += share * S[r, r]
+        share *= 10.0
+    return True
+
+
+@kernel
+def semidefinite_root(P: FloatArray, L: FloatArray) -> None:
+    """Lower Cholesky root of a P that may be singular: a direction without variance has none."""
+    n = P.shape[0]
+    for b in range(n):
+        pivot = P[b, b]
+        for k in range(b):
+            pivot -= L[b, k] * L[b, k]
+        known = pivot <= LIMIT * P[b, b] or not pivot > 0.0
+        L[b, b] = 0.0 if known else math.sqrt(pivot)
+        for a in range(b + 1, n):
+            value = P[a, b]
+            for k in range(b):
+                value -= L[a, k] * L[b, k]
+            L[a, b] = 0.0 if known else value / L[b, b]
+
+
+@kernel
+def triangularise(A: FloatArray) -> None:
+    """A (r, c), c >= r, times an orthogonal matrix (Householder), in place: lower triangular with
+    a diagonal that is not negative, ``A A'`` unchanged."""
+    rows, columns = A.shape
+    for a in range(rows):
+        size = 0.0
+        for k in range(a, columns):
+            size += A[a, k] * A[a, k]
+        size = math.sqrt(size)
+        if not size > 0.0:
+            continue
+        # The mirror that turns the row into +-size e_a; v is the row with its pivot pushed out.
+        pivot = A[a, a]
+        turned = -size if pivot > 0.0 else size
+        A[a, a] = pivot - turned
+        half = size * (size + abs(pivot))
+        for b in range(a + 1, rows):
+            value = 0.0
+            for k in range(a, columns):
+                value += A[b, k] * A[a, k]
+            value /= half
+            for k in range(a, columns):
+                A[b, k] -= value * A[a, k]
+        sign = 1.0 if turned > 0.0 else -1.0
+        A[a, a] = size
+        for b in range(a + 1, rows):
+            A[b, a] *= sign
+        for k in range(a + 1, columns):
+            A[a, k] = 0.0
+
+
+@kernel
+def careful_predict(P: FloatArray, F: FloatArray, Q: FloatArray, out: FloatArray) -> None:
+    """F P F^T + Q into `out` by a root of P, sound (`covariance.propagate`)."""
+    n = P.shape[0]
+    L, FL = np.zeros((n, n)), np.empty((n, n))
+    semidefinite_root(P, L)
+    for a in range(n):
+        for b in range(n):
+            value = 0.0
+            for k in range(n):
+                value += F[a, k] * L[k, b]
+            FL[a, b] = value
+    for a in range(n):
+        for b in range(a + 1):
+            value = 0.0
+            for k in range(n):
+                value += FL[a, k] * FL[b, k]
+            out[a, b] = value + 0.5 * (Q[a, b] + Q[b, a])
+            out[b, a] = out[a, b]
+    lift(out, L)
+
+
+@kernel
+def careful_update(
+    P: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    L: FloatArray,
+    K: FloatArray,
+    out: FloatArray,
+) -> bool:
+    """The update in square-root form (`covariance.correct`): the factor of S into L (m, m), the
+    gain into K (n, m), the sound covariance into `out` (n, n). False, with nothing of use written,
+    where S is not finite or has a component without any variance."""
+    m, n = H.shape
+    for a in range(n):
+        for b in range(n):
+            if not math.isfinite(P[a, b]):
+                return False
+        for r in range(m):
+            if not math.isfinite(H[r, a]):
+                return False
+    root, noise = np.zeros((n, n)), np.zeros((m, m))
+    semidefinite_root(P, root)
+    semidefinite_root(R, noise)
+    seen, own = np.empty((m, n)), np.empty(m)
+    for r in range(m):
+        own[r] = 0.0
+        for b in range(n):
+            value = 0.0
+            for k in range(n):
+                value += H[r, k] * root[k, b]
+            seen[r, b] = value
+            own[r] += value * value
+        for s in range(m):
+            own[r] += noise[r, s] * noise[r, s]
+            if not math.isfinite(R[r, s]):
+                return False
+        if not (own[r] > 0.0 and own[r] < np.inf):
+            return False
+    A = np.empty((m + n, m + n + m))
+    for attempt in range(2):
+        A[:] = 0.0
+        A[:m, :m] = noise
+        A[:m, m : m + n] = seen
+        A[m:, m : m + n] = root
+        for r in range(m):
+            if attempt == 1 or not R[r, r] > LIMIT * own[r]:
+                A[r, m + n + r] = math.sqrt(LIFT * own[r])
+        triangularise(A)
+        clear = True
+        for r in range(m):
+            clear = clear and A[r, r] * A[r, r] > LIMIT * own[r]
+        if clear:
+            break
+    for r in range(m):
+        for s in range(m):
+            L[r, s] = A[r, s] if s <= r else 0.0
+    for a in range(n):
+        for r in range(m - 1, -1, -1):
+            value = A[m + a, r]
+            for k in range(r + 1, m):
+                value -= K[a, k] * L[k, r]
+            K[a, r] = value / L[r, r]
+        for b in range(a + 1):
+            value = 0.0
+            for k in range(b + 1):
+                value += A[m + a, m + k] * A[m + b, m + k]
+            out[a, b] = value
+            out[b, a] = value
+    lift(out, root)
     return True
 
 

@@ -42,8 +42,9 @@ from typing import NamedTuple
 import numpy as np
 
 from . import imm
-from .arrays import FloatArray
-from .kalman import apply, symmetrise, transpose
+from .arrays import BoolArray, FloatArray
+from .covariance import lift, symmetrise, transpose
+from .kalman import apply
 from .unscented import sigma_offsets
 
 # Eigenvalues of a correlation matrix below this are rounding.
@@ -51,11 +52,13 @@ _NEGLIGIBLE = 1e-13
 
 
 class IMMSmoothed(NamedTuple):
-    """x (K, M, n), P (K, M, n, n) of each model given all data, and its probability mu (K, M)."""
+    """x (K, M, n), P (K, M, n, n) of each model given all data, and its probability mu (K, M);
+    repaired (K, M): where P was, see `covariance`."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
+    repaired: BoolArray
 
     def combine(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (K, q) and covariance (K, q, q) of the outputs ``E x``, with E (M, q, n)."""
@@ -72,7 +75,7 @@ def rts_smooth(
         predicted = apply(F[k + 1], x[k]) + (0.0 if B is None else B[k + 1])
         S = F[k + 1] @ P[k] @ transpose(F[k + 1]) + Q[k + 1]
         precision, _ = _precision(S, np.diagonal(S, axis1=-2, axis2=-1))
-        smoothed_x[k], smoothed_P[k] = _draw_back(
+        smoothed_x[k], drawn_P = _draw_back(
             x[k],
             P[k],
             F[k + 1],
@@ -81,6 +84,7 @@ def rts_smooth(
             smoothed_x[k + 1] - predicted,
             smoothed_P[k + 1],
         )
+        smoothed_P[k], _ = lift(drawn_P)
     return smoothed_x, smoothed_P
 
 
@@ -103,12 +107,13 @@ def imm_smooth(
     Raises ValueError when the forward pass contradicts itself: a model is probable at k, but
     `transition` allows no way from any probable model at k-1 to any probable one at k.
     """
-    smoothed = IMMSmoothed(x.copy(), P.copy(), mu.copy())
+    smoothed = IMMSmoothed(x.copy(), P.copy(), mu.copy(), np.zeros(mu.shape, bool))
     for k in range(len(x) - 2, -1, -1):
         b = np.zeros(x.shape[2:]) if B is None else B[k + 1]
-        later = IMMSmoothed(smoothed.x[k + 1], smoothed.P[k + 1], smoothed.mu[k + 1])
+        later = IMMSmoothed(*(part[k + 1] for part in smoothed))
         step = _imm_step(x[k], P[k], mu[k], transition[k + 1], F[k + 1], Q[k + 1], b, later)
-        smoothed.x[k], smoothed.P[k], smoothed.mu[k] = step
+        for part, value in zip(smoothed, step):
+            part[k] = value
     return smoothed
 
 
@@ -143,10 +148,12 @@ def _imm_step(
     smoothed_P = np.einsum('ij,ijab->iab', weights, branch_P) + np.einsum(
         'ij,ija,ijb->iab', weights, spread, spread
     )
+    smoothed_P, repaired = lift(symmetrise(np.where(possible[:, None, None], smoothed_P, P)))
     return IMMSmoothed(
         np.where(possible[:, None], smoothed_x, x),
-        symmetrise(np.where(possible[:, None, None], smoothed_P, P)),
+        smoothed_P,
         smoothed_mu / smoothed_mu.sum(),
+        repaired,
     )
 
 

@@ -1,21 +1,19 @@
-"""The unscented transform: a Gaussian through a curved function, by a handful of points.
+"""The unscented transform: the moments of a Gaussian after a nonlinear function.
 
-A Gaussian is replaced by points on its principal axes, the points go through the function, and
-mean and covariance are read off the other side. Exact for linear functions, and for quadratic ones
-in the mean.
+A Gaussian is replaced by sigma points on its principal axes. The points go through the function,
+and their weighted mean and covariance are those of the result. Exact for linear functions; for
+quadratic ones the mean is exact.
 
-Three choices make it safe:
+Three choices make it robust:
 
-- **No negative weights.** ``kappa = max(0, 3 - n)``: up to three dimensions the fourth moment of
-the Gaussian is matched, above
-  that the centre has no weight and the rule is the cubature rule. Every covariance is a sum of
-  squares with weights that are not negative, so it cannot lose its definiteness, and the
-  measurement update is in the matching (Joseph) form.
+- **No negative weights.** ``kappa = max(0, 3 - n)``. Up to three dimensions the fourth moment of
+  the Gaussian is matched; above that the centre has no weight and the rule is the cubature rule.
+  Every covariance is a sum of squares with non-negative weights, so it cannot lose its
+  definiteness. The measurement update has the matching (Joseph) form.
 - **Angles are averaged as offsets.** Components marked as angles are compared with the image of
-the centre point, wrapped
-  once into [-pi, pi] by rounding (never by a loop), averaged, and added back. Turning the scene
-  turns the answer and changes nothing else, because the points lie on principal axes, which turn
-  with the scene, and singular covariances need no special care.
+  the centre point. The differences are wrapped once into [-pi, pi], averaged and added back.
+  Turning the scene turns the answer and changes nothing else, because the points lie on principal
+  axes, which turn with the scene. Singular covariances need no special care.
 - **What is not finite is refused** by `CovarianceError`, at the step where it appears.
 
 Functions are vectorised: they take points (..., s, n) and give (..., s, m).
@@ -31,26 +29,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import FloatArray
-from .kalman import (
-    apply,
-    BoolArray,
-    CovarianceError,
-    factorise,
-    log_density,
-    solve,
-    symmetrise,
-    transpose,
-    Updated,
-)
+from .angles import wrap_angle
+from .arrays import BoolArray, FloatArray
+from .covariance import CovarianceError, lift, solve, symmetrise, transpose
+from .kalman import apply, factorise, log_density, Predicted, Updated
 
 Function = Callable[[FloatArray], FloatArray]
-TWO_PI = 2.0 * np.pi
-
-
-def wrap_angle(angle: FloatArray) -> FloatArray:
-    """The same direction in [-pi, pi]; angles already inside keep their bits."""
-    return angle - TWO_PI * np.round(angle / TWO_PI)
 
 
 class Transformed(NamedTuple):
@@ -63,8 +47,8 @@ class Transformed(NamedTuple):
 
 
 class _Cloud(NamedTuple):
-    """Offsets from the mean before (..., s, n) and after (..., s, m) the function, weights (s,),
-    mean after (..., m)."""
+    """Sigma points: offsets from the mean before (..., s, n) and after (..., s, m) the function,
+    weights (s,), mean after (..., m)."""
 
     before: FloatArray
     after: FloatArray
@@ -112,10 +96,10 @@ def unscented_transform(
 
 def predict(
     x: FloatArray, P: FloatArray, f: Function, Q: FloatArray, *, angles: BoolArray | None = None
-) -> tuple[FloatArray, FloatArray]:
+) -> Predicted:
     """Time update ``x <- f(x) + w``, ``w ~ N(0, Q)``; `angles` (n,) marks angles of the state."""
     moved = unscented_transform(f, x, P, angles=angles)
-    return moved.mean, symmetrise(moved.covariance + Q)
+    return Predicted(moved.mean, *lift(symmetrise(moved.covariance + Q)))
 
 
 def update(
@@ -134,25 +118,27 @@ def update(
     measurement; state_angles: (n,), angles of the state, which are wrapped into [-pi, pi].
 
     The covariance is ``sum w (dx - K dz)(.)' + K R K'``: squares only, equal to ``P - K S K'`` in
-    exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or the innovation
-    covariance is not positive definite.
+    exact arithmetic. Raises CovarianceError when P or ``h`` is not finite or a component of the
+    innovation has no variance.
     """
     cloud = _transform(h, x, P, angles)
     weighted = cloud.after * cloud.weights[:, None]
-    S = symmetrise(transpose(weighted) @ cloud.after + R)
+    S, singular = lift(symmetrise(transpose(weighted) @ cloud.after + R))
     factor = factorise(S, 'innovation covariance')
     cross = transpose(weighted) @ cloud.before
     gain = transpose(solve(transpose(factor), solve(factor, cross)))
     innovation = _wrap(z - cloud.mean, angles)
     rest = cloud.before - cloud.after @ transpose(gain)
     covariance = transpose(rest * cloud.weights[:, None]) @ rest + gain @ R @ transpose(gain)
+    covariance, repaired = lift(symmetrise(covariance))
     nis, log_likelihood = log_density(innovation, factor)
     return Updated(
         _wrap(x + apply(gain, innovation), state_angles),
-        symmetrise(covariance),
+        covariance,
         S,
         nis,
         log_likelihood,
+        repaired | singular,
     )
 
 

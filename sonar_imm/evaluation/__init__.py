@@ -1,4 +1,4 @@
 """Runs of recordings: tracked offline, scored against truth, shown in a report, timed."""
 
 SECOND = 10**9
-"""Nanoseconds; every stamp counts them."""
+"""Nanoseconds, the unit of every stamp."""

@@ -19,12 +19,12 @@ from ..trackers import SYSTEMS
 from . import SECOND
 
 LONG_GAP = 10.0
-"""A gap is worth telling when it is this many times the usual time between two messages."""
+"""A gap is reported when it is this many times the usual time between two messages."""
 
 
 @define
 class _Heard:
-    """What was seen of one topic."""
+    """What was found on one topic."""
 
     topic: TopicInfo
     logs: array[int] = field(factory=lambda: array('q'))
@@ -40,8 +40,8 @@ class _Heard:
 def inspect(bag: BagReader, advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
     """Read a whole open recording. Gives plain values, fit for JSON.
 
-    topics: one entry each with count, rate, frames, scans, which tracker input it suits and its
-    problems; problems: of the recording as a whole; systems: topic by input for each tracker.
+    topics: one entry per topic with count, rate, frames, scans, the tracker inputs it suits and
+    its problems. problems: of the recording as a whole. systems: topics by input for each tracker.
     """
     heard = {topic.name: _Heard(topic) for topic in bag.topics}
     for item in bag.messages():
@@ -89,7 +89,7 @@ def _usable_stamp(message: Any) -> int | None:
 
 
 def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
-    """The tracker inputs a message could be for. Truth is nobody's input."""
+    """The tracker inputs that a message could be for. Truth is no input."""
     if _is_truth(item.topic):
         return []
     return [
@@ -121,7 +121,7 @@ def _topic_entry(heard: _Heard) -> dict[str, Any]:
 
 
 def _scans(heard: _Heard) -> dict[str, int] | None:
-    """How many stamps a topic of scans has, and how many messages share one at most; else None."""
+    """Number of stamps of a topic of scans, and the most messages that share one; else None."""
     if not heard.stamps or not _holds_scans(heard):
         return None
     counts = np.unique(np.array(heard.stamps, np.int64), return_counts=True)[1]
@@ -129,7 +129,7 @@ def _scans(heard: _Heard) -> dict[str, int] | None:
 
 
 def _holds_scans(heard: _Heard) -> bool:
-    """Whether equal stamps are one look at several targets, not one message twice."""
+    """Whether messages with equal stamps are one scan of several targets, not repetitions."""
     return _is_truth(heard.topic.name) or any(
         entry.scans
         for system, name in heard.good
@@ -155,13 +155,13 @@ def _stamp_problems(heard: _Heard) -> list[str]:
         gaps = int(np.count_nonzero(forward > LONG_GAP * np.median(forward)))
         problems.append(
             f'{gaps} gaps in the stamps, the longest {forward.max() / SECOND:.3g} s '
-            f'against {np.median(forward) / SECOND:.3g} s as a rule'
+            f'against {np.median(forward) / SECOND:.3g} s usually'
         )
     return problems
 
 
 def _content_problems(heard: _Heard) -> list[str]:
-    """Refusals of the input that the topic is, or is called; of others they mean nothing."""
+    """Problems of messages; refusals only for the input that the topic suits or is named after."""
     problems = []
     if len(heard.frames) > 1:
         problems.append(f'several frames: {", ".join(map(repr, heard.frames))}')
@@ -178,7 +178,7 @@ def _content_problems(heard: _Heard) -> list[str]:
 
 
 def _systems(topics: list[dict[str, Any]]) -> dict[str, dict[str, list[str]]]:
-    """Topics by input for each tracker that the recording has something for."""
+    """Topics by input for each tracker that can use the recording."""
     systems: dict[str, dict[str, list[str]]] = {}
     for topic in topics:
         for suited in topic['suits']:

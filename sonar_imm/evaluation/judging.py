@@ -1,10 +1,10 @@
-"""Judges: what is said of a finished run, each system in its own terms.
+"""Judges: scores and summaries of finished runs, one judge per system.
 
-How far a diver's track lies from the diver is one question, how well a sea floor was drawn is
-another. So each system has a module that judges its runs, `System.judge`, which provides
+The metrics of a diver track and of a sea floor differ. So each system has a module that judges its
+runs, `System.judge`, which provides
 
-- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores, finds the words;
-- ``LIMIT``: the `Limit` that the error of a shipped recording has to stay within.
+- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores them and summarises;
+- ``LIMIT``: the `Limit` of the error for the shipped recordings.
 
 Everything else is the same for all of them: the folder of a run, the page, the commands.
 """
@@ -29,7 +29,7 @@ TRUTH_GAP = 60.0
 
 @frozen
 class Check:
-    """One thing that was checked: what came out, and what was wanted."""
+    """One check: its result, and what was wanted."""
 
     name: str
     result: str
@@ -74,12 +74,12 @@ class JudgeOptions:
 
 @frozen(eq=False, kw_only=True)
 class Judgement:
-    """What is said of one run.
+    """Scores and summary of one run.
 
-    metrics: the content of ``metrics.json``. summary: the result in plain words. lines: title and
-    value of the numbers a person wants to see first. part: the run as a part of the report, made
-    only when asked for, with checks that were made besides. accuracy: the error against a limit
-    (None for `LIMIT` of the system); gives None where there is no truth.
+    metrics: the content of ``metrics.json``. summary: the result in a few sentences. lines: title
+    and value of the most important numbers. part: makes the part of the report for the run, with
+    further checks. accuracy: compares the error with a limit (None for `LIMIT` of the system);
+    None without truth.
     """
 
     metrics: dict[str, Any]

@@ -1,9 +1,9 @@
-"""Numbers that every system is judged by, and the words for them.
+"""Metrics that all systems share, and how they are put into words.
 
-Errors are summed up by RMSE, median and 95 % point. Whether the stated uncertainty holds is asked
-of NEES and NIS, which follow chi-square distributions when it does. Their bounds take successive
-errors as independent. Errors of one track are correlated over a few stamps, so a mean slightly
-outside its bounds is no proof; one far outside is.
+Errors are summarised by RMSE, median and 95 % point. Whether the stated uncertainty holds is
+tested by NEES and NIS, which are chi-square distributed when it does. Their bounds suppose that
+successive errors are independent. The errors of one track are correlated over a few stamps, so a
+mean slightly outside its bounds proves nothing; one far outside does.
 """
 
 from __future__ import annotations
@@ -17,6 +17,17 @@ from ..estimation.arrays import FloatArray
 from ..estimation.consistency import average_bounds, nees
 
 SINGULAR = 1e-9
+
+
+def flatten(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
+    """Nested mappings as one; the keys are joined by dots."""
+    result: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            result.update(flatten(value, f'{prefix}{key}.'))
+        else:
+            result[f'{prefix}{key}'] = value
+    return result
 
 
 def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
@@ -34,8 +45,8 @@ def error_summary(error: FloatArray, *, unit: str = 'm') -> dict[str, float]:
 def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """NEES of the rows that are finite and whose covariance is not singular.
 
-    A filter that is certain of one heading states a velocity along that heading only: its whole
-    covariance is singular then, and NEES says nothing.
+    A filter that is certain of one heading states a velocity along that heading only. Then its
+    covariance is singular, and NEES is not defined.
     """
     good = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     values = np.linalg.eigvalsh(covariance[good])
@@ -44,7 +55,7 @@ def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def chi2_summary(values: FloatArray, dof: int) -> dict[str, Any]:
-    """Mean of chi-square values with its 95 % two-sided bounds (dof is expected)."""
+    """Mean of chi-square values, `dof` expected, with its two-sided 95 % bounds."""
     if not len(values):
         return {'n': 0, 'dof': dof, 'mean': float('nan'), 'believable': None}
     low, high = average_bounds(len(values), dof)
@@ -60,7 +71,7 @@ def chi2_summary(values: FloatArray, dof: int) -> dict[str, Any]:
 
 
 def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
-    """NIS of all hits against its bounds; divided by its degrees of freedom where these vary."""
+    """Mean NIS of all hits with its bounds; divided by the degrees of freedom where these vary."""
     if not len(nis) or (dof == dof[0]).all():
         return chi2_summary(nis, int(dof[0]) if len(nis) else 2)
     low, high = average_bounds(1, int(dof.sum()))
@@ -76,18 +87,18 @@ def nis_summary(nis: FloatArray, dof: FloatArray) -> dict[str, Any]:
     }
 
 
-def belief_sentence(coverage: float) -> str:
-    """What the share of truth inside the stated 95 % ellipses says of them."""
+def coverage_sentence(coverage: float) -> str:
+    """What `coverage`, the share of truth inside the stated 95 % ellipses, says about them."""
     held = f'its 95 % ellipses hold the truth {100 * coverage:.0f} % of the time'
     if coverage < 0.90:
-        return f'It is more sure of itself than it should be: {held}.'
+        return f'The tracker is overconfident: {held}.'
     if coverage > 0.99:
-        return f'It is more careful than it needs to be: {held}.'
-    return f'Its stated uncertainty can be believed: {held}.'
+        return f'The tracker is more cautious than it needs to be: {held}.'
+    return f'The stated uncertainty is consistent with the errors: {held}.'
 
 
 def bounds_remark(summary: Mapping[str, Any]) -> str:
-    """What a mean of `chi2_summary` or `nis_summary` is to be compared with."""
+    """What to compare the mean of a `chi2_summary` or `nis_summary` with."""
     if 'low' not in summary:
         return f'{summary["n"]} values'
     if summary.get('divided_by_dof'):
@@ -109,7 +120,7 @@ def error_line(
 
 
 def chi2_line(title: str, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of a `chi2_summary` or `nis_summary`; none without values."""
+    """Title and value of a `chi2_summary` or `nis_summary`, if it has values."""
     if not summary.get('n'):
         return []
     return [

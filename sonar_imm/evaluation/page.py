@@ -1,6 +1,6 @@
-"""The bare page of a report: HTML and CSS, no knowledge of tracking.
+"""The page of a report: HTML and CSS, without any knowledge of tracking.
 
-Everything is inside the one file, plotly.js too: a report can be mailed and opened offline.
+Everything is inside one file, plotly.js too, so a report can be mailed and opened offline.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ footer { color: var(--soft); font-size: 12.5px; padding-bottom: 40px; }
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4
-"""A browser keeps 16 drawings by the graphics card, of which a figure takes up to three, and
-blanks the oldest beyond. So only the largest figures of a page are drawn by it."""
+"""A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
+only the largest figures of a page are drawn by WebGL."""
 
 
 @frozen
 class Card:
-    """One key number: the number, what it is, one line that puts it in relation."""
+    """One key number: the value, what it is, and a line to compare it with."""
 
     value: str
     title: str
@@ -65,7 +65,7 @@ class Card:
 
 @frozen
 class Section:
-    """A part of the page: heading, one paragraph in plain words, then a figure or some HTML."""
+    """A section of the page: heading, one paragraph, then a figure or some HTML."""
 
     title: str
     text: str
@@ -75,7 +75,7 @@ class Section:
 
 @frozen
 class Part:
-    """One recording on the page: a band with title and result, key numbers, sections."""
+    """One recording on the page: a header with title and result, key numbers, sections."""
 
     kicker: str
     title: str
@@ -101,7 +101,7 @@ def render(title: str, parts: Sequence[Part], *, footer: str) -> str:
 
 
 def _accelerated(parts: Sequence[Part]) -> list[go.Figure]:
-    """The figures that are drawn by the graphics card: the few that have most points."""
+    """The figures that are drawn by WebGL: the few that have most points."""
     figures = [one.figure for part in parts for one in part.sections if one.figure is not None]
     heavy = [one for one in figures if _gl_points(one) >= LEAST_GL_POINTS]
     return sorted(heavy, key=_gl_points, reverse=True)[:MOST_GL_FIGURES]
@@ -112,7 +112,7 @@ def _gl_points(figure: go.Figure) -> int:
 
 
 def _without_gl(figure: go.Figure) -> go.Figure:
-    """The same, drawn without the graphics card."""
+    """The same figure, drawn without WebGL."""
     content = figure.to_dict()
     for trace in content['data']:
         if trace['type'] == 'scattergl':
@@ -137,14 +137,14 @@ def _part(part: Part, name: str, fast: Sequence[go.Figure]) -> str:
 
 
 def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """An HTML table; numbers keep their columns."""
+    """An HTML table; numbers are aligned."""
     head = ''.join(f'<th>{escape(text)}</th>' for text in header)
     body = ''.join(f'<tr>{"".join(_cell(value) for value in row)}</tr>' for row in rows)
     return f'<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
 def folded(summary: str, html: str) -> str:
-    """`html` behind a line that opens it."""
+    """`html` folded away behind the line `summary`, which opens it."""
     return f'<details><summary>{escape(summary)}</summary>{html}</details>'
 
 
@@ -154,7 +154,7 @@ def mapping_table(header: tuple[str, str], values: Mapping[str, object]) -> str:
 
 
 def _prose(text: str) -> str:
-    """Running text; a number and its per cent sign stay on one line."""
+    """Running text; a number and its percent sign stay on one line."""
     return escape(text.replace(' %', '\u00a0%'))
 
 

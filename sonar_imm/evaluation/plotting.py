@@ -20,10 +20,10 @@ FONT = 'Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif'
 
 
 def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
-    """NIS of every hit over `time` [s], its running mean, and what chi-square allows.
+    """NIS of every hit over `time` [s], its running mean, and the chi-square bounds.
 
-    Hits with different degrees of freedom (pings heard by more or fewer receivers) are divided by
-    them, and then share no chi-square bounds.
+    Where the degrees of freedom vary (more or fewer receivers per ping), NIS is divided by them,
+    and there are no common bounds.
     """
     same = len(np.unique(dof)) == 1
     shared = int(dof[0]) if same else 0
@@ -54,7 +54,7 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
         figure.add_hline(
             y=chi2.ppf(0.95, shared),
             line={'color': COLOURS[1], 'dash': 'dash'},
-            annotation_text='95 % of hits should lie below',
+            annotation_text='95 % of the hits should lie below',
         )
     figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='NIS' if same else 'NIS / degrees of freedom', rangemode='tozero')
@@ -73,7 +73,7 @@ def add_band(
         mode='lines',
         line={'color': transparent(AMBER, 0.6), 'width': 0.5},
         hoverinfo='skip',
-        name='95 % band it predicted',
+        name='predicted 95 % band',
         legendgroup='band',
         showlegend=first,
         row=row,
@@ -87,12 +87,12 @@ def seconds(stamp_ns: NDArray[np.int64], scan_ns: NDArray[np.int64]) -> FloatArr
 
 
 def thin(count: int, most: int) -> slice:
-    """An even choice of at most `most` out of `count`."""
+    """A slice that takes at most `most` of `count` rows, evenly spaced."""
     return slice(None, None, max(1, -(-count // most)))
 
 
 def transparent(colour: str, opacity: float) -> str:
-    """A colour ``#rrggbb`` that lets others through."""
+    """The colour ``#rrggbb`` with an opacity from 0 to 1."""
     red, green, blue = (int(colour[place : place + 2], 16) for place in (1, 3, 5))
     return f'rgba({red},{green},{blue},{opacity})'
 

@@ -1,7 +1,7 @@
-"""The report: one HTML file that a reader who knows no filter can follow.
+"""The report: one HTML file for readers who need not know filters.
 
-A system brings the key numbers and the figures of a run; `run_part` adds what is the same for all:
-what was compared with a live node, every number, what happened to the input, where it comes from.
+A system provides the key numbers and the figures of a run. `run_part` adds what is the same for
+all: the comparison with a live node, all numbers, what happened to the input, and its provenance.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from typing import Any
 
 from .. import __version__
 from .judging import Check
+from .numbers import flatten
 from .page import Card, folded, mapping_table, Part, render, Section, table
 
 
 def write_report(path: Path, parts: Sequence[Part]) -> None:
-    """Write one report of one or several runs to `path`, of one system or of several."""
+    """Write one report of one or several runs, of one or several systems, to `path`."""
     path.write_text(report_html(parts), encoding='utf-8')
 
 
@@ -71,9 +72,9 @@ def _comparison(checks: Sequence[Check]) -> list[Section]:
 def _numbers(metrics: Mapping[str, Any]) -> Section:
     return Section(
         'All numbers',
-        'The content of metrics.json. Bounds take successive errors as '
+        'The content of metrics.json. The bounds suppose that successive errors are '
         'independent, which those of one track are not quite.',
-        html=folded('Show them', mapping_table(('metric', 'value'), flat(metrics))),
+        html=folded('Show them', mapping_table(('metric', 'value'), flatten(metrics))),
     )
 
 
@@ -107,21 +108,10 @@ def _about(run: Mapping[str, Any]) -> list[Section]:
     about['topics'] = [f'{topic} as {name}' for topic, name in run['topics'].items()]
     return [
         *sections,
-        Section('Parameters', 'What the tracker was told.', html=parameters),
+        Section('Parameters', 'The parameters of the tracker.', html=parameters),
         Section(
-            'Where this comes from',
-            'Input and versions, to do it again.',
+            'Provenance',
+            'Input and versions, to repeat the run.',
             html=mapping_table(('what', 'value'), about),
         ),
     ]
-
-
-def flat(values: Mapping[str, Any], prefix: str = '') -> dict[str, Any]:
-    """Nested keys joined by dots."""
-    result: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            result.update(flat(value, f'{prefix}{key}.'))
-        else:
-            result[f'{prefix}{key}'] = value
-    return result

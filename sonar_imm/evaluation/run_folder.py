@@ -2,11 +2,11 @@
 
 estimate/      the estimates as a bag, topic ``/<system>/estimate``
 estimate.csv   the same rows as text: stamp_ns, then the columns of the contract
-run.json       where they come from; written last, so a folder without it is not a finished run
+run.json       input, parameters, versions; written last, so a folder without it is unfinished
 metrics.json   and report.html, once evaluated
 
-The bag and the CSV hold nothing that depends on the time or the machine: the same command writes
-the same bytes. What does depend on them is in run.json.
+The bag and the CSV hold nothing that depends on the time of the run: the same command writes the
+same bytes. Times and versions are in run.json.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from ..estimates import Estimate
 from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
+from ..recordings.truth import TRUTH_TOPIC
 from ..recordings.writer import BagWriter, naming, ros_message
 from ..trackers import SYSTEMS
 
@@ -43,11 +44,10 @@ BAG, CSV, RUN, METRICS, REPORT = (
     'metrics.json',
     'report.html',
 )
-TRUTH_TOPIC = '/truth/estimate'
 
 
 class RunFolder:
-    """A folder for one run, and how to fill it."""
+    """The folder of one run."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -71,7 +71,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def write_estimates(self, estimates: Iterable[Estimate], system: str) -> dict[str, int]:
-        """Write bag and CSV as the estimates come; gives how many estimates and rows."""
+        """Write bag and CSV while the estimates come; gives the number of estimates and rows."""
         written = {'estimates': 0, 'rows': 0}
         with BagWriter(self.path / BAG) as bag, CsvTable(self.path / CSV) as table:
             for estimate in estimates:
@@ -113,7 +113,7 @@ class RunFolder:
 
 
 class CsvTable:
-    """estimate.csv, a row an estimate row; floats as the shortest text that reads back exactly."""
+    """estimate.csv, one line per row; floats as the shortest text that reads back exactly."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -186,7 +186,7 @@ def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimat
 
 
 def run_record(**facts: Any) -> dict[str, Any]:
-    """The content of run.json: `facts` and the versions of what computes."""
+    """The content of run.json: `facts` and the versions of the software."""
     versions = {
         'sonar_imm': __version__,
         'python': platform.python_version(),

@@ -31,6 +31,7 @@ from ..recordings.scenes import write_scene
 from ..recordings.sources import BagError
 from ..trackers import SYSTEMS
 from .judging import judge
+from .numbers import flatten
 from .run_folder import RunFolder
 from .tracking import InputOptions, OfflineRun, write_run
 
@@ -96,7 +97,7 @@ def _run(sweep: Sweep, seed: int, place: Path) -> Outcome:
         offline = OfflineRun(reader, SYSTEMS[sweep.system], sweep.config, sweep.options)
         folder.prepare()
         run = write_run(folder, offline)
-    return Outcome(seed, dict(flat(judge(folder).metrics)), versions=run['versions'])
+    return Outcome(seed, finite_numbers(judge(folder).metrics), versions=run['versions'])
 
 
 def _sentence(error: BaseException) -> str:
@@ -106,13 +107,13 @@ def _sentence(error: BaseException) -> str:
     return told if expected and told else f'{type(error).__name__}: {told}'
 
 
-def flat(metrics: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, float]]:
+def finite_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     """The finite numbers among nested metrics by dotted name; True is 1, so a mean is a share."""
-    for name, value in metrics.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f'{prefix}{name}.')
-        elif isinstance(value, (bool, int, float)) and math.isfinite(value):
-            yield prefix + name, int(value) if isinstance(value, bool) else value
+    return {
+        name: int(value) if isinstance(value, bool) else value
+        for name, value in flatten(metrics).items()
+        if isinstance(value, (bool, int, float)) and math.isfinite(value)
+    }
 
 
 # -- where the runs run --------------------------------------------------------------------------
@@ -276,7 +277,7 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
 
 
 def write(out: Path, content: Mapping[str, Any], outcomes: Iterable[Outcome]) -> None:
-    """Write sweep.json and sweep.csv: a row a run by seed, an empty cell where a run had none."""
+    """Write sweep.json and sweep.csv: one row per run by seed, empty cells for missing metrics."""
     names = list(content['summary'])
     with (out / CSV).open('w', encoding='utf-8', newline='') as file:
         table = csv.writer(file, lineterminator='\n')

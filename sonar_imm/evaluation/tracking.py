@@ -1,8 +1,8 @@
 """Tracking a recording offline: the same readers, the same tracker and the same order as live.
 
-A tracker revises what it said when late input arrives. Offline only the last word on each stamp is
-wanted, in order of stamps; `Revisions` keeps estimates just as long as they can still change, so
-that memory does not grow with the recording.
+A tracker revises its estimates when late input arrives. Offline only the final estimate of each
+stamp is wanted, in order of stamps. `Revisions` holds estimates only while they can still change,
+so that memory does not grow with the recording.
 """
 
 from __future__ import annotations
@@ -15,10 +15,8 @@ from typing import Any
 from attrs import asdict, define, frozen
 import numpy as np
 
-from msg_adapters.frames import FrameGuard
-
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import FrameGuard, Rejection
 from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
@@ -33,8 +31,8 @@ TO_THE_END = 2**62
 class InputOptions:
     """How to treat a recording.
 
-    topics: input by topic name, None to pick what fits by name; smooth: give each estimate what
-    came after it, too, which takes memory in proportion to the recording.
+    topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
+    later input too, which takes memory in proportion to the recording.
     """
 
     topics: Mapping[str, str] | None = None
@@ -46,17 +44,17 @@ class InputOptions:
 
 @define
 class Refused:
-    """How many messages were refused for one reason, and what the first one was told."""
+    """How many messages were refused for one reason, and the sentence of the first one."""
 
     count: int
     example: str
 
 
 class Revisions:
-    """Holds estimates while they can still be revised; the last one of a stamp wins.
+    """Holds estimates while they can still be revised; the last one of a stamp counts.
 
-    window_ns: how far back a late measurement can reach. A clock that was restarted begins anew:
-    what is held from before is final then.
+    window_ns: how far back a late measurement can reach. When the clock was restarted, what is
+    held from before is final.
     """
 
     def __init__(self, window_ns: int):
@@ -64,7 +62,7 @@ class Revisions:
         self._held: dict[int, Estimate] = {}
 
     def add(self, estimates: Iterable[Estimate]) -> list[Estimate]:
-        """Take in what one measurement made; gives what has become final, oldest first."""
+        """Add the estimates of one measurement; gives those that became final, oldest first."""
         final: list[Estimate] = []
         for estimate in estimates:
             newest = max(self._held, default=estimate.stamp_ns)
@@ -85,7 +83,7 @@ class Revisions:
 
 
 def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
-    """The last word on each stamp out of everything a live tracker of `config` published."""
+    """The final estimate of each stamp out of everything a live tracker of `config` published."""
     revisions = Revisions(window_ns(config))
     return [
         *(final for estimate in estimates for final in revisions.add([estimate])),
@@ -96,7 +94,7 @@ def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estim
 def window_ns(config: Config) -> int:
     """How far back later input can change the estimates of a tracker."""
     if getattr(config, 'smoothing_lag', 0):
-        return TO_THE_END  # so many records, and records come at any rate
+        return TO_THE_END  # a lag in records, which come at any rate
     return round(getattr(config, 'history', 0.0) * SECOND)
 
 
@@ -172,8 +170,11 @@ class OfflineRun:
         entry.count += 1
 
     def outcomes(self) -> dict[str, int]:
-        """What happened to the messages: counts of the tracker, and those refused before."""
+        """What happened to the messages: counts of the tracker, covariances it had to repair, and
+        messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
+        if repairs := self.tracker.health().get('covariance_repairs'):
+            counts['covariance_repairs'] = int(repairs)
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
@@ -182,7 +183,7 @@ class OfflineRun:
         return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
 
     def timings(self) -> dict[str, float]:
-        """Milliseconds a measurement takes the tracker: total, median and 99 % point."""
+        """Milliseconds that the tracker takes per measurement: total, median and 99 % point."""
         spent = np.array(self.durations) * 1e3
         if not len(spent):
             return {}

@@ -8,9 +8,10 @@ makes them from messages.
 from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
-from .checks import check_covariance, check_stamp, frame_role, nanoseconds, Rejection
+from .checks import check_covariance, check_stamp, nanoseconds, Rejection
 from .diver import Arrivals, Fix
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
+from .frames import frame_role, FrameGuard
 from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     'Detections',
     'Fix',
     'frame_role',
+    'FrameGuard',
     'IMAGE_ORDERS',
     'MAX_BINS',
     'Measurement',

@@ -40,14 +40,6 @@ def nanoseconds(seconds: float) -> int:
     return round(seconds * 1e9)
 
 
-def frame_role(measurement: Any) -> str:
-    """Whose frame a measurement is in, as its class says by `FRAME`: ``'world'``, that of the
-    tracks, where it says nothing; ``'own'``, that of its sensor on the vehicle; ``'none'``, when
-    it is the same in any frame."""
-    role: str = getattr(type(measurement), 'FRAME', 'world')
-    return role
-
-
 def check_stamp(stamp_ns: int) -> None:
     """Raise `Rejection` for a stamp that is zero (never filled in), negative, or beyond the year
     2262."""
@@ -75,6 +67,11 @@ def complexes(value: Any) -> NDArray[np.complexfloating]:
     array = array.astype(array.dtype if kept else np.complex128, copy=True)
     array.flags.writeable = False
     return array
+
+
+def content_key(kind: str, *parts: FloatArray | NDArray | None) -> bytes:
+    """The content of a measurement as bytes: it orders those of one stamp and tells duplicates."""
+    return kind.encode() + b''.join(part.tobytes() for part in parts if part is not None)
 
 
 def check_covariance(covariance: FloatArray, what: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
-from .checks import check_covariance, check_stamp, floats, Rejection
+from .checks import check_covariance, check_stamp, content_key, floats, Rejection
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:
@@ -46,6 +46,10 @@ class Fix:
             covariance = 0.5 * covariance + 0.5 * covariance.T
             covariance.flags.writeable = False
             object.__setattr__(self, 'covariance', covariance)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('fix', self.position, self.covariance)
 
 
 @frozen(eq=False, kw_only=True)
@@ -85,6 +89,12 @@ class Arrivals:
 
     def __len__(self) -> int:
         return len(self.toa)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        where = (self.tx_id, self.rx_id, self.tx, self.rx)
+        heard = (self.toa, self.var_toa, self.bearing, self.var_bearing)
+        return content_key('arrivals', *where, *heard)
 
     @property
     def passive(self) -> bool:

@@ -8,7 +8,7 @@ from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, floats, Rejection
+from .checks import check_stamp, content_key, floats, Rejection
 
 BEAM_AXES = ('marine', 'rep103', 'auto')
 """What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
@@ -52,6 +52,12 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.range)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key(
+            'detections', self.range, self.bearing, self.var_range, self.var_bearing
+        )
 
 
 @frozen(eq=False, kw_only=True)
@@ -106,6 +112,10 @@ class Navigation:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, floats(6, 6)(getattr(self, name)))
 
+    def key(self) -> bytes:
+        """See `content_key`; velocities are not used."""
+        return content_key('navigation', self.position, self.orientation)
+
 
 @frozen(eq=False, kw_only=True)
 class Altitude:
@@ -124,3 +134,7 @@ class Altitude:
             raise Rejection('nan', 'the altitude is not finite')
         if self.altitude < 0.0:
             raise Rejection('out_of_range', f'the altitude is {self.altitude:g} m, below zero')
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('altitude', np.float64(self.altitude))

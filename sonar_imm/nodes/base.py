@@ -35,12 +35,11 @@ from rclpy.qos import InvalidQoSProfileException
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
-from msg_adapters.frames import FrameGuard
 from msg_adapters.inputs import inputs_of, InputTopic
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
-from ..measurements import Rejection
+from ..measurements import FrameGuard, Rejection
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS

@@ -24,8 +24,6 @@ from .lockstep import LockStep, only_node
 from .messages import make, message_class
 from .qos import lockstep_qos, output_qos
 
-CLOCK_HZ = 40.0
-"""Rate of /clock where only ``--clock`` is said, as in ``ros2 bag play``."""
 NAME = 'sonar_imm_player'
 _FIRST_LISTENER, _OTHER_LISTENERS = 5.0, 0.5
 _DEPTH = 100

@@ -1,1 +1,1 @@
-"""Recordings: bags in and out, conversion of other formats, replay order."""
+"""Recordings: bags in and out, in replay order; `convert` reads other formats."""

@@ -1,4 +1,4 @@
-"""What every converter shares: counting bad rows, building the bag, telling what was done."""
+"""What every converter shares: counting bad rows, writing the bag, reporting what was done."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Record = tuple[int, str, Any]
 """(stamp in ns, topic, rosbags message)"""
 
 MOST_NAMED = 20
-"""So many bad rows are named one by one, the rest is counted."""
+"""At most this many bad rows are listed; all are counted."""
 
 
 @define

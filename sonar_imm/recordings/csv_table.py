@@ -1,8 +1,7 @@
-"""Other people's CSV files: any delimiter, any names of columns, any unit of time.
+"""CSV files of any origin: any delimiter, any names of columns, any unit of time.
 
-The reader knows each quantity by one name (``x``, ``stamp``, ...) and a list of names that people
-give it. Columns that are called something else are mapped by hand, and a row that cannot be read
-is a `BadRow` that names its line.
+Each quantity has one name here (``x``, ``stamp``, ...) and a list of usual names (`ALIASES`).
+Columns with other names are mapped by hand. A row that cannot be read raises `BadRow`.
 """
 
 from __future__ import annotations
@@ -86,12 +85,12 @@ class BadRow(ValueError):
 class CsvOptions:
     """How to read a CSV file.
 
-    columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``; what is not listed is
-    found by its usual names (`ALIASES`, case and units aside).
-    time_unit: of numeric times, one of s, ms, us, ns; empty: by the header (``time_ms``), else s.
-    ISO 8601 texts are recognised by themselves; without a zone they are UTC.
+    columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``. What is not listed is
+    found by its usual names (`ALIASES`); case and units are ignored.
+    time_unit: of numeric times, one of s, ms, us, ns. Empty: from the header (``time_ms``), else
+    s. ISO 8601 texts are recognised; without a zone they are UTC.
     time_offset_ns: added to every time, for files that count from their own start.
-    delimiter: empty: found from the header line.
+    delimiter: empty to find it from the header line.
     """
 
     columns: Mapping[str, str] = field(factory=dict)
@@ -126,14 +125,14 @@ class Row:
         return self.cells[index].strip() if index < len(self.cells) else ''
 
     def number(self, name: str) -> float:
-        """A number that has to be there and be finite."""
+        """A number that has to be there and finite. Raises `BadRow`."""
         value = self.optional(name)
         if math.isnan(value):
             raise BadRow(f'{self.table.header(name)} is empty')
         return value
 
     def optional(self, name: str) -> float:
-        """A number, NaN when the cell is empty, missing or says NaN."""
+        """A number; NaN when the cell is empty, missing or NaN."""
         text = self.text(name)
         if not text:
             return math.nan
@@ -168,7 +167,7 @@ class Row:
         if not 0 < stamp < 2**31 * 10**9:
             raise BadRow(
                 f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
-                'can hold; a time offset and the time unit can mend that'
+                'can hold; set the time offset or the time unit'
             )
         return stamp
 

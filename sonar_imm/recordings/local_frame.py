@@ -11,10 +11,10 @@ from .sources import BagError
 
 
 class LocalFrame:
-    """Where the positions of a table lie.
+    """The local frame of the positions of a table.
 
     origin: (latitude, longitude, height) in degrees and metres; None for tables in metres. Without
-    a stated origin the first position read becomes it. Raises `BagError` for a table without
+    a stated origin the first position is the origin. Raises `BagError` for a table without
     positions.
     """
 
@@ -31,11 +31,11 @@ class LocalFrame:
         z = row.optional('z') if row.table.has('z') else -row.optional('depth')
         x, y, z = row.number('x'), row.number('y'), 0.0 if math.isnan(z) else z
         if max(abs(x), abs(y), abs(z)) > FARTHEST:
-            raise BadRow(f'the position {x:g}, {y:g}, {z:g} is further than 100,000 km away')
+            raise BadRow(f'the position {x:g}, {y:g}, {z:g} is more than 100,000 km away')
         return x, y, z
 
     def notes(self) -> dict[str, str]:
-        """What has to be kept to find the way back to latitude and longitude."""
+        """The origin, which is needed to convert back to latitude and longitude."""
         if self.origin is None:
             return {}
         return {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
@@ -45,7 +45,9 @@ class LocalFrame:
 
         latitude, longitude = row.number('latitude'), row.number('longitude')
         if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-            raise BadRow(f'latitude {latitude:g}, longitude {longitude:g} is no place on Earth')
+            raise BadRow(
+                f'latitude {latitude:g}, longitude {longitude:g} is not a position on Earth'
+            )
         height = row.optional('height') if row.table.has('height') else -row.optional('depth')
         height = 0.0 if math.isnan(height) else height
         if self.origin is None:
@@ -57,6 +59,6 @@ class LocalFrame:
 def _checked(origin: tuple[float, ...]) -> tuple[float, float, float]:
     """Complete an origin with height 0."""
     if len(origin) not in (2, 3) or not all(map(math.isfinite, origin)) or abs(origin[0]) > 90.0:
-        raise BagError(f'an origin is latitude, longitude and perhaps height, got {origin}')
+        raise BagError(f'an origin is latitude, longitude and optionally height, got {origin}')
     latitude, longitude, height = (*map(float, origin), 0.0)[:3]
     return latitude, longitude, height

@@ -1,12 +1,12 @@
 """Reading an MCAP file without its index: a crashed recorder, a full disk, a broken copy.
 
-An MCAP file is a row of records, each with a one-byte operation code and a length; messages lie in
-chunks, and the index that readers rely on is written last. Without it the records can still be
-walked from the front up to the first one that is damaged. What is whole inside a cut-off chunk
-counts too: a recorder fills a chunk for minutes, so with small messages the last chunk can be most
-of the recording.
+An MCAP file is a sequence of records, each with a one-byte operation code and a length. Messages
+lie in chunks, and the index that readers rely on is written last. Without it the records can still
+be read from the front up to the first damaged one. Whole records inside a cut-off chunk are read
+too: a recorder fills a chunk for minutes, so with small messages the last chunk can be most of the
+recording.
 
-Only the place of each message is kept in memory (about 30 bytes a message), not its content.
+Only the position of each message is kept in memory (about 30 bytes per message), not its content.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Channel(NamedTuple):
 class McapScan:
     """The messages of an MCAP file found by walking its records.
 
-    channels and counts are by channel number; `lost` says in words what could not be read, empty
-    when the whole file was walked. Raises ValueError for a file that is no MCAP file at all.
+    channels and counts are by channel number; `lost` says what could not be read, empty when the
+    whole file was read. Raises ValueError for a file that is not MCAP.
     """
 
     def __init__(self, path: Path):
@@ -180,12 +180,12 @@ class McapScan:
             self._lose(f'has a damaged record near byte {start if block < 0 else block}')
 
     def _lose(self, what: str) -> None:
-        """Remember the first loss in words."""
+        """Keep the first description of a loss."""
         self.lost = self.lost or what
 
 
 def unpack(packed: bytes, compression: str) -> bytes:
-    """Decompress; a streaming decompressor gives what it has when its input ends early.
+    """Decompress. A streaming decompressor returns what it has when its input ends early.
 
     Raises `TooLargeError` as soon as more than `MAX_UNPACKED` bytes come out, KeyError for an
     unknown compression.
@@ -205,8 +205,8 @@ def unpack(packed: bytes, compression: str) -> bytes:
 
 
 def oversized_chunk(path: Path) -> str:
-    """What is wrong with an MCAP file a chunk of which unpacks to more than `MAX_UNPACKED` bytes;
-    empty for a good file. The heads of the chunks tell, as a rule without unpacking any."""
+    """A sentence about the first chunk that unpacks to more than `MAX_UNPACKED` bytes, empty when
+    there is none. The sizes are in the chunk heads, so usually no chunk is unpacked."""
     with path.open('rb') as file:
         size = path.stat().st_size
         position = len(MAGIC)
@@ -222,7 +222,7 @@ def oversized_chunk(path: Path) -> str:
 
 
 def _unpacks_to_too_much(chunk: bytes) -> bool:
-    """Damage of any other kind is left to the reader."""
+    """Whether a chunk is too large. Other damage is left to the reader."""
     try:
         stated = _CHUNK_HEAD.unpack_from(chunk)[2]
         compression, at = _text(chunk, _CHUNK_HEAD.size)

@@ -1,4 +1,4 @@
-"""From a recording to what a tracker takes in, by the same readers that the live nodes use."""
+"""Measurements of a recording, read by the same functions that the live nodes use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DOUBTS = {
 
 
 class Heard(NamedTuple):
-    """What one message brought: a measurement, or the `Rejection` that says why not."""
+    """What one message gave: a measurement, or the `Rejection` that says why there is none."""
 
     topic: str
     measurement: Any
@@ -33,9 +33,9 @@ def fitting_topics(
     """Say which topics of `bag` feed the tracker `system`: input by topic name.
 
     A topic fits when its type can be read and its last name component is the input's name; topics
-    below ``/truth`` never do, and companions alone are nothing. `topics` maps topic names to input
-    names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError`, listing what is
-    there, when nothing fits, and when several topics fit an input that is one instrument.
+    below ``/truth`` never do, and companions alone are not enough. `topics` maps topic names to
+    input names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError` when nothing fits, with
+    a list of what is there, and when several topics fit an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
@@ -53,8 +53,8 @@ def fitting_topics(
         names = [name for name, its in fitting.items() if its is entry]
         if entry.one_topic and len(names) > 1:
             raise BagError(
-                f'several topics fit {entry.name}: {", ".join(names)}; say which one '
-                f'is meant, e.g. --topic {entry.name}={names[0]}'
+                f'several topics fit {entry.name}: {", ".join(names)}; choose one, '
+                f'e.g. --topic {entry.name}={names[0]}'
             )
     return fitting
 
@@ -68,11 +68,11 @@ def measurements_of(
     order: str = 'recorded',
     settings: Mapping[str, Any] | None = None,
 ) -> Iterator[Heard]:
-    """Yield what the tracker `system` hears in an open recording, in replay order.
+    """Yield the measurements for the tracker `system` in an open recording, in replay order.
 
     `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
-    recording uses, `order` is as in `BagReader.messages`, `settings` holds the parameters of the
-    tracker by name, of which readers take what concerns them. Messages that deserve a warning are
+    recording uses, `order` is as in `BagReader.messages`. `settings` holds the parameters of the
+    tracker by name; readers take those that concern them. Messages that deserve a warning are
     counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
     """
     chosen = fitting_topics(bag, system, topics)

@@ -1,4 +1,4 @@
-"""Messages as rosbags sees them: the ROS 2 Jazzy types and the factory the adapters write with."""
+"""Messages of rosbags: the ROS 2 Jazzy types, and the factory that the adapters write with."""
 
 from __future__ import annotations
 
@@ -66,9 +66,9 @@ def _layout(type_name: str) -> tuple[Any, dict[str, Any]]:
 def decode_cdr(types: Typestore, type_name: str, raw: bytes) -> Any:
     """Decode CDR bytes into a rosbags message. Raises `SerdeError` or KeyError (unknown type).
 
-    Fast-CDR, which most of ROS 2 writes with, reserves room to align the elements of sequences and
-    leaves it at the end when the last sequences are empty, as in a JointState without velocities.
-    rosbags takes that for damage, so up to 16 spare bytes are cut off.
+    Fast-CDR, the usual serializer of ROS 2, reserves room to align the elements of sequences. It
+    leaves that room at the end when the last sequences are empty, as in a JointState without
+    velocities. rosbags takes this for damage, so up to 16 spare bytes are cut off.
     """
     for spare in (0, 4, 8, 12):
         try:

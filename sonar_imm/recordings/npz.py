@@ -1,4 +1,4 @@
-"""Numpy archives (npz), the format in which research data usually travel."""
+"""Numpy archives (npz), a usual format of research data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def read_npz(path: Path) -> dict[str, NDArray]:
     try:
         with path.open('rb') as file:
             if not zipfile.is_zipfile(file):
-                raise BagError(f'{path} is no numpy archive (npz)')
+                raise BagError(f'{path} is not a numpy archive (npz)')
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except OSError as error:

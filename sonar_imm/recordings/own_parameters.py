@@ -1,7 +1,8 @@
-"""What a recording itself says of the instrument it was made with: a parameter file beside it.
+"""The parameter file that a recording may have beside it, which describes its instrument.
 
-Most recordings fit the defaults of a tracker. Where the sonar sits elsewhere, or the array is
-another one, a tracker that is not told makes nothing, or nonsense, of the measurements.
+Most recordings fit the defaults of a tracker. Where the sonar is mounted elsewhere, or the array
+is another one, the tracker needs these parameters: without them its estimates are wrong or
+missing.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ import yaml
 from ..parameters import Config
 
 NAME = 'parameters.yaml'
-_HEAD = '# What the tracker has to be told of the instruments of this recording.\n'
+_HEAD = '# Parameters of the tracker that describe the instruments of this recording.\n'
 
 
 def own_parameters(bag: Path) -> Path | None:
-    """The parameter file in the folder of a recording; None without."""
+    """The parameter file in the folder of a recording; None when there is none."""
     path = bag / NAME
     return path if path.is_file() else None
 

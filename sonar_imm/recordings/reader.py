@@ -6,8 +6,8 @@
         for sentence in bag.problems: ...
 
 Messages come in recorded order: by log time, equal times in the order of the file. Live lock-step
-replay and offline tracking both use it, so that late data are late in both. ``order='stamp'``
-sorts by header stamp instead and has to hold the whole selection in memory.
+replay and offline tracking both use this order, so data that are late in one are late in the
+other. ``order='stamp'`` sorts by header stamp instead, and holds the whole selection in memory.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class BagMessage:
 class BagReader:
     """A recording, open for reading; use it in a ``with`` statement.
 
-    topics: what is in it. problems: sentences about what is wrong with it so far; reading
-    messages can add to them. With `strict` the first problem raises `BagError` instead.
+    topics: the topics in it. problems: sentences about what is wrong with it; reading messages can
+    add to them. With `strict` the first problem raises `BagError` instead.
     """
 
     def __init__(self, path: str | Path, *, strict: bool = False):
@@ -90,7 +90,7 @@ class BagReader:
 
     @property
     def problems(self) -> list[str]:
-        """Sentences about what is wrong, those about messages counted by topic."""
+        """Sentences about what is wrong; messages that cannot be decoded are counted by topic."""
         return self._sentences + [
             f'topic {topic}: {count} message{"s" if count > 1 else ""} could not be decoded '
             f'(the first: {reason})'

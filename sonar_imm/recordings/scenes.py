@@ -1,4 +1,4 @@
-"""Simulated scenes as bags: each measurement on the topic that its tracker hears."""
+"""Simulated scenes as bags: each measurement on the input topic of its tracker."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Where recorded messages come from: rosbags for whole files, a record scan for damaged ones.
+"""Sources of recorded messages: rosbags for whole files, a scan of the records for damaged ones.
 
-rosbags answers damage with many kinds of exception, some of them meant for programmers. Everything
-it raises becomes a `BagError` or a problem of one sentence here.
+rosbags raises many kinds of exception on damaged files. Each becomes a `BagError` or a problem of
+one sentence here.
 """
 
 from __future__ import annotations
@@ -66,8 +66,7 @@ class Source(Protocol):
 
 
 class _FolderPath(type(Path())):  # type: ignore[misc]
-    """A folder that may be called dive.bag: rosbags takes every path of that ending for a file of
-    ROS 1."""
+    """A folder whose name may end in .bag, which rosbags would take for a file of ROS 1."""
 
     @property
     def suffix(self) -> str:
@@ -194,7 +193,7 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
             return open_sources(path.parent)
         if path.suffix not in SUFFIXES:
             raise BagError(
-                f'{path} is no recording: the file names of recordings end in '
+                f'{path} is not a recording: the names of recordings end in '
                 f'{", ".join(SUFFIXES)}{_packed_hint([path])}'
             )
         return _open_files([path], [])
@@ -221,7 +220,7 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
         raise BagError(
             problems[0]
             if problems
-            else f'{path} is no recording: it holds neither metadata.yaml nor a file that '
+            else f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
             f'ends in {", ".join(SUFFIXES)}{_packed_hint(path.iterdir())}'
         )
     if not problems and not (path / 'metadata.yaml').exists():
@@ -270,7 +269,7 @@ def _unpacked(raw: bytes) -> bytes:
 
 
 def _leftovers(path: Path) -> list[str]:
-    """Sentences about write-ahead logs that a crashed recorder left: SQLite rows nobody reads."""
+    """Sentences about write-ahead logs that a crashed recorder left, whose rows are not read."""
     logs = path.glob('*.db3-wal') if path.is_dir() else [path.with_name(path.name + '-wal')]
     return [
         f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
@@ -303,6 +302,6 @@ def _add_known_types(types: Any, names: list[str]) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """Put an exception of any kind into one line without a full stop."""
+    """The text of any exception as one line without a full stop."""
     text = ' '.join(str(error).split()).rstrip('.')
     return text if text and not isinstance(error, KeyError) else f'{type(error).__name__} {text}'

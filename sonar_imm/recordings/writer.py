@@ -41,8 +41,7 @@ _RELIABLE = Qos(
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Say of which file an error of the operating system is, such as a full disk, where the system
-    itself does not."""
+    """Add the file name to an error of the operating system that lacks it, e.g. a full disk."""
     try:
         yield
     except OSError as error:
@@ -56,9 +55,9 @@ def naming(path: Path) -> Iterator[None]:
 class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
-    custom_data: notes kept in the bag's metadata, e.g. where the data come from. When an exception
-    leaves the ``with`` block, what was written so far is still a whole bag.
-    Raises `BagError` when the bag cannot be made.
+    custom_data: notes kept in the metadata of the bag, e.g. where the data come from. What was
+    written before an exception is still a whole bag. Raises `BagError` when the bag cannot be
+    made.
     """
 
     def __init__(

@@ -1,1 +1,1 @@
-"""Scenes to test trackers on: truth and the measurements it causes, the same for the same seed."""
+"""Simulated scenes with truth, from a seed: one folder per system, `scene` is what all share."""

@@ -17,9 +17,9 @@ S = TypeVar('S', bound='Scenario')
 
 @frozen(kw_only=True)
 class Scenario(Config):
-    """Base of what a scene of a system can be told.
+    """Base class of the parameters of a scene.
 
-    INSTRUMENT: names that the tracker's parameters have too, and mean the same instrument by.
+    INSTRUMENT: names of parameters of the instrument that the tracker has under the same name.
     """
 
     INSTRUMENT: ClassVar[tuple[str, ...]] = ()
@@ -31,7 +31,7 @@ class Scenario(Config):
         scenarios: Mapping[str, tuple[str, dict[str, Any]]],
         overrides: Mapping[str, Any] | None,
     ) -> S:
-        """The one of `scenarios` (name: description, values) called `name`, with some values
+        """The scenario `name` out of `scenarios` (name: description, values), with some values
         replaced. Raises `ConfigError` naming mistakes."""
         if name not in scenarios:
             raise ConfigError(
@@ -47,9 +47,9 @@ class Scenario(Config):
 
 @frozen(eq=False)
 class Received:
-    """A measurement and when it reached the computer, which may be long after its stamp.
+    """A measurement and when it was received, which may be long after its stamp.
 
-    namespace: put before its topic when several instruments of one kind are on board.
+    namespace: put before the topic when there are several instruments of one kind.
     """
 
     received_ns: int
@@ -106,7 +106,7 @@ class TrueTrack:
 
 @frozen(eq=False)
 class TrueProfile:
-    """The floor that one ping really saw, one row a range bin.
+    """The floor that one ping really saw, one row per range bin.
 
     range (n,) m; height (n,) m above the reference floor; angle (n,) rad from broadside; patch
     (n,) rough floor; valid (n,) False in shadow and water column; xyz (n, 3) m in `frame_id`.
@@ -163,8 +163,8 @@ class TrueReflectors:
 
 @frozen(eq=False)
 class Scene:
-    """measurements in the order in which they were received; truth, e.g. one track a target
-    or one profile a ping."""
+    """Measurements in the order in which they were received, and the truth, e.g. one track per
+    target or one profile per ping."""
 
     measurements: tuple[Received, ...]
     truth: tuple[Truth, ...]

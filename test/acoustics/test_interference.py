@@ -27,8 +27,8 @@ def test_the_covariance_is_the_sum_of_its_parts(scene):
     assert np.allclose(covariance[2], 4.0 * np.outer(b, b.conj()) + 2.0 * np.eye(STAVES))
 
 
-@pytest.mark.parametrize('law', laplace.LAWS)
-def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, law):
+@pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
+def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, likelihood):
     y, covariance = scene
     form = interference.interference_form(y, covariance)
     u, signal = np.append(np.linspace(-1.0, 1.0, 41), np.nan), 7.0
@@ -41,12 +41,12 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, law):
             form.base[n],
             form.spread[n],
             signal,
-            likelihood_kernels.law_table(STAVES, law),
+            likelihood_kernels.likelihood_table(STAVES, likelihood),
             np.empty((4, len(u))),
             out,
         )
         expected = interference.interfered_log_likelihood(
-            u, y[n], signal, covariance[n], STEP, law
+            u, y[n], signal, covariance[n], STEP, likelihood
         )
         assert out[-1] == expected[-1] == -np.inf
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)

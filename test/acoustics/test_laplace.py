@@ -103,15 +103,15 @@ def test_the_form_is_that_of_the_covariance(staves):
             assert determinant == pytest.approx(np.linalg.slogdet(gamma)[1])
 
 
-@pytest.mark.parametrize('law', laplace.LAWS)
+@pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
 @pytest.mark.parametrize('staves', [2, 3, 4, 8, 16, 64])
-def test_the_table_is_the_law(staves, law):
+def test_the_table_is_the_likelihood(staves, likelihood):
     q = np.geomspace(2.0**-20, 2.0**49.99, 20_000)
     out = np.empty(len(q))
     likelihood_kernels.log_densities(
-        q.copy(), np.empty(len(q)), likelihood_kernels.law_table(staves, law), out
+        q.copy(), np.empty(len(q)), likelihood_kernels.likelihood_table(staves, likelihood), out
     )
-    if law == 'gaussian':
+    if likelihood == 'gaussian':
         assert np.allclose(out, -q, rtol=1e-12)
         return
     root = np.sqrt(q)
@@ -122,19 +122,19 @@ def test_the_table_is_the_law(staves, law):
 
 
 def test_what_the_table_does_not_reach_is_held_at_its_end():
-    table, out = likelihood_kernels.law_table(8), np.empty(5)
+    table, out = likelihood_kernels.likelihood_table(8), np.empty(5)
     q = np.array([0.0, -1.0, 1e-30, np.nan, 1e300])
     likelihood_kernels.log_densities(q.copy(), np.empty(5), table, out)
     assert (out[:4] == out[0]).all() and np.isfinite(out).all() and out[4] < -1e7
-    for staves, law in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
+    for staves, likelihood in ((1, 'laplace'), (65, 'laplace'), (8, 'cauchy')):
         with pytest.raises(ValueError):
-            likelihood_kernels.law_table(staves, law)
+            likelihood_kernels.likelihood_table(staves, likelihood)
     assert not table.flags.writeable
 
 
-@pytest.mark.parametrize('law', laplace.LAWS)
+@pytest.mark.parametrize('likelihood', laplace.LIKELIHOODS)
 @pytest.mark.parametrize('staves, spacing', [(2, 0.5), (5, 0.3), (8, 0.5), (8, -0.5), (64, 0.5)])
-def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, law):
+def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, likelihood):
     rng = np.random.default_rng(2)
     u = np.append(rng.uniform(-1.0, 1.0, 300), [np.nan, 1.0, -1.0])
     y, signal, noise = 3.0 * complex_normal(rng, staves), 40.0, 0.7
@@ -146,11 +146,11 @@ def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, law):
         0.0,
         np.empty(0, complex),
         0.0,
-        likelihood_kernels.law_table(staves, law),
+        likelihood_kernels.likelihood_table(staves, likelihood),
         np.empty((4, len(u))),
         out,
     )
-    expected = laplace.log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, law)
+    expected = laplace.log_likelihood(u, y, signal, noise, 2.0 * math.pi * spacing, likelihood)
     assert out[300] == expected[300] == -np.inf
     fine = np.arange(len(u)) != 300
     assert np.allclose(out[fine], expected[fine], rtol=3e-7, atol=1e-6)
@@ -159,10 +159,10 @@ def test_the_compiled_likelihood_is_that_of_numpy(staves, spacing, law):
 def test_the_likelihood_peaks_at_the_direction_of_the_echo():
     rng = np.random.default_rng(3)
     grid = np.linspace(-0.95, 0.95, 381)
-    for law in laplace.LAWS:
+    for likelihood in laplace.LIKELIHOODS:
         for u in (-0.6, 0.1, 0.7):
             y = 10.0 * array.steering(u, 8, 0.5) + complex_normal(rng, 8)
-            best = grid[laplace.log_likelihood(grid, y, 100.0, 1.0, STEP, law).argmax()]
+            best = grid[laplace.log_likelihood(grid, y, 100.0, 1.0, STEP, likelihood).argmax()]
             assert best == pytest.approx(u, abs=0.03)
-            turned = laplace.log_likelihood(grid, y, 100.0, 1.0, -STEP, law)
+            turned = laplace.log_likelihood(grid, y, 100.0, 1.0, -STEP, likelihood)
             assert grid[turned.argmax()] == pytest.approx(-u, abs=0.03)

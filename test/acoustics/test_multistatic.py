@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.acoustics import multistatic
+from sonar_imm.estimation.angles import wrap_angle
 
 COORDINATE = st.floats(-300.0, 300.0)
 POINT = st.tuples(COORDINATE, COORDINATE, st.floats(-40.0, 0.0)).map(np.array)
@@ -59,7 +60,7 @@ def test_jacobians_equal_finite_differences(position, tx, rx, z):
     around = multistatic.bearing(position, rx)
     assert_allclose(
         multistatic.bearing_jacobian(position, rx),
-        slope(lambda p: multistatic.wrap_angle(multistatic.bearing(p, rx) - around), position),
+        slope(lambda p: wrap_angle(multistatic.bearing(p, rx) - around), position),
         rtol=1e-6,
         atol=1e-7,
     )
@@ -77,7 +78,7 @@ def test_models_turn_and_move_with_the_scene(position, tx, rx, angle, shift):
         rtol=1e-9,
     )
     gain = multistatic.bearing(moved[0], moved[2]) - multistatic.bearing(position, rx)
-    assert_allclose(multistatic.wrap_angle(gain - angle), 0.0, atol=1e-9)
+    assert_allclose(wrap_angle(gain - angle), 0.0, atol=1e-9)
     assert_allclose(
         multistatic.range_sum_jacobian(*moved, -5.0),
         turned(multistatic.range_sum_jacobian(position, tx, rx, -5.0), angle, 0.0),
@@ -93,10 +94,6 @@ def test_hand_worked_values():
     assert_allclose(multistatic.bearing(position, rx), [-np.pi / 2])
     assert_allclose(multistatic.bearing_jacobian(position, rx), [[0.25, 0.0]])
     assert_allclose(multistatic.range_sum(position, tx, rx, 4.0), [5.0 + np.sqrt(32.0)])
-    assert_allclose(
-        multistatic.wrap_angle([3.5 * np.pi, -0.1, np.pi + 1e-3]),
-        [-0.5 * np.pi, -0.1, -np.pi + 1e-3],
-    )
 
 
 def test_leading_axes():

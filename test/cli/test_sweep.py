@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from sonar_imm.cli import main
-from sonar_imm.evaluation.sweep import flat
+from sonar_imm.evaluation.sweep import finite_numbers
 
 TINY = ('--set', 'duration=15', '--workers', '1')
 
@@ -59,7 +59,7 @@ def test_a_seed_scores_as_simulate_track_and_evaluate_say(tmp_path, capsys):
     assert main(['track', bag, run, '--params', str(params)]) == 0
     capsys.readouterr()
     assert main(['evaluate', run, '--no-report', '--json']) == 0
-    wanted = dict(flat(json.loads(capsys.readouterr().out)))
+    wanted = finite_numbers(json.loads(capsys.readouterr().out))
     found = {
         name: float(text)
         for name, text in rows[1].items()

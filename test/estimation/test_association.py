@@ -11,6 +11,7 @@ from scipy.stats import chi2, multivariate_normal
 
 from sonar_imm.estimation.association import (
     assign,
+    assign_by_rank,
     association_cost,
     gate,
     gate_threshold,
@@ -126,6 +127,26 @@ def test_the_order_of_the_pairs_does_not_matter():
 def sorted_pairs(t, d, cost):
     order = np.lexsort((d, t))
     return t[order], d[order], cost[order]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(1, 8))
+def test_ranks_choose_in_turn(seed, targets, detections):
+    """Against one target set after the other, written with a table."""
+    rng = np.random.default_rng(seed)
+    table = rng.normal(size=(targets, detections))
+    rank = rng.integers(-1, 3, targets)
+    target, detection = np.divmod(np.arange(table.size), detections)
+    chosen = assign_by_rank(target, detection, table.ravel(), rank, detections)
+    left = list(range(detections))
+    for turn in (0, 1, 2):
+        own = np.flatnonzero(rank == turn)
+        rows, columns = linear_sum_assignment(np.minimum(table[np.ix_(own, left)], 0.0))
+        best = np.minimum(table[np.ix_(own, left)], 0.0)[rows, columns].sum()
+        got = [(t, chosen[t]) for t in own if chosen[t] >= 0]
+        assert {d for _, d in got} <= set(left)
+        assert sum(table[t, d] for t, d in got) == pytest.approx(best)
+        left = [d for d in left if d not in {d for _, d in got}]
+    assert (chosen[rank < 0] == -1).all()
 
 
 def test_association_cost_is_the_log_of_the_ratio_of_the_two_explanations():

@@ -68,7 +68,7 @@ def filtered_innovations(rng, q, q_assumed):
     truth, x, P, nus, Ss = np.zeros(2), np.zeros(2), np.eye(2), [], []
     for _ in range(600):
         truth = F @ truth + np.array([0.5, 1.0]) * rng.normal() * np.sqrt(q)
-        x, P = kalman.predict(x, P, F, q_assumed * shape)
+        x, P, _ = kalman.predict(x, P, F, q_assumed * shape)
         nu = H @ truth + rng.normal(size=1) - H @ x
         updated = kalman.update(x, P, nu, H, R)
         x, P = updated.x, updated.P

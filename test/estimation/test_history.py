@@ -4,6 +4,7 @@ import hashlib
 
 from hypothesis import given
 from hypothesis import strategies as st
+import numpy as np
 import pytest
 
 from sonar_imm.estimation.history import ReplayHistory, StampGate
@@ -143,51 +144,139 @@ def test_history_refuses_nonsense(arguments):
         ReplayHistory(b'', **arguments)
 
 
-# -- the stamp gate -------------------------------------------------------------------------------
-# ---------------------
+# -- the stamp gate --------------------------------------------------------------------------
 
 
 def gate(restart_after=3):
     return StampGate(window_ns=10 * S, max_gap_ns=100 * S, restart_after=restart_after)
 
 
-def judge(stamp_gate, *seconds):
-    return [stamp_gate.judge(int(s * S), s) for s in seconds]
+def decide(stamp_gate, *seconds):
+    return [stamp_gate.decide(int(s * S), s) for s in seconds]
 
 
 def test_stream_and_late_inside_the_window_are_used():
-    judgements = judge(gate(), 1000, 1010, 1000, 1110, 1100)
-    assert [j.verdict for j in judgements] == ['use'] * 5
-    assert [j.released for j in judgements] == [(1000,), (1010,), (1000,), (1110,), (1100,)]
+    decisions = decide(gate(), 1000, 1010, 1000, 1110, 1100)
+    assert [d.verdict for d in decisions] == ['use'] * 5
+    assert [d.released for d in decisions] == [(1000,), (1010,), (1000,), (1110,), (1100,)]
 
 
 def test_older_than_the_window_is_too_late():
-    assert judge(gate(), 1000, 989.999)[-1].verdict == 'too_late'
+    assert decide(gate(), 1000, 989.999)[-1].verdict == 'too_late'
 
 
-def test_one_wild_stamp_in_the_future_does_not_make_the_rest_late():
-    judgements = judge(gate(), 1000, 1001, 9_000_000, 1002, 1003)
-    assert [j.verdict for j in judgements] == ['use', 'use', 'doubtful', 'use', 'use']
-    assert [j.abandoned for j in judgements] == [0, 0, 0, 1, 0]
+def test_one_outlying_stamp_in_the_future_does_not_make_the_rest_late():
+    decisions = decide(gate(), 1000, 1001, 9_000_000, 1002, 1003)
+    assert [d.verdict for d in decisions] == ['use', 'use', 'doubtful', 'use', 'use']
+    assert [d.abandoned for d in decisions] == [0, 0, 0, 1, 0]
 
 
 @pytest.mark.parametrize('restarted', [(5, 6, 7), (5_000_000, 5_000_001, 5_000_002), (5, 7, 6)])
 def test_a_restarted_clock_hands_everything_out_again(restarted):
-    judgements = judge(gate(), 1000, 1001, *restarted, restarted[-1] + 1)
-    assert [j.verdict for j in judgements[-2:]] == ['restart', 'use']
-    assert judgements[-2].released == restarted
-    assert judgements[-2].reinstated == sum(j.verdict == 'too_late' for j in judgements)
+    decisions = decide(gate(), 1000, 1001, *restarted, restarted[-1] + 1)
+    assert [d.verdict for d in decisions[-2:]] == ['restart', 'use']
+    assert decisions[-2].released == restarted
+    assert decisions[-2].reinstated == sum(d.verdict == 'too_late' for d in decisions)
 
 
-def test_a_wild_first_stamp_costs_nothing():
-    judgements = judge(gate(), 9_000_000, 1000, 1001, 1002)
-    assert judgements[-1].verdict == 'restart'
-    assert judgements[-1].released == (1000, 1001, 1002)
+def test_an_outlying_first_stamp_costs_nothing():
+    decisions = decide(gate(), 9_000_000, 1000, 1001, 1002)
+    assert decisions[-1].verdict == 'restart'
+    assert decisions[-1].released == (1000, 1001, 1002)
+
+
+def restarts(decisions):
+    return sum(d.verdict == 'restart' for d in decisions)
+
+
+def released(decisions):
+    return [item for d in decisions for item in d.released]
+
+
+@pytest.mark.parametrize('restart_after', [3, 5])
+@pytest.mark.parametrize('window', [0, 5, 10])
+def test_a_burst_of_late_messages_is_no_restart(window, restart_after):
+    stamp_gate = StampGate(window * S, 600 * S, restart_after)
+    arrivals = [*range(100, 200), *range(165, 170), *range(200, 300)]
+    decisions = decide(stamp_gate, *arrivals)
+    assert [d.verdict for d in decisions[100:105]] == ['too_late'] * 5
+    assert restarts(decisions) == 0
+    assert released(decisions) == [*range(100, 200), *range(200, 300)]
+
+
+@pytest.mark.parametrize('restart_after, window', [(3, 0), (5, 0), (5, 10), (3, 60)])
+@pytest.mark.parametrize('lateness', [3.0, 10.0, 30.0, 90.0])
+def test_random_lateness_is_no_restart(restart_after, window, lateness):
+    random = np.random.default_rng(1)
+    sent = np.arange(1000, 21_000)
+    late = random.uniform(size=len(sent)) < 0.1
+    arrived = sent[np.argsort(sent + late * lateness * random.uniform(size=len(sent)))]
+    decisions = decide(StampGate(window * S, 600 * S, restart_after), *arrived)
+    assert restarts(decisions) == 0
+    assert len(released(decisions)) >= len(sent) - late.sum()
+
+
+def test_what_an_outage_held_back_is_late_but_no_restart():
+    decisions = decide(gate(5), *range(100, 200), 260, *range(200, 260), *range(261, 300))
+    assert restarts(decisions) == 0
+    assert released(decisions) == [*range(100, 200), 260, *range(250, 260), *range(261, 300)]
+
+
+def recording(length, seed=None):
+    """Stamps of a recording; with a seed, shuffled by less than the window and one in ten lost."""
+    stamps = np.arange(500.0, 500.0 + length)
+    if seed is None:
+        return stamps
+    random = np.random.default_rng(seed)
+    stamps = stamps[np.argsort(stamps + 9.0 * random.uniform(size=length), kind='stable')]
+    return stamps[random.uniform(size=length) > 0.1]
+
+
+@pytest.mark.parametrize('length', [30, 90, 1000])
+@pytest.mark.parametrize('lossy', [False, True])
+def test_a_looped_recording_restarts_each_time_and_loses_nothing(length, lossy):
+    arrivals = np.concatenate([recording(length, seed if lossy else None) for seed in range(4)])
+    decisions = decide(StampGate(10 * S, 600 * S, 5), *arrivals)
+    assert restarts(decisions) == 3
+    assert released(decisions) == arrivals.tolist()
+
+
+@pytest.mark.parametrize('back', [350, 3600, 10**9])
+def test_a_clock_set_back_beyond_any_lateness_is_believed_at_once(back):
+    again = [5 * 10**9 - back + i for i in range(10)]
+    decisions = decide(StampGate(10 * S, 600 * S, 5), *range(5 * 10**9 - 50, 5 * 10**9), *again)
+    assert [d.verdict for d in decisions[-10:]] == ['too_late'] * 4 + ['restart'] + ['use'] * 5
+    assert released(decisions)[-10:] == again
+
+
+@pytest.mark.parametrize('rate', [1, 10, 1000])
+def test_a_clock_set_back_inside_the_stream_is_believed_after_a_long_run(rate):
+    stream = [1000 + i / rate for i in range(500 * rate)]
+    again = [1250 + i / rate for i in range(200 * rate)]
+    decisions = decide(StampGate(10 * S, 600 * S, 5), *stream, *again)
+    assert restarts(decisions) == 1
+    assert released(decisions) == stream + again
+    waited = [d.verdict for d in decisions].index('restart') - len(stream) + 1
+    assert waited == {1: 100, 10: 102, 1000: 1000}[rate]
+
+
+def test_a_clock_set_back_a_little_reaches_its_old_time():
+    decisions = decide(StampGate(10 * S, 600 * S, 5), *range(1000, 2000), *range(1970, 2100))
+    assert restarts(decisions) == 0
+    assert released(decisions) == [*range(1000, 2000), *range(1989, 2100)]
+
+
+@pytest.mark.parametrize('ahead', [20, 100, 299])
+def test_an_outlying_first_stamp_inside_the_gap_is_outvoted(ahead):
+    stream = list(range(1000, 1050))
+    decisions = decide(StampGate(5 * S, 600 * S, 5), 1000 + ahead, *stream)
+    assert [d.verdict for d in decisions].index('restart') == 5
+    assert released(decisions)[1:] == stream
 
 
 def test_off_stream_stamps_that_disagree_never_restart():
-    judgements = judge(gate(), 1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001)
-    assert [j.verdict for j in judgements] == [
+    decisions = decide(gate(), 1000, 9_000_000, 5, 8_000_000, 600, 7_000_000, 1001)
+    assert [d.verdict for d in decisions] == [
         'use',
         'doubtful',
         'too_late',
@@ -196,35 +285,51 @@ def test_off_stream_stamps_that_disagree_never_restart():
         'doubtful',
         'use',
     ]
-    assert sum(j.abandoned for j in judgements) == 3
+    assert sum(d.abandoned for d in decisions) == 3
 
 
 def test_good_stamps_between_keep_a_second_wrong_clock_out():
-    judgements = judge(gate(), *[s for i in range(20) for s in (1000 + i, 5 + i)])
-    assert [j.verdict for j in judgements] == ['use', 'too_late'] * 20
+    decisions = decide(gate(), *[s for i in range(20) for s in (1000 + i, 5 + i)])
+    assert [d.verdict for d in decisions] == ['use', 'too_late'] * 20
 
 
-def test_a_scan_of_many_items_with_one_wild_stamp_is_no_restart():
-    judgements = judge(gate(), 1000, *[9_000_000] * 50, 1001)
-    assert [j.verdict for j in judgements] == ['use'] + ['doubtful'] * 50 + ['use']
-    assert judgements[-1].abandoned == 50
+def test_a_scan_of_many_items_with_one_outlying_stamp_is_no_restart():
+    decisions = decide(gate(), 1000, *[9_000_000] * 50, 1001)
+    assert [d.verdict for d in decisions] == ['use'] + ['doubtful'] * 50 + ['use']
+    assert decisions[-1].abandoned == 50
 
 
 def test_what_is_held_is_bounded():
     stamp_gate = StampGate(window_ns=10, max_gap_ns=100, restart_after=3, hold=4)
-    judgements = [stamp_gate.judge(s, None) for s in (1, 900, 900, 900, 900, 900, 2)]
-    assert [j.abandoned for j in judgements] == [0, 0, 0, 0, 0, 1, 4]
+    decisions = [stamp_gate.decide(s, None) for s in (1, 900, 900, 900, 900, 900, 2)]
+    assert [d.abandoned for d in decisions] == [0, 0, 0, 0, 0, 1, 4]
 
 
-@given(st.lists(st.integers(1, 2**62), max_size=60), st.integers(0, 10**6), st.integers(1, 10**9))
-def test_every_item_has_exactly_one_fate(stamps, window, gap):
-    stamp_gate = StampGate(window_ns=window, max_gap_ns=gap, restart_after=3)
+@st.composite
+def clocks(draw):
+    """Stamps of clocks that tick, stop, repeat themselves and are set anew."""
+    stamps = []
+    for _ in range(draw(st.integers(1, 6))):
+        start = draw(st.sampled_from([1, 50, 400, 2**40]))
+        steps = draw(st.lists(st.sampled_from([-7, -1, 0, 1, 1, 1, 5]), max_size=60))
+        stamps += [max(1, start + int(sum(steps[:i]))) for i in range(len(steps))]
+    return stamps
+
+
+@given(
+    st.one_of(st.lists(st.integers(1, 2**62), max_size=60), clocks()),
+    st.integers(0, 10),
+    st.sampled_from([1, 100, 10**9]),
+    st.sampled_from([4, 30, 1000]),
+)
+def test_every_item_has_exactly_one_fate(stamps, window, gap, hold):
+    stamp_gate = StampGate(window, gap, 3, max_late_ns=100, hold=hold)
     released = too_late = abandoned = 0
     for stamp in stamps:
-        judgement = stamp_gate.judge(stamp, stamp)
-        released += len(judgement.released)
-        too_late += (judgement.verdict == 'too_late') - judgement.reinstated
-        abandoned += judgement.abandoned
+        decision = stamp_gate.decide(stamp, stamp)
+        released += len(decision.released)
+        too_late += (decision.verdict == 'too_late') - decision.reinstated
+        abandoned += decision.abandoned
     assert released + too_late + abandoned + stamp_gate.holding == len(stamps)
     assert min(released, too_late, abandoned) >= 0
 

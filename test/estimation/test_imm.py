@@ -41,11 +41,11 @@ class FixedChain:
 def cycle(engine, x, P, mu, transition, F, Q, B, z, H, R):
     """Mix, predict, update; z (m,) for one target, or None when missed."""
     x, P, c = engine.mix(x, P, mu, transition)
-    x, P = engine.predict(x, P, F, Q, B)
+    x, P, _ = engine.predict(x, P, F, Q, B)
     if z is None:
         return x, P, c, 0.0, np.nan
     innovation = np.ascontiguousarray(z - np.einsum('jmn,tjn->tjm', H, x))
-    x, P, mu, log_likelihood, nis, ok = engine.update(x, P, c, innovation, H[None], R[None])
+    x, P, mu, log_likelihood, nis, ok, _ = engine.update(x, P, c, innovation, H[None], R[None])
     assert ok.all()
     return x, P, mu, log_likelihood[0], nis[0]
 
@@ -172,7 +172,7 @@ def test_kernels_and_numpy_are_twins(seed, T, M, n, m):
     results = []
     for engine in ENGINES:
         x, P, c = engine.mix(bank['x'], bank['P'], bank['mu'], bank['transition'])
-        x, P = engine.predict(x, P, bank['F'], bank['Q'], bank['B'])
+        x, P, _ = engine.predict(x, P, bank['F'], bank['Q'], bank['B'])
         updated = engine.update(x, P, c, bank['innovation'], bank['H'], bank['R'])
         results.append((x, P, c, *updated, *engine.combine(*updated[:3], bank['E'])))
     for ours, theirs in zip(*results):
@@ -215,7 +215,7 @@ def test_one_model_is_the_kalman_filter(engine):
             bank['H'][0],
             bank['R'][0],
         )
-        x, P = kalman.predict(x, P, bank['F'][0], bank['Q'][0], bank['B'][0])
+        x, P, _ = kalman.predict(x, P, bank['F'][0], bank['Q'][0], bank['B'][0])
         expected = kalman.update(x, P, z - bank['H'][0, 0] @ x, bank['H'][0, 0], bank['R'][0])
         x, P = expected.x, expected.P
         np.testing.assert_allclose(state[0][0, 0], x, rtol=1e-9, atol=1e-9)
@@ -311,7 +311,7 @@ def test_the_order_of_models_does_not_matter(engine):
         x, P, c = engine.mix(
             bank['x'][:, p].copy(), bank['P'][:, p].copy(), bank['mu'][:, p].copy(), transition
         )
-        x, P = engine.predict(x, P, bank['F'][p], bank['Q'][p], bank['B'][p])
+        x, P, _ = engine.predict(x, P, bank['F'][p], bank['Q'][p], bank['B'][p])
         updated = engine.update(
             x, P, c, bank['innovation'][:, p].copy(), bank['H'][:, p].copy(), bank['R']
         )
@@ -329,7 +329,7 @@ def test_the_order_of_models_does_not_matter(engine):
 def test_an_outlier_favours_the_wider_model(engine, far):
     """Both likelihoods underflow; their logarithms do not."""
     x, P = np.zeros((1, 2, 1)), np.array([[[[1.0]], [[4.0]]]])
-    _, _, mu, _, _, ok = engine.update(
+    _, _, mu, _, _, ok, _ = engine.update(
         x,
         P,
         np.full((1, 2), 0.5),

@@ -26,8 +26,10 @@ class Kernels:
     def mix(x, w, mu, transition, uniform):
         M, n, N = x.shape
         mixed, c = np.empty_like(x), np.empty(M)
-        scratch = np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64)
-        imm_particles_kernels.mix(x, w, mu, transition, uniform, *scratch, mixed, c)
+        scratch = imm_particles_kernels.MixScratch(
+            np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64)
+        )
+        imm_particles_kernels.mix(x, w, mu, transition, uniform, scratch, mixed, c)
         return mixed, c
 
     @staticmethod
@@ -43,7 +45,7 @@ class Kernels:
         w = np.full((M, N), 1.0 / N) if w is None else w.copy()
         mu, work = np.empty(M), np.empty((2, N))
         log_sum = imm_particles_kernels.update(log_likelihood.copy(), c, w, mu, work)
-        return imm_particles.Updated(w, mu, log_sum, log_sum > -np.inf)
+        return imm_particles.WeightUpdate(w, mu, log_sum, log_sum > -np.inf)
 
     @staticmethod
     def combine(x, w, mu):
@@ -118,9 +120,9 @@ def test_mixing_weights_that_are_not_finite_stays_in_its_arrays(value):
     x, w, mu = random_set(rng)
     w[1, 7] = value
     guarded = np.full(50 + 1 + 8, -7)
-    scratch = np.empty((3, 50)), np.empty(50), guarded[:51]
+    scratch = imm_particles_kernels.MixScratch(np.empty((3, 50)), np.empty(50), guarded[:51])
     mixed, c = np.empty_like(x), np.empty(3)
-    imm_particles_kernels.mix(x, w, mu, ASYMMETRIC, rng.random(3), *scratch, mixed, c)
+    imm_particles_kernels.mix(x, w, mu, ASYMMETRIC, rng.random(3), scratch, mixed, c)
     assert (guarded[51:] == -7).all() and np.isin(mixed, x).all()
 
 

@@ -52,12 +52,13 @@ def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path)
     code = """
 import numpy as np
 from sonar_imm.estimation import imm_particles_kernels as imm
-from sonar_imm.trackers.bathymetry.kernels import sines_of
-out, one = np.empty(1), np.ones((1, 1))
-sines_of(np.zeros(1), 2.0, np.array([1.0, 1.0, 0.0, 0.5]), np.empty((2, 1)), out)
+from sonar_imm.trackers.bathymetry.kernels import Geometry, sines_of
+out = np.empty(1)
+sines_of(np.zeros(1), 2.0, Geometry(1.0, 1.0, 0.0, 0.5), np.empty((2, 1)), out)
 mixed, c = np.empty((2, 1, 1)), np.empty(2)
+scratch = imm.MixScratch(np.empty((2, 1)), np.empty(1), np.empty(2, np.int64))
 imm.mix(np.array([[[3.0]], [[4.0]]]), np.ones((2, 1)), np.array([1.0, 1e-9]), np.eye(2),
-        np.zeros(2), np.empty((2, 1)), np.empty(1), np.empty(2, np.int64), mixed, c)
+        np.zeros(2), scratch, mixed, c)
 hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.mix))
 print(out[0], mixed[1, 0, 0], hits)
 """
@@ -80,9 +81,9 @@ def edit(path, old, new):
 def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypatch):
     code = """
 import numpy as np
-from sonar_imm.trackers.bathymetry.kernels import sines_of
+from sonar_imm.trackers.bathymetry.kernels import Geometry, sines_of
 try:
-    sines_of(np.zeros(1), 2.0, np.ones(4), np.empty((1, 2)), np.empty(1)[:0])
+    sines_of(np.zeros(1), 2.0, Geometry(1.0, 1.0, 0.0, 0.5), np.empty((1, 2)), np.empty(1)[:0])
     print('unchecked')
 except IndexError:
     print('checked')

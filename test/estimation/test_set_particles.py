@@ -94,7 +94,7 @@ def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch)
 
         def unpaid(*arguments):
             fill(*arguments)
-            ratio = arguments[-1]
+            ratio = arguments[-1].move_ratio
             ratio[np.isfinite(ratio)] = 0.0
 
         monkeypatch.setattr(set_filter.kernels, 'fill_moves', unpaid)

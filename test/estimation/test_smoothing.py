@@ -32,7 +32,7 @@ def kalman_pass(F, Q, B, H, R, x, P, Z):
     xs, Ps = [], []
     for k, z in enumerate(Z):
         if k:
-            x, P = kalman.predict(x, P, F[k], Q[k], B[k])
+            x, P, _ = kalman.predict(x, P, F[k], Q[k], B[k])
         x, P = kalman.update(x, P, z - kalman.apply(H, x), H, R)[:2]
         xs.append(x)
         Ps.append(P)
@@ -46,7 +46,7 @@ def imm_pass(transition, F, Q, B, H, R, x, P, mu, Z):
     for k, z in enumerate(Z):
         if k:
             mixed = imm.mix(x, P, mu, transition[k][None])
-            (x, P), mu = imm.predict(mixed.x, mixed.P, F[k], Q[k], B[k]), mixed.c
+            (x, P, _), mu = imm.predict(mixed.x, mixed.P, F[k], Q[k], B[k]), mixed.c
         updated = imm.update(x, P, mu, z - np.einsum('jmn,tjn->tjm', H, x), H[None], R[None])
         x, P, mu = updated.x, updated.P, updated.mu
         steps.append((x[0], P[0], mu[0]))
@@ -257,7 +257,7 @@ def enumerate_sequences(F, Q, B, H, R, x, P, mu, transition, Z):
         now = sequences[:, k]
         if k:
             log_weight = log_weight + np.log(transition[sequences[:, k - 1], now])
-            x, P = kalman.predict(x, P, F[now], Q[now], B[now])
+            x, P, _ = kalman.predict(x, P, F[now], Q[now], B[now])
         updated = kalman.update(x, P, Z[k] - x @ H.T, H, R[k] if R.ndim == 3 else R)
         x, P, log_weight = updated.x, updated.P, log_weight + updated.log_likelihood
         xs.append(x)

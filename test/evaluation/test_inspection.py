@@ -70,7 +70,7 @@ def test_several_fixes_of_one_stamp_are_a_scan(tmp_path, capsys):
     assert topics['/fix']['problems'] == []
     assert topics['/fix']['scans'] == {'count': 4, 'most': 3}
     assert main(['info', str(tmp_path / 'bag')]) == 0
-    assert '7 messages, 1 Hz, 4 scans, up to 3 a scan, frame map' in capsys.readouterr().out
+    assert '7 messages, 1 Hz, 4 scans, up to 3 per scan, frame map' in capsys.readouterr().out
 
 
 def test_two_pings_of_one_stamp_are_a_problem(tmp_path):

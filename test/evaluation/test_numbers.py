@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sonar_imm.evaluation.numbers import (
-    belief_sentence,
     bounds_remark,
     chi2_line,
     chi2_summary,
+    coverage_sentence,
     error_line,
     error_summary,
     nis_summary,
@@ -16,10 +16,10 @@ from sonar_imm.evaluation.numbers import (
 
 
 @pytest.mark.parametrize(
-    'coverage, words', [(0.6, 'more sure'), (0.95, 'can be believed'), (1.0, 'more careful')]
+    'coverage, words', [(0.6, 'overconfident'), (0.95, 'is consistent'), (1.0, 'more cautious')]
 )
-def test_belief_is_put_in_words(coverage, words):
-    assert words in belief_sentence(coverage)
+def test_coverage_is_put_in_words(coverage, words):
+    assert words in coverage_sentence(coverage)
 
 
 def test_lines_name_the_unit_and_are_left_out_without_errors():

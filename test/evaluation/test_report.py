@@ -63,9 +63,9 @@ def test_the_page_is_whole_and_loads_nothing():
     assert page.headings[:5] == [
         'my <dive>.bag',
         'Map',
-        'Error, and the error it predicted',
+        'Error, and the predicted error',
         'Which motion model held',
-        'Surprise of each measurement (NIS)',
+        'Normalised innovations (NIS)',
     ]
     assert 'Refused input' in page.headings
     assert 'not &lt;b&gt;finite' in text and 'not <b>finite' not in text
@@ -78,7 +78,7 @@ def test_the_same_material_makes_the_same_bytes():
 def test_without_truth_the_stated_uncertainty_is_shown():
     page = Page(html(material(truth=False)))
     assert 'Stated uncertainty' in page.headings
-    assert 'Error, and the error it predicted' not in page.headings
+    assert 'Error, and the predicted error' not in page.headings
 
 
 def test_several_runs_share_a_page_without_sharing_ids():

@@ -157,7 +157,7 @@ def test_nested_metrics_become_flat_numbers():
         'list': [1.0],
         'far': math.inf,
     }
-    told = dict(sweeps.flat(metrics))
+    told = sweeps.finite_numbers(metrics)
     assert told == {'n': 3, 'a.b.c': 0.5, 'a.ok': 1}
     assert type(told['a.ok']) is int  # not True in a table
 

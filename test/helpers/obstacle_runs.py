@@ -150,10 +150,10 @@ def follow(measurements, config):
         if known is None:
             known = filter_.begin(z, R, sonar)
         else:
-            known = filter_.advance(known, before, sonar, 0.5)
+            known, _ = filter_.advance(known, before, sonar, 0.5)
             if len(z):
                 h, _ = filter_.expected(known, sonar)
-                known, squared = filter_.update(known, h, z, R, sonar)
+                known, squared, _ = filter_.update(known, h, z, R, sonar)
                 nis.append(squared[0])
         before = sonar
     return np.array(nis), filter_.view(known, sonar)

@@ -5,7 +5,7 @@ import pytest
 
 from msg_adapters.arrivals import read_arrivals, write_arrivals
 from msg_adapters.fixes import read_fix, write_fix
-from msg_adapters.headers import make_header, stamp_ns, to_enu, wrap
+from msg_adapters.headers import make_header, stamp_ns, to_enu
 from sonar_imm.measurements import Arrivals, Fix, Rejection
 from sonar_imm.recordings.messages import ros_message
 
@@ -94,10 +94,3 @@ def test_a_ned_frame_is_refused_under_enu_and_read_under_ned():
     assert as_read(fix(), 'enu').position.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match='enu, ned'):
         to_enu(fix(), 'nwu', lambda same: same)
-
-
-def test_wrap_stays_in_its_half_open_interval():
-    angles = np.linspace(-20.0, 20.0, 1001)
-    wrapped = wrap(angles)
-    assert (wrapped >= -np.pi).all() and (wrapped < np.pi).all()
-    assert np.allclose(np.exp(1j * wrapped), np.exp(1j * angles))

@@ -66,7 +66,7 @@ def parameters_of(bag, folder, *options):
 
 def test_track_uses_them_unless_told_otherwise(bag, tmp_path, capsys):
     assert parameters_of(bag, tmp_path / 'own')['sonar_lever'] == [2.0, 0.0, -0.3]
-    assert f'with the parameters of the recording, {bag}' in capsys.readouterr().out
+    assert f'using the parameters of the recording, {bag}' in capsys.readouterr().out
     changed = parameters_of(bag, tmp_path / 'set', '--set', 'components=5')
     assert changed['sonar_lever'] == [2.0, 0.0, -0.3] and changed['components'] == 5
     other = tmp_path / 'other.yaml'

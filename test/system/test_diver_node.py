@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from msg_adapters.fixes import write_fix
-from msg_adapters.frames import FrameGuard
-from sonar_imm.measurements import Fix, Rejection
+from sonar_imm.measurements import Fix, FrameGuard, Rejection
 from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id, run_lockstep
 from sonar_imm.nodes.link import LinkError
 from sonar_imm.recordings.measurements import measurements_of

@@ -1,7 +1,7 @@
-"""How runs of the bathymetry tracker are judged: a floor along each ping against the true floor.
+"""How runs of the bathymetry tracker are judged: the floor along each ping against the true floor.
 
-`profiles` lays estimate and truth of each ping side by side, `scoring` says how far apart they
-are. `summary`, `sections` and `figures` tell it; `bench` measures the filter beside its `peers`.
+`profiles` pairs estimate and truth of each ping, `scoring` compares them. `summary`, `sections`
+and `figures` present the result; `bench` measures the speed beside other filters (`peers`).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ..page import Part
 
 LIMIT = Limit(0.25, 'm', 'height RMSE')
-"""What a shipped recording must stay within, over all bins with an echo. On the scene of the paper
-the default reaches 0.15 m and MUSIC, which knows no terrain, 0.27 m."""
+"""Limit for the shipped recordings, over all bins with an echo. On the scene of the paper the
+default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""
 
 
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:

@@ -1,14 +1,17 @@
 """How fast the bathymetry tracker is, against other filters on the same pings in the same run.
 
-All see the complex64 snapshots of the paper's scene and are timed in turn, round after round; the
-best round counts, as the one least disturbed. What is timed of the tracker is `process`, the whole
-of it: variances, filter and estimate.
+All filters take the complex64 snapshots of the paper's scene and are timed in turn, round after
+round. The best round counts, because it is the least disturbed one. Of the tracker the whole of
+`process` is timed: variances, filter and estimate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 import math
+import os
 import time
 from typing import Any
 
@@ -16,9 +19,9 @@ import numpy as np
 
 from ...measurements import Snapshot
 from ...simulation.bathymetry.simulator import scenario, simulate
-from ...trackers.bathymetry.tracker import BathymetryTracker
+from ...trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from ..benches import Bench
-from .peers import config, cut, numpy_filter, stone_soup_filter
+from .peers import config, cut, numpy_filter, SIGMAS, stone_soup_filter
 
 PEER_BINS = 400
 GOAL, GOAL_RATIO = 80_000, 30
@@ -34,8 +37,8 @@ def a_ping(**values: Any) -> Snapshot:
 
 
 def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
-    """Bins a second of each method, the best of `rounds` rounds in turn; `methods` maps a name to
-    what to call and how many bins that does."""
+    """Bins per second of each method in the best of `rounds` rounds. `methods` maps a name to a
+    function and the number of bins that it processes."""
     best = dict.fromkeys(methods, math.inf)
     for run, _ in methods.values():
         run()
@@ -48,7 +51,7 @@ def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
 
 
 def engines(ping: Snapshot) -> dict[str, Timed]:
-    """The tracker as the peers have it, with its coherence gate, and with the exact grid."""
+    """The tracker with the settings of the peers, with its coherence gate, and with the grid."""
     variants: dict[str, dict[str, Any]] = {
         'particles': {'shadow_gate': False},
         'gated': {},
@@ -62,8 +65,8 @@ def engines(ping: Snapshot) -> dict[str, Timed]:
 
 
 def bench_numpy(rounds: int = 7) -> dict[str, Any]:
-    """Bins a second of the tracker and of the same filter in plain numpy; and how far their
-    estimates are apart, which has to be as little as Monte Carlo noise."""
+    """Bins per second of the tracker and of the same filter in plain numpy. Their estimates may
+    differ by no more than Monte Carlo noise."""
     ping = a_ping()
     short = cut(ping, PEER_BINS)
     peer: Timed = (lambda: numpy_filter(short), PEER_BINS)
@@ -81,11 +84,53 @@ def bench_numpy(rounds: int = 7) -> dict[str, Any]:
 
 
 def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
-    """Bins a second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
+    """Bins per second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
     short = cut(a_ping(), PEER_BINS)
     peer: Timed = (lambda: stone_soup_filter(short), PEER_BINS)
     speed = rates({'particles': engines(short)['particles'], 'stone_soup': peer}, min(rounds, 3))
     return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
+
+
+def bench_scaling(rounds: int = 7) -> dict[str, Any]:
+    """Bins a second with more models (M), more particles of each (N), more staves (P)."""
+    ping = a_ping()
+    variants: dict[str, tuple[dict[str, Any], Snapshot]] = {}
+    for M in (1, 2, 4, 8):
+        sigmas = tuple(np.geomspace(0.01, 1.0, M).tolist())
+        variants[f'M = {M}'] = {'model_set': 'height_bank', 'sigmas': sigmas}, ping
+    for N in (50, 100, 300, 1000):
+        variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
+    for P in (2, 4, 8, 16, 32):
+        variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
+    methods = {
+        name: (
+            partial(BathymetryTracker(BathymetryConfig(shadow_gate=False, **values)).process, one),
+            len(one),
+        )
+        for name, (values, one) in variants.items()
+    }
+    return {'bins_per_second': rates(methods, rounds)}
+
+
+def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
+    """Bins a second of one tracker, and of one in each of several threads: the kernels release
+    Python's lock. The best of `rounds` rounds in turn."""
+    ping = a_ping()
+
+    def together(trackers: list[BathymetryTracker]) -> None:
+        with ThreadPoolExecutor(len(trackers)) as pool:
+            list(pool.map(lambda one: [one.process(ping) for _ in range(pings)], trackers))
+
+    most = min(4, os.cpu_count() or 1)
+    groups = {
+        n: [BathymetryTracker(config(shadow_gate=False)) for _ in range(n)]
+        for n in sorted({1, most})
+    }
+    methods = {
+        str(n): (partial(together, trackers), n * pings * len(ping))
+        for n, trackers in groups.items()
+    }
+    return {'bins_per_second': rates(methods, min(rounds, 3))}
 
 
 def _heights(ping: Snapshot) -> np.ndarray:
@@ -111,7 +156,18 @@ def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
     )
 
 
+def _rates_sentence(result: Mapping[str, Any], what: str) -> str:
+    each = ', '.join(f'{name} {speed:,.0f}' for name, speed in result['bins_per_second'].items())
+    return f'{what}: {each} bins/s'
+
+
 BENCHES = (
     Bench('numpy', bench_numpy, _numpy_sentence),
     Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
+    Bench(
+        'scaling',
+        bench_scaling,
+        partial(_rates_sentence, what='models (M), particles of each (N), staves (P)'),
+    ),
+    Bench('threads', bench_threads, partial(_rates_sentence, what='trackers in so many threads')),
 )

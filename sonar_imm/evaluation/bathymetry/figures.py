@@ -21,7 +21,7 @@ FLOOR_DB = -20
 
 
 def profile_figure(profile: Profile) -> go.Figure:
-    """Height of the floor along one ping with its band, the truth and the true patch."""
+    """Height of the floor along one ping with its two-sigma band, the truth and the true patch."""
     figure = go.Figure()
     shown = thin(len(profile.range), MOST_BINS)
     ranges, height, std = profile.range[shown], profile.height[shown], profile.height_std[shown]
@@ -61,7 +61,7 @@ def profile_figure(profile: Profile) -> go.Figure:
 def spectrum_figure(
     profile: Profile, snapshot: Snapshot, spacing: float, method: str = 'capon'
 ) -> go.Figure:
-    """Angular pseudo-spectrum of one ping with the estimated and the true angle over it.
+    """Angular pseudo-spectrum of one ping, with the estimated and the true angle.
 
     spacing: distance between staves in wavelengths, negative for a conjugated array.
     """
@@ -135,7 +135,7 @@ def models_figure(profile: Profile, names: Iterable[str]) -> go.Figure:
 
 
 def segmentation_figure(swath: Swath) -> go.Figure:
-    """Probability of rough floor over pings and range, the ends of the true patches over it."""
+    """Probability of rough floor over pings and range, with the ends of the true patches."""
     pings = thin(len(swath.profiles), 400)
     profiles = swath.profiles[pings]
     longest = max(profiles, key=lambda profile: len(profile.range))
@@ -181,7 +181,7 @@ def segmentation_figure(swath: Swath) -> go.Figure:
 
 
 def _view(shown: FloatArray, angles: FloatArray) -> list[float]:
-    """Range of the angle axis: what was estimated with some room, inside what the array sees."""
+    """Range of the angle axis: the estimates with a margin, inside the view of the array."""
     known = shown[np.isfinite(shown)]
     if not len(known):
         return [float(angles[0]), float(angles[-1])]
@@ -201,7 +201,7 @@ def _mark_patches(figure: go.Figure, profile: Profile) -> None:
 
 
 def _mark_silence(figure: go.Figure, profile: Profile) -> None:
-    """Grey ticks at the bottom where no echo was heard."""
+    """Ticks at the bottom where there was no echo."""
     silent = profile.range[~profile.heard]
     if len(silent):
         silent = silent[thin(len(silent), MOST_BINS)]

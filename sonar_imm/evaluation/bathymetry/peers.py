@@ -1,9 +1,10 @@
 """Other filters for the same floor, to compare speed and result with.
 
-`numpy_filter` is the IMM particle filter written as one would: all particles of a model at once,
-one bin after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup: not
-the same algorithm (one set of particles that carry their model), with the same law and as many
-particles in all. Both suppose the scene of the paper, two random walks and noise of unit variance.
+`numpy_filter` is the IMM particle filter in plain numpy: all particles of a model at once, one bin
+after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup. That is
+another algorithm (one set of particles that carry their model) with the same likelihood and as
+many particles in all. Both suppose the scene of the paper, two random walks and noise of unit
+variance.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ HEIGHT, TILT, SPACING = 15.0, math.radians(30.0), 0.5
 
 
 def config(**values: Any) -> BathymetryConfig:
-    """Parameters under which the tracker does what the peers do."""
+    """Parameters with which the tracker computes what the peers compute."""
     defaults = {'sigmas': SIGMAS, 'initial_std': 1.0, 'transition_matrix': tuple(CHAIN.ravel())}
     return BathymetryConfig(**{**defaults, **values})
 
 
-class NumpyLaw:
-    """The Laplace law of all bins of a ping over heights."""
+class NumpyLikelihood:
+    """Log likelihood of heights for every bin of a ping, complex Laplace, without constants."""
 
     def __init__(self, ping: Snapshot):
         self.range, self.P = ping.range, ping.staves
@@ -43,7 +44,7 @@ class NumpyLaw:
         self.c = autocorrelation(ping.iq)
         self.kappa = rho / (1.0 + self.P * rho)
 
-    def log_density(self, t: int, height: FloatArray) -> FloatArray:
+    def log_likelihood(self, t: int, height: FloatArray) -> FloatArray:
         ratio = (HEIGHT - height) / self.range[t]
         with np.errstate(invalid='ignore'):
             u = ratio * math.cos(TILT) - np.sqrt(1.0 - ratio**2) * math.sin(TILT)
@@ -56,7 +57,7 @@ class NumpyLaw:
 
 def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatArray:
     """Mean height (T,) by the IMM particle filter, one bin after the other."""
-    law, rng, N = NumpyLaw(ping), np.random.default_rng(seed), particles
+    likelihood, rng, N = NumpyLikelihood(ping), np.random.default_rng(seed), particles
     x, w = rng.normal(size=(2, N)), np.full((2, N), 1.0 / N)
     mu, sigma = np.array([0.5, 0.5]), np.array(SIGMAS)[:, None]
     mean = np.empty(len(ping))
@@ -70,7 +71,7 @@ def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatAr
             index = np.searchsorted(cumulative, points[j] * cumulative[-1])
             drawn[j] = x.ravel()[np.minimum(index, 2 * N - 1)]
         x = drawn + sigma * rng.standard_normal((2, N))
-        log_q = law.log_density(t, x)
+        log_q = likelihood.log_likelihood(t, x)
         q = np.exp(log_q - log_q.max())
         total = q.sum(axis=1)
         w = q / np.maximum(total, 1e-300)[:, None]
@@ -93,10 +94,10 @@ def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
     from stonesoup.types.state import MultiModelParticleState
     from stonesoup.updater.particle import MultiModelParticleUpdater
 
-    class Law(MeasurementModel):
-        """A detection is the number of its bin; the law knows the samples."""
+    class Likelihood(MeasurementModel):
+        """A detection is the number of its bin; the likelihood has the samples."""
 
-        law: NumpyLaw = Property()
+        likelihood: NumpyLikelihood = Property()
         ndim_meas = 1
 
         def function(self, state, noise=False, **kwargs):
@@ -110,12 +111,12 @@ def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
 
         def logpdf(self, state1, state2, **kwargs):
             heights = np.asarray(state2.state_vector[0, :], np.float64)
-            return self.law.log_density(int(state1.state_vector[0, 0]), heights)
+            return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
 
     # Stone Soup scales the variance with the time step, which is one second here.
     predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
-    law = Law(ndim_state=1, mapping=(0,), law=NumpyLaw(ping))
-    updater = MultiModelParticleUpdater(law, predictor, SystematicResampler())
+    model = Likelihood(ndim_state=1, mapping=(0,), likelihood=NumpyLikelihood(ping))
+    updater = MultiModelParticleUpdater(model, predictor, SystematicResampler())
     np.random.seed(0)
     start = datetime(2026, 1, 1)
     state = MultiModelParticleState(
@@ -137,6 +138,7 @@ def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
 
 
 def cut(ping: Snapshot, bins: int) -> Snapshot:
+    """The first `bins` bins of a ping."""
     return Snapshot(
         stamp_ns=ping.stamp_ns,
         range=ping.range[:bins],

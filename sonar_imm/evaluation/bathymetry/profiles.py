@@ -11,14 +11,14 @@ from ...estimates import Estimate
 from ...estimation.arrays import BoolArray, FloatArray
 
 FAR = 0.55
-"""Share of a bin by which the range of a true floor may differ from that of an estimate. Half a
-bin, and what single precision adds."""
+"""Share of a bin by which the range of the true floor may differ from that of the estimate: half a
+bin, and a margin for single precision."""
 
 
 @frozen(eq=False)
 class TrueFloor:
-    """The true floor at the bins of one ping (n,): height m and angle rad, NaN where unknown;
-    patch: rough there; echo: neither shadow nor water column."""
+    """The true floor at the bins of one ping, each (n,): height m and angle rad, NaN where
+    unknown; patch: rough floor; echo: neither shadow nor water column."""
 
     height: FloatArray
     angle: FloatArray
@@ -28,8 +28,8 @@ class TrueFloor:
 
 @frozen(eq=False)
 class Profile:
-    """What the tracker said of one ping (n,): height m, angle rad, their standard deviations, and
-    probabilities (n, M) of its models; heard: bins with an echo; truth: None where unknown."""
+    """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
+    probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown."""
 
     stamp_ns: int
     range: FloatArray
@@ -51,14 +51,14 @@ class Swath:
     rough: BoolArray
 
     def roughness(self, profile: Profile) -> FloatArray:
-        """Probability (n,) that the floor is rough; NaN when the models do not tell."""
+        """Probability (n,) that the floor is rough; NaN when no model means rough floor."""
         if not self.rough.any():
             return np.full(len(profile.range), np.nan)
         return profile.probabilities[:, self.rough].sum(axis=1)
 
 
 def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None) -> Swath:
-    """Lay out the estimates of a run, each beside the truth of the same stamp."""
+    """The estimates of a run, each with the truth of the same stamp."""
     known = {one.stamp_ns: one for one in truth or ()}
     profiles, names = [], ()
     for estimate in estimates:
@@ -68,8 +68,8 @@ def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None)
 
 
 def rough_models(names: tuple[str, ...]) -> BoolArray:
-    """Which models (M,) mean rough floor: the random walk beside a constant slope, else the upper
-    half of a bank, whose noise grows from model to model. None of a single model."""
+    """Which models (M,) mean rough floor. Beside a constant slope it is the random walk, in a
+    bank, whose noise grows from model to model, the upper half. A single model never does."""
     if 'ncs' in names:
         return np.array([name == 'rw' for name in names])
     rough = np.arange(len(names)) >= len(names) // 2

@@ -1,9 +1,8 @@
-"""How far estimated floors lie from true ones, whether the stated error holds, and whether the
-rough floor was found.
+"""Scores of estimated floors: errors, coverage of the stated band, and segmentation.
 
-Heights and angles are scored in bins with an echo; shadows apart, since nothing is known there but
-what the models carry across. The segmentation is scored by the labels: rough where rough models
-have more than half of the probability.
+Heights and angles are scored in bins with an echo. Shadows are scored apart, because there the
+estimate is a prediction of the models. The segmentation is scored by labels: rough where the rough
+models have more than half of the probability.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from ..numbers import error_summary
 from .profiles import BoolArray, Profile, Swath, TrueFloor
 
 BAND = 2.0
-"""Standard deviations to either side that the band in figures and scores has."""
+"""Half width of the band in figures and scores, in standard deviations."""
 
 _PLACES: dict[str, Callable[[TrueFloor], BoolArray]] = {
     'all': lambda truth: truth.echo,
@@ -30,7 +29,7 @@ _PLACES: dict[str, Callable[[TrueFloor], BoolArray]] = {
 
 
 def score(swath: Swath) -> dict[str, Any]:
-    """Everything that can be said of a run, as plain numbers; less without truth."""
+    """All metrics of a run as plain numbers; without truth only those that need none."""
     profiles = swath.profiles
     stamps = [profile.stamp_ns for profile in profiles]
     metrics: dict[str, Any] = {
@@ -71,7 +70,7 @@ def _errors(known: list[Profile]) -> dict[str, Any]:
 
 
 def _gate(known: list[Profile]) -> dict[str, Any]:
-    """Whether shadow and echo were told apart."""
+    """How well the gate tells shadow from echo."""
     shadow = [profile.heard[_PLACES['shadow'](profile.truth)] for profile in known]
     echo = [profile.heard[profile.truth.echo] for profile in known]
     return {
@@ -82,7 +81,7 @@ def _gate(known: list[Profile]) -> dict[str, Any]:
 
 
 def segmentation(swath: Swath, known: list[Profile]) -> dict[str, Any]:
-    """Overlap of the labels with the true patches, and how late their ends are noticed."""
+    """Overlap of the labels with the true patches, and by how many bins their ends are late."""
     both = either = rough = true = 0
     late_in, late_out, missed = [], [], 0
     for profile in known:

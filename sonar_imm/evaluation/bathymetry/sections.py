@@ -83,8 +83,8 @@ def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
     sections = [
         Section(
             'Profile of the floor',
-            'Height along one ping. Dotted: truth. Shaded: where the floor should be 95 times in '
-            f'a hundred; blue ground: the true rough patch.{which}',
+            'Height along one ping. Dotted: truth. Shaded: two standard deviations, which should '
+            f'hold 95 % of the truth. Blue: the true rough patch.{which}',
             figures.profile_figure(profile),
         )
     ]
@@ -92,9 +92,9 @@ def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
         spacing = spacing_of(snapshot, BathymetryConfig.from_mapping(run['parameters']))
         sections.append(
             Section(
-                'What the array hears, and what the tracker makes of it',
-                'Light: sound from there (Capon spectrum of the samples, 11 bins at a time, no '
-                f'terrain model). Over it the estimated angle.{which}',
+                'Pseudo-spectrum and estimated angle',
+                'Light: directions with much sound (Capon spectrum of the samples, 11 bins at a '
+                f'time, no terrain model). Line: the estimated angle.{which}',
                 figures.spectrum_figure(profile, snapshot, spacing),
             )
         )
@@ -109,7 +109,7 @@ def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
         sections.append(
             Section(
                 'Rough floor over the whole run',
-                'One row a ping. Dark: rough with great probability.',
+                'One row per ping. Dark: probably rough.',
                 figures.segmentation_figure(swath),
             )
         )

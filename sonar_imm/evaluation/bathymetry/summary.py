@@ -1,4 +1,4 @@
-"""The scores of a run of sea floors in words and lines for people."""
+"""The scores of a bathymetry run as sentences and lines of text."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from ..numbers import error_line
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
-    """The result in plain words."""
+    """The result in a few sentences."""
     height = metrics.get('height', {}).get('all', {})
     if not height.get('n'):
         return (
             f'{metrics["pings"]} pings with {metrics["bins"]} range bins, of which '
             f'{percent(metrics["heard_share"])} have an echo. There is no truth to compare with, '
-            'so this page shows what the tracker says of itself.'
+            'so only the estimates and their stated uncertainty are shown.'
         )
-    words = [f'On average the floor lies {height["rmse_m"]:.2f} m from the truth (RMS)']
+    sentences = [f'On average the floor lies {height["rmse_m"]:.2f} m from the truth (RMS)']
     patch, smooth = metrics['height']['patch'], metrics['height']['smooth']
     if patch['n'] and smooth['n']:
-        words[0] += (
+        sentences[0] += (
             f': {smooth["rmse_m"]:.2f} m where it is smooth, {patch["rmse_m"]:.2f} m in rough '
             'patches'
         )
-    words[0] += '.'
-    words.append(
+    sentences[0] += '.'
+    sentences.append(
         f'{percent(metrics["inside_band"]["all"])} of the bins lie inside the band of two '
         'standard deviations; 95 % would be perfect.'
     )
     found = metrics.get('segmentation', {})
     if found.get('patches'):
-        words.append(
+        sentences.append(
             f'What is labelled rough and what is rough overlap by {percent(found["iou"])}.'
         )
-    return ' '.join(words)
+    return ' '.join(sentences)
 
 
 def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the numbers a person wants to see first."""
+    """Title and value of the most important numbers."""
     result = [
         ('pings, range bins', f'{metrics["pings"]}, {metrics["bins"]}'),
         ('bins with an echo', percent(metrics['heard_share'])),
@@ -73,5 +73,5 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def percent(share: float) -> str:
-    """A share as per cent, '-' when it is unknown."""
+    """A share in percent, '-' when it is unknown."""
     return '-' if math.isnan(share) else f'{100.0 * share:.0f} %'

@@ -1,8 +1,8 @@
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
-`series` lays estimates end to end, `truth` says where the divers were, `matching` which track is
-whose, `scoring` how far off. `summary`, `sections` and `figures` tell it; `bench` measures the
-filter.
+`series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
+belongs to which diver, `scoring` compares them. `summary`, `sections` and `figures` present the
+result; `bench` measures the speed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from ..page import Part
 
 LIMIT = Limit(1.25, 'm', 'position RMSE')
-"""What a shipped recording must stay within. The raw fixes of Table 1 have 1.71 m and its best
-tracker 0.85 m on average; one recording is not an average."""
+"""Limit for the shipped recordings. The raw fixes of Table 1 have 1.71 m and its best tracker
+0.85 m on average; one recording can be worse than the average."""
 
 CUTOFF = 10.0
 """Metres from which an estimate is on no diver, where there are several."""

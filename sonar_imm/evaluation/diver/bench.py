@@ -1,8 +1,8 @@
-"""How fast the diver filter is, against FilterPy doing the same sums in the same run.
+"""How fast the diver filter is, against FilterPy with the same computation in the same run.
 
-Times of one machine at one moment say little; ratios of two programs measured in turn say much.
-Each round times both, one after the other, and the median of the rounds' ratios is reported. That
-both did the same work is checked: their estimates have to agree.
+Times depend on the machine and its load; the ratio of two programs measured in turn hardly does.
+Each round times both, one after the other, and the median of the ratios is reported. Their
+estimates have to agree, which shows that both did the same work.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Problem:
 
 
 def problem(steps: int, seed: int = 0) -> Problem:
-    """A target that turns this way and that. The transition matrix is not symmetric."""
+    """A target that turns left and right. The transition matrix is not symmetric."""
     rng = np.random.default_rng(seed)
     rates = np.radians(np.linspace(-40.0, 40.0, MODELS))
     F = np.array([turn(rate) for rate in rates])
@@ -154,7 +154,7 @@ def _scan(
     targets = len(x)
     H = np.tile(p.H, (1, MODELS, 1, 1))
     x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
-    x, P = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
+    x, P, _ = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
     expected = np.ascontiguousarray(x[:, :, :2])
     fit = imm_kernels.gate(
         expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2)

@@ -54,7 +54,7 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
         )
     for order, track_id in enumerate(_tracks_by_length(series)):
         _add_track(figure, series.pick(series.track_id == track_id), order)
-    # Clutter can lie anywhere: the first view is of the tracks and the truth, the rest by zoom.
+    # Clutter can lie anywhere: the first view shows tracks and truth, the rest by zooming out.
     paths = truth.paths if truth else ()
     x_range, y_range = view_of(
         np.concatenate([series.state[:, :2], *(path.state[:, :2] for path in paths)])
@@ -65,7 +65,7 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
 
 
 def view_of(points: FloatArray) -> tuple[list[float] | None, list[float] | None]:
-    """Ranges of x and y with some room around `points` (n, 2); None, None without points."""
+    """Ranges of x and y with a margin around `points` (n, 2); None, None without points."""
     if not len(points):
         return None, None
     low, high = points.min(axis=0), points.max(axis=0)
@@ -104,7 +104,7 @@ def _add_track(figure: go.Figure, track: Series, order: int) -> None:
 
 
 def error_figure(matching: Matching, track_id: int) -> go.Figure:
-    """Error in x and y of one track, over the band the tracker said it would stay in."""
+    """Error in x and y of one track, over the 95 % band that the tracker predicted."""
     rows = matching.series.track_id[matching.row] == track_id
     row = matching.row[rows]
     order = np.argsort(matching.series.stamp_ns[row], kind='stable')
@@ -133,7 +133,7 @@ def error_figure(matching: Matching, track_id: int) -> go.Figure:
 
 
 def sigma_figure(series: Series, track_id: int) -> go.Figure:
-    """Without truth: only the uncertainty the tracker states, over time."""
+    """Stated standard deviations over time, for runs without truth."""
     track = series.pick(series.track_id == track_id)
     figure = go.Figure()
     for axis, name in enumerate('xy'):
@@ -216,7 +216,7 @@ def model_order(names: tuple[str, ...]) -> list[int]:
 
 
 def model_label(name: str) -> str:
-    """What to print for a model: ``heading_022`` is ``22°``."""
+    """Label of a model: ``heading_022`` gives ``22°``."""
     return f'{int(name[8:])}°' if name.startswith('heading_') and name[8:].isdigit() else name
 
 

@@ -1,9 +1,9 @@
-"""Which estimate belongs to which true target, stamp by stamp, and what follows for the tracks.
+"""Which estimate belongs to which true target, stamp by stamp, and the metrics of whole tracks.
 
-One target and never more than one track: they belong together, however far apart; an error is not
-explained away. Otherwise the rows of each stamp are assigned to the true targets by least total
-distance (Hungarian method), and pairs further apart than the cut-off are no pairs: the target was
-missed and the track false.
+With one target and never more than one track they belong together, however far apart, so that no
+large error is left out. Otherwise the rows of each stamp are assigned to the true targets by least
+total distance (Hungarian method). Pairs further apart than the cutoff do not count: the target was
+missed and the track is false.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
 
 
 def assign(distance: FloatArray, limit: float) -> list[tuple[int, int]]:
-    """Pairs (row, column) of least total cost; those not nearer than `limit` are left apart."""
+    """Pairs (row, column) of least total distance, without those at `limit` or beyond."""
     cost = np.where(np.isfinite(distance), np.minimum(distance, limit), 1e12)
     return [
         (int(row), int(column))
@@ -98,11 +98,11 @@ def _one_to_one(series: Series, truth: Truth) -> bool:
 
 
 def track_summary(matching: Matching) -> dict[str, float]:
-    """How whole the tracks are, in counts.
+    """Counts that describe whole tracks.
 
-    identity_switches: a target is taken over by another track id. fragmentations: a target is lost
-    and found again. false_tracks: tracks on no target for most of their life.
-    completeness: share of (target, stamp) pairs that were found.
+    identity_switches: how often a target is taken over by another track id. fragmentations: how
+    often a target is lost and found again. false_tracks: tracks that are on no target for most of
+    their life. completeness: share of (target, stamp) pairs that were found.
     """
     series = matching.series
     found = matching.followed_by != -1

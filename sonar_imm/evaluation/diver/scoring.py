@@ -1,13 +1,13 @@
-"""Scores of a tracked recording: how far from the truth, and whether the stated uncertainty holds.
+"""Scores of a tracked recording: errors, and whether the stated uncertainty holds.
 
 `score` gives one nested dict of plain numbers, which is `metrics.json`:
 
 position, velocity   RMSE, median and 95 % point of the error of confirmed tracks
-raw_fix              the same of the fixes as they came, the number a tracker has to beat
-lag                  the shift of truth that makes the error smallest: late stamps, a towed tag
-consistency          NEES and NIS against their chi-square bounds, coverage of the ellipses
+raw_fix              the same for the raw fixes, which a tracker has to beat
+lag                  the shift of truth with the smallest error: late stamps, a towed tag
+consistency          NEES and NIS with their chi-square bounds, coverage of the ellipses
 tracks, gospa        several targets: identity switches, losses, false tracks, and GOSPA
-models               how probable each motion model was, and how often the leading one changed
+models               probability of each motion model, and how often the most probable one changed
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def score(
     fixes: Series | None = None,
     cutoff: float = 10.0,
 ) -> dict[str, Any]:
-    """All metrics of a run. Without `truth` only what needs none: NIS, models, counts.
+    """All metrics of a run. Without `truth` only those that need none: NIS, models, counts.
 
-    fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is off target.
+    fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is on no target.
     """
     confirmed = series.confirmed()
     hits = confirmed.hits()
@@ -117,7 +117,8 @@ def truth_consistency(matching: Matching) -> dict[str, Any]:
 
 
 def model_summary(series: Series) -> dict[str, Any]:
-    """Mean probability and share of leading of each model; changes of the leader a minute."""
+    """Mean probability of each model, the share of rows in which it is the most probable one, and
+    how often per minute the most probable one changes."""
     if not len(series) or not series.model_names:
         return {}
     leader = np.argmax(series.probabilities, axis=1)
@@ -138,7 +139,7 @@ def model_summary(series: Series) -> dict[str, Any]:
 
 
 def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, float]:
-    """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and the parts it is made of."""
+    """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and its parts."""
     series, states = matching.series, truth.at(matching.scan_ns)
     starts = np.searchsorted(series.stamp_ns, matching.scan_ns, side='left')
     ends = np.searchsorted(series.stamp_ns, matching.scan_ns, side='right')
@@ -159,7 +160,7 @@ def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, 
 def best_lag(matching: Matching, truth: Truth) -> dict[str, float]:
     """The lag of `Truth.shifted` with the least RMSE: a coarse search, then a fine one.
 
-    Positive: the estimates agree best with truth that much later. The pairs stay as they are.
+    Positive: the estimates agree best with the truth that much later. The pairing is kept.
     """
     stamp_ns = matching.series.stamp_ns[matching.row]
     position = matching.series.state[matching.row, :2]

@@ -22,7 +22,7 @@ from .truth import Truth
 
 @frozen(eq=False, kw_only=True)
 class Material:
-    """What the page is made from. run: content of ``run.json``; metrics: of ``metrics.json``."""
+    """What the page shows. run: content of ``run.json``; metrics: of ``metrics.json``."""
 
     run: Mapping[str, Any]
     metrics: Mapping[str, Any]
@@ -106,8 +106,8 @@ def _sections(material: Material) -> list[Section]:
     sections = [
         Section(
             'Map',
-            'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: the ellipses that '
-            'should hold the target 95 times in a hundred.',
+            'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: ellipses that should '
+            'hold the target 95 % of the time.',
             figures.map_figure(series, material.truth, material.fixes),
         )
     ]
@@ -124,9 +124,8 @@ def _track_sections(material: Material, series: Series, track_id: int) -> list[S
         matching = match(series, material.truth, cutoff=material.metrics['cutoff_m'])
         sections.append(
             Section(
-                'Error, and the error it predicted',
-                'A tracker that knows its limits keeps its error '
-                f'inside the band 95 % of the time.{which}',
+                'Error, and the predicted error',
+                f'The error of a consistent tracker lies inside the band 95 % of the time.{which}',
                 figures.error_figure(matching, track_id),
             )
         )
@@ -151,9 +150,9 @@ def _track_sections(material: Material, series: Series, track_id: int) -> list[S
     if len(hits):
         sections.append(
             Section(
-                'Surprise of each measurement (NIS)',
-                'How far each measurement fell from where it was expected, in units of the stated '
-                'uncertainty. Amber: where the mean should stay.',
+                'Normalised innovations (NIS)',
+                'Distance of each measurement from its prediction, in units of the stated '
+                'uncertainty, squared. Amber: where the mean should stay.',
                 nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, hits.nis_dof),
             )
         )
@@ -163,7 +162,7 @@ def _track_sections(material: Material, series: Series, track_id: int) -> list[S
 def _true_course(
     material: Material, series: Series, track_id: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Seconds and degrees of the true course of the target a track followed; None if unknown."""
+    """Seconds and degrees of the true course of the target of a track; None when unknown."""
     relative = material.run.get('parameters', {}).get('model_set') == 'relative_headings'
     if material.truth is None or relative or 'position' not in material.metrics:
         return None

@@ -1,8 +1,8 @@
-"""Estimates as flat arrays: what scoring and reports work on, whatever made the estimates.
+"""Estimates as flat arrays, for scoring and reports.
 
-A run is a list of `Estimate`, one a stamp, with one row a track. Scoring wants the opposite: long
-columns over the whole run, from which the rows of a track or of a stamp can be picked. `Series`
-holds them, sorted by stamp.
+A run is a list of `Estimate`, one per stamp, each with one row per track. Scoring needs columns
+over the whole run, from which the rows of a track or of a stamp can be picked. `Series` holds
+them, sorted by stamp.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Series:
         return self.pick(self.track_state > 0)
 
     def hits(self) -> Series:
-        """The rows that took a measurement in."""
+        """The rows that were updated by a measurement."""
         return self.pick(np.isfinite(self.nis) & (self.nis_dof > 0))
 
     def longest_track(self) -> int | None:
@@ -78,7 +78,7 @@ _ROW_FIELDS = (
 
 
 def series_of(estimates: Iterable[Estimate]) -> Series:
-    """Lay `estimates` end to end, sorted by stamp.
+    """Concatenate `estimates`, sorted by stamp.
 
     Truth tables, which state no covariance and no model, work too. Raises ValueError when there
     is no column px or py, or when the models change from one estimate to another.

@@ -1,29 +1,29 @@
-"""The scores of a run of divers in words and lines for people."""
+"""The scores of a diver run as sentences and lines of text."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from ..numbers import belief_sentence, chi2_line, error_line
+from ..numbers import chi2_line, coverage_sentence, error_line
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
-    """The result in plain words."""
+    """The result in a few sentences."""
     position = metrics.get('position', {})
     if not position.get('n'):
         known = 'scored_stamps' in metrics
         return f'{metrics["tracks_confirmed"]} confirmed tracks in {metrics["span_s"]:.0f} s. ' + (
-            'None of them met the truth.'
+            'None of them was matched with the truth.'
             if known
-            else 'There is no truth to compare '
-            'with, so this page shows what the tracker says of itself.'
+            else 'There is no truth to compare with, so only the estimates and their stated '
+            'uncertainty are shown.'
         )
-    words = [f'On average the track lies {position["rmse_m"]:.2f} m from the truth (RMS).']
+    sentences = [f'On average the track lies {position["rmse_m"]:.2f} m from the truth (RMS).']
     raw = metrics.get('raw_fix', {})
     if raw.get('n'):
         change = 1.0 - position['rmse_m'] / raw['rmse_m']
-        words.append(
+        sentences.append(
             f'The raw fixes lie {raw["rmse_m"]:.2f} m away: tracking '
             + (
                 f'removes {100 * change:.0f} % of the error.'
@@ -31,12 +31,12 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
                 else f'adds {-100 * change:.0f} % to it.'
             )
         )
-    words.append(belief_sentence(metrics['consistency']['coverage']['95']))
-    return ' '.join(words)
+    sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
+    return ' '.join(sentences)
 
 
 def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the numbers a person wants to see first."""
+    """Title and value of the most important numbers."""
     consistency = metrics['consistency']
     result = [
         *error_line('position error', metrics.get('position', {}), 'm'),

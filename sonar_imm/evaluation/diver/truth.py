@@ -1,8 +1,8 @@
-"""Truth, and what it says at the stamps of the estimates.
+"""Truth, interpolated to the stamps of the estimates.
 
-Truth comes at its own rate (GPS once a second, a simulation each step). Between two truth points
-position and velocity are interpolated linearly; beyond the ends, and across gaps longer than a
-limit, truth is unknown and nothing is scored there.
+Truth has its own rate (GPS once per second, a simulation at each step). Between two points
+position and velocity are interpolated linearly. Beyond the ends, and in gaps longer than a limit,
+truth is unknown and nothing is scored.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ class Truth:
         return len(self.paths)
 
     def shifted(self, lag: float) -> Truth:
-        """The same truth told `lag` seconds earlier: an estimate at t meets truth of t + lag."""
+        """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
+        lag."""
         shift = round(lag * SECOND)
         return Truth(
             tuple(

@@ -1,7 +1,8 @@
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
-`records` lays estimates and truth side by side, `scoring` compares them: how many there are, where
-they are, how strong. `summary`, `sections` and `figures` tell it; `bench` measures the filter.
+`records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
+reflectors. `summary`, `sections` and `figures` present the result; `fixed_order` shows filters of
+a fixed number for comparison; `bench` measures the speed.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
     from ..page import Part
 
 LIMIT = Limit(0.08, 'm', 'OSPA')
-"""What a shipped recording must stay within. The best configuration has 0.05 m on average over
-long drifts, and one recording is not an average."""
+"""Limit for the shipped recordings. The best configuration has 0.05 m on average over long drifts;
+one recording can be worse than the average."""
 
 
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:

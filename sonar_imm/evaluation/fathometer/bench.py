@@ -1,21 +1,24 @@
 """How fast the reflector filter is, against the likelihood by least squares over the whole trace.
 
-What makes a particle cheap is that its likelihood needs the responses at its reflectors alone,
-O(m^2). The textbook way fits the pulses to all N samples of the trace, O(N m^2) in numpy. Both
-are timed in turn, and their values have to agree.
+A particle is cheap because its likelihood needs the response at its reflectors only, O(m^2). The
+textbook way fits the pulses to all N samples of the trace, O(N m^2). Both are timed in turn, and
+their values have to agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 import time
 from typing import Any
 
 import numpy as np
 
+from ...acoustics.fathometer import coherence, steering
 from ...acoustics.pulse import band_pulse
+from ...acoustics.spectra import outer_sum, SnapshotStream
 from ...estimation.arrays import FloatArray
-from ...measurements import Trace
+from ...measurements import CrossSpectra, Trace
 from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from ..benches import Bench
 
@@ -65,9 +68,59 @@ def bench_record(records: int = 12) -> dict[str, Any]:
     }
 
 
+def bench_threads(threads: int = 4, records: int = 9) -> dict[str, Any]:
+    """Milliseconds of a record on one core and on `threads`, which must give the same bytes."""
+    median, said = {}, []
+    for count in (1, threads):
+        rng = np.random.default_rng(0)
+        tracker = FathometerTracker(FathometerConfig(particles=PARTICLES, threads=count))
+        times, states = [], b''
+        for record in range(records):
+            one = trace(record, rng)
+            begin = time.perf_counter()
+            estimates = tracker.process(one)
+            times.append(1e3 * (time.perf_counter() - begin))
+            states += b''.join(e.state.tobytes() + e.probabilities.tobytes() for e in estimates)
+        median[str(count)] = float(np.median(times[3:]))
+        said.append(states)
+    return {'median_ms': median, 'same_bytes': said[0] == said[1], 'good': said[0] == said[1]}
+
+
+def bench_array(
+    rounds: int = 7, snapshots: int = 64, length: int = 16_800, phones: int = 32
+) -> dict[str, Any]:
+    """Milliseconds from pressure to depth responses, for `snapshots` of `length` samples (90 s of
+    a real array): transforms, cross-spectra, the checks of their measurement, the processors."""
+    rng = np.random.default_rng(0)
+    blocks = rng.standard_normal((snapshots, length, phones), np.float32)
+    band = slice(length // 240, length // 3)
+
+    def transform() -> np.ndarray:
+        stream = SnapshotStream(length, length, band)
+        return np.concatenate([stream.push(block) for block in blocks])
+
+    spectra = transform()
+    R = outer_sum(spectra) / np.float32(snapshots)
+    frequency = np.arange(band.start, band.stop) / 1.4
+    w = steering(frequency, 0.18 * np.arange(phones), 1500.0)
+    works: dict[str, Callable[[], Any]] = {
+        'transforms': transform,
+        'cross-spectra': lambda: outer_sum(spectra),
+        'their checks': lambda: CrossSpectra(stamp_ns=1, frequency=frequency, csdm=R),
+        **{name: partial(coherence, R, w, name) for name in ('conventional', 'mvdr')},
+    }
+    times = {
+        name: float(np.median([_seconds(work) for _ in range(min(rounds, 3))]))
+        for name, work in works.items()
+    }
+    times['white_noise'] = _seconds(coherence, R, w, 'white_noise')
+    return {'snapshots': snapshots, 'ms': {name: 1e3 * spent for name, spent in times.items()}}
+
+
 def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
-    """Microseconds of the log likelihood ratio of one set of eight: from G and b at its places,
-    in plain numpy, and by least squares over the trace; and of a whole particle of the tracker."""
+    """Microseconds of the log likelihood ratio of one set of eight reflectors, in plain numpy:
+    from G and b at their depths, and by least squares over the trace. Also those of a whole
+    particle of the tracker."""
     rng = np.random.default_rng(1)
     lattice = STEP * np.arange(SAMPLES)
     pulse = band_pulse(50.0, 4000.0, 1500.0)
@@ -99,8 +152,9 @@ def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
 
 
 def whitened_pulses(pulse: Any, lattice: FloatArray) -> FloatArray:
-    """What each depth leaves on the data before they are correlated with the pulse, one column a
-    depth: an orthonormal basis of the band, so that the Gram matrix is that of the pulse."""
+    """Signature of each depth in the data before they are correlated with the pulse, one column
+    per depth: the square root of the pulse's spectrum, so that the Gram matrix is that of the
+    pulse."""
     length, step = len(lattice), float(lattice[1] - lattice[0])
     size = length + 200  # a circle with some room between its ends
     lags = step * np.minimum(np.arange(size), size - np.arange(size))
@@ -119,7 +173,7 @@ def _by_gram(b: FloatArray, gram: FloatArray, places: np.ndarray) -> FloatArray:
 
 
 def _by_least_squares(x: FloatArray, shapes: FloatArray, places: np.ndarray) -> FloatArray:
-    """Half of what the residual sum of squares loses by fitting each set to all samples."""
+    """Half of the decrease of the residual sum of squares by fitting each set to all samples."""
     values = np.empty(len(places))
     for k, z in enumerate(places):
         A = shapes[:, z]
@@ -151,7 +205,20 @@ def _likelihood_sentence(result: Mapping[str, Any]) -> str:
     )
 
 
+def _threads_sentence(result: Mapping[str, Any]) -> str:
+    each = ', '.join(f'{ms:.1f} ms on {count}' for count, ms in result['median_ms'].items())
+    same = 'the same bytes' if result['same_bytes'] else 'OTHER BYTES'
+    return f'a record on so many threads: {each}; {same}'
+
+
+def _array_sentence(result: Mapping[str, Any]) -> str:
+    each = ', '.join(f'{name} {spent:,.0f} ms' for name, spent in result['ms'].items())
+    return f'{result["snapshots"]} snapshots of 32 phones: {each}'
+
+
 BENCHES = (
     Bench('record', lambda rounds: bench_record(), _record_sentence),
     Bench('likelihood', bench_likelihood, _likelihood_sentence),
+    Bench('threads', lambda rounds: bench_threads(), _threads_sentence),
+    Bench('array', bench_array, _array_sentence),
 )

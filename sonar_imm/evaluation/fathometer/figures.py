@@ -1,5 +1,4 @@
-"""Figures of a run of reflectors: the response with the tracks over it, the number of reflectors,
-amplitudes, distance from the truth."""
+"""Figures of a run of reflectors: response and tracks, number of reflectors, amplitudes, OSPA."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ MOST_DEPTHS, MOST_RECORDS = 500, 1500
 
 
 def response_figure(image: Image | None, records: Sequence[Record], start_ns: int) -> go.Figure:
-    """The response as an image, the truth as dots and the tracks as lines over it."""
+    """The response as an image, with the truth as dots and the tracks as lines."""
     figure = go.Figure()
     if image is not None:
         image = _thinned(image)
@@ -84,8 +83,7 @@ def order_figure(records: Sequence[Record], start_ns: int) -> go.Figure:
 def amplitude_figure(
     records: Sequence[Record], start_ns: int, factor: float | None = None
 ) -> go.Figure:
-    """The strength of every track over time, and the true ones brought to its scale by
-    `factor`."""
+    """Amplitude of every track over time, and the true amplitudes times `factor`."""
     figure = go.Figure()
     if factor:
         true = [record for record in records if record.true is not None]
@@ -122,7 +120,7 @@ def distance_figure(records: Sequence[Record], ospa: FloatArray, start_ns: int) 
 def fixed_order_figure(
     fixed: Sequence[FixedOrder], records: Sequence[Record], start_ns: int
 ) -> go.Figure:
-    """Beside each other, what filters of a fixed number of reflectors find, and the truth."""
+    """What filters of a fixed number of reflectors find, and the truth, side by side."""
     titles = [f'{one.order} reflectors' for one in fixed]
     figure = make_subplots(
         cols=len(fixed), shared_yaxes=True, subplot_titles=titles, horizontal_spacing=0.02

@@ -1,7 +1,7 @@
-"""What filters of a fixed number of reflectors make of the same records: the paper's Figure 3.
+"""Filters of a fixed number of reflectors on the same records, as in the paper's Figure 3.
 
-Bootstrap filters, as one would write them who knows how many reflectors there are: one of the
-usual number, one of one less, one of one more. They see the responses that the run's tracker saw.
+These are bootstrap filters for the usual number of reflectors, for one less and for one more. They
+take the same responses as the tracker of the run.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class FixedOrder:
 def fixed_orders(
     run: Mapping[str, Any], image: Image, records: Sequence[Record], cutoff: float
 ) -> list[FixedOrder]:
-    """The usual number of reflectors in `records`, the true one when known, and its
-    neighbours. `image`: the responses of the run."""
+    """Run filters of the most frequent number of reflectors in `records` (the true number when
+    known), of one less and of one more. image: the responses of the run."""
     numbers = [r.order if r.true is None else len(r.true) for r in records]
     usual = int(np.bincount(numbers).argmax())
     config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)

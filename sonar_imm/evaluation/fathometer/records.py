@@ -1,4 +1,4 @@
-"""Records of a run beside their truth."""
+"""Records of a run, each with its truth."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ class Reflections:
 
 @frozen(eq=False)
 class Record:
-    """What was said of one record, and what is true.
+    """The estimate of one record, and its truth.
 
-    found: its strengths are amplitudes freed of spreading; depth_std, existence (K,) of them; pmf
-    (orders,) of the number of reflectors from `order_min` on. true: None when not known.
+    found: the K reflectors; their strengths are amplitudes corrected for spreading. depth_std,
+    existence: (K,) of these. pmf: (orders,) of the number of reflectors, from `order_min` on.
+    true: None when not known.
     """
 
     stamp_ns: int

@@ -1,11 +1,11 @@
-"""How far sets of reflectors lie from the true sets.
+"""Scores of sets of reflectors against the true sets.
 
-OSPA of second order (Schuhmacher, Vo and Vo 2008) says it in one number, in metres: the RMS error
-of a reflector, where one too many or too few counts as one that is the cutoff away. For everything
-else found and true reflectors are paired so that the sum of distances is least, none further apart
-than `NEAR` of the cutoff: who has no partner is false, or missed.
+OSPA of second order (Schuhmacher, Vo and Vo 2008) is one number in metres: the RMS error of a
+reflector, where one too many or too few counts as an error of the cutoff. For the other metrics
+found and true reflectors are paired by least total distance, none further apart than `NEAR` times
+the cutoff. Found reflectors without a partner are false, true ones are missed.
 
-Previews are not scored: they are revised by their record.
+Previews are not scored, because their record revises them.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from ..numbers import error_summary
 from .records import Record, Reflections
 
 CUTOFF = 2.0
-"""Metres: what a reflector too many or too few counts."""
+"""OSPA cutoff, m: the error that a false or missed reflector counts as."""
 NEAR = 0.2
-"""Share of the cutoff within which a found reflector is a true one."""
+"""Share of the cutoff within which a found reflector can be paired with a true one."""
 
 
 class Pairing(NamedTuple):
@@ -90,7 +90,7 @@ def _against_truth(scored: Sequence[tuple[Record, Reflections]], cutoff: float) 
 def _amplitudes(
     scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
 ) -> dict[str, float]:
-    """Relative errors after one common factor: a passive array knows ratios only."""
+    """Relative errors after one common factor, because a passive array measures ratios only."""
     found = np.concatenate([r.found.strength[p.found] for (r, _), p in zip(scored, pairs)])
     true = np.concatenate([t.strength[p.true] for (_, t), p in zip(scored, pairs)])
     use = np.isfinite(found) & (true > 0.0)
@@ -110,7 +110,7 @@ def _amplitudes(
 def _existence(
     scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
 ) -> dict[str, float]:
-    """Stated probability of existence against the share that was true."""
+    """Stated probability of existence, and the share that was true."""
     stated = np.concatenate([record.existence for record, _ in scored])
     right = np.concatenate(
         [np.isin(np.arange(len(r.found)), p.found) for (r, _), p in zip(scored, pairs)]
@@ -126,7 +126,7 @@ def _existence(
 
 
 def _switches(scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]) -> int:
-    """How often a true reflector is found under another id than the last time."""
+    """How often a true reflector is found under another id than before."""
     last: dict[int, int] = {}
     switches = 0
     for (record, true), p in zip(scored, pairs):

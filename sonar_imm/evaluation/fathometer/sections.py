@@ -40,7 +40,7 @@ def fathometer_part(
 def response_image(run: Mapping[str, Any]) -> Image | None:
     """The depth responses of a run as its tracker saw them; None when its recording is gone.
 
-    They are made anew by a tracker with two particles, whose estimates nobody asks for.
+    They are computed again by a tracker with two particles, whose estimates are not used.
     """
     config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
     tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
@@ -68,7 +68,7 @@ def response_image(run: Mapping[str, Any]) -> Image | None:
 def _cards(metrics: Mapping[str, Any]) -> list[Card]:
     if 'scored_records' not in metrics:
         return [
-            Card(f'{metrics["reflectors_mean"]:.1f}', 'Reflectors a record'),
+            Card(f'{metrics["reflectors_mean"]:.1f}', 'Reflectors per record'),
             Card(str(metrics['ids']), 'Reflectors in all', f'{metrics["records"]} records'),
         ]
     cards = [
@@ -76,7 +76,7 @@ def _cards(metrics: Mapping[str, Any]) -> list[Card]:
         Card(f'{metrics["ospa_m"]:.3f} m', 'OSPA', f'cutoff {metrics["cutoff_m"]:g} m'),
         Card(
             f'{metrics["false_per_record"]:.2f} / {metrics["missed_per_record"]:.2f}',
-            'False / missed a record',
+            'False / missed per record',
         ),
     ]
     if metrics['depth']['n']:
@@ -103,8 +103,8 @@ def _sections(
     sections = [
         Section(
             'Depth response and reflectors',
-            'Grey: what the records show. Lines: the reflectors that were found, a colour an '
-            'identity. Yellow: where they truly are, when that is known.',
+            'Grey: the response. Lines: the reflectors that were found, one colour per identity. '
+            'Yellow: the true depths, where they are known.',
             figures.response_figure(image, committed, start),
         )
     ]
@@ -117,8 +117,8 @@ def _sections(
             ),
             Section(
                 'Amplitudes',
-                'Freed of spherical spreading where the depth of the array is known. A passive '
-                'array knows ratios only: the truth is brought to the same scale.',
+                'Corrected for spherical spreading where the depth of the array is known. A '
+                'passive array measures ratios only, so the truth is scaled to match.',
                 figures.amplitude_figure(
                     committed, start, metrics.get('amplitude', {}).get('factor')
                 ),
@@ -130,8 +130,8 @@ def _sections(
         sections.append(
             Section(
                 'Distance from the truth',
-                'OSPA: depth errors (RMS), and reflectors too many or too few as if they were the '
-                'cutoff away.',
+                'OSPA: RMS depth error, where a false or missed reflector counts as an error of '
+                'the cutoff.',
                 figures.distance_figure(true, np.array(ospa), start),
             )
         )
@@ -148,11 +148,13 @@ def _fixed_section(
     start_ns: int,
 ) -> Section:
     fixed = fixed_orders(run, image, records, cutoff)
-    text = 'Bootstrap filters that are told how many reflectors there are, on the same responses. '
-    text += 'Blue: what they find. Yellow: where reflectors truly are, when that is known.'
+    text = 'Bootstrap filters with a fixed number of reflectors, on the same responses. '
+    text += 'Blue: what they find. Yellow: the true depths, where they are known.'
     if np.isfinite([one.ospa for one in fixed]).all():
         apart = ', '.join(f'{one.ospa:.2f} m with {one.order}' for one in fixed)
         text += f' OSPA: {apart}.'
     return Section(
-        'Had the number been fixed', text, figures.fixed_order_figure(fixed, records, start_ns)
+        'With a fixed number of reflectors',
+        text,
+        figures.fixed_order_figure(fixed, records, start_ns),
     )

@@ -1,4 +1,4 @@
-"""The scores of a run of reflectors in words and lines for people."""
+"""The scores of a fathometer run as sentences and lines of text."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from ..numbers import error_line
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
-    """The result in plain words."""
+    """The result in a few sentences."""
     if not metrics['records']:
         return 'There is no record in this run.'
     if 'scored_records' not in metrics:
         return (
-            f'{metrics["reflectors_mean"]:.1f} reflectors a record in {metrics["records"]} '
-            'records. There is no truth to compare with, so this page shows what the tracker says '
-            'of itself.'
+            f'{metrics["reflectors_mean"]:.1f} reflectors per record in {metrics["records"]} '
+            'records. There is no truth to compare with, so only the estimates and their stated '
+            'uncertainty are shown.'
         )
-    words = [
+    sentences = [
         f'The number of reflectors is right in {100 * metrics["order_right"]:.0f} % of the '
         f'records; a record lies {metrics["ospa_m"]:.3f} m from the true set (OSPA).'
     ]
     if metrics['depth']['n']:
-        words.append(
+        sentences.append(
             f'Depths are off by {metrics["depth"]["rmse_m"]:.3f} m (RMS); '
-            f'{metrics["false_per_record"]:.2f} reflectors a record are false and '
+            f'{metrics["false_per_record"]:.2f} reflectors per record are false and '
             f'{metrics["missed_per_record"]:.2f} are missed.'
         )
-    return ' '.join(words)
+    return ' '.join(sentences)
 
 
 def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the numbers a person wants to see first."""
+    """Title and value of the most important numbers."""
     result = [
         ('records', f'{metrics["records"]}'),
-        ('reflectors a record', f'{metrics["reflectors_mean"]:.2f}'),
+        ('reflectors per record', f'{metrics["reflectors_mean"]:.2f}'),
     ]
     if 'scored_records' not in metrics:
         return result
@@ -43,7 +43,7 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         ('number of reflectors right', f'{100 * metrics["order_right"]:.1f} %'),
         ('OSPA', f'{metrics["ospa_m"]:.3f} m'),
         (
-            'false / missed a record',
+            'false / missed per record',
             f'{metrics["false_per_record"]:.3f} / {metrics["missed_per_record"]:.3f}',
         ),
         *error_line('depth error', metrics['depth'], 'm'),

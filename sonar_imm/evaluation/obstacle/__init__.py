@@ -1,8 +1,9 @@
-"""How runs of the obstacle tracker are judged: heights and bands against what was really there.
+"""How runs of the obstacle tracker are judged: heights and 90 % bands against the truth.
 
-`series` lays estimates end to end and says which track is which obstacle, `scoring` how far off
-and how honest, `deferred` what the paper's deferred estimate would have said. `summary`,
-`sections` and `figures` tell it; `bench` measures the tracker.
+`series` lays estimates end to end and says which track is which obstacle. `scoring` says how large
+the errors are and whether the stated uncertainty holds, `deferred` what the paper's deferred
+estimate would have been. `summary`, `sections` and `figures` present it; `bench` measures the
+tracker.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from ...recordings.sources import BagError
 from ...trackers.obstacle.config import ObstacleConfig
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_measurements, read_truth, RunFolder
-from .deferred import look_back
+from .deferred import deferred_estimates
 from .scoring import score
 from .series import Matching, series_of, truth_of
 from .summary import lines, summary_sentence
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 T = TypeVar('T')
 
 LIMIT = Limit(2.5, 'm', 'vertical offset RMSE within 50 m')
-"""What a shipped recording must stay within. 300 runs have 1.6 m at 50 m and 0.9 m at 20 m; one
-recording is not an average."""
+"""Limit for the shipped recordings. 300 runs have 1.6 m at 50 m and 0.9 m at 20 m on average; one
+recording can be worse than the average."""
 
 CUTOFF = 5.0
 """Metres in range and bearing from which a track is on no obstacle."""
@@ -51,9 +52,9 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     metrics['truth_lag_s'] = options.lag
     config = ObstacleConfig.from_mapping(run['parameters'], ignore_unknown=True)
     received = list(read_measurements(run))
-    back = look_back(series, received, config, _whose(found, truth), options.gap)
-    if back is not None:
-        metrics['looking_back'] = back.as_dict()
+    deferred = deferred_estimates(series, received, config, _met_first(found, truth), options.gap)
+    if deferred is not None:
+        metrics['deferred'] = deferred.as_dict()
 
     def part(checks: Sequence[Check]) -> Part:
         # plotly, which only a report needs, takes a second to load.
@@ -66,7 +67,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
                 series=series,
                 truth=truth,
                 found=found,
-                back=back,
+                deferred=deferred,
                 received=received,
                 gap=options.gap,
             ),
@@ -89,8 +90,8 @@ def _understood(read: Callable[[], T], where: Path) -> T:
         raise BagError(f'{where}: {error}') from None
 
 
-def _whose(found: Matching | None, truth: Sequence[Any] | None) -> dict[int, Any]:
-    """The obstacle that each track met first."""
+def _met_first(found: Matching | None, truth: Sequence[Any] | None) -> dict[int, Any]:
+    """The obstacle that each track was matched with first, by track id."""
     if found is None or not truth:
         return {}
     pairs = zip(found.series.track_id[found.row].tolist(), found.target.tolist())
@@ -104,7 +105,7 @@ def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None
     if not near['n']:
         return Check(
             f'{LIMIT.meaning} against truth',
-            'no obstacle was followed to 50 m',
+            'no obstacle was tracked to within 50 m',
             'at least one',
             good=False,
         )

@@ -1,7 +1,8 @@
 """The deferred estimate of the paper beside the online one: RMSD against the vertical offset.
 
 The echoes of a track are those nearest to where the track was at its hits. With them, and the
-navigation of the recording, `trackers.obstacle_deferred` draws the paper's Figure 3.
+navigation of the recording, `trackers.obstacle.deferred` computes the curves of the paper's
+Figure 3.
 """
 
 from __future__ import annotations
@@ -23,10 +24,13 @@ LEAST_ECHOES = 5
 
 
 @frozen(eq=False, kw_only=True)
-class LookingBack:
-    """Both curves of one track, and what to compare them with, all offsets at its first echo
-    (NaN when unknown): `truth`; `online` the tracker's at its last echo with its band; `altitude`
-    of the sonar's vehicle above the sea floor."""
+class DeferredEstimates:
+    """Both deferred curves of one track, and what to compare them with.
+
+    All offsets hold at the first echo of the track, m below the sonar, NaN when unknown. `truth`;
+    `online` and `band`: what the tracker says at its last echo; `altitude`: of the vehicle above
+    the sea floor.
+    """
 
     track_id: int
     echoes: int
@@ -57,16 +61,16 @@ class LookingBack:
         return result
 
 
-def look_back(
+def deferred_estimates(
     series: Series,
     measurements: Iterable[Any],
     config: ObstacleConfig,
     truth: dict[int, TruePath],
     gap: float,
-) -> LookingBack | None:
+) -> DeferredEstimates | None:
     """The deferred estimates of the track with most hits; None when it has too few echoes.
 
-    truth: obstacle by track id, of the tracks that met one.
+    truth: obstacle by track id, for the tracks that were matched with one.
     """
     track_id = series.longest_track()
     if track_id is None:
@@ -89,7 +93,7 @@ def look_back(
     first, last = track.stamp_ns[rows[:1]], rows[-1]
     path = truth.get(track_id)
     heights = [one for one in received if isinstance(one, Altitude)]
-    return LookingBack(
+    return DeferredEstimates(
         track_id=track_id,
         echoes=len(rows),
         plain=deferred(z, at, config),

@@ -11,7 +11,7 @@ from ...estimation.arrays import FloatArray
 from ...measurements import Detections
 from ...trackers.obstacle.deferred import Deferred
 from ..plotting import AMBER, COLOURS, GREY, INK, MOST_POINTS, styled, thin, transparent
-from .deferred import LookingBack
+from .deferred import DeferredEstimates
 from .series import level, Matching, Series, TruePath
 
 
@@ -59,7 +59,8 @@ def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> go
 def image_figure(
     series: Series, pings: Sequence[Detections], truths: Sequence[TruePath], sign: float
 ) -> go.Figure:
-    """Tracks and echoes in the image of the sonar: ahead is up. `sign` turns bearings to port."""
+    """Tracks and echoes in the image of the sonar, ahead is up. `sign` makes bearings positive to
+    port."""
     figure = go.Figure()
     if pings:
         echoes = np.concatenate(
@@ -99,26 +100,26 @@ def image_figure(
     return styled(figure, height=620)
 
 
-def rmsd_figure(back: LookingBack) -> go.Figure:
+def rmsd_figure(deferred: DeferredEstimates) -> go.Figure:
     """The paper's Figure 3: RMSD against the assumed offset, or the height above the floor."""
     figure = go.Figure()
     for curve, name, colour in (
-        (back.plain, 'RMSD, as the paper', COLOURS[0]),
-        (back.refit, 'first echo and scale refitted', COLOURS[2]),
+        (deferred.plain, 'RMSD, as the paper', COLOURS[0]),
+        (deferred.refit, 'first echo and scale refitted', COLOURS[2]),
     ):
-        _add_curve(figure, curve, name, colour, back.altitude)
+        _add_curve(figure, curve, name, colour, deferred.altitude)
     figure.add_vrect(
-        x0=back.band[0],
-        x1=back.band[1],
+        x0=deferred.band[0],
+        x1=deferred.band[1],
         fillcolor=AMBER,
         opacity=0.25,
         line_width=0,
         annotation_text='90 % band, online',
     )
     for value, name, dash, side in (
-        (back.online, 'online', 'dash', 'right'),
-        (back.truth, 'truth', 'dot', 'left'),
-        (back.altitude, 'sea floor', 'dashdot', 'right'),
+        (deferred.online, 'online', 'dash', 'right'),
+        (deferred.truth, 'truth', 'dot', 'left'),
+        (deferred.altitude, 'sea floor', 'dashdot', 'right'),
     ):
         if np.isfinite(value):
             figure.add_vline(

@@ -3,10 +3,10 @@
 range, bearing, vertical_offset   RMSE, median and 95 % point of confirmed tracks, whole run
 vertical_offset_near              the same within 50 m, where a vehicle has to decide
 consistency                       NEES, NIS, and how often the 90 % band holds the truth
-above                             whether stated probabilities of being above come true
-gospa                             several obstacles: distance, missed and false a ping
+above                             calibration of the stated probability of being above
+gospa                             several obstacles: distance, missed and false per ping
 tracks                            how many, found and false, and identity switches: an obstacle
-                                  taken over by another track
+                                  is taken over by another track
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BINS = (0.0, 0.1, 0.3, 0.7, 0.9, 1.0)
 def score(
     series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, gap: float
 ) -> tuple[dict[str, Any], Matching | None]:
-    """All metrics of a run and the matching they rest on; without truth only what needs none."""
+    """All metrics of a run, and the matching they rest on. Without truth only what needs none."""
     pings = series.ping_ns
     nis = series.nis[np.isfinite(series.nis)]
     metrics: dict[str, Any] = {

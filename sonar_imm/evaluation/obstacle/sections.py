@@ -15,21 +15,21 @@ from ..page import Card, Part, Section, table
 from ..plotting import nis_figure, seconds
 from ..report import run_part
 from . import figures
-from .deferred import LookingBack
+from .deferred import DeferredEstimates
 from .series import Matching, Series, TruePath
 from .summary import summary_sentence
 
 
 @frozen(eq=False, kw_only=True)
 class Material:
-    """What the page is made from. run: content of ``run.json``; metrics: of ``metrics.json``."""
+    """What the page shows. run: content of ``run.json``; metrics: of ``metrics.json``."""
 
     run: Mapping[str, Any]
     metrics: Mapping[str, Any]
     series: Series
     truth: tuple[TruePath, ...] | None = None
     found: Matching | None = None
-    back: LookingBack | None = None
+    deferred: DeferredEstimates | None = None
     received: Sequence[Any] = ()
     gap: float = 60.0
 
@@ -77,7 +77,7 @@ def _cards(metrics: Mapping[str, Any]) -> list[Card]:
                 f'{metrics["gospa"]["mean_m"]:.2f} m',
                 'GOSPA',
                 f'{metrics["gospa"]["missed_per_ping"]:.2f} missed, '
-                f'{metrics["gospa"]["false_per_ping"]:.2f} false a ping',
+                f'{metrics["gospa"]["false_per_ping"]:.2f} false per ping',
             )
         )
     else:
@@ -113,29 +113,29 @@ def _sections(material: Material) -> list[Section]:
         ),
         Section(
             'Above or below',
-            'On a level path nothing tells above from below, and the '
-            'probability has to stay at one half; rolling decides it.',
+            'On a level path above and below look the same, and the probability has to stay at '
+            'one half. Rolling decides it.',
             figures.above_figure(series),
         ),
         Section(
-            'Seen by the sonar',
+            'Image of the sonar',
             'Tracks among the detections of all pings. Dotted: truth, while the beam holds it.',
             figures.image_figure(series, pings, material.truth or (), sign),
         ),
     ]
-    if material.back is not None:
+    if material.deferred is not None:
         sections.append(
             Section(
-                f'Looking back: RMSD of track {material.back.track_id}',
-                'The deferred estimate of the paper: how badly each assumed offset explains all '
-                'echoes. Diamonds: the least RMSD.',
-                figures.rmsd_figure(material.back),
+                f'Deferred estimate: RMSD of track {material.deferred.track_id}',
+                'The paper estimates the offset afterwards, from all echoes of the track. The '
+                'curve shows how badly each assumed offset explains them. Diamonds: least RMSD.',
+                figures.rmsd_figure(material.deferred),
             )
         )
     if found is not None and len(found.row):
         sections.append(
             Section(
-                'Error, and the error it predicted',
+                'Error, and the predicted error',
                 'Errors of the vertical offset in units of the stated standard deviation.',
                 figures.error_figure(found),
             )
@@ -143,9 +143,9 @@ def _sections(material: Material) -> list[Section]:
         bins = material.metrics['above']['bins']
         sections.append(
             Section(
-                'Do probabilities come true?',
-                'Of all the times the tracker said an obstacle is '
-                'above, by how sure it was. Pings of one approach are not independent.',
+                'Calibration of the probability of being above',
+                'How often an obstacle was above, by the stated probability. Pings of one '
+                'approach are not independent.',
                 html=table(
                     ('P(above)', 'pings', 'stated', 'was above'),
                     [
@@ -159,9 +159,10 @@ def _sections(material: Material) -> list[Section]:
     if len(hits):
         sections.append(
             Section(
-                'Surprise of each detection (NIS)',
-                'How far each detection fell from where it was expected. It says nothing of the '
-                'height: a sonar mounted the wrong way round has a perfect NIS.',
+                'Normalised innovations (NIS)',
+                'Distance of each detection from its prediction, in units of the stated '
+                'uncertainty, squared. NIS says nothing about the height: with a wrong sign of '
+                'roll it is perfect too.',
                 nis_figure(
                     seconds(hits.stamp_ns, series.ping_ns), hits.nis, np.full(len(hits), 2.0)
                 ),

@@ -1,7 +1,7 @@
 """Obstacle estimates and truth as flat arrays, and which track is which obstacle.
 
-Tracks and obstacles are matched ping by ping where they lie in the image of the sonar, by range
-and bearing laid flat, because that is what the sonar sees; the height is what is to be judged.
+Tracks and obstacles are matched ping by ping by their position in the image of the sonar, range
+and bearing projected to a plane. The height, which is to be judged, plays no part in the matching.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...estimates import Estimate
+from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.consistency import gospa
 from .. import SECOND
 
 STATES = ('range', 'bearing', 'vertical_offset')
 PINGS_TO_SEE = 6
-"""Pings in the beam after which an obstacle ought to be known."""
+"""Pings in the beam after which an obstacle should be tracked."""
 PASSED = 0.2
-"""Cosine to the axis below which range and azimuth fix nothing."""
+"""Cosine to the axis of the sonar below which an obstacle counts as passed."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -58,8 +59,8 @@ _ROWS = ('stamp_ns', 'track_id', 'state', 'covariance', 'low', 'high', 'above', 
 
 @frozen(eq=False)
 class TruePath:
-    """One obstacle as the sonar should have seen it: stamp_ns (n,); seen (n, 3) in the order of
-    `STATES`; in_beam (n,)."""
+    """True states of one obstacle: stamp_ns (n,); seen (n, 3) in the order of `STATES`; in_beam
+    (n,)."""
 
     track_id: int
     stamp_ns: IntArray
@@ -78,7 +79,7 @@ class TruePath:
         return np.where(known[:, None], between, np.nan)
 
     def there(self, stamp_ns: IntArray, gap: float) -> NDArray[np.bool_]:
-        """True (m,) where it ought to be tracked: seen for a while and not passed yet."""
+        """True (m,) where it should be tracked: in the beam for a while and not passed yet."""
         seen = np.cumsum(self.in_beam)[
             np.clip(
                 np.searchsorted(self.stamp_ns, stamp_ns, side='right') - 1,
@@ -94,8 +95,8 @@ class TruePath:
 
 @frozen(eq=False)
 class Matching:
-    """row (m,) of the series and the truth (m, 3) it met, by number of the obstacle (m,); gospa
-    (pings, 4): distance, localisation, missed and false parts."""
+    """Pairs of estimate rows and obstacles: row (m,) of the series, target (m,) the index of the
+    obstacle, truth (m, 3) its state; gospa (pings, 4): distance, localisation, missed, false."""
 
     series: Series
     row: IntArray
@@ -107,12 +108,12 @@ class Matching:
     def error(self) -> FloatArray:
         """(m, 3) estimate minus truth."""
         difference = self.series.state[self.row] - self.truth
-        difference[:, 1] = (difference[:, 1] + np.pi) % (2.0 * np.pi) - np.pi
+        difference[:, 1] = wrap_angle(difference[:, 1])
         return difference
 
 
 def series_of(estimates: Iterable[Estimate]) -> Series:
-    """Lay the confirmed rows end to end. Raises ValueError for estimates of something else."""
+    """Concatenate the confirmed rows. Raises ValueError for estimates of another system."""
     ordered = sorted(estimates, key=lambda one: one.stamp_ns)
     filled = [one for one in ordered if len(one)]
     if any(one.state_names != STATES for one in filled):
@@ -141,7 +142,7 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
 
 
 def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ...]:
-    """Truth tables by obstacle, told `lag` seconds earlier. Raises ValueError for other tables."""
+    """Truth by obstacle, shifted to `lag` seconds earlier. Raises ValueError for other tables."""
     rows: dict[int, list[tuple[int, float, float, float, float]]] = {}
     for table in tables:
         if missing := [name for name in STATES if name not in table.extras]:
@@ -191,6 +192,6 @@ def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: fl
 
 
 def level(seen: FloatArray) -> FloatArray:
-    """(..., 2) metres ahead and to port of states (..., 3), as if nothing lay above or below."""
+    """(..., 2) metres ahead and to port of states (..., 3), as if the vertical offset were 0."""
     distance, bearing = seen[..., 0], seen[..., 1]
     return np.stack([distance * np.cos(bearing), distance * np.sin(bearing)], axis=-1)

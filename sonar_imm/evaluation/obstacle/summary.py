@@ -1,4 +1,4 @@
-"""The scores of a run of obstacles in words and lines for people."""
+"""The scores of an obstacle run as sentences and lines of text."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from .scoring import NEAR
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
-    """The result in plain words."""
+    """The result in a few sentences."""
     offset = metrics.get('vertical_offset', {})
     if not offset.get('n'):
         known = 'scored_rows' in metrics
         return (
             f'{metrics["tracks_confirmed"]} confirmed obstacles in {metrics["span_s"]:.0f} s. '
             + (
-                'None of them met the truth.'
+                'None of them was matched with the truth.'
                 if known
-                else 'There is no truth to compare '
-                'with, so this page shows what the tracker says of itself.'
+                else 'There is no truth to compare with, so only the estimates and their stated '
+                'uncertainty are shown.'
             )
         )
     near = metrics['vertical_offset_near']
-    words = []
+    sentences = []
     if near['n']:
-        words.append(
+        sentences.append(
             f'Within {NEAR:.0f} m the height of an obstacle is right to '
             f'{near["rmse_m"]:.2f} m (RMS).'
         )
     held = metrics['consistency']['band_coverage']
-    words.append(f'Its 90 % band holds the truth {100 * held:.0f} % of the time.')
+    sentences.append(f'Its 90 % band holds the truth {100 * held:.0f} % of the time.')
     tracks = metrics['tracks']
-    words.append(
+    sentences.append(
         f'{tracks["found_obstacles"]} of {tracks["true_obstacles"]} obstacles were '
         f'found, {tracks["false_tracks"]} tracks were false.'
     )
-    return ' '.join(words)
+    return ' '.join(sentences)
 
 
 def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the numbers a person wants to see first."""
+    """Title and value of the most important numbers."""
     consistency = metrics['consistency']
     result = [
         *error_line('range error', metrics.get('range', {}), 'm'),
@@ -57,13 +57,13 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         result.append(('truth inside the 90 % band', f'{100 * held:.0f} %'))
         result.append(('Brier score of P(above)', f'{metrics["above"]["brier"]:.3f}'))
         result.append(('GOSPA', f'{metrics["gospa"]["mean_m"]:.2f} m'))
-    if back := metrics.get('looking_back'):
+    if deferred := metrics.get('deferred'):
         result.append(
             (
                 'vertical offset: online / RMSD / refitted',
-                ' / '.join(f'{back[name]:+.2f}' for name in ('online_m', 'rmsd_m', 'refit_m'))
+                ' / '.join(f'{deferred[name]:+.2f}' for name in ('online_m', 'rmsd_m', 'refit_m'))
                 + ' m'
-                + (f', truth {back["truth_m"]:+.2f} m' if 'truth_m' in back else ''),
+                + (f', truth {deferred["truth_m"]:+.2f} m' if 'truth_m' in deferred else ''),
             )
         )
     result += [

@@ -1,8 +1,8 @@
 """Conversion of other people's recordings into bags.
 
 Every converter takes the file, the path of the new bag and options, and gives a
-`ConversionReport`. Rows that cannot be used are counted and named by line; only a file that gives
-nothing at all raises `BagError`. Records are written in the order of their stamps.
+`ConversionReport`. Rows that cannot be used are counted and listed by line. Only a file without a
+usable row raises `BagError`. Records are written in the order of their stamps.
 """
 
 from __future__ import annotations

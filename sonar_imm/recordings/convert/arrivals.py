@@ -1,15 +1,14 @@
-"""Arrival times from a CSV, with the places of the receivers from a second one.
+"""Arrival times from a CSV, with the positions of the receivers from a second one.
 
 Two kinds of file are understood:
 
-- *synchronised one-way arrivals* of an acoustic tag: ``ping``, ``receiver`` and the absolute
-``arrival`` time. When the tag
-  emitted is unknown, so a ping is stamped with its earliest arrival, ``toa`` counts from there and
-  the transmitter is NaN: the emission lies before the stamp by the travel time to the nearest
-  receiver.
-- *travel times* from known transmitters: ``stamp`` (the transmission), ``transmitter``,
-``receiver`` and ``toa``. Rows with
-  the same ``ping``, or the same stamp when there is no such column, are one ping.
+- *Synchronised one-way arrivals* of an acoustic tag: ``ping``, ``receiver`` and the absolute time
+  of ``arrival``. The time of emission is unknown. So a ping is stamped with its earliest arrival,
+  ``toa`` counts from there, and the transmitter is NaN. The emission lies before the stamp by the
+  travel time to the nearest receiver.
+- *Travel times* from known transmitters: ``stamp`` (the transmission), ``transmitter``,
+  ``receiver`` and ``toa``. Rows with the same ``ping``, or with the same stamp where there is no
+  such column, are one ping.
 
 Optional in both: ``var_toa`` or ``std_toa``, ``bearing`` [rad] with ``var_bearing`` or
 ``std_bearing``.
@@ -66,12 +65,12 @@ def convert_arrivals(
     origin: tuple[float, ...] | None = None,
     storage: str = 'mcap',
 ) -> ConversionReport:
-    """Convert a CSV of arrivals to the topic ``/arrivals``, one message a ping.
+    """Convert a CSV of arrivals to the topic ``/arrivals``, one message per ping.
 
-    receivers: CSV with ``receiver`` and a position (``depth`` becomes negative z); transmitters:
-    the same for transmitters, by default looked up among the receivers; toa_std: standard
-    deviation [s] for rows that state none; truth: as in `convert_truth`. `receiver_options` is for
-    both position files. Raises `BagError`.
+    receivers: CSV with ``receiver`` and a position (``depth`` becomes negative z). transmitters:
+    the same for transmitters, which are looked up among the receivers by default. toa_std:
+    standard deviation [s] for rows that state none. truth: as in `convert_truth`.
+    receiver_options: for both position files. Raises `BagError`.
     """
     report = ConversionReport(Path(out))
     places, origin = _read_places(receivers, report, receiver_options, origin, 'receiver')
@@ -124,9 +123,9 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
     """Read one line of the arrivals."""
     receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')
     if receiver not in places:
-        raise BadRow(f"the place of receiver '{receiver}' is not known")
+        raise BadRow(f"the position of receiver '{receiver}' is not known")
     if not passive and transmitter not in senders:
-        raise BadRow(f"the place of transmitter '{transmitter}' is not known")
+        raise BadRow(f"the position of transmitter '{transmitter}' is not known")
     ping = row.text('ping')
     if passive and not ping:
         raise BadRow('the ping is empty')
@@ -146,7 +145,7 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
 
 
 def _variance(row: Row, what: str) -> float:
-    """The variance a row states as such or as a standard deviation, NaN for none."""
+    """The variance that a row states, also as a standard deviation; NaN without either."""
     if row.table.has(f'var_{what}'):
         return row.optional(f'var_{what}')
     std = row.optional(f'std_{what}')
@@ -189,7 +188,7 @@ def _read_places(
     origin: tuple[float, ...] | None,
     name: str,
 ) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
-    """Read where receivers or transmitters are: places by name, and the origin they are around."""
+    """Read the positions of receivers or transmitters by name, and the origin of local metres."""
     table = CsvTable(path, options)
     table.require(name)
     frame = LocalFrame(table, origin)
@@ -199,12 +198,12 @@ def _read_places(
         if not row.text(name):
             raise BadRow(f'the {name} has no name')
         if row.text(name) in places:
-            raise BadRow(f"{name} '{row.text(name)}' is listed twice, the first place is used")
+            raise BadRow(f"{name} '{row.text(name)}' is listed twice; the first position is used")
         return row.text(name), frame.position(row)
 
     for _, (label, place) in report.read_rows(table, parse):
         places[label] = place
     if not places:
-        raise BagError(f'{table.path} lists no {name} with a place')
+        raise BagError(f'{table.path} lists no {name} with a position')
     report.notes.update(frame.notes())
     return places, frame.origin

@@ -1,9 +1,9 @@
 """The Autoferry sensor fusion data set: radar and lidar detections of boats, with clutter, in NED.
 
-A record holds one scan of one sensor: ``measurement`` is 2 x M, norths then easts relative to the
-own ship (a flat pair for M = 1, empty for none), and ``ownshipPosition`` is the own ship's north
-and east. Records are not sorted by time. Every detection becomes a fix; those of one scan share
-its stamp. A scan without detections leaves no message. Infrared and camera (bearings only) are not
+A record holds one scan of one sensor. ``measurement`` is 2 x M, north then east relative to the
+own ship (a flat pair for M = 1, empty for none). ``ownshipPosition`` is north and east of the own
+ship. Records are not sorted by time. Every detection becomes a fix; those of one scan share its
+stamp. A scan without detections gives no message. Infrared and camera (bearings only) are not
 converted. The targets are boats, not divers.
 """
 

@@ -62,7 +62,7 @@ def convert_fixes(
 
 
 def _covariance(row: Row) -> np.ndarray | None:
-    """The covariance (2, 2) a row states, None for none: empty, negative or all zero."""
+    """The covariance (2, 2) that a row states; None when it is empty, negative or all zero."""
     if row.table.has('var_x', 'var_y'):
         var_x, var_y = row.optional('var_x'), row.optional('var_y')
         cov_xy = row.optional('cov_xy') if row.table.has('cov_xy') else 0.0

@@ -1,7 +1,7 @@
-"""A bag with images of a forward-looking sonar as a bag with detections, for the obstacle tracker.
+"""From images of a forward-looking sonar to detections for the obstacle tracker, bag to bag.
 
-Every image becomes one message on ``/detections``, also when nothing is found in it. Navigation
-and altitudes, which the tracker needs too, come along as ``/nav`` and ``/altitude``.
+Every image gives one message on ``/detections``, also when nothing is found in it. Navigation and
+altitudes, which the tracker needs too, are copied to ``/nav`` and ``/altitude``.
 """
 
 from __future__ import annotations
@@ -77,5 +77,5 @@ def _converted(name: str, item: Any, config: DetectorConfig) -> Any:
         image = read_sonar_image(item.message, **config.reading())
         return write_detections(detect(image, config), ros_message)
     entry = FURTHER[name]
-    # Conventions of the axes stay what they are: whoever tracks the new bag states them.
+    # The axes stay as recorded; who tracks the new bag states them.
     return entry.write(entry.readers[item.type_name](item.message, world_frame='ned'), ros_message)

@@ -1,8 +1,8 @@
 """Traces of a sub-bottom profiler from SEG-Y, the format of seismic instruments.
 
-Only what every trace header has is used: the date, the sample interval and the recording delay.
-The interval that small profilers state is often wrong; then the distance of samples has to be
-told. Headers count whole seconds, so that traces of one second are spread over it evenly.
+Of the trace headers only the date, the sample interval and the recording delay are used. The
+interval that small profilers state is often wrong; then the sample spacing has to be given.
+Headers count whole seconds, so the traces of one second are spread over it evenly.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ def convert_segy(
     """Convert a SEG-Y file to the topic ``/trace``.
 
     sample_spacing: m from sample to sample; None: from the sample interval and `sound_speed`.
-    first_sample, samples: which part of a trace is taken. stack: so many traces in turn are
-    averaged; the stamp is that of the last. depth_offset: m, of the transducer. Raises `BagError`,
-    and ModuleNotFoundError without segyio.
+    first_sample, samples: which part of a trace is taken. stack: how many successive traces are
+    averaged into one, which has the stamp of the last. depth_offset: m, of the transducer. Raises
+    `BagError`, and ModuleNotFoundError without segyio.
     """
     import segyio
 
@@ -60,11 +60,11 @@ def convert_segy(
             delay = header[segyio.TraceField.DelayRecordingTime] * 1e-3
     except (OSError, RuntimeError, ValueError) as error:
         # segyio has no errors of its own.
-        reason = getattr(error, 'strerror', None) or f'it is damaged, or no SEG-Y ({error})'
+        reason = getattr(error, 'strerror', None) or f'it is damaged or not SEG-Y ({error})'
         raise BagError(f'{path} cannot be read: {reason}') from None
     spacing = sample_spacing or 0.5 * sound_speed * interval
     if not spacing > 0.0:
-        raise BagError(f'{path} states no sample interval: tell the sample spacing')
+        raise BagError(f'{path} states no sample interval; give the sample spacing')
     depth = depth_offset + 0.5 * sound_speed * delay + spacing * np.arange(amplitude.shape[1])
     part = slice(first_sample, None if samples is None else first_sample + samples)
     depth, amplitude = depth[part], amplitude[:, part]

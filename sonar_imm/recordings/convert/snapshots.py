@@ -1,9 +1,9 @@
-"""Array snapshots from a numpy archive (npz), the format in which research data usually travel.
+"""Array snapshots from a numpy archive (npz).
 
-Arrays are found by name, usual names of each are known (`NAMES`), others can be told. Needed are
-the complex samples, (bins, staves) for one ping or (pings, bins, staves), and the range or the
-two-way time of each bin. Where the true floor is there as well, with the sonar's height and tilt,
-it goes to ``/truth/estimate``.
+Arrays are found by their usual names (`NAMES`); other names can be given. Needed are the complex
+samples, (bins, staves) for one ping or (pings, bins, staves), and the range or the two-way time of
+each bin. Where the archive also has the true floor, with the height and tilt of the sonar, it goes
+to ``/truth/estimate``.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ NAMES: dict[str, tuple[str, ...]] = {
     'sonar_height': ('sonar_height', 'H'),
     'tilt': ('tilt',),
 }
-"""What is looked for: the names under which it is found, the first that is there counts. Stamps
-in seconds, spacings in metres and wavelengths, snr linear and at one stave, tilt in radians."""
+"""Usual names of each array; the first one that the archive has is taken. Stamps in seconds,
+spacings in metres or wavelengths, snr linear and at one stave, tilt in radians."""
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _CONSTANTS = ('sound_speed', 'frequency', 'sample_rate')
@@ -61,11 +61,11 @@ def convert_snapshots(
     frame_id: str = 'sonar',
     storage: str = 'mcap',
 ) -> ConversionReport:
-    """Convert an npz archive to the topic ``/snapshot``, one message a ping.
+    """Convert an npz archive to the topic ``/snapshot``, one message per ping.
 
-    names: what an array is called in this archive, by the names of `NAMES`. staves: for each stave
-    of the array the channels, from 0, that are added up to make it; None takes the channels as
-    they are. Without stamps pings follow each other at `ping_rate` a second. Raises `BagError`.
+    names: name in this archive by the names of `NAMES`. staves: for each stave the channels, from
+    0, that are summed; None takes each channel as a stave. Without stamps there are `ping_rate`
+    pings per second. Raises `BagError`.
     """
     report = ConversionReport(Path(out))
     content = _Archive(path, names or {})
@@ -88,12 +88,12 @@ def convert_snapshots(
 
 
 class _Archive:
-    """The arrays of an npz file by what they are."""
+    """The arrays of an npz file, by the names of `NAMES`."""
 
     def __init__(self, path: str | Path, names: Mapping[str, str]):
         self.path = Path(path)
         if unknown := [name for name in names if name not in NAMES]:
-            raise BagError(f"nothing is called '{unknown[0]}'; there are {', '.join(NAMES)}")
+            raise BagError(f"unknown array '{unknown[0]}'; the names are {', '.join(NAMES)}")
         there = read_npz(self.path)
         wanted = {what: (names[what],) if what in names else NAMES[what] for what in NAMES}
         self._arrays: dict[str, NDArray] = {}
@@ -116,17 +116,17 @@ class _Archive:
         return self._arrays[what]
 
     def number(self, what: str) -> float | None:
-        """Give a scalar; None for none."""
+        """Give a scalar; None when the archive has none."""
         value = self.get(what)
         if value is None:
             return None
         if value.size != 1 or not np.isfinite(value).all():
-            raise BagError(f'{self.path}: {what} is to be one finite number')
+            raise BagError(f'{self.path}: {what} has to be one finite number')
         return float(value.ravel()[0])
 
     def per_bin(self, what: str, ping: int, bins: int) -> NDArray | None:
-        """Give the row (bins,) of a ping, from one number, (bins,) or (pings, bins); None for
-        none."""
+        """Give the row (bins,) of a ping, from one number, (bins,) or (pings, bins); None when the
+        archive has none."""
         value = self.get(what)
         if value is None:
             return None
@@ -167,8 +167,8 @@ def _stamps(content: _Archive, pings: int, ping_rate: float) -> list[int]:
 def _element_spacing(
     content: _Archive, constants: Mapping[str, float | None], report: ConversionReport
 ) -> float | None:
-    """Metres between staves; what cannot be told in metres is noted for the tracker's
-    parameters."""
+    """Metres between staves. A spacing in wavelengths that cannot be converted is noted instead,
+    for the parameters of the tracker."""
     metres = content.number('element_spacing')
     wavelengths = content.number('spacing_wavelengths')
     if metres is not None or wavelengths is None:

@@ -35,12 +35,13 @@ def convert_traces(
 ) -> ConversionReport:
     """Convert traces to the topic ``/trace``.
 
-    An archive (.npz) has ``depth`` (n,) and ``amplitude`` (n,) or (T, n), and optionally ``stamp``
-    (T,) s, else traces follow each other at `rate` a second; ``sigma`` as one number, (T,) or
-    (T, n); ``reference_depth`` (T,), that of the array; and as truth ``reflector_depth`` and
-    ``reflector_amplitude`` (T, K): a reflector is there while its amplitude exceeds 0.4 of its
-    greatest. Anything else is read as a CSV of ``stamp``, ``depth``, ``amplitude`` and optionally
-    ``std``, one row a sample, traces one after the other. Raises `BagError`.
+    An archive (.npz) has ``depth`` (n,) and ``amplitude`` (n,) or (T, n). Optional: ``stamp`` (T,)
+    s, without which there are `rate` traces per second; ``sigma`` as one number, (T,) or (T, n);
+    ``reference_depth`` (T,) of the array; as truth ``reflector_depth`` and ``reflector_amplitude``
+    (T, K), where a reflector is present while its amplitude exceeds 0.4 of its largest value.
+
+    Any other file is read as a CSV of ``stamp``, ``depth``, ``amplitude`` and optionally ``std``,
+    one row per sample, trace after trace. Raises `BagError`.
     """
     report = ConversionReport(Path(out))
     if Path(path).suffix.lower() == '.npz':
@@ -96,7 +97,8 @@ def _stamps(arrays: Arrays, path: Path, count: int, rate: float) -> list[int]:
 
 
 def _rows(arrays: Arrays, path: Path, name: str, shape: tuple[int, ...]) -> NDArray | None:
-    """The array `name` as `shape`, from one number, one a trace or all; None for none."""
+    """The array `name` broadcast to `shape`, from one number, one per trace or all of them; None
+    when there is none."""
     value = arrays.get(name)
     if value is None:
         return None
@@ -116,8 +118,8 @@ def _truth(arrays: Arrays, path: Path, stamps: list[int], frame_id: str) -> list
         return []
     if depth.ndim != 2 or depth.shape != amplitude.shape or len(depth) != len(stamps):
         raise BagError(
-            f'{path}: reflector_depth {depth.shape} and reflector_amplitude {amplitude.shape} are '
-            f'to have a row for each of {len(stamps)} traces'
+            f'{path}: reflector_depth {depth.shape} and reflector_amplitude {amplitude.shape} '
+            f'need one row for each of {len(stamps)} traces'
         )
     present = np.isfinite(depth) & (amplitude > PRESENT * np.nanmax(amplitude, axis=0))
     records = []

@@ -1,9 +1,8 @@
 """Truth from a CSV of positions, as the table ``/truth/estimate``.
 
 A velocity that the file does not state comes from central differences of the positions
-(`numpy.gradient`, uneven steps allowed). That is as noisy as the positions are: at one position a
-second and half a metre of noise it is good to about 0.4 m/s. A single position has no velocity:
-NaN.
+(`numpy.gradient`, uneven steps allowed). It is as noisy as the positions: with one position per
+second and 0.5 m of noise it is good to about 0.4 m/s. A single position has the velocity NaN.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Sea floors as a tilted side-scan array hears them, ping by ping.
+"""Pings of a tilted side-scan array over a sea floor.
 
-`paper` is the scene of Saucan et al. 2013: a sonar 15 m above a flat floor with one rough patch,
-whose signal-to-noise ratio falls from 30 to 10 dB along the swath (linearly in decibels over the
-logarithm of range, as spreading has it). The other scenarios add one difficulty each: slope,
+`paper` is the scene of Saucan et al. 2013: a sonar 15 m above a flat floor with one rough patch.
+The signal-to-noise ratio falls from 30 to 10 dB along the swath, linearly in decibels over the
+logarithm of range, as spreading loss does. The other scenarios add one difficulty each: slope,
 undulation, roughness that is correlated as real roughness is, shadows, spikes, echoes by way of
 the surface, Gaussian echoes, a second side; and a ship that moves (`ship`).
 
-One bin is y = sqrt(z) (s a(u) + n), the law of `acoustics.laplace`. Surface echoes fade with a z
-of their own. A spike is a burst as incoherent across the array as it is strong.
+One bin is y = sqrt(z) (s a(u) + n), the observation model of `acoustics.laplace`. Surface echoes
+fade with a z of their own. A spike is a strong burst of noise, incoherent across the array.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 @frozen(kw_only=True)
 class BathymetryScenario(ShipScenario):
-    """Everything a bathymetry scene can be told; the defaults are the scene of the paper."""
+    """Parameters of a bathymetry scene; the defaults are the scene of the paper."""
 
     INSTRUMENT = ('tilt_deg', 'conjugate', 'sonar_height', 'sonar_depth')
 
     pings: int = parameter(20, 'number of pings', low=1, high=1_000_000)
-    ping_rate: float = parameter(10.0, 'pings a second', unit='Hz', low=0.01, high=1000.0)
+    ping_rate: float = parameter(10.0, 'pings per second', unit='Hz', low=0.01, high=1000.0)
     side: str = parameter('starboard', 'which sides the sonar looks to', choices=SIDES)
 
     staves: int = parameter(8, 'staves of the array', low=2, high=64)
@@ -69,9 +69,7 @@ class BathymetryScenario(ShipScenario):
     state_signal: bool = parameter(False, 'the snapshot says its signal variance')
     law: str = parameter('laplace', 'how the power of echoes varies', choices=LAWS)
 
-    slope: float = parameter(
-        0.0, 'rise of the floor over a metre of slant range', low=-1.0, high=1.0
-    )
+    slope: float = parameter(0.0, 'rise of the floor per metre of slant range', low=-1.0, high=1.0)
     undulation_height: float = parameter(0.0, 'amplitude of an undulation', unit='m', low=0.0)
     undulation_length: float = parameter(20.0, 'its length in slant range', unit='m', low=0.1)
     patch_start: float = parameter(40.0, 'slant range at which the rough patch begins', unit='m')
@@ -137,7 +135,7 @@ _UNDER_WAY: dict[str, Any] = {
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'paper': ('flat floor with a rough patch, 30 to 10 dB: the scene of the paper', {}),
-    'slope': ('paper on a floor that rises 0.1 m a metre', {'slope': 0.1}),
+    'slope': ('paper on a floor that rises 0.1 m per metre', {'slope': 0.1}),
     'correlated': (
         'paper with roughness correlated over a metre, as real roughness is',
         {'correlation_length': 1.0},
@@ -177,17 +175,16 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> BathymetryScenario:
-    """The scenario called `name` with some values replaced. Raises `ConfigError` naming
-    mistakes."""
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
     return BathymetryScenario.named(name, SCENARIOS, overrides)
 
 
 def simulate(config: BathymetryScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene.
 
-    A measurement is received when its last echo is. With both sides, each has a namespace of its
-    own. The frame is that of the sonar: x forward, y to port, z up. With a moving ship it is the
-    world, and the navigation is part of the scene.
+    A measurement is received together with its last echo. With both sides, each has a namespace of
+    its own. The frame is that of the sonar: x forward, y to port, z up. With a moving ship it is
+    the world, and the navigation is part of the scene.
     """
     rng = np.random.default_rng(seed)
     sides = ('port', 'starboard') if config.side == 'both' else (config.side,)
@@ -322,7 +319,7 @@ def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) 
 
 
 def _hear(config: BathymetryScenario, floor: TrueProfile, rng: np.random.Generator) -> Snapshot:
-    """What the staves hear of a floor."""
+    """The samples of the staves for one ping over a floor."""
     bins = len(floor.range)
     sine = np.nan_to_num(np.sin(floor.angle))
     signal = config.noise_variance * snr(config, floor.range) * floor.valid

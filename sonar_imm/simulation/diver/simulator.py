@@ -1,9 +1,9 @@
-"""Divers that swim as divers do, seen by a polar sonar or by a multistatic one.
+"""Swimming divers, observed by a polar or a multistatic sonar.
 
-How a diver moves is a `motion`, what the sensors see of it a `sensor`; a scenario is a choice of
-both with a name (`SCENARIOS`). The paper's Table 1 gives start, speed, sampling and accuracy but
-not the path; `table1` swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
-one: zigzag with general consistent direction, as the paper puts it.
+A scenario (`SCENARIOS`) is a named choice of `motion`, how the divers move, and `sensor`, how they
+are observed. The paper's Table 1 gives start, speed, sampling and accuracy, but not the path. In
+`table1` the diver swims legs of 7 to 15 s whose headings lie within 85 degrees of a general
+heading ("zigzag with general consistent direction" in the paper).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 @frozen(kw_only=True)
 class DiverScenario(Scenario):
-    """Everything a diver scene can be told; the defaults are Table 1 of the paper."""
+    """Parameters of a diver scene; the defaults are Table 1 of the paper."""
 
     motion: str = parameter('legs', 'how the diver moves', choices=MOTIONS)
     speed: float = parameter(1.0, 'swimming speed', unit='m/s', low=0.0, high=10.0)
@@ -71,7 +71,9 @@ class DiverScenario(Scenario):
     detection_probability: float = parameter(
         1.0, 'that a sensor sees a diver in a scan', low=0.0, high=1.0
     )
-    outlier_probability: float = parameter(0.0, 'that a detection is wild', low=0.0, high=1.0)
+    outlier_probability: float = parameter(
+        0.0, 'that a detection is an outlier', low=0.0, high=1.0
+    )
     clutter: float = parameter(0.0, 'false detections in a scan, on average', low=0.0, high=1e4)
     clutter_range: float = parameter(
         100.0, 'half width of the square they fall in', unit='m', low=1.0
@@ -121,7 +123,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         {'step_jitter': 0.4, 'late_fraction': 0.25, 'detection_probability': 0.9},
     ),
     'multistatic': (
-        'raw arrival times at four receivers, some missing, some wild',
+        'raw arrival times at four receivers, some missing, some outliers',
         {
             'sensor': 'arrivals',
             'speed': 0.75,
@@ -149,8 +151,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> DiverScenario:
-    """The scenario called `name` with some values replaced. Raises `ConfigError` naming
-    mistakes."""
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
     return DiverScenario.named(name, SCENARIOS, overrides)
 
 
@@ -264,12 +265,12 @@ def _sense_polar(
 ) -> list[Fix]:
     """Range and bearing from the origin, converted without bias; clutter uniform in the square."""
     seen = present[rng.uniform(size=len(present)) < config.detection_probability]
-    wild = rng.uniform(size=len(seen)) < config.outlier_probability
+    outlier = rng.uniform(size=len(seen)) < config.outlier_probability
     false = rng.poisson(config.clutter)
     half = config.clutter_range
     points = np.vstack(
         [
-            np.where(wild[:, None], rng.uniform(-half, half, seen.shape), seen),
+            np.where(outlier[:, None], rng.uniform(-half, half, seen.shape), seen),
             rng.uniform(-half, half, (false, 2)),
         ]
     )
@@ -322,13 +323,13 @@ def _sense_arrivals(
 def _paths(
     config: DiverScenario, rx: FloatArray, present: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Path lengths heard at one receiver, metres: divers, some of them late by a reflection, and
+    """Path lengths, m, received at one receiver: divers, some late by a reflection, and
     clutter."""
     path = multistatic.range_sum(present, TRANSMITTER[None], rx[None], 0.0)[:, 0]
     path = path[rng.uniform(size=len(path)) < config.detection_probability]
     path = path + config.sound_speed * config.toa_std * rng.normal(size=len(path))
-    wild = rng.uniform(size=len(path)) < config.outlier_probability
-    path = path + wild * rng.uniform(5.0, 50.0, len(path))
+    outlier = rng.uniform(size=len(path)) < config.outlier_probability
+    path = path + outlier * rng.uniform(5.0, 50.0, len(path))
     direct = float(np.linalg.norm(rx - TRANSMITTER))
     false = rng.uniform(direct, direct + 2.0 * config.clutter_range, rng.poisson(config.clutter))
     return np.concatenate([path, false])
@@ -337,7 +338,7 @@ def _paths(
 def _sense_multistatic_fixes(
     config: DiverScenario, stamp_ns: int, present: FloatArray, rng: np.random.Generator
 ) -> list[Fix]:
-    """A fix a ping for each diver, from its own echoes; none where the geometry gives none."""
+    """One fix per ping and diver, from its own echoes; none where the geometry gives none."""
     fixes = []
     for position in present:
         for ping in _sense_arrivals(config, stamp_ns, position[None], rng):

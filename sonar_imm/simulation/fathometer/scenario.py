@@ -1,8 +1,8 @@
-"""What a scene of the fathometer can be told, and the floor and drift drawn from it.
+"""Parameters of the fathometer scenes, and the floor and the drift drawn from them.
 
-The layers lie about evenly below the first and undulate on their own; some fade away and some
+The layers lie about evenly below the first one and undulate independently. Some fade away and some
 appear, each over `fade_records`. A layer counts as present while its amplitude exceeds 0.4 of its
-greatest. The array drifts and heaves.
+largest value. The array drifts and heaves.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ LEVELS = ('csdm', 'response', 'trace', 'pressure')
 MOST_MEMORY = 2e9
 """Bytes of cross-spectra that one scene may hold."""
 PRESENT = 0.4
-"""A reflector is present while it has more than this share of its greatest amplitude."""
+"""A reflector is present while it has more than this share of its largest amplitude."""
 
 
 @frozen(kw_only=True)
 class FathometerScenario(Scenario):
-    """Everything a fathometer scene can be told; the defaults are like the drift of the paper."""
+    """Parameters of a fathometer scene; the defaults are like the drift of the paper."""
 
     INSTRUMENT = (
         'record_seconds',
@@ -51,17 +51,19 @@ class FathometerScenario(Scenario):
     )
     frequency_min: float = parameter(50.0, 'lower edge of the band', unit='Hz', low=1.0)
     frequency_max: float = parameter(4000.0, 'upper edge of the band', unit='Hz', low=2.0)
-    sample_rate: float = parameter(12000.0, 'pressure: samples a second', unit='Hz', low=10.0)
-    phones: int = parameter(32, 'phones of the array', low=3, high=256)
-    element_spacing: float = parameter(0.18, 'distance between phones', unit='m', low=1e-3)
+    sample_rate: float = parameter(12000.0, 'pressure: samples per second', unit='Hz', low=10.0)
+    phones: int = parameter(32, 'hydrophones of the array', low=3, high=256)
+    element_spacing: float = parameter(0.18, 'distance between hydrophones', unit='m', low=1e-3)
     sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
 
-    array_depth: float = parameter(73.5, 'mean depth of the deepest phone', unit='m', low=0.0)
+    array_depth: float = parameter(73.5, 'mean depth of the deepest hydrophone', unit='m', low=0.0)
     heave: float = parameter(2.5, 'amplitude of its slow heave', unit='m', low=0.0)
     heave_records: float = parameter(180.0, 'records to a period of the heave', low=2.0)
-    array_depth_std: float = parameter(0.03, 'error of the depth that is told', unit='m', low=0.0)
+    array_depth_std: float = parameter(
+        0.03, 'error of the depth that is stated', unit='m', low=0.0
+    )
     depth_companion: bool = parameter(
-        False, 'the depth of the array is told beside the records, not in them'
+        False, 'the depth of the array is sent beside the records, not in them'
     )
 
     first_depth: float = parameter(130.0, 'depth of the first layer', unit='m', low=1.0)
@@ -84,10 +86,12 @@ class FathometerScenario(Scenario):
     fading: tuple[int, ...] = parameter(
         (85,), 'records at which a layer begins to fade', kind='int[]', low=0
     )
-    fade_records: int = parameter(5, 'records that takes', low=1, high=10_000)
+    fade_records: int = parameter(
+        5, 'over how many records layers appear and fade', low=1, high=10_000
+    )
 
     phone_noise: float = parameter(
-        0.01, 'noise power of a phone against the surface noise', low=1e-6, high=1e6
+        0.01, 'noise power of a hydrophone against the surface noise', low=1e-6, high=1e6
     )
     ship_noise: float = parameter(
         3.0, 'power of distant ships at 200 Hz against the surface noise', low=0.0, high=1e6
@@ -99,7 +103,7 @@ class FathometerScenario(Scenario):
         1.3e-3, 'trace: standard deviation of the noise', low=1e-9, high=1.0
     )
     processor: str = parameter(
-        'mvdr', 'response: how the array looks up and down', choices=PROCESSORS
+        'mvdr', 'response: beamformer that looks up and down', choices=PROCESSORS
     )
     depth_min: float = parameter(122.0, 'response, trace: least depth', unit='m', low=0.0)
     depth_max: float = parameter(172.0, 'response, trace: greatest depth', unit='m', low=0.1)
@@ -132,7 +136,7 @@ class FathometerScenario(Scenario):
         """See `Scenario.told`."""
         told = Scenario.told(self)
         if self.level == 'csdm':
-            # They are drawn frequency by frequency: no window fades their noise with depth.
+            # They are drawn frequency by frequency: no window makes their noise fade with depth.
             told |= {'window': 'rectangular', 'overlap': 0.0}
         return told
 
@@ -145,7 +149,7 @@ class FathometerScenario(Scenario):
 _SHORT = {'records': 1, 'appearing': (), 'fading': (), 'heave': 0.0}
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
-    'drift': ('300 records of the drift of the paper, processed by MVDR: 2 s a record', {}),
+    'drift': ('300 records of the drift of the paper, processed by MVDR: 2 s per record', {}),
     'drift_conventional': (
         'drift, processed conventionally',
         {'processor': 'conventional', 'frequency_min': 200.0},
@@ -156,7 +160,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     'drift_traces': ('drift, traces straight away', {'level': 'trace'}),
     'small': (
-        'a short drift of an array of 8 phones in a coarse band, small enough for a bag',
+        'a short drift of an array of 8 hydrophones in a coarse band, small enough for a bag',
         {
             'level': 'csdm',
             'phones': 8,
@@ -191,15 +195,15 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> FathometerScenario:
-    """The scenario called `name` with some values replaced. Raises `ConfigError` naming
-    mistakes."""
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
     return FathometerScenario.named(name, SCENARIOS, overrides)
 
 
 @frozen(eq=False)
 class Drift:
-    """What the floor and the array do: depth and amplitude (records, K) of every layer that there
-    ever is, present (records, K), array_depth (records,), and array_depth_told (records,)."""
+    """The floor and the array over time: depth and amplitude (records, K) of all layers that ever
+    exist, present (records, K), array_depth (records,) and the depth that is stated,
+    array_depth_told (records,)."""
 
     depth: FloatArray
     amplitude: FloatArray

@@ -1,10 +1,11 @@
-"""A line array that drifts over a layered floor, and hears the sea surface twice.
+"""A vertical line array that drifts over a layered floor, in the noise of the sea surface.
 
-What is made of a scene is a matter of `level`:
-    csdm      cross-spectra, drawn around the exact ones of `acoustics.ambient` (Wishart), with
-              noise of ships from the horizontal, red, and of the phones;
-    response  these, processed: traces;
-    trace     traces straight away: pulses and noise of the same band, hundreds a second;
+The array receives the surface noise directly and as echoes of the layers. `level` says what is
+written of a scene:
+    csdm      cross-spectra: Wishart samples of the exact ones of `acoustics.ambient`, with red
+              noise of ships from the horizontal and noise of the hydrophones;
+    response  traces processed from such cross-spectra;
+    trace     traces made directly, of pulses and noise in the same band: hundreds per second;
     pressure  time series from many plane waves: slow, for short scenes.
 """
 
@@ -40,8 +41,8 @@ FRAME_ID = 'array'
 def simulate(config: FathometerScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene.
 
-    A record is stamped when its last sample is in. Array depths, when told beside, come with the
-    record's own stamp, before it.
+    The stamp of a record is that of its last sample. Array depths that are sent beside the records
+    have the stamp of their record and come before it.
     """
     records = list(stream(config, seed))
     received = tuple(one for measurements, _ in records for one in measurements)
@@ -51,7 +52,7 @@ def simulate(config: FathometerScenario, seed: int) -> Scene:
 def stream(
     config: FathometerScenario, seed: int
 ) -> Iterator[tuple[list[Received], TrueReflectors]]:
-    """The same, record after record: long scenes of cross-spectra do not fit into memory."""
+    """Like `simulate`, record by record: long scenes of cross-spectra do not fit into memory."""
     rng = np.random.default_rng(seed)
     drift = drift_of(config, rng)
     for record, measurements in enumerate(_measurements(config, drift, rng)):
@@ -73,14 +74,14 @@ def stream(
 
 
 def stamp_of(config: FathometerScenario, record: int) -> int:
-    """When the last sample of a record is in."""
+    """Time of the last sample of a record."""
     return FIRST_STAMP_NS + round((record + 1) * config.record_seconds * 1e9)
 
 
 def _measurements(
     config: FathometerScenario, drift: Drift, rng: np.random.Generator
 ) -> Iterator[list[Any]]:
-    """What is measured of each record."""
+    """The measurements of each record."""
     for record in range(config.records):
         told = None if config.depth_companion else float(drift.array_depth_told[record])
         if config.level == 'pressure':
@@ -99,7 +100,7 @@ def cross_spectra(
     told: float | None,
     rng: np.random.Generator,
 ) -> CrossSpectra:
-    """What the array makes of one record, on average, and a draw around it. told: the depth of the
+    """A sample of the cross-spectra of one record around their expectation. told: the depth of the
     array that the record states."""
     spacing = 1.0 / config.snapshot_seconds
     first = int(np.ceil(config.frequency_min / spacing - 1e-9))
@@ -118,7 +119,7 @@ def cross_spectra(
     ships = (100.0 if passing else 1.0) * config.ship_noise / (1.0 + (frequency / 200.0) ** 2)
     R += ships[:, None, None] * horizontal_noise_csdm(frequency, *array, 0.03, config.sound_speed)
     R += config.phone_noise * np.eye(config.phones)
-    # Surface noise is red: it falls by 5 dB an octave.
+    # Surface noise is red: it falls by 5 dB per octave.
     R *= ((frequency / 1000.0) ** -1.6)[:, None, None]
     return CrossSpectra(
         stamp_ns=stamp_of(config, record),
@@ -175,7 +176,7 @@ def _trace(
     noise = np.fft.irfft(spectrum, size)[: len(depth)]
     noise *= config.noise_sigma * size / np.sqrt(4.0 * np.count_nonzero(band))
     shift = drift.array_depth_told[record] - drift.array_depth[record]
-    # The level of an MVDR response: a twelfth of what the echo of a metre's way would be.
+    # The level of an MVDR response falls with the two-way path plus the length of the array.
     height = drift.depth[record] - drift.array_depth[record]
     level = (
         12.0 * drift.amplitude[record] / (2.0 * height + config.phones * config.element_spacing)

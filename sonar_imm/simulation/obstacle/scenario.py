@@ -1,4 +1,4 @@
-"""What an obstacle scene can be told, and the scenes that have a name."""
+"""Parameters of the obstacle scenes, and the named scenarios."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PLACEMENTS = ('offset', 'tether', 'seabed', 'surface')
 
 @frozen(kw_only=True)
 class ObstacleScenario(Scenario):
-    """Everything an obstacle scene can be told; the defaults are the first case of the docs."""
+    """Parameters of an obstacle scene; the defaults are the first case of docs/obstacle.md."""
 
     INSTRUMENT = (
         'sonar_lever',
@@ -39,7 +39,7 @@ class ObstacleScenario(Scenario):
         0.0, 'amplitude of ripples of the sea floor', unit='m', low=0.0, high=100.0
     )
     dive: float = parameter(
-        0.0, 'the vehicle goes up and down by this once a minute', unit='m', low=0.0, high=100.0
+        0.0, 'the vehicle goes up and down by this once per minute', unit='m', low=0.0, high=100.0
     )
     roll_rms_deg: float = parameter(1.5, 'swing in roll', unit='deg', low=0.0, high=30.0)
     roll_period: float = parameter(6.0, 'its period', unit='s', low=0.5, high=600.0)
@@ -54,7 +54,7 @@ class ObstacleScenario(Scenario):
 
     # -- navigation ------------------------------------------------------------------------------
     ideal_navigation: bool = parameter(False, 'navigation without errors')
-    navigation_rate: float = parameter(10.0, 'poses a second', unit='Hz', low=0.1, high=1000.0)
+    navigation_rate: float = parameter(10.0, 'poses per second', unit='Hz', low=0.1, high=1000.0)
     log_scale_error: float = parameter(
         0.002, 'scale error of the Doppler log, 1 sigma', low=0.0, high=0.2
     )
@@ -85,9 +85,9 @@ class ObstacleScenario(Scenario):
         0.0, 'poses are received this long after their stamp', unit='s', low=0.0, high=60.0
     )
     navigation_gaps: float = parameter(
-        0.0, 'times the navigation falls silent, on average', low=0.0, high=1000.0
+        0.0, 'number of gaps in the navigation, on average', low=0.0, high=1000.0
     )
-    navigation_gap: float = parameter(3.0, 'for how long', unit='s', low=0.0, high=600.0)
+    navigation_gap: float = parameter(3.0, 'length of a gap', unit='s', low=0.0, high=600.0)
 
     # -- the sonar -------------------------------------------------------------------------------
     sonar_lever: tuple[float, ...] = parameter(
@@ -100,7 +100,7 @@ class ObstacleScenario(Scenario):
     ping_timing: str = parameter(
         'instant', 'to which pose an echo belongs', choices=('instant', 'two_way')
     )
-    ping_rate: float = parameter(2.0, 'pings a second', unit='Hz', low=0.05, high=50.0)
+    ping_rate: float = parameter(2.0, 'pings per second', unit='Hz', low=0.05, high=50.0)
     ping_jitter: float = parameter(
         0.0, 'ping times vary uniformly by this much of a step', low=0.0, high=0.9
     )
@@ -133,7 +133,7 @@ class ObstacleScenario(Scenario):
     outlier_bearing_deg: float = parameter(
         6.0, 'by how much at most', unit='deg', low=0.0, high=90.0
     )
-    clutter: float = parameter(0.0, 'false detections a ping, on average', low=0.0, high=1000.0)
+    clutter: float = parameter(0.0, 'false detections per ping, on average', low=0.0, high=1000.0)
     late_fraction: float = parameter(0.0, 'share of pings received late', low=0.0, high=1.0)
     late_delay: float = parameter(2.0, 'most they are late by', unit='s', low=0.0, high=600.0)
 

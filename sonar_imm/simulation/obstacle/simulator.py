@@ -1,10 +1,10 @@
-"""An AUV that swims towards obstacles and sees them on a forward-looking sonar.
+"""An AUV that approaches obstacles and detects them with a forward-looking sonar.
 
-The vehicle is like Daurade, the sonar like a Blueview P450: 1.5 m/s along a straight course,
-rolling, pitching, yawing and heaving a little as vehicles do in swell, two pings a second into a
-sector of 45 by 15 degrees. Navigation is dead reckoning at 10 Hz from a Doppler log with a scale
+The vehicle is like Daurade, the sonar like a Blueview P450: 1.5 m/s along a straight course, a
+little roll, pitch, yaw and heave as in swell, two pings per second into a sector of 45 by 15
+degrees. Navigation is dead reckoning at 10 Hz from a Doppler log with a scale
 error and a bias, and from an attitude sensor with a bias. Obstacles are given by their vertical
-offset from the sonar, or as spheres on tethers, things on the sea floor and floats at the surface.
+offset from the sonar, or as spheres on tethers, objects on the sea floor or floats at the surface.
 
 Measurements are in ROS axes, ENU and FLU; inside, all is NED and FRD as in the papers.
 """
@@ -32,13 +32,14 @@ LEAD_IN = 1.0
 """Seconds of navigation before the first ping and after the last."""
 WAVES = 3
 """Sinusoids that make up a swing, with periods of 0.75 to 1.3 times the stated one: narrow-band,
-as swell is. The study whose numbers docs/obstacle.md compares with swings like this."""
+as swell is. The study that docs/obstacle.md compares with has such swings."""
 _FINE = 0.02
+"""Seconds to either side for numerical derivatives."""
 
 
 @frozen(eq=False)
 class TrueObstacle:
-    """What the sonar should have seen of one obstacle at each ping.
+    """True position of one obstacle relative to the sonar at each ping.
 
     stamp_ns (n,); position (3,) ENU; range m, bearing rad (to port), vertical_offset m (below), in
     the sonar's frame, each (n,); in_beam (n,) True where a ping can show it.
@@ -68,8 +69,7 @@ class TrueObstacle:
 
 
 def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> ObstacleScenario:
-    """The scenario called `name` with some values replaced. Raises `ConfigError` naming
-    mistakes."""
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
     return ObstacleScenario.named(name, SCENARIOS, overrides)
 
 
@@ -109,7 +109,7 @@ class _Swing:
 
 
 class _Vehicle:
-    """Where the vehicle is at any time, NED and FRD."""
+    """Pose of the vehicle at any time, NED and FRD."""
 
     def __init__(self, config: ObstacleScenario, rng: np.random.Generator):
         self.config = config
@@ -130,7 +130,7 @@ class _Vehicle:
         return np.stack([self.roll(t), self.pitch(t), self.course + self.yaw(t)], axis=-1)
 
     def position(self, t: FloatArray) -> FloatArray:
-        """(..., 3)"""
+        """(..., 3) m, NED."""
         along, across = self.config.speed * t, self.sway(t)
         c, s = np.cos(self.course), np.sin(self.course)
         dive = self.config.dive * np.sin(2.0 * np.pi * t / 60.0)
@@ -151,7 +151,7 @@ class _Vehicle:
 
 
 def _ping_times(config: ObstacleScenario, rng: np.random.Generator) -> FloatArray:
-    """Pings until the vehicle is `last_range` from where the first obstacle stands."""
+    """Times of the pings, s, until the vehicle is `last_range` from the first obstacle."""
     step = 1.0 / config.ping_rate
     times = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
     return times + rng.uniform(-0.5, 0.5, len(times)) * config.ping_jitter * step
@@ -169,8 +169,8 @@ def _seabed(config: ObstacleScenario, along: FloatArray) -> FloatArray:
 def _place(
     config: ObstacleScenario, vehicle: _Vehicle, rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Where the obstacles are, NED: the first `first_range` from the first ping, others at
-    `spacing` behind it, each passed at a distance drawn at random."""
+    """Positions of the obstacles, NED. The first one is `first_range` from the first ping, each
+    further one `spacing` behind. The passing distance of each is drawn at random."""
     sonar = vehicle.sonar(np.zeros(()))
     c, s = np.cos(vehicle.course), np.sin(vehicle.course)
     places = []
@@ -196,7 +196,7 @@ def _offset(
     return {'seabed': seabed - 0.5, 'surface': 0.5}[config.placement] - depth
 
 
-# -- what the instruments say ------------------------------------------------------------------
+# -- measurements ------------------------------------------------------------------------------
 
 
 def _navigate(
@@ -267,7 +267,7 @@ def _turn_rate(vehicle: _Vehicle, t: FloatArray) -> FloatArray:
 
 
 def _gaps(config: ObstacleScenario, t: FloatArray, rng: np.random.Generator) -> np.ndarray:
-    """True (n,) where the navigation is silent: `navigation_gap` seconds, now and then."""
+    """True (n,) in the gaps of the navigation, of `navigation_gap` seconds each."""
     silent = np.zeros(len(t), bool)
     if config.navigation_gaps > 0.0:
         for start in rng.uniform(t[0], t[-1], rng.poisson(config.navigation_gaps)):
@@ -282,8 +282,8 @@ def _echoes(
     place: FloatArray,
     sound: float,
 ) -> tuple[FloatArray, np.ndarray]:
-    """Range and azimuth (n, 2) of an obstacle at each ping without noise, and whether the beam
-    holds it (n,)."""
+    """Range and azimuth (n, 2) of an obstacle at each ping without noise, and whether it is inside
+    the beam (n,)."""
     out = geometry.to_body(vehicle.sonar(times), place)
     d, azimuth = geometry.project(out, config.azimuth_model)
     if config.ping_timing == 'two_way':
@@ -307,18 +307,18 @@ def _pings(
     echoes: list[tuple[FloatArray, np.ndarray]],
     rng: np.random.Generator,
 ) -> list[Received]:
-    """The detections of each ping: echoes that are seen, some of them wild, and clutter."""
+    """The detections of each ping: echoes that are seen, some of them outliers, and clutter."""
     half = np.radians(0.5 * config.horizontal_fov_deg)
     noise = np.array([config.range_std, np.radians(config.bearing_std_deg)])
     step = np.array([config.range_step, np.radians(config.bearing_step_deg)])
-    wild = np.array([config.outlier_range, np.radians(config.outlier_bearing_deg)])
+    largest = np.array([config.outlier_range, np.radians(config.outlier_bearing_deg)])
     received = []
     for k, stamp in enumerate(stamps):
         rows = []
         for echo, inside in echoes:
             seen = rng.uniform() < config.detection_probability
-            far = rng.uniform() < config.outlier_probability
-            error = noise * rng.normal(size=2) + far * wild * rng.uniform(-1.0, 1.0, 2)
+            outlier = rng.uniform() < config.outlier_probability
+            error = noise * rng.normal(size=2) + outlier * largest * rng.uniform(-1.0, 1.0, 2)
             if seen and inside[k]:
                 rows.append(echo[k] + error)
         for _ in range(rng.poisson(config.clutter)):

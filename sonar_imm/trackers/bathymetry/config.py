@@ -11,7 +11,7 @@ import math
 
 from attrs import frozen
 
-from ...acoustics.laplace import LAWS
+from ...acoustics.laplace import LIKELIHOODS
 from ...parameters import Config
 from ...parameters import parameter as fixed_parameter
 from ..model_checks import chain_problems
@@ -139,7 +139,9 @@ class BathymetryConfig(Config):
     )
 
     # -- what is heard ---------------------------------------------------------------------------
-    likelihood: str = parameter('laplace', 'law of the samples of one bin', choices=LAWS)
+    likelihood: str = parameter(
+        'laplace', 'distribution of the samples of one bin', choices=LIKELIHOODS
+    )
     noise_variance: float = parameter(
         0.0,
         'noise power at a stave, for snapshots that do not bring it; 0: from the water column, '

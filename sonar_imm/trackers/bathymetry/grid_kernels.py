@@ -1,90 +1,80 @@
 """The grid filter and smoother along the range bins of one ping, compiled.
 
-The verbs are those of `estimation.grid_kernels`; see `bathymetry_kernels.filter_block` for the
-arguments that describe the ping.
+The verbs are those of `estimation.grid_kernels`. Shapes: T bins of a ping, M models, G cells.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ...acoustics import likelihood_kernels as law
 from ...estimation import grid_kernels as grid
-from ...estimation.arrays import BoolArray, ComplexArray, FloatArray, IntArray
+from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.jit import kernel
-from .kernels import sines_of
+from .kernels import log_likelihoods, PingLikelihood, Track
+
+
+class GridMotion(NamedTuple):
+    """How the models move on the grid: cells (G,), the states it is made of; transition (M, M) of
+    the models; sigma (T, M) of their walks, in cells; `coast` is the model that all follow through
+    bins where nothing is heard."""
+
+    cells: FloatArray
+    transition: FloatArray
+    sigma: FloatArray
+    coast: int
 
 
 @kernel
 def filter_ping(
     p: FloatArray,
-    cells: FloatArray,
-    transition: FloatArray,
-    sigma: FloatArray,
-    coast: int,
-    slant_range: FloatArray,
-    heard: BoolArray,
-    form: ComplexArray,
-    base: FloatArray,
-    spread: ComplexArray,
-    signal: FloatArray,
-    geometry: FloatArray,
-    table: FloatArray,
+    motion: GridMotion,
+    ping: PingLikelihood,
     window: IntArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    probability: FloatArray,
-    log_likelihood: FloatArray,
+    track: Track,
     keep: bool,
 ) -> FloatArray:
-    """All T bins from p (M, G), the joint probability before the first; sigma (T, M) in cells.
+    """All T bins from p (M, G), the joint probability before the first.
 
-    The windows [low, high) of the filtered densities go to window (T, 2). With `keep` the
-    densities themselves are given, one after the other, M rows each; else nothing (0,).
+    The windows [low, high) of the filtered densities go into window (T, 2), the answers into
+    `track`. With `keep` the densities themselves are returned, one after the other, M rows each;
+    else nothing (0,).
     """
-    (M, G), T = p.shape, slant_range.shape[0]
+    (M, G), T = p.shape, ping.ranges.shape[0]
+    cells, sigma, coast = motion.cells, motion.sigma, motion.coast
     mixed, scratch = np.empty((M, G)), np.empty((7, max(G, 128) + 16))
     work, value, sines = np.empty((4, G)), np.empty(G), np.empty(G)
     kept, used = np.empty(4096 if keep else 0), 0
     low, high = grid.trim(p, 0, G)
     for t in range(T):
-        reach = 0
-        if heard[t]:
-            grid.mix(p, low, high, transition, mixed)
+        heard, reach = ping.heard[t], 0
+        if heard:
+            grid.mix(p, low, high, motion.transition, mixed)
         else:
             for j in range(M):
                 for g in range(low, high):
                     mixed[j, g] = p[j, g]
         for j in range(M):
-            reach = max(reach, grid.reach_of(sigma[t, j if heard[t] else coast]))
+            reach = max(reach, grid.reach_of(sigma[t, j if heard else coast]))
         new_low, new_high = max(low - reach, 0), min(high + reach, G)
         for j in range(M):
-            width = sigma[t, j if heard[t] else coast]
+            width = sigma[t, j if heard else coast]
             grid.walk(mixed[j], low, high, width, scratch, p[j], new_low, new_high)
         low, high = new_low, new_high
         n = high - low
-        if heard[t]:
-            bins_sines, bins_value = sines[:n], value[:n]
-            sines_of(cells[low:high], slant_range[t], geometry, work, bins_sines)
-            law.log_likelihoods(
-                bins_sines,
-                geometry[3],
-                form[t],
-                base[t],
-                spread[t],
-                signal[t],
-                table,
-                work,
-                bins_value,
-            )
+        here = value[:n]
+        if heard:
+            log_likelihoods(cells[low:high], ping, t, sines[:n], work, here)
         else:
-            bins_value = value[:n]
             for g in range(n):
-                bins_value[g] = 0.0
-        log_likelihood[t] = grid.update(p, low, high, bins_value, work)
+                here[g] = 0.0
+        track.log_likelihood[t] = grid.update(p, low, high, here, work)
         low, high = grid.trim(p, low, high)
         window[t, 0], window[t, 1] = low, high
-        mean[t, 0], covariance[t, 0, 0] = grid.combine(p, low, high, cells, probability[t])
+        track.mean[t, 0], track.covariance[t, 0, 0] = grid.combine(
+            p, low, high, cells, track.probability[t]
+        )
         if keep:
             needed = used + M * (high - low)
             if needed > kept.shape[0]:
@@ -103,25 +93,14 @@ def filter_ping(
 def smooth_ping(
     kept: FloatArray,
     window: IntArray,
-    cells: FloatArray,
-    transition: FloatArray,
-    sigma: FloatArray,
-    coast: int,
-    slant_range: FloatArray,
-    heard: BoolArray,
-    form: ComplexArray,
-    base: FloatArray,
-    spread: ComplexArray,
-    signal: FloatArray,
-    geometry: FloatArray,
-    table: FloatArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    probability: FloatArray,
+    motion: GridMotion,
+    ping: PingLikelihood,
+    track: Track,
 ) -> None:
-    """Forward-backward: what `filter_ping` kept, given the whole ping; the answers of all bins but
-    the last are written anew."""
-    M, G, T = transition.shape[0], cells.shape[0], slant_range.shape[0]
+    """Forward-backward: what `filter_ping` kept, given the whole ping. The answers of all bins but
+    the last are written anew into `track`."""
+    cells, coast = motion.cells, motion.coast
+    M, G, T = motion.transition.shape[0], cells.shape[0], ping.ranges.shape[0]
     beta, back, p = np.empty((M, G)), np.empty((M, G)), np.empty((M, G))
     scratch, work = np.empty((7, max(G, 128) + 16)), np.empty((4, G))
     value, sines = np.empty(G), np.empty(G)
@@ -134,29 +113,18 @@ def smooth_ping(
             beta[j, g] = 1.0
     end -= M * (high - low)
     for t in range(T - 2, -1, -1):
-        if heard[t + 1]:
+        heard = ping.heard[t + 1]
+        if heard:
             n = high - low
-            bins_sines, bins_value = sines[:n], value[:n]
-            sines_of(cells[low:high], slant_range[t + 1], geometry, work, bins_sines)
-            law.log_likelihoods(
-                bins_sines,
-                geometry[3],
-                form[t + 1],
-                base[t + 1],
-                spread[t + 1],
-                signal[t + 1],
-                table,
-                work,
-                bins_value,
-            )
-            grid.update(beta, low, high, bins_value, work)
+            log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
+            grid.update(beta, low, high, value[:n], work)
         new_low, new_high = window[t, 0], window[t, 1]
         for j in range(M):
-            width = sigma[t + 1, j if heard[t + 1] else coast]
+            width = motion.sigma[t + 1, j if heard else coast]
             grid.walk(beta[j], low, high, width, scratch, back[j], new_low, new_high)
         low, high = new_low, new_high
-        if heard[t + 1]:
-            grid.mix(back, low, high, transition.T, beta)
+        if heard:
+            grid.mix(back, low, high, motion.transition.T, beta)
         else:
             for j in range(M):
                 for g in range(low, high):
@@ -171,4 +139,6 @@ def smooth_ping(
         for j in range(M):
             for g in range(low, high):
                 p[j, g] /= total
-        mean[t, 0], covariance[t, 0, 0] = grid.combine(p, low, high, cells, probability[t])
+        track.mean[t, 0], track.covariance[t, 0, 0] = grid.combine(
+            p, low, high, cells, track.probability[t]
+        )

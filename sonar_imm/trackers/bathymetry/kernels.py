@@ -1,16 +1,20 @@
 """The particle filter along a block of range bins of one ping, compiled as one loop.
 
 Each verb is a kernel of its own room (`estimation.imm_particles_kernels`,
-`acoustics.law_kernels`); here they are called bin after bin on arrays that stay in the cache.
+`acoustics.likelihood_kernels`); here they are called bin after bin on arrays that stay in the
+cache.
+
+Shapes: T bins of a ping, M models, n states, k noises, N particles per model, P staves.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import likelihood_kernels as law
+from ...acoustics import likelihood_kernels
 from ...estimation import imm_particles_kernels as imm
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...estimation.elementary import phasors
@@ -20,25 +24,95 @@ _HALF_CIRCLE = 0.5 * math.pi
 _TURNS = 0.5 / math.pi
 
 
+class Geometry(NamedTuple):
+    """How a state becomes a direction: `sonar_height` in metres above the reference floor, NaN
+    when the states are angles; cosine and sine of the tilt; `spacing` of the staves in
+    wavelengths, negative for a conjugated array."""
+
+    sonar_height: float
+    cos_tilt: float
+    sin_tilt: float
+    spacing: float
+
+
+class PingLikelihood(NamedTuple):
+    """The likelihood of the state in each of T bins.
+
+    ranges (T,) in metres; heard (T,): bins that say something; form (T, P), base (T,), spread
+    (T, P), or (T, 0) in white noise, signal (T,) and table: see
+    `likelihood_kernels.log_likelihoods`; noise (T,): the variance it was made for; constant (T,):
+    what the kernels leave out of the log likelihood.
+    """
+
+    ranges: FloatArray
+    heard: BoolArray
+    form: ComplexArray
+    base: FloatArray
+    spread: ComplexArray
+    signal: FloatArray
+    noise: FloatArray
+    constant: FloatArray
+    table: FloatArray
+    geometry: Geometry
+
+
+class Motion(NamedTuple):
+    """How the models move: F (M, n, n), G (M, n, k) times scale (T, M); transition (M, M) of the
+    models; `coast` is the model that moves all particles through bins where nothing is heard."""
+
+    F: FloatArray
+    G: FloatArray
+    scale: FloatArray
+    transition: FloatArray
+    coast: int
+
+
+class Particles(NamedTuple):
+    """x (M, n, N), their weights w (M, N) and the probabilities mu (M,) of the models."""
+
+    x: FloatArray
+    w: FloatArray
+    mu: FloatArray
+
+
+class Draws(NamedTuple):
+    """Random numbers for B bins: uniform (B, 2, M) for mixing and resampling, standard normal
+    noise (B, M, k, N)."""
+
+    uniform: FloatArray
+    noise: FloatArray
+
+
+class Track(NamedTuple):
+    """The floor along one ping: mean (T, n), covariance (T, n, n), probability (T, M) of each
+    model, log_likelihood (T,) of each bin given those before it, sample_size (T,) effective."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    probability: FloatArray
+    log_likelihood: FloatArray
+    sample_size: FloatArray
+
+
 @kernel
 def sines_of(
     state: FloatArray,
     slant_range: float,
-    geometry: FloatArray,
+    geometry: Geometry,
     work: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Direction sines of states (n,) into out (n,), NaN where no echo can come from.
-
-    geometry: sonar height, cos tilt, sin tilt, spacing; a sonar height of NaN says that the states
-    are angles, else they are heights of the floor. work (2, n) is scratch.
-    """
+    """Direction sines of states (n,) into out (n,), NaN where no echo can come from. States are
+    heights of the floor, or angles, as `geometry` says; work (1 or more, n or more) is scratch."""
     n = state.shape[0]
     first = work[0, :n]
-    if geometry[0] == geometry[0]:
+    height = geometry.sonar_height
+    if height == height:
         for s in range(n):
-            first[s] = geometry[0] - state[s]
-        law.direction_sines(first, slant_range, geometry[1], geometry[2], out)
+            first[s] = height - state[s]
+        likelihood_kernels.direction_sines(
+            first, slant_range, geometry.cos_tilt, geometry.sin_tilt, out
+        )
     else:
         phasors(state, _TURNS, first, out)
         for s in range(n):
@@ -47,89 +121,81 @@ def sines_of(
 
 
 @kernel
+def log_likelihoods(
+    state: FloatArray,
+    ping: PingLikelihood,
+    t: int,
+    sines: FloatArray,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Log likelihood of states (n,) given bin t into out (n,); sines (n,) and work (4, n or more)
+    are scratch."""
+    sines_of(state, ping.ranges[t], ping.geometry, work, sines)
+    likelihood_kernels.log_likelihoods(
+        sines,
+        ping.geometry.spacing,
+        ping.form[t],
+        ping.base[t],
+        ping.spread[t],
+        ping.signal[t],
+        ping.table,
+        work,
+        out,
+    )
+
+
+@kernel
 def filter_block(
     first: int,
-    x: FloatArray,
-    w: FloatArray,
-    mu: FloatArray,
-    transition: FloatArray,
-    F: FloatArray,
-    G: FloatArray,
-    scale: FloatArray,
-    coast: int,
-    redraw: bool,
-    uniform: FloatArray,
-    noise: FloatArray,
-    slant_range: FloatArray,
-    heard: BoolArray,
-    form: ComplexArray,
-    base: FloatArray,
-    spread: ComplexArray,
-    signal: FloatArray,
-    geometry: FloatArray,
-    table: FloatArray,
-    mean: FloatArray,
-    covariance: FloatArray,
-    probability: FloatArray,
-    log_likelihood: FloatArray,
-    sample_size: FloatArray,
+    particles: Particles,
+    motion: Motion,
+    draws: Draws,
+    ping: PingLikelihood,
+    resample: bool,
+    track: Track,
 ) -> None:
-    """Bins first, first + 1, ... of a ping, as many as `noise` (B, M, k, N) and `uniform`
-    (B, 2, M) last for.
+    """Bins first, first + 1, ... of a ping, as many as `draws` last for.
 
-    x (M, n, N), w (M, N), mu (M,) are carried on. F (M, n, n), G (M, n, k) times scale (T, M) are
-    the motions; `coast` is the model that moves all particles through bins that are not `heard`
-    (T,), where the chain rests. `redraw` resamples each model's particles after the update, before
-    the answer. form, base, spread, signal: the law of each of the T bins, see
-    `law_kernels.log_likelihoods` (spread is (T, 0) in white noise); geometry: see `sines_of`. The
-    answers go to mean (T, n), covariance (T, n, n), probability (T, M), log_likelihood (T,) and
-    sample_size (T,).
+    `particles` are carried on, the answers go into `track`. Where nothing is heard the chain of
+    the models rests. `resample` resamples each model's particles after the update, before the
+    answer.
     """
+    x, w, mu = particles
     M, n, N = x.shape
-    running, points = np.empty((M, N)), np.empty(N)
-    origin = np.empty(N + 1, np.int64)
+    G, heard = motion.G, ping.heard
+    scratch = imm.MixScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
     sines, value = np.empty(N), np.empty((M, N))
     mixed, work, c = np.empty((M, n, N)), np.empty((4, N)), np.empty(M)
     step, alone = np.empty((n, G.shape[2])), np.eye(M)
-    for b in range(noise.shape[0]):
+    for b in range(draws.noise.shape[0]):
         t = first + b
         if heard[t]:
-            imm.mix(x, w, mu, transition, uniform[b, 0], running, points, origin, mixed, c)
+            imm.mix(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
         for j in range(M):
-            model = j if heard[t] else coast
+            model = j if heard[t] else motion.coast
             for a in range(n):
                 for k in range(G.shape[2]):
-                    step[a, k] = G[model, a, k] * scale[t, model]
+                    step[a, k] = G[model, a, k] * motion.scale[t, model]
             if heard[t]:
-                imm.predict(mixed[j], F[model], step, noise[b, j], x[j])
-                sines_of(x[j, 0], slant_range[t], geometry, work, sines)
-                law.log_likelihoods(
-                    sines,
-                    geometry[3],
-                    form[t],
-                    base[t],
-                    spread[t],
-                    signal[t],
-                    table,
-                    work,
-                    value[j],
-                )
+                imm.predict(mixed[j], motion.F[model], step, draws.noise[b, j], x[j])
+                log_likelihoods(x[j, 0], ping, t, sines, work, value[j])
                 for s in range(N):
                     w[j, s] = 1.0 / N
             else:
-                imm.predict(x[j], F[model], step, noise[b, j], mixed[j])
+                imm.predict(x[j], motion.F[model], step, draws.noise[b, j], mixed[j])
                 for a in range(n):
                     for s in range(N):
                         x[j, a, s] = mixed[j, a, s]
-        log_likelihood[t] = imm.update(value, c, w, mu, work[:2]) if heard[t] else 0.0
-        sample_size[t] = imm.effective_sample_size(w, mu)
-        if redraw and heard[t]:
-            imm.mix(x, w, mu, alone, uniform[b, 1], running, points, origin, mixed, c)
+        track.log_likelihood[t] = imm.update(value, c, w, mu, work[:2]) if heard[t] else 0.0
+        track.sample_size[t] = imm.effective_sample_size(w, mu)
+        if resample and heard[t]:
+            imm.mix(x, w, mu, alone, draws.uniform[b, 1], scratch, mixed, c)
             for j in range(M):
                 for s in range(N):
                     w[j, s] = 1.0 / N
                     for a in range(n):
                         x[j, a, s] = mixed[j, a, s]
-        imm.combine(x, w, mu, mean[t], covariance[t])
+        imm.combine(x, w, mu, track.mean[t], track.covariance[t])
         for j in range(M):
-            probability[t, j] = mu[j]
+            track.probability[t, j] = mu[j]

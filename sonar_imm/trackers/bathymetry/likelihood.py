@@ -10,39 +10,17 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from attrs import frozen
 import numpy as np
 
 from ...acoustics import array, coherence, interference, laplace, likelihood_kernels, variances
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from .config import BathymetryConfig
+from .kernels import Geometry, PingLikelihood
 
 WATER_COLUMN = 0.8
 """Bins nearer than this share of the sonar's height hold no echo of the floor."""
 FEWEST_QUIET_BINS = 16
-
-
-@frozen(eq=False)
-class PingLikelihood:
-    """The likelihood of each of T bins; see `likelihood_kernels.log_likelihoods` for form (T, P),
-    base (T,), spread (T, P or 0), signal (T,) and table; noise (T,) is the variance
-    it was made for.
-
-    heard (T,): bins that say something; constant (T,): what the kernels leave out of the log
-    likelihood; geometry: see `bathymetry_kernels.sines_of`.
-    """
-
-    ranges: FloatArray
-    heard: BoolArray
-    form: ComplexArray
-    base: FloatArray
-    spread: ComplexArray
-    signal: FloatArray
-    noise: FloatArray
-    constant: FloatArray
-    table: FloatArray
-    geometry: FloatArray
 
 
 def spacing_of(snapshot: Snapshot, config: BathymetryConfig) -> float:
@@ -52,7 +30,7 @@ def spacing_of(snapshot: Snapshot, config: BathymetryConfig) -> float:
     return -spacing if config.conjugate else spacing
 
 
-def ping_law(snapshot: Snapshot, config: BathymetryConfig) -> PingLikelihood:
+def ping_likelihood(snapshot: Snapshot, config: BathymetryConfig) -> PingLikelihood:
     """The likelihood of every bin of a snapshot under `config`."""
     ranges = np.array(snapshot.ranges(config.sound_speed))
     spacing, tilt = spacing_of(snapshot, config), math.radians(config.tilt_deg)
@@ -70,11 +48,11 @@ def ping_law(snapshot: Snapshot, config: BathymetryConfig) -> PingLikelihood:
         form=np.ascontiguousarray(parts.form),
         base=np.ascontiguousarray(parts.base),
         spread=np.ascontiguousarray(parts.spread),
-        signal=parts.signal,
-        noise=noise,
-        constant=constant(P, parts.log_determinant),
-        table=likelihood_kernels.law_table(P, config.likelihood),
-        geometry=np.array([height, math.cos(tilt), math.sin(tilt), spacing]),
+        signal=np.ascontiguousarray(parts.signal),
+        noise=np.ascontiguousarray(noise),
+        constant=np.ascontiguousarray(constant(P, parts.log_determinant)),
+        table=likelihood_kernels.likelihood_table(P, config.likelihood),
+        geometry=Geometry(height, math.cos(tilt), math.sin(tilt), spacing),
     )
 
 
@@ -148,9 +126,9 @@ def _heard(
 def _noise(snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig) -> FloatArray:
     """Noise variance (T,) at a stave: from the snapshot, the config, the water column, or from
     what is not coherent."""
-    known = snapshot.noise_variance
-    if known is not None and np.isfinite(known).all():
-        return np.array(known)
+    given = snapshot.noise_variance
+    if given is not None and np.isfinite(given).all():
+        return np.array(given)
     level = config.noise_variance
     if not level > 0.0:
         quiet = (ranges < WATER_COLUMN * config.sonar_height) & snapshot.usable
@@ -162,16 +140,16 @@ def _noise(snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig) -> 
         # Too few bins to tell noise from echo: suppose the 20 dB of a usual swath.
         level = 0.01 * float(np.mean(variances.mean_power(snapshot.iq[snapshot.usable])))
     noise = np.full(len(snapshot), level)
-    return noise if known is None else np.where(np.isfinite(known), known, noise)
+    return noise if given is None else np.where(np.isfinite(given), given, noise)
 
 
 def _signal(snapshot: Snapshot, noise: FloatArray, echoes: FloatArray) -> FloatArray:
     """Signal variance (T,) at a stave: from the snapshot, else a moving mean of the power, of
     which the floor has one part in `echoes` (T,)."""
-    known = snapshot.signal_variance
-    if known is not None and np.isfinite(known).all():
-        return np.array(known)
+    given = snapshot.signal_variance
+    if given is not None and np.isfinite(given).all():
+        return np.array(given)
     power = np.where(snapshot.usable, variances.mean_power(snapshot.iq), 0.0)
     signal = variances.signal_variance(power, noise, usable=snapshot.usable) / echoes
     signal = np.fmax(signal, variances.LEAST_SNR * noise)
-    return signal if known is None else np.where(np.isfinite(known), known, signal)
+    return signal if given is None else np.where(np.isfinite(given), given, signal)

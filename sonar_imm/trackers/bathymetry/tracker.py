@@ -22,7 +22,6 @@ from collections import Counter
 import math
 from typing import Any
 
-from attrs import evolve
 import numpy as np
 
 from ...acoustics.array import across_track, angle_of_depth, depth_of_angle
@@ -31,8 +30,9 @@ from ...estimation.arrays import FloatArray
 from ...estimation.mode_smoothing import smooth_modes
 from ...measurements import Snapshot
 from .config import BathymetryConfig
-from .engines import run_grid, run_particles, Track
-from .likelihood import ping_law, PingLikelihood
+from .engines import run_grid, run_particles
+from .kernels import PingLikelihood, Track
+from .likelihood import ping_likelihood
 from .models import build_models, grid_cells, TerrainModels
 
 __all__ = ['BathymetryConfig', 'BathymetryTracker']
@@ -76,60 +76,60 @@ class BathymetryTracker:
         if self._other_spacing(measurement):
             self.counts['other_spacing'] += 1
             return []
-        law = ping_law(measurement, self.config)
-        first = int(np.argmax(law.heard)) if law.heard.any() else 0
-        models = build_models(self.config, law.ranges, first)
-        track = self._track(models, law, measurement.stamp_ns)
-        self._count(measurement, law, track)
-        return [self._estimate(measurement, models, law, track)]
+        ping = ping_likelihood(measurement, self.config)
+        first = int(np.argmax(ping.heard)) if ping.heard.any() else 0
+        models = build_models(self.config, ping.ranges, first)
+        track = self._track(models, ping, measurement.stamp_ns)
+        self._count(measurement, ping, track)
+        return [self._estimate(measurement, models, ping, track)]
 
     def _other_spacing(self, snapshot: Snapshot) -> bool:
         """True when the snapshot contradicts the spacing that was configured."""
         told, said = self.config.element_spacing_wavelengths, snapshot.spacing_wavelengths
         return told > 0.0 and said is not None and abs(said / told - 1.0) > SPACING_TOLERANCE
 
-    def _track(self, models: TerrainModels, law: PingLikelihood, stamp_ns: int) -> Track:
+    def _track(self, models: TerrainModels, ping: PingLikelihood, stamp_ns: int) -> Track:
         config = self.config
         if config.engine == 'grid':
             cells = grid_cells(config, models)
-            track = run_grid(models, law, cells, smooth=config.smoothing == 'states')
+            track = run_grid(models, ping, cells, smooth=config.smoothing == 'states')
         else:
             entropy = config.seed, stamp_ns, int(config.side == 'port')
             track = run_particles(
                 models,
-                law,
+                ping,
                 config.particles_per_model,
                 entropy,
-                redraw=config.variant == 'paper',
+                resample=config.variant == 'paper',
             )
         if config.smoothing == 'modes':
-            smoothed = smooth_modes(track.probability, models.transition, law.heard)
-            track = evolve(track, probability=smoothed)
+            smoothed = smooth_modes(track.probability, models.transition, ping.heard)
+            track = track._replace(probability=smoothed)
         return track
 
-    def _count(self, snapshot: Snapshot, law: PingLikelihood, track: Track) -> None:
+    def _count(self, snapshot: Snapshot, ping: PingLikelihood, track: Track) -> None:
         self.counts['used'] += 1
         self.counts['bins'] += len(snapshot)
         self.counts['bins_unusable'] += int((~snapshot.usable).sum())
-        self.counts['bins_silent'] += int((snapshot.usable & ~law.heard).sum())
+        self.counts['bins_silent'] += int((snapshot.usable & ~ping.heard).sum())
         self.counts['bins_unexplained'] += int(np.isneginf(track.log_likelihood).sum())
         self._health = {
             'bins': len(snapshot),
-            'heard_share': float(law.heard.mean()),
+            'heard_share': float(ping.heard.mean()),
             'effective_sample_size': float(track.sample_size.mean()),
-            'log_likelihood_mean': float(track.log_likelihood[law.heard].mean())
-            if law.heard.any()
+            'log_likelihood_mean': float(track.log_likelihood[ping.heard].mean())
+            if ping.heard.any()
             else math.nan,
-            'noise_variance': float(np.median(law.noise)),
+            'noise_variance': float(np.median(ping.noise)),
         }
 
     def _estimate(
-        self, snapshot: Snapshot, models: TerrainModels, law: PingLikelihood, track: Track
+        self, snapshot: Snapshot, models: TerrainModels, ping: PingLikelihood, track: Track
     ) -> Estimate:
-        height, angle = self._floor(models, law.ranges, track.mean[:, 0])
+        height, angle = self._floor(models, ping.ranges, track.mean[:, 0])
         other = ('angle', angle) if models.state_names[0] == 'height' else ('height', height)
         depth = self.config.sonar_height - height
-        outward = np.nan_to_num(across_track(depth, law.ranges))
+        outward = np.nan_to_num(across_track(depth, ping.ranges))
         left = outward if self.config.side == 'port' else -outward
         label = track.probability.argmax(axis=1)
         return Estimate(
@@ -142,9 +142,9 @@ class BathymetryTracker:
             model_names=models.names,
             probabilities=track.probability,
             extras={
-                'range': law.ranges,
+                'range': ping.ranges,
                 other[0]: other[1],
-                'valid': law.heard.astype(np.uint8),
+                'valid': ping.heard.astype(np.uint8),
                 'log_likelihood': track.log_likelihood,
                 'label': label.astype(np.uint8),
                 'label_probability': track.probability[np.arange(len(label)), label],

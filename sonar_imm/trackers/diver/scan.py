@@ -1,5 +1,4 @@
-"""One scan of the diver tracker: what is known before it, the updates in the middle, what is known
-after it."""
+"""One scan of the diver tracker: the state before it, the updates in between, the state after."""
 
 from __future__ import annotations
 
@@ -13,7 +12,13 @@ import numpy as np
 from ...estimation import imm, imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
+from ...estimation.association import (
+    assign_by_rank,
+    association_cost,
+    gate_threshold,
+    Tracks,
+    TrackStatus,
+)
 from .config import DiverConfig
 from .models import ModelSet
 from .sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing
@@ -35,14 +40,15 @@ SCALE_MEMORY = 400.0
 
 
 @frozen(eq=False, kw_only=True)
-class Divers:
+class DiverState:
     """All that is known after a scan: T tracks with M models of n states.
 
     x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite.
+    broken: tracks ended so far because their numbers were not finite; repairs: covariances repaired
+    so far (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -56,21 +62,30 @@ class Divers:
     score: FloatArray
     scale: FloatArray
     broken: int = 0
+    repairs: int = 0
 
     def factor(self) -> FloatArray:
         """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
         return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
 
+    def rows(self, kept: np.ndarray) -> DiverState:
+        """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
+        if kept.all():
+            return self
+        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score')
+        return evolve(self, **{name: getattr(self, name)[kept] for name in names})
+
 
 class Step(NamedTuple):
-    """Tracks after a step of dt seconds without a measurement, and the transitions (T or 1, M, M)
-    of that step."""
+    """Tracks after a step of dt seconds without a measurement, the transitions (T or 1, M, M) of
+    that step, and how many covariances it had to repair."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
     transition: FloatArray
     dt: float
+    repairs: int
 
     def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
         """The step as one track took it."""
@@ -80,7 +95,7 @@ class Step(NamedTuple):
 
 
 def cross(
-    models: ModelSet, chain: AdaptiveChain, before: Divers, dt: float, longest: float
+    models: ModelSet, chain: AdaptiveChain, before: DiverState, dt: float, longest: float
 ) -> Iterator[Step]:
     """Mix and predict over dt seconds, in equal steps of at most `longest`.
 
@@ -92,27 +107,28 @@ def cross(
     x, P, mu = before.x, before.P, before.mu
     for _ in range(count):
         x, P, mu = imm_kernels.mix(x, P, mu, transition)
-        x, P = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-        yield Step(x, P, mu, transition, dt / count)
+        x, P, repaired = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
+        yield Step(x, P, mu, transition, dt / count, int(repaired.sum()))
 
 
 class Scan:
-    """The tracks in the middle of a scan: predicted when made, updated by `take`, done with
-    `result`."""
+    """The tracks in the middle of a scan: predicted when made, then `associate_and_update` for
+    each message, and `learn` at the end."""
 
     def __init__(
         self,
         config: DiverConfig,
         models: ModelSet,
         chain: AdaptiveChain,
-        before: Divers,
+        before: DiverState,
         stamp_ns: int,
     ):
         self.config, self.models, self.chain, self.before = config, models, chain, before
         self.stamp_ns = stamp_ns
         self.dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
         steps = list(cross(models, chain, before, self.dt, config.longest_step))
-        self.x, self.P, self.mu, transition, _ = steps[-1]
+        self.x, self.P, self.mu, transition, *_ = steps[-1]
+        self.repairs = sum(step.repairs for step in steps)
         self.transition = np.linalg.matrix_power(transition, len(steps))
         self.nis = np.zeros(len(self.x))
         self.nis_dof = np.zeros(len(self.x), np.uint16)
@@ -120,7 +136,7 @@ class Scan:
         self.scale = before.scale.copy()
         self.rank = np.zeros(len(self.x), np.int64)
 
-    def take(self, groups: Sequence[Group]) -> list[np.ndarray]:
+    def associate_and_update(self, groups: Sequence[Group]) -> list[np.ndarray]:
         """Update the tracks with what one message holds for them, group after group. Gives for
         each group True (D,) where a detection was taken.
 
@@ -162,8 +178,8 @@ class Scan:
                 self._take_bearings(group.bearings(), tracks, chosen[tracks])
         return chosen
 
-    def result(self) -> Divers:
-        """What is known now; the transitions have learnt from the tracks that were hit."""
+    def learn(self) -> DiverState:
+        """The state after the updates; transitions have learnt from the tracks that were hit."""
         hit = np.flatnonzero(self.nis_dof > 0)
         learnt = self.before.learnt.copy()
         shared = len(self.transition) == 1
@@ -185,6 +201,7 @@ class Scan:
             nis_dof=self.nis_dof,
             score=self.score,
             scale=self.scale,
+            repairs=self.before.repairs + self.repairs,
         )
 
     def _fit(self, group: Group) -> FloatArray:
@@ -197,8 +214,6 @@ class Scan:
 
     def _associate(self, group: Group) -> np.ndarray:
         """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
-        chosen = np.full(len(self.x), -1)
-        free = np.ones(len(group.z), bool)
         fit = self._fit(group)
         target, detection = imm.pairs_inside(fit)
         likelihood = fit[target, detection]
@@ -207,11 +222,7 @@ class Scan:
         else:
             p_detection = self.config.detection_probability
             cost = association_cost(likelihood, p_detection, group.clutter)
-        for rank in np.unique(self.rank[self.rank != EXCLUDED]):
-            pairs = (self.rank == rank)[target] & free[detection]
-            found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
-            chosen = np.where(found >= 0, found, chosen)
-            free[found[found >= 0]] = False
+        chosen = assign_by_rank(target, detection, cost, self.rank, len(group.z))
         self._keep_score(fit, chosen, group)
         return chosen
 
@@ -240,9 +251,10 @@ class Scan:
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
         h, H = group.linearise(x, self.models.E)
         R = np.ascontiguousarray(group.R[detection])
-        x, P, mu, _, nis, ok = imm_kernels.update(
+        x, P, mu, _, nis, ok, repaired = imm_kernels.update(
             x, P, mu, group.innovation(h, detection), np.ascontiguousarray(H), R
         )
+        self.repairs += int(repaired.sum())
         self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
         self.nis[tracks] += np.where(ok, nis, 0.0)
         self.nis_dof[tracks] += np.where(ok, group.z.shape[1], 0).astype(np.uint16)
@@ -252,9 +264,9 @@ class Scan:
     def _take_bearings(
         self, bearings: Bearings, tracks: np.ndarray, detection: np.ndarray
     ) -> None:
-        """Bearings belong to the echo they came with; the gate only keeps wild ones out."""
-        known = np.isfinite(bearings.z[detection, 0])
-        tracks, detection = tracks[known], detection[known]
+        """Bearings belong to the echo they came with; the gate only keeps outliers out."""
+        measured = np.isfinite(bearings.z[detection, 0])
+        tracks, detection = tracks[measured], detection[measured]
         if not len(tracks):
             return
         h, H = bearings.linearise(self.x[tracks], self.models.E)

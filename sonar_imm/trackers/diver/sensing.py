@@ -17,6 +17,7 @@ import numpy as np
 
 from ...acoustics import multistatic
 from ...acoustics.localisation import Localisation, localise
+from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray
 from ...measurements import Arrivals, Fix, Measurement
 from .config import DiverConfig
@@ -103,7 +104,7 @@ class Bearings(Group):
         )
 
     def innovation(self, expected: FloatArray, detection: np.ndarray) -> FloatArray:
-        return multistatic.wrap_angle(super().innovation(expected, detection))
+        return wrap_angle(super().innovation(expected, detection))
 
 
 @frozen(eq=False, kw_only=True)

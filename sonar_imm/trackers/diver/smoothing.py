@@ -12,7 +12,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from .scan import cross, Divers
+from .scan import cross, DiverState
 from .tracker import DiverTracker
 
 LONGEST_GAP = 5
@@ -49,10 +49,16 @@ class SmoothingDiverTracker(DiverTracker):
 
     def reset(self) -> None:
         super().reset()
-        self._passed: dict[int, Divers] = {}
+        self._passed: dict[int, DiverState] = {}
+        self._smoothed_repairs = 0
 
-    def _revise(self, item: Measurement) -> list[tuple[int, Divers]]:
-        revised = super()._revise(item)
+    def health(self) -> dict[str, float]:
+        health = super().health()
+        health['covariance_repairs'] += self._smoothed_repairs
+        return health
+
+    def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
+        revised = super()._revise(measurement)
         self._passed.update(revised)
         return revised
 
@@ -67,13 +73,14 @@ class SmoothingDiverTracker(DiverTracker):
         ]
         for track_id, one in self._passes(scans):
             result = imm_smooth(*self._arrays(one))
+            self._smoothed_repairs += int(result.repaired.sum())
             for scan, x, P, mu in zip(one.scans, result.x, result.P, result.mu):
                 if scan is not None:
                     row = np.flatnonzero(scans[scan].life.track_id == track_id)[0]
                     smooth[scan].x[row], smooth[scan].P[row], smooth[scan].mu[row] = x, P, mu
         return [self._estimate(scan) for scan in smooth]
 
-    def _passes(self, scans: Sequence[Divers]) -> list[tuple[int, _Pass]]:
+    def _passes(self, scans: Sequence[DiverState]) -> list[tuple[int, _Pass]]:
         """Each track, cut where a gap is too long to look across."""
         passes: list[tuple[int, _Pass]] = []
         newest: dict[int, _Pass] = {}

@@ -19,7 +19,7 @@ reflector identification with multiple model particle filtering*.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
-from collections import Counter, deque
+from collections import deque
 import math
 from typing import Any
 
@@ -29,11 +29,11 @@ import numpy as np
 from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.history import StampGate
 from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
 from ...measurements import ArrayDepth, CrossSpectra, nanoseconds, Pressure, Rejection, Trace
+from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
 from .pressure import PressureStream
 from .reflectors import Identities, Known, nearest_ids, Reflectors, reflectors_of, write_estimate
@@ -74,24 +74,22 @@ class FathometerTracker:
         self.reset()
 
     def reset(self) -> None:
-        self.counts: Counter[str] = Counter()
+        rules = StreamRules(0, nanoseconds(self.config.max_gap), self.config.restart_after)
+        self._stream = OnceStream((Pressure, CrossSpectra, Trace), rules)
+        self.counts = self._stream.counts
         self.response: Response | None = None
         self._ids = Identities()
-        self._gate: StampGate[Any] = StampGate(
-            0, nanoseconds(self.config.max_gap), self.config.restart_after
-        )
         self._array_depths: list[tuple[int, float]] = []
         self._forget()
 
     def _forget(self) -> None:
         """Begin anew, but for counts and ids."""
-        self._newest_ns = 0
         self._phones = self.config.phones
-        self._stream = PressureStream(self.config, self.counts)
+        self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
         self._lattice: Lattice | None = None
         self._filter: SetFilter | None = None
-        self._known: Weighted | None = None
+        self._before: Weighted | None = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
         self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
         self._health: dict[str, float] = {}
@@ -114,43 +112,37 @@ class FathometerTracker:
     def health(self) -> dict[str, float]:
         """Numbers of the last record: effective sample size, log evidence against an empty one,
         noise, most probable number of reflectors; and phones left out, snapshots waiting."""
-        return {**self._health, 'snapshots_waiting': float(self._stream.waiting)}
+        return {**self._health, 'snapshots_waiting': float(self._pressure.waiting)}
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
             self._hear_depth(measurement)
             return []
-        if not isinstance(measurement, (Pressure, CrossSpectra, Trace)):
-            self.counts['unknown_type'] += 1
-            return []
-        if measurement.stamp_ns == self._newest_ns:
-            self.counts['duplicate'] += 1
-            return []
-        judgement = self._gate.judge(measurement.stamp_ns, measurement)
-        judgement.count_in(self.counts)
-        if judgement.verdict == 'restart':
+        admitted = self._stream.admit(measurement)
+        if admitted.restarted:
             self._forget()
-        estimates: list[Estimate] = []
-        for item in sorted(judgement.released, key=lambda one: one.stamp_ns):
-            self._newest_ns = item.stamp_ns
-            try:
-                estimates += self._take(item)
-            except Rejection as rejection:
-                self.counts[rejection.reason] += 1
-        return estimates
+        return [estimate for item in admitted.items for estimate in self._take(item)]
 
     def _take(self, item: Pressure | CrossSpectra | Trace) -> list[Estimate]:
+        """The estimates of one item; one that cannot be used is counted."""
+        try:
+            return self._estimates(item)
+        except Rejection as rejection:
+            self.counts[rejection.reason] += 1
+            return []
+
+    def _estimates(self, item: Pressure | CrossSpectra | Trace) -> list[Estimate]:
         if isinstance(item, Trace):
             depth = self._array_depth(item, 0)
             if self._lattice is None:
                 self._begin(lattice_of_trace(item, self.config))
             assert self._lattice is not None
-            known = math.nan if depth is None else depth
-            return self._record(trace_response(item, self._lattice, self.config, known))
+            reference = math.nan if depth is None else depth
+            return self._record(trace_response(item, self._lattice, self.config, reference))
         self._count_phones(item)
         if isinstance(item, CrossSpectra):
             return self._record(self._hear(item, 0))
-        records, previews = self._stream.push(item)
+        records, previews = self._pressure.push(item)
         self.counts['blocks'] += 1
         span_ns = round(self.config.record_seconds * 1e9)
         estimates = [one for each in records for one in self._record(self._hear(each, span_ns))]
@@ -216,11 +208,11 @@ class FathometerTracker:
         assert self._filter is not None
         b = np.ascontiguousarray(response.amplitude / response.sigma)
         self.response = response
-        return self._filter.step(self._known, b, (self.config.seed, response.stamp_ns))
+        return self._filter.step(self._before, b, (self.config.seed, response.stamp_ns))
 
     def _record(self, response: Response) -> list[Estimate]:
         step = self._try(response)
-        self._known = step.after if step.ok else None
+        self._before = step.after if step.ok else None
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)

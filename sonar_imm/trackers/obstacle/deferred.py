@@ -19,8 +19,8 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
+from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray
-from ...estimation.unscented import wrap_angle
 from ...measurements import Navigation
 from .config import ObstacleConfig
 from .navigation import Mount, NavigationBuffer

@@ -25,6 +25,7 @@ from ...acoustics.geometry import Pose
 from ...estimation import kalman, unscented
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
+from ...estimation.covariance import symmetrise
 from . import kernels as kernels
 from .config import ObstacleConfig
 
@@ -114,12 +115,17 @@ class DepthSlices:
             fresh.x[..., :2] += z[:, None] - self._echo(fresh, sonar)
         return fresh
 
-    def advance(self, known: Mixture, before: Sonar, after: Sonar, dt: float) -> Mixture:
-        """The targets as the sonar will see them `dt` seconds later."""
+    def advance(
+        self, known: Mixture, before: Sonar, after: Sonar, dt: float
+    ) -> tuple[Mixture, int]:
+        """The targets as the sonar will see them `dt` seconds later, and how many covariances had
+        to be repaired."""
         known = self._nailed(known, before)
         noise = np.array(self._noise) * dt
-        x, P = kernels.advance(known.x, known.P, *before.pose, *after.pose, noise, self.cone)
-        return Mixture(x, P, known.mu)
+        x, P, repaired = kernels.advance(
+            known.x, known.P, *before.pose, *after.pose, noise, self.cone
+        )
+        return Mixture(x, P, known.mu), int(repaired.sum())
 
     def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
@@ -128,11 +134,12 @@ class DepthSlices:
 
     def update(
         self, known: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
-    ) -> tuple[Mixture, FloatArray]:
-        """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,)."""
+    ) -> tuple[Mixture, FloatArray, int]:
+        """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,), and how
+        many covariances had to be repaired."""
         wild = self.config.outlier_probability
-        *after, nis = kernels.soft_update(*known, h, z, R, wild, self.outlier_density)
-        return Mixture(*after), nis
+        *after, nis, repaired = kernels.soft_update(*known, h, z, R, wild, self.outlier_density)
+        return Mixture(*after), nis, int(repaired.sum())
 
     def view(self, known: Mixture, sonar: Sonar) -> View:
         """See `View`."""
@@ -146,7 +153,7 @@ class DepthSlices:
         std = np.sqrt(P[..., 2, 2])
         low, high, above = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
         place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
-        return View(mean, kalman.symmetrise(covariance), low, high, above, *place)
+        return View(mean, symmetrise(covariance), low, high, above, *place)
 
     def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
@@ -205,13 +212,15 @@ class Landmark:
         moved = unscented.unscented_transform(place, seen, covariance)
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
 
-    def advance(self, known: Mixture, before: Sonar, after: Sonar, dt: float) -> Mixture:
+    def advance(
+        self, known: Mixture, before: Sonar, after: Sonar, dt: float
+    ) -> tuple[Mixture, int]:
         """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
         level, depth = (part * dt for part in self._noise)
         F = np.eye(4)
         F[:2, 3] = (before.pose.position - after.pose.position)[:2]
-        x, P = kalman.predict(known.x, known.P, F, np.diag([level, level, depth, 0.0]))
-        return Mixture(x, P, known.mu)
+        x, P, repaired = kalman.predict(known.x, known.P, F, np.diag([level, level, depth, 0.0]))
+        return Mixture(x, P, known.mu), int(repaired.sum())
 
     def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         seen = unscented.unscented_transform(
@@ -221,12 +230,12 @@ class Landmark:
 
     def update(
         self, known: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
-    ) -> tuple[Mixture, FloatArray]:
+    ) -> tuple[Mixture, FloatArray, int]:
         after = unscented.update(
             known.x, known.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
             angles=_ANGLES,
         )  # fmt: skip
-        return Mixture(after.x, after.P, known.mu), after.nis[:, 0]
+        return Mixture(after.x, after.P, known.mu), after.nis[:, 0], int(after.repaired.sum())
 
     def view(self, known: Mixture, sonar: Sonar) -> View:
         x, P = known.x[:, 0], known.P[:, 0]

@@ -15,29 +15,20 @@ import math
 
 import numpy as np
 
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.covariance import LIMIT
 from ...estimation.jit import kernel
+from ...estimation.small_matrices import (
+    careful_update,
+    lift,
+    semidefinite_root,
+    sound,
+    whitened_square,
+)
 
 KAPPA = 1.0
 NEGLIGIBLE = 1e-12
 """A component that weighs less plays no part in a quantile or a place."""
-
-
-@kernel
-def root(P: FloatArray, L: FloatArray) -> None:
-    """Lower Cholesky root of a P that may be singular: a direction without variance has none."""
-    n = P.shape[0]
-    for b in range(n):
-        pivot = P[b, b]
-        for k in range(b):
-            pivot -= L[b, k] * L[b, k]
-        known = pivot <= 1e-14 * P[b, b] or not pivot > 0.0
-        L[b, b] = 0.0 if known else math.sqrt(pivot)
-        for a in range(b + 1, n):
-            value = P[a, b]
-            for k in range(b):
-                value -= L[a, k] * L[b, k]
-            L[a, b] = 0.0 if known else value / L[b, b]
 
 
 @kernel
@@ -96,20 +87,22 @@ def advance(
     R1: FloatArray,
     noise: FloatArray,
     cone: bool,
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Predict what sonar pose (p1, R1) will see of what (p0, R0) saw, by the unscented transform.
 
-    noise (3,): variances the time between adds to horizontal position, azimuth and depth.
+    noise (3,): variances the time between adds to horizontal position, azimuth and depth. Gives x,
+    P and where P (T, K) was repaired (`estimation.covariance`).
     """
     T, K, n = x.shape
     x1, P1 = np.empty((T, K, n)), np.empty((T, K, n, n))
+    repaired = np.zeros((T, K), dtype=np.bool_)
     L, images = np.zeros((n, n)), np.empty((2 * n + 1, n))
     y, m, world = np.empty(n), np.empty(3), np.empty(3)
     weight = 0.5 / (n + KAPPA)
     centre = KAPPA / (n + KAPPA)
     for t in range(T):
         for j in range(K):
-            root(P[t, j], L)
+            semidefinite_root(P[t, j], L)
             for number in range(2 * n + 1):
                 _sigma_point(x[t, j], L, number, y)
                 point(y[0], y[1], y[2] - p0[2], R0, cone, m)
@@ -143,7 +136,8 @@ def advance(
             P1[t, j, 0, 0] += noise[0]
             P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
             P1[t, j, 2, 2] += noise[2]
-    return x1, P1
+            repaired[t, j] = lift(P1[t, j], L)
+    return x1, P1, repaired
 
 
 @kernel
@@ -172,7 +166,7 @@ def locate(
         for j in range(K):
             if mu[t, j] <= NEGLIGIBLE:
                 continue
-            root(P[t, j], L)
+            semidefinite_root(P[t, j], L)
             for number in range(2 * n + 1):
                 _sigma_point(x[t, j], L, number, y)
                 point(y[0], y[1], y[2] - p[2], R, cone, m)
@@ -209,16 +203,20 @@ def soft_update(
     R: FloatArray,
     outlier_probability: float,
     outlier_density: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
     """Update with one detection a target that may be an outlier; range and azimuth are states.
 
     h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). With probability beta the detection is
     the target's, else it says nothing; both cases together are matched in mean and covariance.
-    Gives x, P, mu (T, K) and the normalised innovation squared (T,) of the mixture's mean.
+    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where P
+    (T, K) was repaired (`estimation.covariance`).
     """
     T, K, n = x.shape
     x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
+    repaired = np.zeros((T, K), dtype=np.bool_)
     g0, g1, k0, k1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    L, v = np.empty((n, n)), np.empty(2)
+    wild = outlier_probability * outlier_density
     for t in range(T):
         total = 0.0
         v0 = v1 = 0.0
@@ -231,7 +229,8 @@ def soft_update(
             s00 += mu[t, j] * (P[t, j, 0, 0] + R[t, 0, 0] + e0 * e0)
             s01 += mu[t, j] * (P[t, j, 0, 1] + R[t, 0, 1] + e0 * e1)
             s11 += mu[t, j] * (P[t, j, 1, 1] + R[t, 1, 1] + e1 * e1)
-        nis[t] = (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / (s00 * s11 - s01 * s01)
+        determinant = max(s00 * s11 - s01 * s01, LIMIT * s00 * s11)
+        nis[t] = (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / determinant
         for j in range(K):
             r0, r1 = z[t, 0] - h[t, j, 0], z[t, 1] - h[t, j, 1]
             s00 = P[t, j, 0, 0] + R[t, 0, 0]
@@ -241,9 +240,7 @@ def soft_update(
             distance = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / determinant
             own = (1.0 - outlier_probability) * math.exp(-0.5 * distance)
             own /= 2.0 * math.pi * math.sqrt(determinant)
-            wild = outlier_probability * outlier_density
-            mu1[t, j] = mu[t, j] * (own + wild)
-            total += mu1[t, j]
+            likelihood = own + wild
             beta = own / (own + wild) if own + wild > 0.0 else 0.0
             for a in range(n):
                 g0[a], g1[a] = P[t, j, a, 0], P[t, j, a, 1]
@@ -257,9 +254,53 @@ def soft_update(
                     value = P[t, j, a, b] - beta * known + beta * (1.0 - beta) * spread
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
+            trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
+            trusted = trusted and determinant > LIMIT * s00 * s11
+            if not (trusted and sound(P1[t, j], L)):
+                repaired[t, j] = True
+                v[0], v[1] = r0, r1
+                likelihood = _careful_soft_update(
+                    x[t, j], P[t, j], v, R[t], outlier_probability, wild, x1[t, j], P1[t, j]
+                )
+            mu1[t, j] = mu[t, j] * likelihood
+            total += mu1[t, j]
         for j in range(K):
             mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
-    return x1, P1, mu1, nis
+    return x1, P1, mu1, nis, repaired
+
+
+@kernel
+def _careful_soft_update(
+    x: FloatArray,
+    P: FloatArray,
+    v: FloatArray,
+    R: FloatArray,
+    outlier_probability: float,
+    wild: float,
+    x1: FloatArray,
+    P1: FloatArray,
+) -> float:
+    """`soft_update` of one component with innovation v (2,) in square-root form, into x1 and P1;
+    its likelihood. What cannot be used, because it is not finite, leaves x and P as they are."""
+    n = len(x)
+    L, K, H, w = np.zeros((2, 2)), np.empty((n, 2)), np.eye(2, n), np.empty(2)
+    x1[:], P1[:] = x, P
+    known = np.empty((n, n))
+    if not careful_update(P, H, R, L, K, known):
+        return wild
+    own = (1.0 - outlier_probability) * math.exp(-0.5 * whitened_square(L, v, w))
+    own /= 2.0 * math.pi * L[0, 0] * L[1, 1]
+    beta = own / (own + wild) if own + wild > 0.0 else 0.0
+    for a in range(n):
+        w[0] = K[a, 0] * v[0] + K[a, 1] * v[1]
+        x1[a] += beta * w[0]
+        for b in range(a + 1):
+            w[1] = K[b, 0] * v[0] + K[b, 1] * v[1]
+            spread = beta * (1.0 - beta) * w[0] * w[1]
+            P1[a, b] = (1.0 - beta) * P[a, b] + beta * known[a, b] + spread
+            P1[b, a] = P1[a, b]
+    lift(P1, known)
+    return own + wild
 
 
 @kernel
@@ -310,5 +351,6 @@ def bands(
     for t in range(T):
         low[t] = quantile(mean[t], std[t], mu[t], tail)
         high[t] = quantile(mean[t], std[t], mu[t], 1.0 - tail)
-        negative[t] = below(mean[t], std[t], mu[t], 0.0)[0]
+        # Weights add up to one but for rounding: no probability may leave [0, 1] for that.
+        negative[t] = min(below(mean[t], std[t], mu[t], 0.0)[0], 1.0)
     return low, high, negative

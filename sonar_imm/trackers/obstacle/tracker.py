@@ -5,18 +5,17 @@ how an echo of a fixed obstacle must move, and that depends on how far above or 
 lies. The tracker follows each obstacle in sonar coordinates and learns its vertical offset on the
 way (`filters`). A ping goes through
 
-    sonar pose -> predict -> gate, associate, update -> end, begin tracks
+    sonar pose -> predict -> associate -> update -> prune -> spawn
 
-Navigation and pings arrive in any order. All that is known is one value, `Obstacles`, and a step
-from stamp to stamp: a pose completes the pings that waited for it. So a late message is put in its
-place by taking the steps after it again (`estimation.history`).
+Navigation and pings arrive in any order. All that is known is one value, `ObstacleState`, and a
+step from stamp to stamp: a pose completes the pings that waited for it. So a late message is put
+in its place by taking the steps after it again (`trackers.stream`).
 
 Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daurade).
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 
 from attrs import evolve, frozen
@@ -25,15 +24,21 @@ import numpy as np
 from ...estimates import Estimate
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign, association_cost, gate_threshold, Tracks, TrackStatus
-from ...estimation.history import ReplayHistory, StampGate
+from ...estimation.association import (
+    assign_by_rank,
+    association_cost,
+    gate_threshold,
+    Tracks,
+    TrackStatus,
+)
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
+from ..stream import ReplayStream, StreamRules
 from .config import ObstacleConfig
 from .filters import build_filter, Mixture, Sonar
 from .navigation import Mount, NavigationBuffer
 
-__all__ = ['ObstacleConfig', 'Obstacles', 'ObstacleTracker']
+__all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
 STATES = ('range', 'bearing', 'vertical_offset')
 MODELS = ('above', 'below')
@@ -47,23 +52,36 @@ nothing."""
 
 
 @frozen(eq=False, kw_only=True)
-class Ping:
-    """What is known after a ping of T obstacles: nis (T,), NaN without a hit."""
+class PingState:
+    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired."""
 
     stamp_ns: int
     sonar: Sonar
     life: Tracks
-    known: Mixture
+    mixture: Mixture
     nis: FloatArray
+    repairs: int = 0
+
+    def rows(self, kept: np.ndarray) -> PingState:
+        """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
+        if kept.all():
+            return self
+        return evolve(self, mixture=self.mixture.rows(kept), nis=self.nis[kept])
+
+    def only(self, kept: np.ndarray) -> PingState:
+        """The obstacles where `kept` (T,) is True."""
+        return self if kept.all() else evolve(self.rows(kept), life=self.life.only(kept))
 
 
 @frozen(eq=False, kw_only=True)
-class Obstacles:
+class ObstacleState:
     """All that is known at a stamp. last: after the newest ping used, None before the first; done:
-    the pings this step completed; skipped: pings so far for which navigation had a gap."""
+    the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
+    skipped: pings so far for which navigation had a gap; broken: tracks ended so far because their
+    numbers were not finite."""
 
-    last: Ping | None = None
-    done: tuple[Ping, ...] = ()
+    last: PingState | None = None
+    done: tuple[PingState, ...] = ()
     navigation: NavigationBuffer = NavigationBuffer()
     altitude: Altitude | None = None
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
@@ -82,16 +100,14 @@ class ObstacleTracker:
         self.reset()
 
     def reset(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self._frames: dict[type, str] = {}
-        self._gate: StampGate[Measurement] = StampGate(
-            nanoseconds(self.config.history),
-            nanoseconds(self.config.max_gap),
-            self.config.restart_after,
+        self._stream = ReplayStream(
+            (Detections, Navigation, Altitude),
+            StreamRules.of(self.config),
+            step=self._step,
+            initial=ObstacleState(),
+            survivor=_identities,
         )
-        self._history = ReplayHistory[Obstacles, Measurement](
-            Obstacles(), nanoseconds(self.config.history)
-        )
+        self.counts = self._stream.counts
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
@@ -112,7 +128,7 @@ class ObstacleTracker:
             tracker.process(Detections(stamp_ns=stamp, range=echoes, bearing=[0.0, 0.001]))
 
     def health(self) -> dict[str, float]:
-        state = self._history.state
+        state = self._stream.state
         status = state.last.life.status if state.last else np.empty(0)
         nis = state.last.nis[np.isfinite(state.last.nis)] if state.last else np.empty(0)
         return {
@@ -122,46 +138,19 @@ class ObstacleTracker:
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
             'broken_tracks': state.broken,
+            'covariance_repairs': state.last.repairs if state.last else 0,
         }
 
     def process(self, measurement: Measurement) -> list[Estimate]:
-        if not isinstance(measurement, (Detections, Navigation, Altitude)):
-            self.counts['unknown_type'] += 1
-            return []
-        frame = self._frames.setdefault(type(measurement), measurement.frame_id)
-        if frame != measurement.frame_id:
-            self.counts['other_frame'] += 1
-            return []
-        judgement = self._gate.judge(measurement.stamp_ns, measurement)
-        judgement.count_in(self.counts)
-        if judgement.verdict == 'restart':
-            self._history = ReplayHistory(
-                self._after_restart(self._history.state), nanoseconds(self.config.history)
-            )
-        revised: dict[int, Ping] = {}
-        for item in judgement.released:
-            revised.update((ping.stamp_ns, ping) for ping in self._revise(item))
-        return [self._estimate(revised[stamp_ns]) for stamp_ns in sorted(revised)]
-
-    def _revise(self, item: Measurement) -> list[Ping]:
-        """Put an item in its place in time; the pings it completed or changed."""
-        newest = self._history.newest_ns
-        inserted = self._history.insert(item.stamp_ns, _key(item), item, self._step)
-        self.counts[inserted.verdict] += 1
-        if inserted.revised and newest is not None and item.stamp_ns < newest:
-            self.counts['late'] += 1
-        return [ping for _, state in inserted.revised for ping in state.done]
-
-    def _after_restart(self, state: Obstacles) -> Obstacles:
-        """Nothing but the identities that are used up."""
-        if state.last is None:
-            return Obstacles()
-        nobody = np.zeros(len(state.last.life), bool)
-        return Obstacles(last=self._only(evolve(state.last, stamp_ns=0), nobody))
+        revised = self._stream.revise(measurement)
+        pings = {ping.stamp_ns: ping for _, state in revised for ping in state.done}
+        return [self._estimate(pings[stamp_ns]) for stamp_ns in sorted(pings)]
 
     # -- one step ------------------------------------------------------------------------------
 
-    def _step(self, before: Obstacles, stamp_ns: int, items: Sequence[Measurement]) -> Obstacles:
+    def _step(
+        self, before: ObstacleState, stamp_ns: int, items: Sequence[Measurement]
+    ) -> ObstacleState:
         """The state after all measurements of one stamp. Pure."""
         buffer, altitude = before.navigation, before.altitude
         for item in items:
@@ -184,7 +173,7 @@ class ObstacleTracker:
             broken += lost
             done.append(last)
         oldest = waiting[0][0].stamp_ns if waiting else stamp_ns
-        return Obstacles(
+        return ObstacleState(
             last=last,
             done=tuple(done),
             navigation=buffer.since(oldest),
@@ -223,20 +212,33 @@ class ObstacleTracker:
         late = self.mount.sonar(buffer.pose(ping.stamp_ns + late_ns))
         return Sonar(pose, height, late, late_ns * 1e-9)
 
-    def _ping(self, before: Ping | None, ping: Detections, sonar: Sonar) -> tuple[Ping, int]:
+    def _ping(
+        self, before: PingState | None, ping: Detections, sonar: Sonar
+    ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
         z, R = self._detections(ping)
-        if before is None:
-            before = self._nobody(sonar, ping.stamp_ns)
-        dt = (ping.stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
-        known = self.filter.advance(before.known, before.sonar, sonar, dt)
-        sound = np.isfinite(known.x).all(axis=(1, 2)) & np.isfinite(known.P).all(axis=(1, 2, 3))
-        now = self._only(evolve(before, stamp_ns=ping.stamp_ns, sonar=sonar, known=known), sound)
-        chosen, h = self._associate(now, z, R)
-        now = self._update(now, chosen, h, z, R)
+        now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
+        chosen, expected = self._associate(now, z, R)
+        now = self._update(now, chosen, expected, z, R)
+        now = self._prune(now, chosen >= 0)
         free = np.ones(len(z), bool)
         free[chosen[chosen >= 0]] = False
-        return self._census(now, chosen >= 0, z[free], R[free]), int((~sound).sum())
+        return self._spawn(now, z[free], R[free]), broken
+
+    def _predict(self, before: PingState, stamp_ns: int, sonar: Sonar) -> tuple[PingState, int]:
+        """The tracks as this ping should show them, and how many had numbers not finite."""
+        dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
+        mixture, repairs = self.filter.advance(before.mixture, before.sonar, sonar, dt)
+        sound = np.isfinite(mixture.x).all(axis=(1, 2))
+        sound &= np.isfinite(mixture.P).all(axis=(1, 2, 3))
+        now = evolve(
+            before,
+            stamp_ns=stamp_ns,
+            sonar=sonar,
+            mixture=mixture,
+            repairs=before.repairs + repairs,
+        )
+        return now.only(sound), int((~sound).sum())
 
     def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray]:
         """z (D, 2) and R (D, 2, 2) of the rows that are echoes, azimuth positive to starboard. A
@@ -252,52 +254,50 @@ class ObstacleTracker:
         real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
         return z[real], variance[real, :, None] * np.eye(2)
 
-    def _associate(self, now: Ping, z: FloatArray, R: FloatArray) -> tuple[np.ndarray, FloatArray]:
+    def _associate(
+        self, now: PingState, z: FloatArray, R: FloatArray
+    ) -> tuple[np.ndarray, FloatArray]:
         """The detection of each track (T,), -1 for none, and what was expected (T, K, 2);
         confirmed tracks choose before tentative ones."""
-        h, C = self.filter.expected(now.known, now.sonar)
-        chosen, free = np.full(len(h), -1), np.ones(len(z), bool)
+        h, C = self.filter.expected(now.mixture, now.sonar)
         if not len(h) or not len(z):
-            return chosen, h
+            return np.full(len(h), -1), h
         H = np.tile(np.eye(2), (1, h.shape[1], 1, 1))
         threshold = gate_threshold(self.config.gate_probability, 2)
-        fit = imm_kernels.gate(h, H, C, now.known.mu, z, R, threshold)
+        fit = imm_kernels.gate(h, H, C, now.mixture.mu, z, R, threshold)
         target, detection = np.nonzero(np.isfinite(fit))
         cost = association_cost(
             fit[target, detection], self.config.detection_probability, self.config.clutter_density
         )
         tentative = now.life.status == TrackStatus.TENTATIVE
-        for own in (~tentative, tentative):
-            pairs = own[target] & free[detection]
-            found = assign(target[pairs], detection[pairs], cost[pairs], len(chosen), len(free))
-            chosen = np.where(found >= 0, found, chosen)
-            free[found[found >= 0]] = False
+        chosen = assign_by_rank(target, detection, cost, tentative.astype(np.int64), len(z))
         return chosen, h
 
     def _update(
-        self, now: Ping, chosen: np.ndarray, h: FloatArray, z: FloatArray, R: FloatArray
-    ) -> Ping:
+        self, now: PingState, chosen: np.ndarray, h: FloatArray, z: FloatArray, R: FloatArray
+    ) -> PingState:
         nis = np.full(len(chosen), np.nan)
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
             return evolve(now, nis=nis)
-        after, nis[hit] = self.filter.update(
-            now.known.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
+        after, nis[hit], repairs = self.filter.update(
+            now.mixture.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
         )
-        known = Mixture(*(part.copy() for part in now.known))
-        for part, new in zip(known, after):
+        mixture = Mixture(*(part.copy() for part in now.mixture))
+        for part, new in zip(mixture, after):
             part[hit] = new
-        return evolve(now, known=known, nis=nis)
+        return evolve(now, mixture=mixture, nis=nis, repairs=now.repairs + repairs)
 
-    def _census(self, now: Ping, hit: np.ndarray, z: FloatArray, R: FloatArray) -> Ping:
-        """End the tracks that are over or passed, begin one at each detection left."""
-        rules = track_rules(self.config)
+    def _prune(self, now: PingState, hit: np.ndarray) -> PingState:
+        """End the tracks that are over or passed; `hit` (T,): those that got a detection."""
         tentative = now.life.status == TrackStatus.TENTATIVE
-        in_beam, ahead = self.filter.outlook(now.known, now.sonar)
+        in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
         looked = tentative | (in_beam > IN_BEAM)
-        life, kept = now.life.scan(hit, now.stamp_ns, rules, looked=looked)
-        now = evolve(now, life=life, known=now.known.rows(kept), nis=now.nis[kept])
-        now = self._only(now, ahead[kept])
+        life, kept = now.life.scan(hit, now.stamp_ns, track_rules(self.config), looked=looked)
+        return evolve(now.rows(kept), life=life).only(ahead[kept])
+
+    def _spawn(self, now: PingState, z: FloatArray, R: FloatArray) -> PingState:
+        """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
         room = max(0, self.config.max_tracks - len(now.life))
         if not self.filter.ready(now.sonar):
             room = 0
@@ -306,25 +306,19 @@ class ObstacleTracker:
             return now
         return evolve(
             now,
-            life=now.life.born(len(z), now.stamp_ns, rules),
-            known=now.known.joined(self.filter.begin(z, R, now.sonar)),
+            life=now.life.born(len(z), now.stamp_ns, track_rules(self.config)),
+            mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
         )
 
-    def _nobody(self, sonar: Sonar, stamp_ns: int) -> Ping:
+    def _nobody(self, sonar: Sonar) -> PingState:
         K, n = self.filter.K, self.filter.n
         nothing = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
         life = Tracks.none(track_rules(self.config))
-        return Ping(stamp_ns=stamp_ns, sonar=sonar, life=life, known=nothing, nis=np.empty(0))
+        return PingState(stamp_ns=0, sonar=sonar, life=life, mixture=nothing, nis=np.empty(0))
 
-    @staticmethod
-    def _only(now: Ping, kept: np.ndarray) -> Ping:
-        if kept.all():
-            return now
-        return evolve(now, life=now.life.only(kept), known=now.known.rows(kept), nis=now.nis[kept])
-
-    def _estimate(self, ping: Ping) -> Estimate:
-        view = self.filter.view(ping.known, ping.sonar)
+    def _estimate(self, ping: PingState) -> Estimate:
+        view = self.filter.view(ping.mixture, ping.sonar)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_navigation(view.place, view.place_covariance)
         extras = {
@@ -339,7 +333,7 @@ class ObstacleTracker:
                 extras[f'place_cov_{a}_{b}'] = place_covariance[:, i, j]
         return Estimate(
             stamp_ns=ping.stamp_ns,
-            frame_id=self._frames.get(Navigation, ''),
+            frame_id=self._stream.frame_id,
             xyz=place.astype(np.float32),
             state_names=STATES,
             state=view.state * side,
@@ -350,11 +344,9 @@ class ObstacleTracker:
         )
 
 
-def _key(measurement: Measurement) -> bytes:
-    """The content of a measurement: it orders those of one stamp and tells duplicates."""
-    if isinstance(measurement, Navigation):
-        return b'navigation' + measurement.position.tobytes() + measurement.orientation.tobytes()
-    if isinstance(measurement, Altitude):
-        return b'altitude' + np.float64(measurement.altitude).tobytes()
-    names = ('range', 'bearing', 'var_range', 'var_bearing')
-    return b'detections' + b''.join(getattr(measurement, name).tobytes() for name in names)
+def _identities(state: ObstacleState) -> ObstacleState:
+    """What outlives a restarted clock: the identities that are used up."""
+    if state.last is None:
+        return ObstacleState()
+    nobody = np.zeros(len(state.last.life), bool)
+    return ObstacleState(last=evolve(state.last, stamp_ns=0).only(nobody))

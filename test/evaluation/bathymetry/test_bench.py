@@ -49,3 +49,9 @@ def test_stone_soup_follows_the_same_floor(short):
     height = stone_soup_filter(cut(short, 60))
     assert abs(height[20:]).max() < 0.5
     assert set(bench.bench_stone_soup(rounds=1)['bins_per_second']) == {'particles', 'stone_soup'}
+
+
+def test_every_variant_is_measured(short):
+    assert all(speed > 0.0 for speed in bench.bench_threads(1, 1)['bins_per_second'].values())
+    speed = bench.bench_scaling(rounds=1)['bins_per_second']
+    assert len(speed) == 13 and min(speed.values()) > 0.0

@@ -57,7 +57,7 @@ def test_a_run_is_scored_and_has_a_page(tracked, capsys):
     page = (tracked / 'report.html').read_text()
     for title in (
         'Profile of the floor',
-        'What the array hears',
+        'Pseudo-spectrum and estimated angle',
         'Which terrain model held',
         'Rough floor over the whole run',
     ):
@@ -79,7 +79,7 @@ def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
     judgement = judge(folder)
     assert judgement.accuracy(None) is None
     part = judgement.part([])
-    assert 'What the array hears, and what the tracker makes of it' not in [
+    assert 'Pseudo-spectrum and estimated angle' not in [
         section.title for section in part.sections
     ]
 

@@ -141,7 +141,7 @@ def test_a_whole_run_is_judged_and_told(run, capsys):
         'How many there are',
         'Amplitudes',
         'Distance from the truth',
-        'Had the number been fixed',
+        'With a fixed number of reflectors',
     ]
     assert main(['evaluate', str(run.path), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['ospa_m'] == judgement.metrics['ospa_m']

@@ -177,16 +177,16 @@ def test_a_run_of_two_moored_spheres_is_judged(run, tmp_path):
     metrics = verdict.metrics
     assert metrics['tracks']['found_obstacles'] == 2 and metrics['tracks']['false_tracks'] == 0
     assert metrics['range']['rmse_m'] < 0.2 and metrics['bearing']['rmse_deg'] < 0.3
-    back = metrics['looking_back']
+    back = metrics['deferred']
     assert abs(back['refit_error_m']) < 2.0 and back['echoes'] > 50
     assert abs(back['online_error_m']) < 2.0
     assert verdict.accuracy(None).good and not verdict.accuracy(0.01).good
     assert 'obstacles were found' in verdict.summary
     titles = [section.title for section in verdict.part([]).sections]
-    assert {'Height over range', 'Seen by the sonar', 'Above or below'} <= set(titles)
-    assert any(title.startswith('Looking back: RMSD') for title in titles)
+    assert {'Height over range', 'Image of the sonar', 'Above or below'} <= set(titles)
+    assert any(title.startswith('Deferred estimate: RMSD') for title in titles)
     assert main(['evaluate', str(run), '--report', str(tmp_path / 'report.html')]) == 0
-    assert 'Diamonds: the least RMSD' in (tmp_path / 'report.html').read_text()
+    assert 'Diamonds: least RMSD' in (tmp_path / 'report.html').read_text()
 
 
 def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):
@@ -200,7 +200,7 @@ def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):
         range_step='0',
         bearing_step_deg='0',
     )
-    back = judge(RunFolder(run)).metrics['looking_back']
+    back = judge(RunFolder(run)).metrics['deferred']
     assert back['truth_m'] == pytest.approx(3.0, abs=0.2)
     assert abs(back['rmsd_error_m']) < 0.1 and abs(back['refit_error_m']) < 0.1
 

@@ -73,7 +73,7 @@ def test_bad_rows_are_named(convert):
         "line 5: receiver '2' is listed twice",
         'line 6: the receiver has no name',
         "line 7: x is 'x'",
-        "line 3: the place of receiver '9'",
+        "line 3: the position of receiver '9'",
         'line 4: the ping is empty',
         "line 5: arrival is 'x'",
     ):

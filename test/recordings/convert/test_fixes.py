@@ -120,7 +120,7 @@ def test_latitudes_become_metres_around_the_origin(convert, origin):
         assert np.linalg.norm(fix.position) == pytest.approx(np.linalg.norm(ecef), abs=1e-6)
     offset = second.position - first.position  # north 222 m and east 143 m at 50 degrees
     assert offset[:2] == pytest.approx([143.4, 222.5], abs=0.5)
-    assert report.bad_rows == 1 and 'no place on Earth' in report.problems[0]
+    assert report.bad_rows == 1 and 'not a position on Earth' in report.problems[0]
     assert f'latitude {around[0]!r}' in report.notes['origin']
     with BagReader(report.path) as bag:
         assert bag.custom_data['origin'] == report.notes['origin']

@@ -77,18 +77,18 @@ def test_arrivals_are_transmitter_diver_receiver():
         np.testing.assert_array_equal(one.measurement.rx, RECEIVERS)
 
 
-def test_misses_clutter_and_wild_ones_come_as_often_as_asked():
+def test_misses_clutter_and_outliers_come_as_often_as_asked():
     missed = simulate(scenario('table1', {'detection_probability': 0.7, 'duration': 2000.0}), 5)
     assert len(missed.measurements) == pytest.approx(0.7 * 2001, abs=80)
     cluttered = simulate(scenario('table1', {'clutter': 3.0, 'duration': 400.0}), 6)
     assert len(cluttered.measurements) == pytest.approx(4.0 * 401, abs=150)
-    wild = simulate(scenario('table1', {'outlier_probability': 0.1, 'duration': 2000.0}), 7)
+    scene = simulate(scenario('table1', {'outlier_probability': 0.1, 'duration': 2000.0}), 7)
     error = [
         np.hypot(*(one.measurement.position - place)[:2])
-        for one, place in zip(wild.measurements, wild.truth[0].position)
+        for one, place in zip(scene.measurements, scene.truth[0].position)
     ]
-    # A bearing error of 2 degrees is never 8 times its size; most wild fixes are far off.
-    far = np.linalg.norm(wild.truth[0].position[:, :2], axis=1) * np.deg2rad(16.0)
+    # A bearing error of 2 degrees is never 8 times its size; most outliers are far off.
+    far = np.linalg.norm(scene.truth[0].position[:, :2], axis=1) * np.deg2rad(16.0)
     assert np.mean(np.array(error) > far) == pytest.approx(0.1, abs=0.03)
 
 

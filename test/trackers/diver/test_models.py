@@ -37,10 +37,10 @@ def test_every_set_is_consistent(model_set):
 def test_ten_short_steps_are_one_long_step(model_set):
     models = build_models(DiverConfig(model_set=model_set, speed_noise=0.2))
     x, P, _ = models.new_track(CENTRE, SPREAD)
-    long_x, long_P = imm.predict(x[None], P[None], *models.motion(1.0))
+    long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
     short_x, short_P = x[None], P[None]
     for _ in range(10):
-        short_x, short_P = imm.predict(short_x, short_P, *models.motion(0.1))
+        short_x, short_P, _ = imm.predict(short_x, short_P, *models.motion(0.1))
     np.testing.assert_allclose(short_x, long_x, atol=1e-12)
     np.testing.assert_allclose(short_P, long_P, atol=1e-12)
     ten = np.linalg.matrix_power(models.chain.transition(0.1), 10)
@@ -51,9 +51,9 @@ def test_world_headings_compose_in_position():
     """Their velocity is drawn afresh at each step; the law of the position composes."""
     models = build_models(DiverConfig(model_set='world_headings'))
     x, P, _ = models.new_track(CENTRE, SPREAD)
-    long_x, long_P = imm.predict(x[None], P[None], *models.motion(1.0))
+    long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
     for _ in range(10):
-        x, P = (a[0] for a in imm.predict(x[None], P[None], *models.motion(0.1)))
+        x, P, _ = (a[0] for a in imm.predict(x[None], P[None], *models.motion(0.1)))
     np.testing.assert_allclose(x[:, :2], long_x[0, :, :2], atol=1e-12)
     np.testing.assert_allclose(P[:, :2, :2], long_P[0, :, :2, :2], atol=1e-12)
 

@@ -111,7 +111,7 @@ def test_bad_timing_is_counted_and_harmless():
     assert tracker.counts['too_late'] == 1
     assert tracker.process(fix(19, 19.0, 0.0)) == []
     assert tracker.counts['duplicate'] == 1
-    assert tracker.process(fix(10**6, 0.0, 0.0)) == []  # a wild stamp far ahead
+    assert tracker.process(fix(10**6, 0.0, 0.0)) == []  # an outlying stamp far ahead
     assert len(tracker.process(fix(20, 20.0, 0.0))) == 1
     assert tracker.counts['doubted'] == 1
 
@@ -123,6 +123,15 @@ def test_a_restarted_clock_is_noticed_and_loses_nothing():
     assert tracker.counts['restarts'] == 1 and tracker.counts['too_late'] == 0
     assert [estimate.stamp_ns // SECOND for estimate in again] == list(range(10, 30))
     assert first[-1].extras['track_id'][0] != again[-1].extras['track_id'][0]
+
+
+def test_a_burst_of_late_fixes_ends_no_track():
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    before = run(tracker, [fix(second, second, 0.0) for second in range(100, 160)])
+    assert run(tracker, [fix(second + 0.5, second, 0.0) for second in range(125, 130)]) == []
+    after = run(tracker, [fix(second, second, 0.0) for second in range(160, 170)])
+    assert tracker.counts['restarts'] == 0 and tracker.counts['too_late'] == 5
+    assert after[-1].extras['track_id'].tolist() == before[-1].extras['track_id'].tolist()
 
 
 def test_reset_equals_a_fresh_tracker():
@@ -146,9 +155,9 @@ def test_an_outlier_is_not_believed():
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     clean = DiverTracker(DiverConfig(max_tracks=1))
     for second in range(1, 30):
-        wild = second == 20
-        last = tracker.process(fix(second, 0.5 * second + 500.0 * wild, 0.0))[-1]
-        if not wild:
+        outlier = second == 20
+        last = tracker.process(fix(second, 0.5 * second + 500.0 * outlier, 0.0))[-1]
+        if not outlier:
             clean.process(fix(second, 0.5 * second, 0.0))
     assert abs(last.state[0, 0] - 14.5) < 0.5
     assert last.extras['track_id'][0] == 1
@@ -241,7 +250,7 @@ def test_a_long_gap_is_no_straight_line():
     config = DiverConfig(hover=False, adaptation='fixed', speed_noise=0.0, lateral_noise=0.0)
     tracker = DiverTracker(config)
     tracker.process(fix(1, 0.0, 0.0, 1e-6 * np.eye(2)))
-    before, dt = tracker._history.state, 30.0
+    before, dt = tracker._stream.state, 30.0
     P = tracker.models.chain.matrix
     mode = rng.integers(16, size=4000)
     speed = rng.normal(config.speed_mean, config.speed_std, size=4000)

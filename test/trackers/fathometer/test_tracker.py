@@ -246,7 +246,12 @@ def test_a_trace_may_lie_elsewhere_later(vectors):
     tracker, found = run(
         [
             *traces(vectors, range(2)),
-            Trace(stamp_ns=10**13, depth=np.arange(500.0, 600.0), amplitude=np.arange(100.0)),
+            Trace(
+                stamp_ns=10**13,
+                depth=np.arange(500.0, 600.0),
+                amplitude=np.arange(100.0),
+                frame_id='array',
+            ),
             next(traces(vectors, [250])),
         ],
         particles=300,

@@ -44,6 +44,7 @@ def test_variances_of_the_detections_win():
 def test_strangers_are_counted():
     tracker = ObstacleTracker(ObstacleConfig())
     run(tracker, approach(NAME)[:6])
+    tracker.process(Detections(stamp_ns=SECOND, range=[2.0], bearing=[0.0], frame_id='sonar'))
     assert not tracker.process(Fix(stamp_ns=SECOND, position=[0.0, 0.0, 0.0]))
     assert not tracker.process(
         Detections(stamp_ns=2 * SECOND, range=[1.0], bearing=[0.0], frame_id='other')

@@ -49,7 +49,7 @@ def test_prediction_equals_numpy(model):
     before, after = poses(rng)
     x, P, _ = targets(rng, before)
     noise = np.array([1e-3, 2e-7, 3e-4])
-    x1, P1 = kernels.advance(x, P, *before, *after, noise, MODELS[model])
+    x1, P1, _ = kernels.advance(x, P, *before, *after, noise, MODELS[model])
     points, weights = sigma_points(x, P)
     d, delta, z, s = np.moveaxis(points, -1, 0)
     m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
@@ -74,7 +74,7 @@ def test_prediction_of_a_known_target_is_exact():
     before, after = poses(rng)
     x, _, _ = targets(rng, before)
     x[..., 3] = 0.0
-    x1, P1 = kernels.advance(x, np.zeros((3, 4, 4, 4)), *before, *after, np.zeros(3), False)
+    x1, P1, _ = kernels.advance(x, np.zeros((3, 4, 4, 4)), *before, *after, np.zeros(3), False)
     m = geometry.reconstruct(x[..., 0], x[..., 1], x[..., 2] - before.position[2], before.R)
     assert_allclose(
         x1[..., :2], np.stack(geometry.project(geometry.predict(m, before, after)), -1), rtol=1e-12
@@ -88,7 +88,7 @@ def test_a_turn_through_the_back_keeps_the_spread_of_the_azimuth():
     P = np.diag([0.01, 1e-4, 0.01, 1e-6])[None, None]
     still = np.zeros(3)
     turned = geometry.rotation(0.0, 0.0, -(np.pi - 3.0))
-    _, P1 = kernels.advance(x, P, still, np.eye(3), still, turned, np.zeros(3), False)
+    _, P1, _ = kernels.advance(x, P, still, np.eye(3), still, turned, np.zeros(3), False)
     assert_allclose(P1[0, 0, 1, 1], 1e-4, rtol=1e-3)
 
 
@@ -121,7 +121,7 @@ def test_soft_update_equals_two_cases_put_together():
     z = x[:, 0, :2] + rng.normal(size=(3, 2)) * [0.3, 0.005]
     R = np.tile(np.diag([0.025, 2.5e-5]), (3, 1, 1))
     h = np.ascontiguousarray(x[..., :2])
-    after, covariance, weight, _ = kernels.soft_update(x, P, mu, h, z, R, 0.1, 0.5)
+    after, covariance, weight, *_ = kernels.soft_update(x, P, mu, h, z, R, 0.1, 0.5)
     H = np.eye(2, 4)
     for t in range(3):
         likelihood = np.empty(4)
@@ -146,7 +146,7 @@ def test_soft_update_equals_two_cases_put_together():
 def test_an_update_that_no_component_explains_keeps_the_weights():
     x, P = np.zeros((1, 2, 4)), np.tile(np.eye(4) * 1e-6, (1, 2, 1, 1))
     mu, z = np.array([[0.3, 0.7]]), np.full((1, 2), 1e3)
-    *_, weight, nis = kernels.soft_update(
+    *_, weight, nis, _ = kernels.soft_update(
         x, P, mu, x[..., :2].copy(), z, np.eye(2)[None] * 1e-6, 0.0, 1.0
     )
     assert_allclose(weight, mu)

@@ -2,8 +2,15 @@
 
 import pytest
 
-from msg_adapters.frames import FrameGuard
-from sonar_imm.measurements import Altitude, Detections, Fix, Navigation, Rejection
+from sonar_imm.measurements import (
+    Altitude,
+    ArrayDepth,
+    Detections,
+    Fix,
+    FrameGuard,
+    Navigation,
+    Rejection,
+)
 
 
 def fix(frame_id):
@@ -59,3 +66,9 @@ def test_what_sensors_on_board_say_is_in_frames_of_their_own():
         assert caught.value.reason == 'frame'
     guard.reset()
     guard.check(Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'))
+
+
+def test_a_depth_is_a_depth_in_any_frame():
+    guard = FrameGuard('map')
+    guard.check(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
+    assert guard.frame_id == 'map'

@@ -1,0 +1,59 @@
+"""One tracker, one frame: measurements in different frames must not be mixed without a word.
+
+What a sensor on a vehicle says of itself is not in the frame of the tracks, but in its own, and
+each such kind of measurement has to keep to one, too.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .checks import Rejection
+
+
+def frame_role(measurement: Any) -> str:
+    """Whose frame a measurement is in, as its class says by `FRAME`: ``'world'``, that of the
+    tracks, where it says nothing; ``'own'``, that of its sensor on the vehicle; ``'none'``, when
+    it is the same in any frame."""
+    role: str = getattr(type(measurement), 'FRAME', 'world')
+    return role
+
+
+class FrameGuard:
+    """Lets one frame of the tracks pass: the one it is told, or else the first that a measurement
+    names; and one frame for each kind of measurement that is in a frame of its own."""
+
+    def __init__(self, frame_id: str = ''):
+        """Expect `frame_id`; empty means that the measurements decide."""
+        self._told = frame_id
+        self.reset()
+
+    @property
+    def frame_id(self) -> str:
+        """The frame of the tracks, empty until one is known."""
+        return self._world
+
+    def check(self, measurement: Any) -> None:
+        """Raise `Rejection` when `measurement` is in another frame.
+
+        One without a frame passes only until a frame is known.
+        """
+        role, frame_id = frame_role(measurement), measurement.frame_id
+        if role == 'world':
+            _compare(frame_id, self._world, 'the tracks')
+            self._world = frame_id
+        elif role == 'own':
+            _compare(frame_id, self._own.get(type(measurement), ''), 'earlier ones')
+            self._own[type(measurement)] = frame_id
+
+    def reset(self) -> None:
+        """Let the measurements decide again, unless a frame was told."""
+        self._world = self._told
+        self._own: dict[type, str] = {}
+
+
+def _compare(frame_id: str, expected: str, whose: str) -> None:
+    if expected and frame_id != expected:
+        raise Rejection(
+            'frame', f"the frame '{frame_id}' is not the frame '{expected}' of {whose}"
+        )

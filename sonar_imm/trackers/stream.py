@@ -1,0 +1,164 @@
+"""The stream of measurements, as every tracker has it: what is taken, in which order, how often.
+
+A measurement passes three gates before a tracker's own mathematics sees it. Each refusal is
+counted, none is raised:
+
+    type accepted? -> frame the same as before? -> stamp in the stream? (`estimation.history`)
+
+Two streams differ in what happens then. `OnceStream` hands each measurement out once and for good,
+in rising order of stamps. `ReplayStream` puts each in its place in time and computes the states
+after it again, so that the order of arrival changes nothing:
+
+    def process(self, measurement):
+        return [self._estimate(state) for _, state in self._stream.revise(measurement)]
+
+Both hear of a restarted clock. Counts: ``unknown_type``, ``other_frame``, ``doubted``,
+``too_late``, ``restarts``, ``duplicate``; of a `ReplayStream` also ``used``, ``late``, ``full``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+from attrs import frozen
+
+from ..estimation.history import MAX_LATE_NS, ReplayHistory, StampGate, Step
+from ..measurements import FrameGuard, nanoseconds, Rejection
+
+State = TypeVar('State')
+
+
+class StreamParameters(Protocol):
+    """The parameters of a stream with history; history and max_gap in seconds."""
+
+    history: float
+    max_gap: float
+    restart_after: int
+
+
+@frozen
+class StreamRules:
+    """What belongs to a stream: see `StampGate`. window_ns: 0 where nothing late is used."""
+
+    window_ns: int
+    max_gap_ns: int
+    restart_after: int
+    max_late_ns: int = MAX_LATE_NS
+
+    @classmethod
+    def of(cls, config: StreamParameters) -> StreamRules:
+        """The rules that `config` states."""
+        return cls(nanoseconds(config.history), nanoseconds(config.max_gap), config.restart_after)
+
+
+class Admitted(NamedTuple):
+    """The measurements to process now, and whether the clock was restarted before them."""
+
+    items: tuple[Any, ...] = ()
+    restarted: bool = False
+
+
+class Stream:
+    """The gates that both streams share. accepts: the measurement classes a tracker takes.
+
+    counts: what happened to the measurements, by reason; a tracker adds its own.
+    """
+
+    def __init__(self, accepts: tuple[type, ...], rules: StreamRules):
+        self.counts: Counter[str] = Counter()
+        self._accepts = accepts
+        self._rules = rules
+        self._frames = FrameGuard()
+        self._gate: StampGate[Any] = StampGate(
+            rules.window_ns, rules.max_gap_ns, rules.restart_after, max_late_ns=rules.max_late_ns
+        )
+
+    @property
+    def frame_id(self) -> str:
+        """The frame of the tracks, empty until a measurement names one."""
+        return self._frames.frame_id
+
+    def _admit(self, measurement: Any) -> Admitted:
+        """Ask the gate of stamps about a measurement that is `_recognised`."""
+        decision = self._gate.decide(measurement.stamp_ns, measurement)
+        decision.count_in(self.counts)
+        return Admitted(decision.released, decision.verdict == 'restart')
+
+    def _recognised(self, measurement: Any) -> bool:
+        """Whether type and frame are those of the stream; counts a refusal."""
+        if not isinstance(measurement, self._accepts):
+            self.counts['unknown_type'] += 1
+            return False
+        try:
+            self._frames.check(measurement)
+        except Rejection:
+            self.counts['other_frame'] += 1
+            return False
+        return True
+
+
+class OnceStream(Stream):
+    """A stream that hands out each measurement once, in rising order of stamps."""
+
+    def admit(self, measurement: Any) -> Admitted:
+        """The measurements to process now. One with the newest stamp is a duplicate."""
+        if not self._recognised(measurement):
+            return Admitted()
+        if measurement.stamp_ns == self._gate.newest_ns:
+            self.counts['duplicate'] += 1
+            return Admitted()
+        admitted = self._admit(measurement)
+        by_stamp: dict[int, Any] = {}
+        for item in admitted.items:
+            self.counts['duplicate'] += item.stamp_ns in by_stamp
+            by_stamp.setdefault(item.stamp_ns, item)
+        return Admitted(tuple(by_stamp[stamp] for stamp in sorted(by_stamp)), admitted.restarted)
+
+
+class ReplayStream(Stream, Generic[State]):
+    """A stream with history: what is late, but inside the window, gets its place in time.
+
+    step: ``step(state, stamp_ns, measurements) -> state``, pure, for all measurements of a stamp.
+    initial: the state before the first measurement. survivor: what is left of a state when the
+    clock was restarted, such as the identities that are used up. Measurements have a ``key()``.
+    """
+
+    def __init__(
+        self,
+        accepts: tuple[type, ...],
+        rules: StreamRules,
+        *,
+        step: Step[State, Any],
+        initial: State,
+        survivor: Callable[[State], State],
+    ):
+        super().__init__(accepts, rules)
+        self._step = step
+        self._survivor = survivor
+        self._history = ReplayHistory[State, Any](initial, rules.window_ns)
+
+    @property
+    def state(self) -> State:
+        """The newest state."""
+        return self._history.state
+
+    def revise(self, measurement: Any) -> list[tuple[int, State]]:
+        """Take a measurement in: every stamp with a new or a changed state, and that state, oldest
+        first."""
+        admitted = self._admit(measurement) if self._recognised(measurement) else Admitted()
+        if admitted.restarted:
+            self._history = ReplayHistory(self._survivor(self.state), self._rules.window_ns)
+        revised: dict[int, State] = {}
+        for item in admitted.items:
+            revised.update(self._insert(item))
+        return [(stamp_ns, revised[stamp_ns]) for stamp_ns in sorted(revised)]
+
+    def _insert(self, item: Any) -> list[tuple[int, State]]:
+        newest_ns = self._history.newest_ns
+        inserted = self._history.insert(item.stamp_ns, item.key(), item, self._step)
+        self.counts[inserted.verdict] += 1
+        if inserted.revised and newest_ns is not None and item.stamp_ns < newest_ns:
+            self.counts['late'] += 1
+        return inserted.revised

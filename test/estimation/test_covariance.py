@@ -1,0 +1,277 @@
+"""Covariances stay positive definite: cases no double can hold, exact fractions, and both engines
+in batches."""
+
+from fractions import Fraction
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from sonar_imm.estimation import imm, imm_kernels, kalman, small_matrices
+from sonar_imm.estimation.covariance import correct, LIFT, lift, LIMIT, propagate, sound
+from sonar_imm.trackers.obstacle import kernels as obstacle_kernels
+
+ROUNDING = 1e-14
+
+
+def least_eigenvalue(P):
+    """Of the correlation matrix, where a component has a variance: a number without units."""
+    own = np.diagonal(P, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(own > 0.0, own, 1.0))
+    return np.linalg.eigvalsh(P / (scale[..., :, None] * scale[..., None, :]))[..., 0]
+
+
+def is_covariance(P):
+    """Finite, symmetric to the last bit, and with a Cholesky factor."""
+    assert np.isfinite(P).all()
+    np.testing.assert_array_equal(P, np.swapaxes(P, -1, -2))
+    np.linalg.cholesky(P)  # LAPACK's, which raises
+    assert (least_eigenvalue(P) > -ROUNDING).all()
+    return True
+
+
+def ill_conditioned(rng, count, n, m):
+    """Batches of P, F, Q, H, R whose scales lie up to 1e24 apart: nearly and wholly dependent
+    components, measurements that repeat each other, noise that is nothing beside P, or zero."""
+
+    def covariance(size, low, high):
+        root = rng.normal(size=(count, size, size))
+        root *= 10.0 ** rng.uniform(low / 2, high / 2, (count, 1, size))
+        thin = rng.random(count) < 0.4
+        root[thin, :, 0] *= 10.0 ** rng.uniform(-9, 0, (thin.sum(), 1))
+        P = root @ np.swapaxes(root, -1, -2)
+        scale = 10.0 ** rng.uniform(-3, 3, (count, size))
+        return lift(0.5 * (P + np.swapaxes(P, -1, -2)) * scale[:, :, None] * scale[:, None])[0]
+
+    P, Q = covariance(n, -12, 12), covariance(n, -20, 2)
+    Q[rng.random(count) < 0.3] = 0.0
+    R = covariance(m, -14, 4)
+    R[rng.random(count) < 0.2] = 0.0
+    flat = rng.random(count) < 0.2
+    R[flat, -1] = R[flat, :, -1] = 0.0  # a perfect component
+    F = np.tile(np.eye(n), (count, 1, 1)) + np.triu(
+        10.0 ** rng.uniform(-6, 4, (count, n, n)) * rng.choice([-1, 1], (count, n, n)), 1
+    )
+    H = rng.normal(size=(count, m, n))
+    plain = rng.random(count) < 0.4
+    H[plain] = np.eye(m, n)
+    if m > 1:
+        same = rng.random(count) < 0.2
+        H[same, 1] = H[same, 0] * (1.0 + 10.0 ** rng.uniform(-16, -4, (same.sum(), 1)))
+    return P, F, Q, H, R
+
+
+@pytest.mark.parametrize(('n', 'm', 'seed'), [(2, 1, 0), (3, 2, 1), (4, 2, 2), (4, 1, 3)])
+def test_ten_thousand_ill_conditioned_cases_stay_positive_definite(n, m, seed):
+    """2500 for each size, ten steps of the same measurement each, numpy and compiled."""
+    rng = np.random.default_rng(seed)
+    count = 2500
+    P, F, Q, H, R = ill_conditioned(rng, count, n, m)
+    x, v = np.zeros((1, count, n)), np.zeros((1, count, m))
+    B = np.zeros((count, n))
+    for engine in (imm, imm_kernels):
+        now = P[None].copy()
+        repairs = 0
+        for _ in range(10):  # the numpy form stops at 1e-308 after some more perfect measurements
+            _, now, repaired = engine.predict(x, now, F, Q, B)
+            assert is_covariance(now)
+            repairs += repaired.sum()
+            # One R for all models of a target: each case is a target of its own.
+            out = engine.update(
+                x.reshape(count, 1, n), now.reshape(count, 1, n, n), np.ones((count, 1)),
+                v.reshape(count, 1, m), H[:, None], R,
+            )  # fmt: skip
+            now = out[1].reshape(1, count, n, n)
+            assert is_covariance(now)
+            assert np.isfinite(out[0]).all() and np.isfinite(out[2]).all()
+            repairs += out[6].sum()
+        assert 0 < repairs < 20 * count
+    for case in range(0, count, 50):
+        assert is_covariance(correct(P[case], H[case], R[case]).P)
+
+
+def exact_posterior(P, H, R):
+    """P - P H' S^-1 H P for one measured value, in fractions of the numbers given."""
+    P = [[Fraction(float(value)) for value in row] for row in P]
+    H = [Fraction(float(value)) for value in H]
+    PH = [sum(a * b for a, b in zip(row, H)) for row in P]
+    S = sum(a * b for a, b in zip(H, PH)) + Fraction(float(R))
+    return [[P[i][j] - PH[i] * PH[j] / S for j in range(len(H))] for i in range(len(H))]
+
+
+@pytest.mark.parametrize('engine', [imm, imm_kernels])
+def test_a_measurement_much_better_than_the_state(engine):
+    """1e12 against 1e-6, eighteen digits, fifty times: what is claimed along the measurement is
+    neither less than the truth, 1e-6 / k, nor more than the stated limit allows."""
+    P = np.diag([1e12, 1e12])[None, None]
+    h = np.array([1.0, 1.0 + 1e-7])
+    H, R = h[None, None, None], np.array([[[1e-6]]])
+    x, one = np.zeros((1, 1, 2)), np.ones((1, 1))
+    for k in range(1, 51):
+        out = engine.update(x, P, one, np.zeros((1, 1, 1)), H, R)
+        x, P = out[:2]
+        assert is_covariance(P)
+        claimed = [Fraction(value) for value in P[0, 0].ravel()]
+        h0, h1 = (Fraction(float(value)) for value in h)
+        along = h0 * h0 * claimed[0] + 2 * h0 * h1 * claimed[1] + h1 * h1 * claimed[3]
+        assert Fraction(1, 10**6) / k <= along <= Fraction(20 * LIFT) * 10**12
+        across = np.array([1.0, -1.0]) @ P[0, 0] @ np.array([1.0, -1.0])
+        assert across == pytest.approx(2e12, rel=1e-6)
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.integers(2, 4), st.integers(0, 2**32 - 1))
+def test_an_update_is_as_good_as_the_limit_says(n, seed):
+    """Against exact arithmetic, one measured value. Rounding the prior alone changes the result by
+    the rounding over the prior's least eigenvalue."""
+    rng = np.random.default_rng(seed)
+    P, _, _, H, R = (each[0] for each in ill_conditioned(rng, 1, n, 1))
+    exact = np.array(exact_posterior(P, H[0], R[0, 0]), dtype=float)
+    got = correct(P, H, R)
+    assert got.usable
+    scale = np.sqrt(np.diagonal(P))
+    error = np.abs(got.P - exact) / np.outer(scale, scale)
+    assert error.max() <= 10.0 * LIFT + 1e-14 / max(float(least_eigenvalue(P)), LIMIT)
+
+
+@pytest.mark.parametrize('engine', [imm, imm_kernels])
+def test_a_perfect_component_and_one_repeated(engine):
+    """R with a zero eigenvalue, R slightly below zero by rounding, and two perfect measurements
+    of the same thing: S itself is singular."""
+    P = np.tile(np.diag([4.0, 9.0, 1.0]), (3, 1, 1, 1))
+    H = np.zeros((3, 1, 2, 3))
+    H[:, 0, 0, 0] = 1.0
+    H[:2, 0, 1, 1] = 1.0
+    H[2, 0, 1, 0] = 1.0
+    R = np.zeros((3, 2, 2))
+    R[0, 0, 0], R[1, 0, 0], R[1, 1, 1] = 0.25, 0.25, -1e-19
+    x, mu, v = np.zeros((3, 1, 3)), np.ones((3, 1)), np.ones((3, 1, 2))
+    for _ in range(3):
+        x, P, mu, log_likelihood, _, ok, repaired = engine.update(x, P, mu, v, H, R)
+        assert ok.all() and np.isfinite(log_likelihood).all()
+        assert is_covariance(P)
+        v = np.zeros_like(v)
+    np.testing.assert_allclose(x[:2, 0, 1], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(x[2, 0, 0], 1.0, rtol=1e-9)
+    assert (P[:2, 0, 1, 1] < 1e-8).all() and P[2, 0, 0, 0] < 1e-8
+
+
+def test_models_that_are_sharp_and_far_apart_mix():
+    """The compiled mix sums about the common mean; 1e7 m from it, nothing is left of 1e-6 m^2."""
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-1e7, 1e7, (4, 6, 3))
+    P = np.tile(1e-6 * np.eye(3), (4, 6, 1, 1))
+    mu, stay = np.full((4, 6), 1.0 / 6.0), np.eye(6)[None]
+    got, want = imm_kernels.mix(x, P, mu, stay), imm.mix(x, P, mu, stay)
+    for P0 in (got[1], want.P):
+        assert is_covariance(P0)
+        np.testing.assert_allclose(P0, P, rtol=1e-6, atol=1e-12)
+
+
+def test_a_shared_drift_leaves_its_correlation():
+    """Coasting 1e9 s with a velocity known to 1 m/s makes position and velocity one number."""
+    P, F = np.diag([1e-6, 1.0]), np.array([[1.0, 1e9], [0.0, 1.0]])
+    moved, repaired = propagate(F, P, np.zeros((2, 2)))
+    assert repaired and is_covariance(moved)
+    np.testing.assert_allclose(moved, F @ P @ F.T, rtol=1e-12)
+
+
+def test_ordinary_covariances_keep_their_bits():
+    rng = np.random.default_rng(6)
+    root = rng.normal(size=(50, 4, 6))
+    P = root @ np.swapaxes(root, -1, -2)
+    P = 0.5 * (P + np.swapaxes(P, -1, -2))
+    P[0] = np.diag([1.0, 0.0, 2.0, 3.0])  # nothing to lift where there is no variance
+    P[1] = 0.0
+    lifted, repaired = lift(P)
+    np.testing.assert_array_equal(lifted, P)
+    assert not repaired.any()
+    L = np.empty((4, 4))
+    assert not any(small_matrices.lift(one, L) for one in lifted)
+
+
+def test_a_lift_adds_no_more_than_it_must():
+    hurt = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])
+    lifted, repaired = lift(np.stack([np.eye(2), hurt, 1e9 * hurt]))
+    np.testing.assert_array_equal(repaired, [False, True, True])
+    np.testing.assert_array_equal(lifted[0], np.eye(2))
+    assert (np.diagonal(lifted[1]) <= 1.0 + 1e-7).all() and is_covariance(lifted)
+    compiled = hurt.copy()
+    assert small_matrices.lift(compiled, np.empty((2, 2)))
+    np.testing.assert_allclose(compiled, lifted[1], rtol=1e-15)
+
+
+@pytest.mark.parametrize('bad', [np.diag([-0.1, 1.0]), np.full((2, 2), np.inf), -np.eye(2)])
+def test_what_is_no_covariance_is_left_for_the_caller_to_see(bad):
+    lifted, repaired = lift(bad)
+    assert repaired and not sound(lifted)
+    np.testing.assert_array_equal(lifted, bad)
+    compiled = bad.copy()
+    assert small_matrices.lift(compiled, np.empty((2, 2)))
+    np.testing.assert_array_equal(compiled, bad)
+
+
+@pytest.mark.parametrize('broken', ['P', 'H', 'R'])
+def test_numbers_that_are_not_finite_change_nothing_and_are_told(broken):
+    parts = {'P': np.eye(2), 'H': np.eye(2), 'R': np.eye(2)}
+    parts[broken] = parts[broken].copy()
+    parts[broken][0, 0] = np.nan
+    got = correct(*parts.values())
+    assert not got.usable and not got.repaired
+    args = (parts['P'][None, None], np.ones((1, 1)), np.ones((1, 1, 2)))
+    for engine in (imm, imm_kernels):
+        out = engine.update(np.zeros((1, 1, 2)), *args, parts['H'][None, None], parts['R'][None])
+        assert not out[5].any() and not out[6].any()
+        np.testing.assert_array_equal(out[1], args[0])
+
+
+@pytest.mark.parametrize('ratio', [1e6, 1e14, 1e18, 1e24])
+def test_a_diver_seen_far_better_than_known_keeps_a_covariance(ratio):
+    """Position and velocity from one birth and one step without noise are one number; the next
+    fix is `ratio` better. Joseph's form alone made a correlation of this with eigenvalue -.02."""
+    dt, v = 0.08, 400.0
+    P = np.kron(np.array([[v * dt * dt, v * dt], [v * dt, v]]), np.eye(2))[None, None]
+    R = (np.array([[2.1, 2.5], [2.5, 11.0]]) * P[0, 0, 0, 0] / ratio)[None]
+    H = np.eye(2, 4)[None, None]
+    for engine in (imm, imm_kernels):
+        out = engine.update(
+            np.zeros((1, 1, 4)), P, np.ones((1, 1)), np.ones((1, 1, 2)) * 1e-9, H, R
+        )
+        assert is_covariance(out[1])
+        floor = 3.0 * LIFT * P[0, 0, 0, 0]
+        np.testing.assert_allclose(out[1][0, 0, :2, :2], R[0], rtol=1e-4, atol=floor)
+
+
+def test_the_obstacle_update_stays_positive_definite():
+    rng = np.random.default_rng(8)
+    P = ill_conditioned(rng, 2000, 4, 2)[0].reshape(500, 4, 4, 4)
+    R = ill_conditioned(rng, 500, 4, 2)[4]
+    mu, x = rng.dirichlet(np.ones(4), 500), np.zeros((500, 4, 4))
+    h, z = np.zeros((500, 4, 2)), np.zeros((500, 2))
+    repairs = 0
+    for _ in range(5):
+        x, P, mu, _, repaired = obstacle_kernels.soft_update(x, P, mu, h, z, R, 0.05, 1e-3)
+        assert is_covariance(P)
+        assert np.isfinite(x).all() and (mu >= 0.0).all()
+        np.testing.assert_allclose(mu.sum(axis=1), 1.0, rtol=1e-12)
+        repairs += repaired.sum()
+    assert repairs > 0
+
+
+def test_a_probability_below_zero_depth_stays_in_its_interval():
+    """Weights add up to one but for rounding; the probability of `below` is their sum at most."""
+    rng = np.random.default_rng(9)
+    mu = rng.dirichlet(np.full(16, 0.3), 4000)
+    mean, std = -10.0 * np.ones((4000, 16)), 0.1 * np.ones((4000, 16))
+    *_, negative = obstacle_kernels.bands(mean, std, mu, 0.05)
+    assert (mu.sum(axis=1) > 1.0).any()
+    assert (negative <= 1.0).all() and (negative > 1.0 - 1e-9).all()
+
+
+def test_kalman_reports_what_it_repaired():
+    P = np.stack([np.eye(2), np.diag([1e12, 1e12])])
+    H = np.array([[1.0, 1.0 + 1e-7]])
+    updated = kalman.update(np.zeros((2, 2)), P, np.ones((2, 1)), H, np.array([[1e-6]]))
+    np.testing.assert_array_equal(updated.repaired, [False, True])
+    assert not kalman.predict(np.zeros(2), np.eye(2), np.eye(2), np.eye(2)).repaired

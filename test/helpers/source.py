@@ -1,0 +1,77 @@
+"""The source tree as the tests of the house read it: modules, imports, circles of imports."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+MODULES = sorted(
+    path for room in ('sonar_imm', 'msg_adapters') for path in (ROOT / room).rglob('*.py')
+)
+
+COMMON_INTERFACES = {
+    'actionlib_msgs',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'nav_msgs',
+    'sensor_msgs',
+    'shape_msgs',
+    'std_msgs',
+    'std_srvs',
+    'stereo_msgs',
+    'trajectory_msgs',
+    'visualization_msgs',
+}
+COME_WITH_RCLPY = {'builtin_interfaces', 'rcl_interfaces', 'rosgraph_msgs'}
+ROS_MODULES = COMMON_INTERFACES | COME_WITH_RCLPY | {'rclpy', 'ament_index_python'}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def known_module(modules: Iterable[str], name: str) -> str | None:
+    """The module of ours that a dotted name is or is defined in."""
+    while name and name not in modules:
+        name = name.rpartition('.')[0]
+    return name or None
+
+
+def circle_of(graph: Mapping[str, set[str]]) -> list[str] | None:
+    """A way from a module over its imports back to it, or None."""
+    done: set[str] = set()
+    way: list[str] = []
+
+    def visit(name: str) -> list[str] | None:
+        if name in way:
+            return [*way[way.index(name) :], name]
+        if name in done:
+            return None
+        way.append(name)
+        found = next(filter(None, map(visit, sorted(graph[name]))), None)
+        way.pop()
+        done.add(name)
+        return found
+
+    return next(filter(None, map(visit, sorted(graph))), None)
+
+
+def imports(path: Path) -> list[str]:
+    return imported_names(path.read_text(encoding='utf-8'), path)
+
+
+def imported_names(source: str, path: Path) -> list[str]:
+    """Every name the source imports, made absolute, at the top or inside a function."""
+    package = module_name(path) if path.name == '__init__.py' else module_name(path.parent)
+    names = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package.split('.')[: len(package.split('.')) - node.level + 1]
+            stem = '.'.join([*(base if node.level else []), *filter(None, [node.module])])
+            names += [f'{stem}.{alias.name}' for alias in node.names]
+    return names

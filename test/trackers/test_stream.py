@@ -1,0 +1,95 @@
+"""The streams that every tracker stands on, with measurements of three lines."""
+
+from attrs import frozen
+import pytest
+
+from sonar_imm.trackers.stream import Admitted, OnceStream, ReplayStream, StreamRules
+
+S = 10**9
+RULES = StreamRules(window_ns=10 * S, max_gap_ns=600 * S, restart_after=5)
+
+
+@frozen
+class Number:
+    """A measurement that is a number."""
+
+    stamp_ns: int
+    value: int = 0
+    frame_id: str = 'map'
+
+    def key(self):
+        return self.value.to_bytes(4, 'big')
+
+
+def at(*seconds, **values):
+    return [Number(round(second * S), **values) for second in seconds]
+
+
+def total(state, stamp_ns, items):
+    return state + sum(item.value for item in items)
+
+
+def replay():
+    return ReplayStream((Number,), RULES, step=total, initial=0, survivor=lambda state: -1000)
+
+
+def once(window_ns=0):
+    return OnceStream((Number,), StreamRules(window_ns, 600 * S, 3))
+
+
+@pytest.mark.parametrize('make, take', [(replay, 'revise'), (once, 'admit')])
+def test_strangers_and_other_frames_are_counted(make, take):
+    stream = make()
+    assert stream.frame_id == ''
+    getattr(stream, take)(Number(S))
+    nothing = Admitted() if take == 'admit' else []
+    assert getattr(stream, take)('a word') == nothing
+    assert getattr(stream, take)(Number(2 * S, frame_id='odom')) == nothing
+    assert stream.counts['unknown_type'] == stream.counts['other_frame'] == 1
+    assert stream.frame_id == 'map'
+
+
+def test_what_is_late_revises_what_comes_after():
+    stream = replay()
+    for one in (Number(S, 1), Number(3 * S, 4), Number(5 * S, 16)):
+        stream.revise(one)
+    assert stream.revise(Number(2 * S, 2)) == [(2 * S, 3), (3 * S, 7), (5 * S, 23)]
+    assert stream.revise(Number(2 * S, 2)) == []
+    assert stream.revise(Number(5 * S, 32)) == [(5 * S, 55)]
+    assert stream.state == 55
+    assert stream.counts == {'used': 5, 'late': 1, 'duplicate': 1, 'doubted': 0}
+
+
+def test_a_restart_keeps_what_survives_and_hands_everything_out():
+    stream = replay()
+    for one in at(*range(5000, 5020), value=1):
+        stream.revise(one)
+    held = [stream.revise(one) for one in at(*range(1, 6), value=1)]
+    assert held[:4] == [[]] * 4
+    assert held[4] == [(second * S, -1000 + second) for second in range(1, 6)]
+    assert stream.counts['restarts'] == 1 and stream.counts['too_late'] == 0
+
+
+def test_a_stream_without_history_takes_each_stamp_once_and_in_order():
+    stream = once()
+    assert stream.admit(Number(5 * S)).items == (Number(5 * S),)
+    assert stream.admit(Number(5 * S, 1)) == Admitted()
+    assert stream.admit(Number(4 * S)) == Admitted()
+    assert stream.counts == {'duplicate': 1, 'too_late': 1, 'doubted': 0}
+
+
+def test_a_restart_without_history_is_in_order_too():
+    stream = once(window_ns=S)
+    for one in at(5000, 5001):
+        stream.admit(one)
+    admitted = [stream.admit(one) for one in at(10, 9.5, 9.5, 11)]
+    assert admitted[:3] == [Admitted()] * 3
+    assert admitted[3] == Admitted(tuple(at(9.5, 10, 11)), restarted=True)
+    assert stream.counts['duplicate'] == 1
+
+
+def test_rules_come_from_a_config():
+    class Config:
+        history, max_gap, restart_after = 2.5, 60.0, 4
+
+    assert StreamRules.of(Config) == StreamRules(2_500_000_000, 60 * S, 4)
