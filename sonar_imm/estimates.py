@@ -18,6 +18,8 @@ class Estimate:
     state: (rows, n) in the order of `state_names`; covariance: (rows, n, n).
     probabilities: (rows, models) in the order of `model_names`, each row sums to one.
     extras: further columns, each (rows,), dtypes as published.
+    source: which of several instruments it comes from, empty for the only one; estimates of one
+    stamp and several sources stand side by side.
     """
 
     stamp_ns: int
@@ -29,6 +31,7 @@ class Estimate:
     model_names: tuple[str, ...] = ()
     probabilities: NDArray[np.float64] = field(factory=lambda: np.empty((0, 0)))
     extras: Mapping[str, NDArray] = field(factory=dict)
+    source: str = ''
 
     def __len__(self) -> int:
         return len(self.state)

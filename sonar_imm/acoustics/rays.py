@@ -305,3 +305,35 @@ def _invert(
                 value[k, i] = r * (sines[e - 1] + share * (sines[e] - sines[e - 1]))
             else:  # the rays fold back: whatever lies above is in the shade
                 value[k, i] = math.nan
+
+
+@kernel
+def look_up(
+    value: FloatArray, row: float, first_depth: float, depth_step: float, depth: FloatArray
+) -> None:
+    """Replace depths (n,) by ``r sin(phi)`` from a launch table (R, D), bilinearly; row: the range
+    over its range step. NaN outside the table."""
+    k = min(max(int(row), 0), value.shape[0] - 2)
+    f = row - k
+    near, far, last = value[k], value[k + 1], value.shape[1] - 2
+    for s in range(depth.shape[0]):
+        place = (depth[s] - first_depth) / depth_step
+        if not 0.0 <= place <= last + 1.0:
+            depth[s] = math.nan
+            continue
+        i = min(int(place), last)
+        g = place - i
+        low = near[i] + g * (near[i + 1] - near[i])
+        high = far[i] + g * (far[i + 1] - far[i])
+        depth[s] = low + f * (high - low)
+
+
+@kernel
+def look_up_each(
+    value: FloatArray, row: FloatArray, first_depth: float, depth_step: float, depth: FloatArray
+) -> FloatArray:
+    """`look_up` of one depth per range: row (T,), depth (T,); gives (T,)."""
+    out = depth.copy()
+    for t in range(depth.shape[0]):
+        look_up(value, row[t], first_depth, depth_step, out[t : t + 1])
+    return out

@@ -6,17 +6,13 @@ next ping is the first to see it.
 
 from __future__ import annotations
 
-from functools import partial
 import math
 
 from attrs import frozen
 
 from ...acoustics.laplace import LIKELIHOODS
-from ...parameters import Config
-from ...parameters import parameter as fixed_parameter
 from ..model_checks import chain_problems
-
-parameter = partial(fixed_parameter, read_only=False)
+from .sea_parameters import parameter, SeaParameters
 
 DEFAULT_SIGMAS = {
     'height_rw_ncs': (0.5, 1.0),
@@ -31,7 +27,7 @@ SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
 
 
 @frozen(kw_only=True)
-class BathymetryConfig(Config):
+class BathymetryConfig(SeaParameters):
     """Everything the bathymetry tracker can be told."""
 
     # -- which models ----------------------------------------------------------------------------
@@ -113,9 +109,20 @@ class BathymetryConfig(Config):
         high=100.0,
     )
 
+    angle_drift: bool = parameter(
+        True,
+        'angle_two_rw: the floor is predicted at constant height, not at constant angle; near '
+        'nadir it turns by degrees from bin to bin',
+    )
+
     # -- sonar -----------------------------------------------------------------------------------
     sonar_height: float = parameter(
-        15.0, 'height of the sonar above the reference floor', unit='m', low=0.01, high=12000.0
+        15.0,
+        'height of the sonar above the reference floor; with nav only where the filter starts, '
+        'see also sonar_height_std',
+        unit='m',
+        low=0.01,
+        high=12000.0,
     )
     side: str = parameter('starboard', 'side the array looks to', choices=('port', 'starboard'))
     tilt_deg: float = parameter(
@@ -180,7 +187,8 @@ class BathymetryConfig(Config):
     )
     grid_extent: float = parameter(
         20.0,
-        'the grid reaches so far to both sides of initial_mean (angles: all that can be)',
+        'the grid reaches so far to both sides of the start, and at least 2 sonar_height_std '
+        '(angles: all that can be)',
         unit='m',
         low=0.1,
         high=1000.0,
@@ -194,7 +202,7 @@ class BathymetryConfig(Config):
     seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
 
     def check(self) -> list[str]:
-        problems = self._check_sigmas()
+        problems = super().check() + self._check_sigmas()
         models = self.model_count()
         problems += chain_problems(
             self.transition_matrix, self.initial_probabilities, models, self.model_set
