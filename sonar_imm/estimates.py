@@ -18,8 +18,6 @@ class Estimate:
     state: (rows, n) in the order of `state_names`; covariance: (rows, n, n).
     probabilities: (rows, models) in the order of `model_names`, each row sums to one.
     extras: further columns, each (rows,), dtypes as published.
-    source: which of several instruments it comes from, empty for the only one; estimates of one
-    stamp and several sources stand side by side.
     """
 
     stamp_ns: int
@@ -31,7 +29,13 @@ class Estimate:
     model_names: tuple[str, ...] = ()
     probabilities: NDArray[np.float64] = field(factory=lambda: np.empty((0, 0)))
     extras: Mapping[str, NDArray] = field(factory=dict)
-    source: str = ''
+
+    @property
+    def source(self) -> int:
+        """Which of several instruments it comes from, by the column ``side``; 0 for the only one.
+        Estimates of one stamp and several sources stand side by side."""
+        side = self.extras.get('side')
+        return int(side[0]) if side is not None and len(side) else 0
 
     def __len__(self) -> int:
         return len(self.state)

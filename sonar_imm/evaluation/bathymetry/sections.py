@@ -119,6 +119,8 @@ def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
 def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
     """The samples of one ping, None when the recording is gone."""
     for one in read_measurements(run):
-        if one.stamp_ns == profile.stamp_ns and len(one) == len(profile.range):
+        if not isinstance(one, Snapshot) or one.stamp_ns != profile.stamp_ns:
+            continue
+        if len(one) == len(profile.range) and profile.side in ('', one.side):
             return one
     return None

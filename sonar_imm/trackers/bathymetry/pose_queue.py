@@ -60,12 +60,12 @@ class PoseQueue:
         if self._frame_id and sample.frame_id != self._frame_id:
             self.counts['other_frame'] += 1
             return
-        judgement = self._gate.judge(sample.stamp_ns, sample)
-        judgement.count_in(self.counts)
-        if judgement.verdict == 'restart':
+        decision = self._gate.decide(sample.stamp_ns, sample)
+        decision.count_in(self.counts)
+        if decision.verdict == 'restart':
             self.counts['navigation_gap'] += len(self._waiting)
             self._buffer, self._altitudes, self._waiting = NavigationBuffer(), [], []
-        for one in judgement.released:
+        for one in decision.released:
             self.heard, self._frame_id = True, one.frame_id
             self.counts['poses'] += 1
             self._buffer = self._buffer.inserted(one)

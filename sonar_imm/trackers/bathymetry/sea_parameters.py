@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from functools import partial
 import math
+from typing import TypeVar
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from ...acoustics.rays import profile_problem
 from ...acoustics.sounding import ErrorBudget
@@ -14,6 +15,8 @@ from ...parameters import Config
 from ...parameters import parameter as fixed_parameter
 
 parameter = partial(fixed_parameter, read_only=False)
+
+S = TypeVar('S', bound='SeaParameters')
 
 NAVIGATION = ('auto', 'required', 'ignored')
 
@@ -107,6 +110,12 @@ class SeaParameters(Config):
     sound_speed_std: float = parameter(
         0.5, 'standard deviation of the sound speed', unit='m/s', low=0.0, high=100.0
     )
+
+    def for_inputs(self: S, inputs: frozenset[str]) -> S:
+        """A recording says whether there is navigation: its first pings wait for it, too."""
+        if self.navigation != 'auto':
+            return self
+        return evolve(self, navigation='required' if 'nav' in inputs else 'ignored')
 
     def check(self) -> list[str]:
         problems = super().check()

@@ -147,10 +147,24 @@ def level_swath(
     config: BathymetryConfig, ranges: FloatArray, sound_speed: float, side: str, spacing: float
 ) -> Swath:
     """The swath of a sonar at rest, `sonar_height` above its reference floor."""
-    T, tilt = len(ranges), math.radians(config.tilt_deg)
-    geometry = Geometry(
+    geometry = level_geometry(
+        ranges,
+        config.sonar_height,
+        math.radians(config.tilt_deg),
+        spacing,
         of_heights=config.model_set != 'angle_two_rw',
-        height=np.full(T, config.sonar_height),
+    )
+    return Swath(ranges, sound_speed, side, geometry)
+
+
+def level_geometry(
+    ranges: FloatArray, height: float, tilt: float, spacing: float, *, of_heights: bool = True
+) -> Geometry:
+    """The geometry of an array that does not move, `height` metres above its reference floor."""
+    T = len(ranges)
+    return Geometry(
+        of_heights=of_heights,
+        height=np.full(T, height),
         reach=ranges.copy(),
         tilt=np.full(T, tilt),
         cos_tilt=np.full(T, math.cos(tilt)),
@@ -162,7 +176,6 @@ def level_swath(
         depth_step=1.0,
         drift_from=T,
     )
-    return Swath(ranges, sound_speed, side, geometry)
 
 
 def ship_swath(

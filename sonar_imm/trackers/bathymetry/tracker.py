@@ -240,7 +240,6 @@ class BathymetryTracker:
             model_names=models.names,
             probabilities=track.probability,
             extras=extras,
-            source=snapshot.side,
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.cli import main
-from sonar_imm.evaluation.bathymetry import truth_topic
+from sonar_imm.evaluation.bathymetry import truth_topics
 from sonar_imm.evaluation.bathymetry.figures import spectrum_figure
 from sonar_imm.evaluation.bathymetry.profiles import profile_of
 from sonar_imm.evaluation.judging import judge
@@ -138,8 +138,13 @@ def test_two_sides_need_a_choice(tmp_path, capsys):
 
 
 def test_truth_lies_beside_the_topic_that_was_tracked():
-    assert truth_topic({'topics': {'/snapshot': 'snapshot'}}) == '/truth/estimate'
-    assert truth_topic({'topics': {'/port/snapshot': 'snapshot'}}) == '/truth/port/estimate'
+    def of(**topics):
+        return truth_topics({'topics': {f'/{k.replace("__", "/")}': v for k, v in topics.items()}})
+
+    assert of(snapshot='snapshot', nav='nav') == {'/truth/estimate': None}
+    assert of(port__snapshot='snapshot') == {'/truth/port/estimate': None}
+    both = of(port__snapshot='port/snapshot', starboard__snapshot='starboard/snapshot')
+    assert both == {'/truth/port/estimate': 0, '/truth/starboard/estimate': 1}
 
 
 @pytest.mark.parametrize('conjugate', [False, True])
