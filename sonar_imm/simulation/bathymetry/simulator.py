@@ -20,7 +20,7 @@ from attrs import frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from ...acoustics import array, geometry, sounding
+from ...acoustics import array, geometry, rays, sounding
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from ...parameters import parameter
@@ -347,9 +347,16 @@ def _hear(config: BathymetryScenario, floor: TrueProfile, rng: np.random.Generat
         signal_variance=signal if config.state_signal else None,
         sound_speed=config.sound_speed,
         frequency=config.frequency,
-        element_spacing=config.spacing_wavelengths * config.sound_speed / config.frequency,
+        element_spacing=config.spacing_wavelengths * _speed_at_array(config) / config.frequency,
         sample_rate=0.5 * config.sound_speed / config.bin_width,
     )
+
+
+def _speed_at_array(config: BathymetryScenario) -> float:
+    """Sound speed that makes the wavelength at the array, m/s."""
+    if not config.sound_speed_profile:
+        return config.sound_speed
+    return float(rays.profile_of(config.sound_speed_profile).at(config.sonar_depth))
 
 
 def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator) -> ComplexArray:
