@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import functools
 import math
+from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from attrs import evolve
@@ -44,7 +45,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
         metrics=metrics,
         summary=summary_sentence(metrics),
         lines=tuple(lines(metrics)),
-        part=functools.partial(_part, run, metrics, swath),
+        part=functools.partial(_part, folder.path, run, metrics, swath),
         accuracy=functools.partial(_accuracy, metrics),
     )
 
@@ -61,12 +62,16 @@ def truth_topics(run: Mapping[str, Any]) -> dict[str, int | None]:
 
 
 def _part(
-    run: Mapping[str, Any], metrics: Mapping[str, Any], swath: Swath, checks: Sequence[Check]
+    folder: Path,
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    swath: Swath,
+    checks: Sequence[Check],
 ) -> Part:
     # plotly, which only a report needs, takes a second to load.
     from .sections import bathymetry_part
 
-    return bathymetry_part(run, metrics, swath, checks)
+    return bathymetry_part(folder, run, metrics, swath, checks)
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:

@@ -31,7 +31,8 @@ class TrueFloor:
 class Profile:
     """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
     probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown;
-    side: empty where the estimate does not say it."""
+    side: empty where the estimate does not say it; rough: probability (n,) of rough floor where the
+    estimate itself says it, as those of a bank do."""
 
     stamp_ns: int
     range: FloatArray
@@ -43,6 +44,7 @@ class Profile:
     probabilities: FloatArray
     truth: TrueFloor | None
     side: str = ''
+    rough: FloatArray | None = None
 
 
 @frozen(eq=False)
@@ -55,6 +57,8 @@ class Swath:
 
     def roughness(self, profile: Profile) -> FloatArray:
         """Probability (n,) that the floor is rough; NaN when no model means rough floor."""
+        if profile.rough is not None:
+            return profile.rough
         if not self.rough.any():
             return np.full(len(profile.range), np.nan)
         return profile.probabilities[:, self.rough].sum(axis=1)
@@ -106,6 +110,7 @@ def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
         heard=estimate.extras['valid'].astype(bool),
         probabilities=estimate.probabilities,
         truth=None if truth is None else true_floor(truth, ranges),
+        rough=_column(estimate, 'rough') if 'rough' in estimate.extras else None,
         side=SIDES[estimate.source] if 'side' in estimate.extras else '',
     )
 

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from ...acoustics.array import angle_of_depth
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS, DEFAULT_SIGMAS_DEG
 from .kernels import Geometry
@@ -84,7 +84,8 @@ class TerrainModels:
 
     F (M, n, n), G (M, n, k); scale (T, M): noise of each model at each bin; transition (M, M);
     initial (M,) probabilities before the first bin; mean (n,) and std (n,) of the state then;
-    coast: the model that crosses bins where nothing is heard. start: the law of the first state
+    coast: the model that crosses bins where nothing is heard. rough (M,): models that mean rough
+    floor, none but in a bank. start: the law of the first state
     where it is no normal one.
     """
 
@@ -98,6 +99,7 @@ class TerrainModels:
     mean: FloatArray
     std: FloatArray
     coast: int
+    rough: BoolArray
     start: UnknownHeight | None = None
 
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
@@ -156,6 +158,7 @@ def build_models(
         mean=np.array([mean, 0.0][: F.shape[1]]),
         std=np.array([std, config.initial_slope_std][: F.shape[1]]),
         coast=1 if slope_set else int(np.argmin(scale.sum(axis=0))),
+        rough=_rough(config, M),
         start=_unknown_height(config, ranges, geometry, first, floor_below),
     )
 
@@ -172,6 +175,12 @@ def _states(config: BathymetryConfig) -> tuple[str, ...]:
     if config.model_set == 'height_rw_ncs':
         return 'height', 'slope'
     return ('angle',) if config.model_set == 'angle_two_rw' else ('height',)
+
+
+def _rough(config: BathymetryConfig, models: int) -> BoolArray:
+    if not config.in_bank:
+        return np.zeros(models, bool)
+    return np.array(config.sigmas or DEFAULT_SIGMAS['height_bank']) >= config.rough_sigma
 
 
 def _bin_width(ranges: FloatArray) -> float:
@@ -212,7 +221,7 @@ def _noises(config: BathymetryConfig, ranges: FloatArray) -> FloatArray:
 def _transition(config: BathymetryConfig, models: int) -> FloatArray:
     if config.transition_matrix:
         return check_transition_matrix(np.reshape(config.transition_matrix, (models, models)))
-    return persistent(models, config.stay_probability)
+    return persistent(models, config.stay_used)
 
 
 def _start(

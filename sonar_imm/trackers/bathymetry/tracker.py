@@ -158,9 +158,9 @@ class BathymetryTracker:
         self, models: TerrainModels, ping: PingLikelihood, stamp_ns: int, side: str
     ) -> Track:
         config = self.config
-        if config.engine == 'grid':
+        if config.runs_on_grid:
             cells = grid_cells(config, models)
-            track = run_grid(models, ping, cells, smooth=config.smoothing == 'states')
+            track = run_grid(models, ping, cells, smooth=config.smoothing_used == 'states')
         else:
             entropy = config.seed, stamp_ns, int(side == 'port')
             track = run_particles(
@@ -170,7 +170,7 @@ class BathymetryTracker:
                 entropy,
                 resample=config.variant == 'paper',
             )
-        if config.smoothing == 'modes':
+        if config.smoothing_used == 'modes':
             smoothed = smooth_modes(track.probability, models.transition, ping.heard)
             track = track._replace(probability=smoothed)
         return track
@@ -213,6 +213,8 @@ class BathymetryTracker:
             'label': label.astype(np.uint8),
             'label_probability': track.probability[np.arange(len(label)), label],
         }
+        if config.in_bank:
+            extras['rough'] = track.probability[:, models.rough].sum(axis=1)
         xyz = floor.xyz
         if posed is not None:
             vertical, horizontal = swath.uncertainties(floor, config.budget())
