@@ -191,7 +191,8 @@ class BathymetryConfig(SeaParameters):
     particles_per_model: int = parameter(100, 'particles of each model', low=2, high=100_000)
     grid_step: float = parameter(
         0.0,
-        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most',
+        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most; '
+        '0.01 m for height_bank',
         low=0.0,
         high=100.0,
     )

@@ -264,7 +264,9 @@ def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
     step = config.grid_step
     if not step > 0.0:
         noises = models.scale[models.scale > 0.0]
-        step = min(noises.min(initial=np.inf), ANGLE_STEP if angle else HEIGHT_STEP)
+        finest = ANGLE_STEP if angle else HEIGHT_STEP
+        # The smallest walk of a bank is far below what an echo tells: no need to resolve it.
+        step = finest if config.in_bank else min(noises.min(initial=np.inf), finest)
     extent = math.pi if angle else max(config.grid_extent, 2.0 * config.sonar_height_std)
     count = math.ceil(min(extent / step, MOST_CELLS))
     cells = models.mean[0] + extent * np.arange(-count, count + 1) / count
