@@ -30,7 +30,6 @@ import numpy as np
 
 from .arrays import FloatArray
 
-
 NARROW = 0.5
 """A walk of less than so many cells goes to the next cell at most, with the chance that gives it
 its variance: samples of the normal law would have too little."""

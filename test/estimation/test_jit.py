@@ -84,8 +84,9 @@ def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypat
 import numpy as np
 from sonar_imm.trackers.bathymetry.kernels import sines_of
 from sonar_imm.trackers.bathymetry.swath import level_geometry
+geometry = level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5)
 try:
-    sines_of(np.zeros(1), 0, level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5), np.empty((1, 2)), np.empty(1)[:0])
+    sines_of(np.zeros(1), 0, geometry, np.empty((1, 2)), np.empty(1)[:0])
     print('unchecked')
 except IndexError:
     print('checked')

@@ -31,8 +31,8 @@ class TrueFloor:
 class Profile:
     """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
     probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown;
-    side: empty where the estimate does not say it; rough: probability (n,) of rough floor where the
-    estimate itself says it, as those of a bank do."""
+    side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
+    the estimate itself says it, as those of a bank do."""
 
     stamp_ns: int
     range: FloatArray

@@ -2,8 +2,8 @@
 what floor each echo of a ping comes from.
 
 The world is east-north-up with the water line at z = `water_level`. The ship goes straight on
-while it rolls, pitches, yaws and heaves, each a sum of three sines about the swell's period. What the
-navigation states differs from the truth by errors that last seconds, as those of real attitude
+while it rolls, pitches, yaws and heaves, each a sum of three sines about the swell's period. What
+the navigation states differs from the truth by errors that last seconds, as those of real attitude
 sensors do: within a ping they are nearly constant.
 
 The floor is a function of the place. Its course coordinates are the distance along the track and

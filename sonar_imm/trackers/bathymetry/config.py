@@ -184,8 +184,8 @@ class BathymetryConfig(SeaParameters):
     # -- computation -----------------------------------------------------------------------------
     engine: str = parameter(
         'auto',
-        'particles, or a grid: exact, without Monte Carlo noise, for sets of one state; auto: grid '
-        'for height_bank, else particles',
+        'particles, or a grid: exact, without Monte Carlo noise, for sets of one state; auto: '
+        'grid for height_bank, else particles',
         choices=('auto', 'particles', 'grid'),
     )
     particles_per_model: int = parameter(100, 'particles of each model', low=2, high=100_000)

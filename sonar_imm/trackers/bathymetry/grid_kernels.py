@@ -39,7 +39,13 @@ class Drift(NamedTuple):
 
 @kernel
 def find_drift(
-    cells: FloatArray, low: int, high: int, t: int, geometry: Geometry, out: Drift, work: FloatArray
+    cells: FloatArray,
+    low: int,
+    high: int,
+    t: int,
+    geometry: Geometry,
+    out: Drift,
+    work: FloatArray,
 ) -> tuple[int, int]:
     """The drift of the cells [low, high) from bin t - 1 to bin t; the window they reach. work (1
     or more, G) is scratch."""

@@ -107,9 +107,7 @@ class PoseQueue:
 
     def _altitude(self, stamp_ns: int) -> float | None:
         usable = [
-            one
-            for one in self._altitudes
-            if 0 <= stamp_ns - one.stamp_ns <= ALTITUDE_AGE_NS
+            one for one in self._altitudes if 0 <= stamp_ns - one.stamp_ns <= ALTITUDE_AGE_NS
         ]
         return max(usable, key=lambda one: one.stamp_ns).altitude if usable else None
 

@@ -103,9 +103,7 @@ class Swath:
         assert self.looks is not None
         return sounding.beam_angle(sounding.direction(self.looks, np.sin(angle)), self.side)
 
-    def uncertainties(
-        self, floor: Floor, budget: ErrorBudget
-    ) -> tuple[FloatArray, FloatArray]:
+    def uncertainties(self, floor: Floor, budget: ErrorBudget) -> tuple[FloatArray, FloatArray]:
         """Vertical and horizontal variance (T,) of the soundings, m^2."""
         assert self.looks is not None
         offset = floor.xyz - self.looks.position
@@ -186,8 +184,8 @@ def ship_swath(
     spacing: float,
     poses: Pose,
 ) -> Swath:
-    """The swath of a moving ship. poses (T + 1,): of the ship, ENU from FLU, when the ping was sent
-    and when each of the T bins was received."""
+    """The swath of a moving ship. poses (T + 1,): of the ship, ENU from FLU, when the ping was
+    sent and when each of the T bins was received."""
     T = len(ranges)
     mount = frames.rotation(*np.radians(config.sonar_mount_rpy_deg))
     axes = sounding.array_axes(side, math.radians(config.tilt_deg), mount)

@@ -37,7 +37,9 @@ def errors(estimates):
         np.array([one.extras[f'{name}_uncertainty'] for one in estimates])
         for name in ('vertical', 'horizontal')
     )
-    aside = np.linalg.norm(np.array([one.xyz for one in estimates])[..., :2] - CASE['X'][..., :2], axis=-1)
+    aside = np.linalg.norm(
+        np.array([one.xyz for one in estimates])[..., :2] - CASE['X'][..., :2], axis=-1
+    )
     return (
         np.sqrt(np.mean(z**2)),
         np.mean(np.abs(z) < 2.0 * np.sqrt(vertical)),
