@@ -34,8 +34,9 @@ def fitting_topics(
 
     A topic fits when its type can be read and its name ends in the input's name; where several
     inputs fit, the later one counts. Topics below ``/truth`` never fit, and companions alone are
-    not enough. `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError` when nothing fits, with
-    a list of what is there, and when several topics fit an input that is one instrument.
+    not enough. `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``.
+    Raises `BagError` when nothing fits, with a list of what is there, and when several topics fit
+    an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
