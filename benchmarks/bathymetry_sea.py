@@ -1,4 +1,4 @@
-"""A side-scan array at sea: motion, refraction, unknown height, nadir and labels, with and without.
+"""A side-scan array at sea: motion, refraction, unknown height, nadir, labels; with and without.
 
     python -m benchmarks.bathymetry_sea --out docs/results/bathymetry_sea.json
 

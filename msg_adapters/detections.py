@@ -10,6 +10,9 @@ marine_acoustic_msgs receive angles count to starboard, and beams point along z 
 starboard; some drivers and simulators publish beams with x forward and y to port all the same
 (`beam_axes`).
 
+A sender that counts bearings to the other side than its message says is read with
+`bearing_positive` ``'starboard'``, which turns round what the rules above give.
+
 Ranges and bearings that are not finite (REP-117: too near, nothing there, error) are dropped, so
 that the length of the result may be smaller than that of the message.
 """
@@ -33,11 +36,12 @@ SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
 NEAREST, FARTHEST = 0.01, 1e5
 """Metres: no echo comes from nearer or farther."""
+BEARING_SIDES = ('port', 'starboard')
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
 """A stated variance outside is a field that was not filled in."""
 
 
-def read_detections(message: Any, **_: Any) -> Detections:
+def read_detections(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a table of detections; with no row it is a ping in which nothing was seen.
 
     Raises `Rejection`.
@@ -59,18 +63,18 @@ def read_detections(message: Any, **_: Any) -> Detections:
     for name in ('var_range', 'var_bearing'):
         if name in optional:
             optional[name] = _variances(optional[name])
-    return _detections(message, distance, bearing, **optional)
+    return _detections(message, distance, bearing, bearing_positive, **optional)
 
 
-def read_pose_array(message: Any, **_: Any) -> Detections:
+def read_pose_array(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a PoseArray: positions in the sonar's frame, x forward, y to port, z up."""
     places = np.array(
         [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses], np.float64
     ).reshape(-1, 3)
-    return _detections(message, *_polar(*places.T))
+    return _detections(message, *_polar(*places.T), bearing_positive)
 
 
-def read_laser_scan(message: Any, **_: Any) -> Detections:
+def read_laser_scan(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a LaserScan: an echo for each range inside its limits; angles count to port."""
     distance = np.array(message.ranges, np.float64)
     bearing = float(message.angle_min) + float(message.angle_increment) * np.arange(len(distance))
@@ -78,10 +82,13 @@ def read_laser_scan(message: Any, **_: Any) -> Detections:
     intensity = np.array(message.intensities, np.float64)
     if len(intensity) != len(distance):
         intensity = np.full(len(distance), np.nan)
-    return _detections(message, np.where(inside, distance, np.nan), bearing, intensity=intensity)
+    distance = np.where(inside, distance, np.nan)
+    return _detections(message, distance, bearing, bearing_positive, intensity=intensity)
 
 
-def read_sonar_ranges(message: Any, *, beam_axes: str = 'auto', **_: Any) -> Detections:
+def read_sonar_ranges(
+    message: Any, *, beam_axes: str = 'auto', bearing_positive: str = 'port', **_: Any
+) -> Detections:
     """Read a SonarRanges: ranges along unit vectors whose axes are `beam_axes`.
 
     ``'marine'``: z forward, x up, y to starboard, as the message defines; ``'rep103'``: x forward,
@@ -99,11 +106,14 @@ def read_sonar_ranges(message: Any, *, beam_axes: str = 'auto', **_: Any) -> Det
         message,
         _good(distance, message.flags),
         beam_bearings(beams, beam_axes),
+        bearing_positive,
         intensity=_one_each(message.intensities, len(distance), 'intensities'),
     )
 
 
-def read_sonar_detections(message: Any, *, sound_speed: float = 1500.0, **_: Any) -> Detections:
+def read_sonar_detections(
+    message: Any, *, sound_speed: float = 1500.0, bearing_positive: str = 'port', **_: Any
+) -> Detections:
     """Read a SonarDetections: two-way travel times and receive angles, starboard positive.
 
     The speed of sound is that of the message, `sound_speed` [m/s] where it states none. The stamp
@@ -117,6 +127,7 @@ def read_sonar_detections(message: Any, *, sound_speed: float = 1500.0, **_: Any
         message,
         _good(0.5 * speed * times, message.flags),
         -angles,
+        bearing_positive,
         intensity=_one_each(message.intensities, len(times), 'intensities'),
     )
 
@@ -152,9 +163,17 @@ def beam_bearings(beams: FloatArray, beam_axes: str) -> FloatArray:
 
 
 def _detections(
-    message: Any, distance: FloatArray, bearing: FloatArray, **optional: FloatArray
+    message: Any,
+    distance: FloatArray,
+    bearing: FloatArray,
+    bearing_positive: str,
+    **optional: FloatArray,
 ) -> Detections:
     """Put columns (n,) together, without the rows that are no echo."""
+    if bearing_positive not in BEARING_SIDES:
+        raise ValueError(
+            f"bearing_positive must be one of {', '.join(BEARING_SIDES)}, got '{bearing_positive}'"
+        )
     if len(distance) > MAX_DETECTIONS:
         raise Rejection(
             'too_large', f'a ping of {len(distance)} detections; at most {MAX_DETECTIONS} are read'
@@ -171,7 +190,7 @@ def _detections(
         stamp_ns=stamp_ns(message),
         frame_id=str(message.header.frame_id),
         range=distance[keep],
-        bearing=bearing[keep],
+        bearing=bearing[keep] if bearing_positive == 'port' else -bearing[keep],
         **{name: column[keep] for name, column in optional.items()},
     )
 

@@ -1,7 +1,10 @@
 """Header stamps as integer nanoseconds, and coordinate frames.
 
-REP-103 asks for ENU world frames; a frame in NED carries the suffix ``_ned``. Everything inside
-this software is ENU.
+REP-103 asks for ENU world frames and FLU body frames; a frame in NED carries the suffix ``_ned``.
+**From here to the estimate everything is ENU and FLU, in every system.** The reader of a message
+turns what a publisher states in NED and FRD, as `world_frame` tells it (the parameter
+`world_frame_convention` of nodes and commands). Every output is ENU. A tracker that computes in
+other axes, as its paper does, turns them where measurements come in and estimates go out.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Navigation of a vehicle: nav_msgs/Odometry, and altitudes from sensor_msgs/Range or a Dvl.
 
 The twist of an Odometry is defined in the child frame, the vehicle's own; many drivers state it in
-the axes of the world instead, which `nav_twist_frame` undoes. Poses are passed on in the axes they
-came in (`world_frame` only says whether a frame called ``_ned`` is expected), because the tracker
-gives its map positions in the same.
+the axes of the world instead, which `nav_twist_frame` undoes. With `world_frame` ``'ned'`` the
+pose is that of an FRD body in a NED world; it is turned into that of an FLU body in an ENU world.
 """
 
 from __future__ import annotations
@@ -13,12 +12,15 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
+from sonar_imm.acoustics.geometry import flip_quaternion
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Altitude, Navigation, Rejection
 
-from .headers import Make, make_header, stamp_ns, WORLD_FRAMES
+from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
 
 TWIST_FRAMES = ('child', 'world')
+_FRD = np.array([1.0, -1.0, -1.0])
+"""Signs that turn a vector in FRD into FLU, and back."""
 HIGHEST = 1.2e4
 """Metres above the sea floor: no sea is deeper."""
 
@@ -27,20 +29,15 @@ def read_navigation(
     message: Any, *, world_frame: str = 'enu', nav_twist_frame: str = 'child', **_: Any
 ) -> Navigation:
     """Read an Odometry. Raises `Rejection`."""
-    if world_frame not in WORLD_FRAMES or nav_twist_frame not in TWIST_FRAMES:
-        raise ValueError(f'unknown axes {world_frame}, {nav_twist_frame}')
-    frame_id = str(message.header.frame_id)
-    if frame_id.endswith('_ned') and world_frame == 'enu':
-        raise Rejection(
-            'frame_ned',
-            f"the frame '{frame_id}' is north-east-down but "
-            'east-north-up is expected; set the world frame to ned',
+    if nav_twist_frame not in TWIST_FRAMES:
+        raise ValueError(
+            f"nav_twist_frame must be one of {', '.join(TWIST_FRAMES)}, got '{nav_twist_frame}'"
         )
     pose, twist = message.pose.pose, message.twist.twist
     q = pose.orientation
     navigation = Navigation(
         stamp_ns=stamp_ns(message),
-        frame_id=frame_id,
+        frame_id=str(message.header.frame_id),
         child_frame_id=str(message.child_frame_id),
         position=_vector(pose.position),
         orientation=(float(q.x), float(q.y), float(q.z), float(q.w)),
@@ -49,7 +46,9 @@ def read_navigation(
         pose_covariance=_covariance(message.pose.covariance),
         twist_covariance=_covariance(message.twist.covariance),
     )
-    return _in_child_frame(navigation) if nav_twist_frame == 'world' else navigation
+    if nav_twist_frame == 'world':
+        navigation = _in_child_frame(navigation)
+    return to_enu(navigation, world_frame, _turned)
 
 
 def doubt_navigation(message: Any) -> str | None:
@@ -134,6 +133,31 @@ def _altitude(message: Any, height: float, variance: float) -> Altitude:
         variance=variance,
         frame_id=str(message.header.frame_id),
     )
+
+
+def _turned(navigation: Navigation) -> Navigation:
+    """An FLU body in ENU, of an FRD body in NED, or the other way round."""
+    world, body = ([1, 0, 2], np.array([1.0, 1.0, -1.0])), ([0, 1, 2], _FRD)
+    return evolve(
+        navigation,
+        position=swap_axes(navigation.position),
+        orientation=flip_quaternion(navigation.orientation),
+        velocity=_FRD * navigation.velocity,
+        turn_rate=_FRD * navigation.turn_rate,
+        pose_covariance=_turned_covariance(navigation.pose_covariance, *world),
+        twist_covariance=_turned_covariance(navigation.twist_covariance, *body),
+        child_frame_id=navigation.child_frame_id.removesuffix('_frd'),
+    )
+
+
+def _turned_covariance(
+    covariance: FloatArray | None, order: list[int], signs: FloatArray
+) -> FloatArray | None:
+    """(6, 6) of two vectors whose axes are put in another order and sign."""
+    if covariance is None:
+        return None
+    axes = [*order, *(axis + 3 for axis in order)]
+    return covariance[np.ix_(axes, axes)] * np.outer(np.tile(signs, 2), np.tile(signs, 2))
 
 
 def _in_child_frame(navigation: Navigation) -> Navigation:

@@ -35,11 +35,9 @@ def write_poses(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
     )
 
 
-def write_markers(
-    estimate: Estimate, rows: Iterable[int], make: Make, *, down: bool = False
-) -> Any:
-    """Write a MarkerArray of bars, balls and labels; `down`: z of the frame points down."""
-    markers = [marker for row in rows for marker in _obstacle(estimate, row, make, down)]
+def write_markers(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
+    """Write a MarkerArray of bars, balls and labels."""
+    markers = [marker for row in rows for marker in _obstacle(estimate, row, make)]
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
 
 
@@ -57,17 +55,17 @@ def write_no_markers(frame_id: str, make: Make) -> Any:
     )
 
 
-def band(estimate: Estimate, row: int, *, down: bool = False) -> tuple[float, float]:
+def band(estimate: Estimate, row: int) -> tuple[float, float]:
     """Smallest and largest z of the 90 % band of one obstacle, metres in the frame."""
     z, offset = float(estimate.xyz[row, 2]), float(estimate.state[row, 2])
     low, high = (float(estimate.extras[f'vertical_offset_{end}'][row]) for end in ('lo', 'hi'))
     # The offset counts down from the sonar: its largest value is the deepest.
-    return (z + low - offset, z + high - offset) if down else (z + offset - high, z + offset - low)
+    return z + offset - high, z + offset - low
 
 
-def _obstacle(estimate: Estimate, row: int, make: Make, down: bool) -> list[Any]:
+def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
     x, y, z = (float(value) for value in estimate.xyz[row])
-    bottom, top = band(estimate, row, down=down)
+    bottom, top = band(estimate, row)
     track_id = int(estimate.extras['track_id'][row])
     colour = _colour(float(estimate.probabilities[row, estimate.model_names.index('above')]))
     label = (
@@ -102,7 +100,7 @@ def _obstacle(estimate: Estimate, row: int, make: Make, down: bool) -> list[Any]
         marker(
             'label',
             _TEXT,
-            (bottom - 1.0) if down else (top + 1.0),
+            top + 1.0,
             (0.0, 0.0, 1.0),
             1.0,
             text=label,

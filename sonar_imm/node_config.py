@@ -31,14 +31,23 @@ class NodeConfig(Config):
     )
     world_frame_convention: str = parameter(
         'enu',
-        'axes of the input: enu (x east, y north, z up) or ned (x north, y east, z down); '
-        'the output is always enu',
+        'axes of the input: enu (world x east, y north, z up; vehicle x forward, y port, z up) or '
+        'ned (world x north, y east, z down; vehicle x forward, y starboard, z down); the output '
+        'is always enu',
         choices=('enu', 'ned'),
     )
     publish_revisions: bool = parameter(
         True,
         'late input changes estimates already made: publish those again too, oldest first; '
         'false: only the newest',
+        read_only=False,
+    )
+    max_revisions: int = parameter(
+        100,
+        'most earlier estimates published again for one late message, the newest of them; the '
+        'others are counted; 0: all',
+        low=0,
+        high=1_000_000,
         read_only=False,
     )
     diagnostics_period: float = parameter(

@@ -35,7 +35,7 @@ TOPICS = (
             'marine_acoustic_msgs/msg/SonarRanges': read_sonar_ranges,
         },
         write=write_detections,
-        settings=('beam_axes', 'sound_speed'),
+        settings=('beam_axes', 'bearing_positive', 'sound_speed'),
     ),
     InputTopic(
         'nav',

@@ -64,6 +64,13 @@ def flip_rotation(R: ArrayLike) -> FloatArray:
     return np.asarray(_WORLD @ np.asarray(R, np.float64) * _BODY)
 
 
+def flip_quaternion(q: ArrayLike) -> FloatArray:
+    """NED-from-FRD of the quaternion (..., 4) x, y, z, w that is ENU-from-FLU, and the other way
+    round: half a turn around the bisector of x and y, then q, then half a turn around x."""
+    x, y, z, w = np.moveaxis(np.asarray(q, np.float64), -1, 0)
+    return np.sqrt(0.5) * np.stack([x + y, x - y, w - z, w + z], axis=-1)
+
+
 def flip_pose(pose: Pose) -> Pose:
     """A pose in NED and FRD given in ENU and FLU, and the other way round."""
     return Pose(flip_world(pose.position), flip_rotation(pose.R))
@@ -212,10 +219,11 @@ class Rates(NamedTuple):
 def rates(
     m: FloatArray, velocity: FloatArray, turn_rate: FloatArray, R: FloatArray, model: str = 'plane'
 ) -> Rates:
-    """How the echo of a fixed point m (..., 3) changes while the sonar moves: eq. (3), (4).
+    """Oracle for tests of `predict`: how the echo of a fixed point m (..., 3) changes while the
+    sonar moves, eq. (3), (4).
 
     velocity (..., 3) and turn_rate (..., 3) are the sonar's own, in its frame: ``dm/dt = -V -
-    omega x m``. Kept as documentation and to test `predict`, with which it agrees to first order:
+    omega x m``. `predict` agrees with it to first order:
     the Euler step the paper takes with it is off by 0.003, 0.011, 0.07 and 0.27 degrees rms of
     azimuth at 0.1, 0.2, 0.5 and 1 s, which is more than an obstacle's vertical offset shows.
     """

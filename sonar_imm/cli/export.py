@@ -78,14 +78,12 @@ def command(
         )
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
-    told = RunFolder(run).read_run()
+    RunFolder(run).read_run()
     if not (run / SOUNDINGS).is_file():
         raise BagError(
             f'{run} holds no soundings: the recording has no navigation, or is of another system'
         )
     points = read_points(run / SOUNDINGS)
-    if told['parameters'].get('world_frame_convention') == 'ned':
-        points = points.flipped()
     points = points.moved(origin)
     result: dict[str, Any] = {'out': str(out), 'soundings': len(points)}
     if kind == 'tif':

@@ -79,9 +79,8 @@ class Navigation:
     """Where the vehicle was: its pose in the world and its velocity in its own frame.
 
     position: (3,) metres and orientation: (4,) quaternion x, y, z, w, world from body; velocity:
-    (3,) m/s and turn_rate: (3,) rad/s of the body, NaN where unknown. ENU and FLU unless the
-    sender keeps another convention. pose_covariance, twist_covariance: (6, 6) or None when
-    unknown.
+    (3,) m/s and turn_rate: (3,) rad/s of the body, NaN where unknown. World ENU, body FLU.
+    pose_covariance, twist_covariance: (6, 6) or None when unknown.
     """
 
     stamp_ns: int

@@ -72,7 +72,7 @@ class TrackerNode(Node):
         self._warm()
 
         self._enabled = True
-        self._ignored = self._published = 0
+        self._ignored = self._published = self._withheld = 0
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
@@ -211,10 +211,18 @@ class TrackerNode(Node):
     def _publish(self, estimates: list[Estimate]) -> None:
         if not estimates:
             return
-        for estimate in estimates if self._node_config.publish_revisions else estimates[-1:]:
+        for estimate in self._wanted(estimates):
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1
         self.show_all(estimates)
+
+    def _wanted(self, estimates: list[Estimate]) -> list[Estimate]:
+        """The newest estimate, and before it the newest revised ones, as many as are wanted."""
+        if not self._node_config.publish_revisions:
+            return estimates[-1:]
+        limit = self._node_config.max_revisions or len(estimates)
+        self._withheld += max(0, len(estimates) - 1 - limit)
+        return estimates[-limit - 1 :]
 
     def _doubt(self, topic: InputTopic, reason: str) -> None:
         if reason not in self._meter.doubted:
@@ -284,6 +292,8 @@ class TrackerNode(Node):
 
     def _report(self) -> None:
         counts = Counter(self.tracker.counts) + self._errors
+        if self._withheld:
+            counts['revisions_withheld'] = self._withheld
         if self._ignored:
             counts['ignored_while_disabled'] = self._ignored
         self._diagnostics.publish(
@@ -294,6 +304,7 @@ class TrackerNode(Node):
                 stale_after=self._node_config.stale_after,
                 counts=counts,
                 health=self.tracker.health(),
+                warnings=getattr(self.tracker, 'warnings', list)(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
             )

@@ -218,6 +218,7 @@ def _arguments(
     parameters = {
         f'qos_overrides./{system}/estimate.publisher.history': 'keep_all',
         'max_wait': '0.0',
+        'max_revisions': '0',
     }
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():

@@ -10,6 +10,11 @@ state only and of confirmed obstacles (also those that have left the beam):
 
 from __future__ import annotations
 
+if __name__ == '__main__':
+    from ..threads import one_blas_thread
+
+    one_blas_thread()  # before numpy is imported
+
 import sys
 from typing import Any
 
@@ -46,8 +51,7 @@ class ObstacleNode(TrackerNode):
         if not len(confirmed):
             return
         if self._markers.get_subscription_count():
-            down = self.tracker.config.world_frame_convention == 'ned'
-            self._markers.publish(write_markers(newest, confirmed, make, down=down))
+            self._markers.publish(write_markers(newest, confirmed, make))
         if self._probabilities.get_subscription_count():
             oldest = confirmed[np.argmin(newest.extras['track_id'][confirmed])]
             self._probabilities.publish(write_model_probabilities(newest, oldest, make))

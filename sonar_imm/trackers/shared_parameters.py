@@ -93,8 +93,9 @@ class StampParameters(Config):
     )
     restart_after: int = parameter(
         5,
-        'consecutive agreeing stamps, too late or further ahead than max_gap, that count as a '
-        'restarted clock',
+        'consecutive agreeing stamps that count as a restarted clock: further ahead than max_gap, '
+        'more than five minutes late, or a repeated beginning; 20 times as many where it may be a '
+        'burst of late messages',
         low=2,
         high=1000,
     )

@@ -20,22 +20,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from attrs import frozen
 
 from ..estimation.history import MAX_LATE_NS, ReplayHistory, StampGate, Step
 from ..measurements import FrameGuard, nanoseconds, Rejection
+from .shared_parameters import StampParameters, StreamParameters
 
 State = TypeVar('State')
-
-
-class StreamParameters(Protocol):
-    """The parameters of a stream with history; history and max_gap in seconds."""
-
-    history: float
-    max_gap: float
-    restart_after: int
 
 
 @frozen
@@ -48,9 +41,10 @@ class StreamRules:
     max_late_ns: int = MAX_LATE_NS
 
     @classmethod
-    def of(cls, config: StreamParameters) -> StreamRules:
-        """The rules that `config` states."""
-        return cls(nanoseconds(config.history), nanoseconds(config.max_gap), config.restart_after)
+    def of(cls, config: StampParameters) -> StreamRules:
+        """The rules that `config` states; without `history` nothing late is used."""
+        history = config.history if isinstance(config, StreamParameters) else 0.0
+        return cls(nanoseconds(history), nanoseconds(config.max_gap), config.restart_after)
 
 
 class Admitted(NamedTuple):

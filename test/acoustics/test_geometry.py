@@ -60,6 +60,13 @@ def test_rotations_of_both_worlds():
     for world in ('ned', 'enu'):
         q = columns(rows, *(f'q{world}_{part}' for part in 'xyzw'))
         assert_allclose(geometry.rotation_of_quaternion(3.0 * q), expected[world], **EXACT)
+    ned, enu = (
+        columns(rows, *(f'q{world}_{part}' for part in 'xyzw')) for world in ('ned', 'enu')
+    )
+    for one, other in ((ned, enu), (enu, ned)):
+        same = geometry.flip_quaternion(one)  # q and -q are the same rotation
+        same *= np.sign(np.sum(same * other, axis=1, keepdims=True))
+        assert_allclose(same, other, **EXACT)
     enu_angles = geometry.euler_angles(expected['enu'])
     stated = columns(rows, 'rpy_enu_r', 'rpy_enu_p', 'rpy_enu_y')
     assert_allclose(np.exp(1j * enu_angles), np.exp(1j * stated), **EXACT)

@@ -141,20 +141,20 @@ def follow(measurements, config):
     """A vector file's obstacle without gate or track logic: NIS (n,) of each echo, and the last
     view."""
     tracker, mount = ObstacleTracker(config), Mount(config)
-    filter_, known, before, nis = build_filter(config), None, None, []
+    filter_, mixture, before, nis = build_filter(config), None, None, []
     for i in range(0, len(measurements), 3):
         altitude, pose, ping = measurements[i : i + 3]
         sonar = Sonar(
             mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
         )
         z, R = tracker._detections(ping)
-        if known is None:
-            known = filter_.begin(z, R, sonar)
+        if mixture is None:
+            mixture = filter_.begin(z, R, sonar)
         else:
-            known, _ = filter_.advance(known, before, sonar, 0.5)
+            mixture, _ = filter_.advance(mixture, before, sonar, 0.5)
             if len(z):
-                h, _ = filter_.expected(known, sonar)
-                known, squared, _ = filter_.update(known, h, z, R, sonar)
+                h, _ = filter_.expected(mixture, sonar)
+                mixture, squared, _ = filter_.update(mixture, h, z, R, sonar)
                 nis.append(squared[0])
         before = sonar
-    return np.array(nis), filter_.view(known, sonar)
+    return np.array(nis), filter_.view(mixture, sonar)

@@ -195,6 +195,31 @@ def test_the_wrong_axes_are_not_mended_in_silence():
         read_sonar_ranges(message, beam_axes='sideways')
 
 
+def a_pose_array():
+    position = ros_message('geometry_msgs/msg/Point', x=4.0, y=3.0, z=0.0)
+    pose = ros_message('geometry_msgs/msg/Pose', position=position)
+    return ros_message('geometry_msgs/msg/PoseArray', header=header(), poses=[pose])
+
+
+@pytest.mark.parametrize(
+    'read, message',
+    [
+        (read_detections, lambda: table(range=np.array([5.0]), bearing=np.array([PORT]))),
+        (read_laser_scan, lambda: scan([5.0, 6.0])),
+        (read_pose_array, a_pose_array),
+        (read_sonar_ranges, lambda: marine.sonar_ranges(beams('marine'), [20.0, 30.0])),
+        (read_sonar_detections, lambda: marine.sonar_detections([0.02], [PORT])),
+    ],
+)
+def test_a_sender_that_counts_to_the_other_side_is_turned_round(read, message):
+    plain, turned = read(message()), read(message(), bearing_positive='starboard')
+    assert len(plain) and np.abs(plain.bearing).min() > 0.05
+    assert np.array_equal(turned.bearing, -plain.bearing)
+    assert np.array_equal(turned.range, plain.range)
+    with pytest.raises(ValueError, match='port, starboard'):
+        read(message(), bearing_positive='left')
+
+
 def test_bad_flags_and_ranges_are_dropped():
     axes = np.repeat(beams('marine')[:1], 5, axis=0)
     message = marine.sonar_ranges(

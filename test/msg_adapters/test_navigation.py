@@ -75,7 +75,46 @@ def test_covariances_that_say_nothing_are_unknown(diagonal):
 def test_a_ned_frame_is_taken_only_when_it_is_expected():
     message = odometry(frame_id='odom_ned')
     assert reason(read_navigation, message) == 'frame_ned'
-    assert read_navigation(message, world_frame='ned').position[2] == -20.0
+    turned = read_navigation(message, world_frame='ned')
+    assert turned.position[2] == 20.0 and turned.frame_id == 'odom'
+    with pytest.raises(ValueError, match='enu, ned'):
+        read_navigation(message, world_frame='nwu')
+
+
+def test_an_frd_vehicle_in_ned_becomes_an_flu_vehicle_in_enu():
+    """Against matrices: east is the second axis of NED, port the negative second of FRD."""
+    W, B = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+    random = np.random.default_rng(3)
+    for _ in range(20):
+        R = Rotation.random(random_state=random)
+        root = random.normal(size=(2, 6, 6))
+        pose, twist = root @ np.swapaxes(root, 1, 2)
+        stated = navigation(
+            orientation=R.as_quat(),
+            position=random.normal(size=3),
+            velocity=random.normal(size=3),
+            turn_rate=random.normal(size=3),
+            pose_covariance=pose,
+            twist_covariance=twist,
+            child_frame_id='base_link_frd',
+        )
+        turned = read_navigation(write_navigation(stated, ros_message), world_frame='ned')
+        expected = W @ R.as_matrix() @ B
+        assert np.allclose(Rotation.from_quat(turned.orientation).as_matrix(), expected)
+        assert np.array_equal(turned.position, W @ stated.position)
+        assert np.array_equal(turned.velocity, B @ stated.velocity)
+        assert np.array_equal(turned.turn_rate, B @ stated.turn_rate)
+        both = np.kron(np.eye(2), W), np.kron(np.eye(2), B)
+        assert np.allclose(turned.pose_covariance, both[0] @ pose @ both[0].T)
+        assert np.allclose(turned.twist_covariance, both[1] @ twist @ both[1].T)
+        assert turned.child_frame_id == 'base_link'
+
+
+def test_a_twist_in_the_world_of_ned_is_turned_into_flu():
+    child = np.array([1.5, 0.1, -0.2])
+    stated = odometry(velocity=TURNED.apply(child))
+    turned = read_navigation(stated, world_frame='ned', nav_twist_frame='world')
+    assert turned.velocity == pytest.approx(child * [1, -1, -1])
 
 
 @pytest.mark.parametrize(

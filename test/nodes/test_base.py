@@ -108,6 +108,14 @@ def test_revisions_can_be_left_out(rig):
     assert rig.means()[2:] == [(3.0, 2.0, 4.0)]
 
 
+def test_revisions_are_bounded_and_counted(rig):
+    rig.node.set_parameters([Parameter('max_revisions', value=2)])
+    rig.send(*[a_fix(seconds, seconds, 0.0) for seconds in (1.0, 3.0, 4.0, 5.0, 6.0, 2.0)])
+    assert [mean[0] for mean in rig.means()[5:]] == [4.0, 5.0, 6.0]
+    assert rig.answer == (6, 0, 8)
+    assert rig.node._withheld == 2
+
+
 def hostile():
     """Messages that a listener to a live topic meets sooner or later."""
     yield 'not a number', nan_fix(5.0)

@@ -96,8 +96,6 @@ def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
         marker.lifetime.sec > 0 and marker.header.frame_id == 'odom'
         for marker in (bar, ball, label)
     )
-    deep = write_markers(an_estimate([7], [1]), [0], make, down=True).markers[0]
-    assert deep.pose.position.z == -23.25 and band(one, 0, down=True) == (-25.0, -21.5)
 
 
 def test_colours_tell_above_from_below_from_unknown():

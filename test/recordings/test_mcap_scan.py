@@ -2,6 +2,7 @@ from collections import Counter
 import struct
 import subprocess
 import sys
+import zlib
 
 from backports import zstd
 from hypothesis import given, settings
@@ -60,12 +61,7 @@ def test_a_scan_of_a_whole_file_equals_the_indexed_reading(recording):
 def test_a_cut_keeps_whole_messages_of_the_last_chunk(recording, tmp_path):
     file, expected = recording
     data = file.read_bytes()
-    chunks = []  # bytes where chunks begin
-    position = len(mcap_scan.MAGIC)
-    while data[position] != mcap_scan._DATA_END:
-        if data[position] == mcap_scan._CHUNK:
-            chunks.append(position)
-        position += 9 + int.from_bytes(data[position + 1 : position + 9], 'little')
+    chunks = chunks_of(data)
     assert len(chunks) > 1
     cut = tmp_path / 'cut.mcap'
     cut.write_bytes(data[: chunks[1] - 1])
@@ -73,7 +69,7 @@ def test_a_cut_keeps_whole_messages_of_the_last_chunk(recording, tmp_path):
     first_chunk = sum(scan.counts.values())
     scan.close()
     assert 0 < first_chunk < 40
-    end = [*chunks, position][2]
+    end = [*chunks, data.index(bytes([mcap_scan._DATA_END]), chunks[-1])][2]
     cut.write_bytes(data[: (chunks[1] + 3 * end) // 4])
     scan = McapScan(cut)
     found = messages(scan)
@@ -95,6 +91,53 @@ def test_a_damaged_chunk_costs_only_itself(recording, tmp_path):
     scan = McapScan(broken)
     assert 'damaged chunk' in scan.lost and set(messages(scan)) <= set(expected)
     scan.close()
+
+
+def chunks_of(data):
+    """The bytes at which chunks begin."""
+    found, position = [], len(mcap_scan.MAGIC)
+    while data[position] != mcap_scan._DATA_END:
+        if data[position] == mcap_scan._CHUNK:
+            found.append(position)
+        position += 9 + int.from_bytes(data[position + 1 : position + 9], 'little')
+    return found
+
+
+def test_a_chunk_whose_checksum_is_wrong_is_not_believed(recording, tmp_path):
+    """A wrong checksum, or, where nothing is compressed, one wrong bit in the text of a message:
+    what is in the chunk is left out. A checksum of zero means that there is none."""
+    file, expected = recording
+    data = bytearray(file.read_bytes())
+    first = chunks_of(data)[1]  # the channels stand in the one before
+    where = slice(first + 9 + 24, first + 9 + 28)
+    name_end = where.stop + 4 + int.from_bytes(data[where.stop : where.stop + 4], 'little')
+    size = int.from_bytes(data[name_end : name_end + 8], 'little')
+    packed = bytes(data[name_end + 8 : name_end + 8 + size])
+    compressed = data[where.stop : where.stop + 4] != bytes(4)
+    content = zstd.decompress(packed) if compressed else packed
+    right = zlib.crc32(content).to_bytes(4, 'little')
+
+    def scanned(checksum, content=packed):
+        data[where] = checksum
+        data[name_end + 8 : name_end + 8 + size] = content
+        (tmp_path / 'spoilt.mcap').write_bytes(data)
+        scan = McapScan(tmp_path / 'spoilt.mcap')
+        found, lost = messages(scan), scan.lost
+        scan.close()
+        return found, lost
+
+    whole = sorted(expected, key=lambda item: item[0])
+    assert scanned(right) == (whole, '')
+    assert scanned(bytes(4)) == (whole, '')
+    found, lost = scanned((int.from_bytes(right, 'little') ^ 1).to_bytes(4, 'little'))
+    assert lost == f'has a chunk at byte {first} whose checksum is wrong'
+    assert 0 < len(found) < len(whole) and set(found) < set(whole)
+    if not compressed:
+        flipped = bytearray(packed)
+        flipped[-1000] ^= 1
+        assert scanned(right, flipped) == (found, lost)
+        spoilt, lost = scanned(bytes(4), flipped)
+        assert len(spoilt) == len(whole) and spoilt != whole and not lost
 
 
 def test_zeros_after_a_power_loss_end_the_walk(recording, tmp_path):

@@ -3,6 +3,7 @@
 from attrs import frozen
 import pytest
 
+from sonar_imm.trackers.shared_parameters import StampParameters, StreamParameters
 from sonar_imm.trackers.stream import Admitted, OnceStream, ReplayStream, StreamRules
 
 S = 10**9
@@ -89,7 +90,7 @@ def test_a_restart_without_history_is_in_order_too():
 
 
 def test_rules_come_from_a_config():
-    class Config:
-        history, max_gap, restart_after = 2.5, 60.0, 4
-
-    assert StreamRules.of(Config) == StreamRules(2_500_000_000, 60 * S, 4)
+    config = StreamParameters(history=2.5, max_gap=60.0, restart_after=4)
+    assert StreamRules.of(config) == StreamRules(2_500_000_000, 60 * S, 4)
+    # Without `history` nothing late is used.
+    assert StreamRules.of(StampParameters(max_gap=60.0)) == StreamRules(0, 60 * S, 5)

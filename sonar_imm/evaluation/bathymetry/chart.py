@@ -23,21 +23,18 @@ CELLS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
 MOST_POSES = 1000
 
 
-def points_of(folder: Path, run: Mapping[str, Any]) -> Points | None:
-    """The soundings of a run in east, north, up; None without any."""
+def points_of(folder: Path) -> Points | None:
+    """The soundings of a run; None without any."""
     if not (folder / SOUNDINGS).is_file():
         return None
     points = read_points(folder / SOUNDINGS)
-    ned = run['parameters'].get('world_frame_convention') == 'ned'
-    return (points.flipped() if ned else points) if len(points) else None
+    return points if len(points) else None
 
 
 def track_of(run: Mapping[str, Any]) -> FloatArray:
     """Where the ship went (n, 2), east and north; empty when the recording is gone."""
     places = [one.position[:2] for one in read_measurements(run) if isinstance(one, Navigation)]
     track = np.array(places).reshape(-1, 2)
-    if run['parameters'].get('world_frame_convention') == 'ned':
-        track = track[:, ::-1]
     return track[thin(len(track), MOST_POSES)]
 
 

@@ -123,7 +123,7 @@ def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
 
 def _chart(folder: Path, run: Mapping[str, Any]) -> list[Section]:
     """The chart of the soundings; nothing without navigation."""
-    points = chart.points_of(folder, run)
+    points = chart.points_of(folder)
     if points is None:
         return []
     grid = chart.chart_of(points)

@@ -109,10 +109,9 @@ def deferred_estimates(
 
 def _echo(ping: Detections, state: FloatArray, config: ObstacleConfig) -> FloatArray:
     """Range and azimuth (to starboard) of the detection nearest to a track's state (3,)."""
-    bearing = ping.bearing if config.bearing_positive == 'port' else -ping.bearing
     away = np.hypot(
         (ping.range - state[0]) / config.range_std,
-        (bearing - state[1]) / np.radians(config.bearing_std_deg),
+        (ping.bearing - state[1]) / np.radians(config.bearing_std_deg),
     )
     nearest = int(np.nanargmin(away))
-    return np.array([ping.range[nearest], -bearing[nearest]])
+    return np.array([ping.range[nearest], -ping.bearing[nearest]])

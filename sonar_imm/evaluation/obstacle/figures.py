@@ -57,15 +57,12 @@ def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> go
 
 
 def image_figure(
-    series: Series, pings: Sequence[Detections], truths: Sequence[TruePath], sign: float
+    series: Series, pings: Sequence[Detections], truths: Sequence[TruePath]
 ) -> go.Figure:
-    """Tracks and echoes in the image of the sonar, ahead is up. `sign` makes bearings positive to
-    port."""
+    """Tracks and echoes in the image of the sonar, ahead is up."""
     figure = go.Figure()
     if pings:
-        echoes = np.concatenate(
-            [np.column_stack([ping.range, sign * ping.bearing]) for ping in pings]
-        )
+        echoes = np.concatenate([np.column_stack([ping.range, ping.bearing]) for ping in pings])
         shown = level(echoes[thin(len(echoes), MOST_POINTS)])
         figure.add_scattergl(
             x=-shown[:, 1],

@@ -101,8 +101,6 @@ def _cards(metrics: Mapping[str, Any]) -> list[Card]:
 
 def _sections(material: Material) -> list[Section]:
     series, found = material.series, material.found
-    parameters = material.run.get('parameters', {})
-    sign = -1.0 if parameters.get('bearing_positive') == 'starboard' else 1.0
     pings = [one for one in material.received if isinstance(one, Detections) and len(one)]
     sections = [
         Section(
@@ -120,7 +118,7 @@ def _sections(material: Material) -> list[Section]:
         Section(
             'Image of the sonar',
             'Tracks among the detections of all pings. Dotted: truth, while the beam holds it.',
-            figures.image_figure(series, pings, material.truth or (), sign),
+            figures.image_figure(series, pings, material.truth or ()),
         ),
     ]
     if material.deferred is not None:

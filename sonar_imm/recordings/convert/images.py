@@ -77,5 +77,8 @@ def _converted(name: str, item: Any, config: DetectorConfig) -> Any:
         image = read_sonar_image(item.message, **config.reading())
         return write_detections(detect(image, config), ros_message)
     entry = FURTHER[name]
-    # The axes stay as recorded; who tracks the new bag states them.
-    return entry.write(entry.readers[item.type_name](item.message, world_frame='ned'), ros_message)
+    # A frame that calls itself NED is turned into ENU; others stay as they are, and whoever tracks
+    # the new bag states their convention.
+    ned = str(item.message.header.frame_id).endswith('_ned')
+    measurement = entry.readers[item.type_name](item.message, world_frame='ned' if ned else 'enu')
+    return entry.write(measurement, ros_message)

@@ -40,11 +40,6 @@ class Points:
     def __getitem__(self, name: str) -> FloatArray:
         return self.columns[name]
 
-    def flipped(self) -> Points:
-        """East, north, up of soundings in north, east, down."""
-        places = {'x': self['y'], 'y': self['x'], 'z': -self['z']}
-        return Points(self.stamp_ns, {**self.columns, **places})
-
     def moved(self, origin: tuple[float, float, float]) -> Points:
         """The same with `origin` (3,), the map coordinates of the local frame, added to x y z."""
         places = {name: self[name] + shift for name, shift in zip('xyz', origin)}

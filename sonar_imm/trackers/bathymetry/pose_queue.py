@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...estimation.history import StampGate
@@ -98,8 +97,6 @@ class PoseQueue:
                 self.counts['navigation_gap'] += 1
             else:
                 poses = self._buffer.poses(stamps)
-                if config.world_frame_convention == 'ned':
-                    poses = geometry.flip_pose(poses)
                 altitude = self._altitude(int(stamps[-1]))
                 done.append(PosedPing(snapshot, poses, self._frame_id, altitude))
         self._waiting = waiting

@@ -32,11 +32,6 @@ class SeaParameters(Config):
         'required (pings wait for it), ignored (a level sonar at rest)',
         choices=NAVIGATION,
     )
-    world_frame_convention: str = parameter(
-        'enu',
-        'axes of the navigation: enu (world ENU, body FLU) or ned (world NED, body FRD)',
-        choices=('enu', 'ned'),
-    )
     sonar_lever: tuple[float, ...] = parameter(
         (0.0, 0.0, 0.0),
         'from the navigation reference to the array, x forward, y port, z up (vehicle FLU)',

@@ -6,7 +6,7 @@ few terrain models (`models`). So the filter runs *along the ping*: range is its
 
     snapshot -> likelihood of each bin (`likelihood`)
              -> mix, predict, update, combine, bin after bin (`engines`)
-             -> optional smoothing -> one row a bin
+             -> optional smoothing -> one row per bin
 
 Nothing is carried from one ping to the next: a floor that was taken over wrongly would do more
 harm than a floor that is taken over rightly does good. Late, shuffled or repeated pings therefore
@@ -29,7 +29,7 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from ...acoustics.geometry import flip_world, Pose
+from ...acoustics.geometry import Pose
 from ...acoustics.rays import profile_of
 from ...acoustics.variances import mean_power
 from ...estimates import Estimate
@@ -215,7 +215,6 @@ class BathymetryTracker:
         }
         if config.in_bank:
             extras['rough'] = track.probability[:, models.rough].sum(axis=1)
-        xyz = floor.xyz
         if posed is not None:
             vertical, horizontal = swath.uncertainties(floor, config.budget())
             extras |= {
@@ -224,8 +223,6 @@ class BathymetryTracker:
                 'intensity': intensity(snapshot),
                 'beam_angle': swath.beam_angle(floor.angle),
             }
-            if config.world_frame_convention == 'ned':
-                xyz = flip_world(xyz)
         elif of_heights and config.sonar_height_std > 0.0:
             # Heights are counted from where the sonar is believed to be: its error is theirs.
             covariance = covariance.copy()
@@ -235,7 +232,7 @@ class BathymetryTracker:
         return Estimate(
             stamp_ns=snapshot.stamp_ns,
             frame_id=snapshot.frame_id if posed is None else posed.frame_id,
-            xyz=xyz.astype(np.float32),
+            xyz=floor.xyz.astype(np.float32),
             state_names=models.state_names,
             state=track.mean,
             covariance=covariance,

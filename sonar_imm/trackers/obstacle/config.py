@@ -51,7 +51,9 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
         choices=AZIMUTH_MODELS,
     )
     bearing_positive: str = parameter(
-        'port', 'side to which bearings of detections count up', choices=('port', 'starboard')
+        'port',
+        'side to which bearings of detections count up once read as their message defines',
+        choices=('port', 'starboard'),
     )
     beam_axes: str = parameter(
         'auto',
@@ -78,11 +80,6 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
         unit='m/s',
         low=1300.0,
         high=1700.0,
-    )
-    world_frame_convention: str = parameter(
-        'enu',
-        'axes of the navigation: enu (world ENU, body FLU) or ned (world NED, body FRD)',
-        choices=('enu', 'ned'),
     )
     depth_is_absolute: bool = parameter(
         True, "the navigation's vertical is zero at the sea surface: nothing lies higher than that"

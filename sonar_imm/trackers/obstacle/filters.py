@@ -1,4 +1,4 @@
-"""What is known of an obstacle, and how a ping changes it: one filter a method.
+"""The state of an obstacle, and how a ping changes it: one filter per method.
 
 `DepthSlices` is the default. The vertical offset d_st shows in two ways: while the vehicle rolls,
 an obstacle above and one below the sonar swing to opposite sides; and on the approach the range
@@ -8,7 +8,7 @@ is known. So the vertical reach of the beam is cut into slices, each slice is an
 filter over (d, delta, z, s), and their likelihoods say in which of them the obstacle is. The state
 that stays constant is the obstacle's own depth z; d_st follows from it and the vehicle's depth.
 
-With a single slice that is nailed to the sea floor below the vehicle the same filter is the
+With a single slice that is clamped to the sea floor below the vehicle the same filter is the
 paper's (`seafloor`). `Landmark` keeps one Gaussian in world coordinates instead.
 
 Everything is in NED and FRD; T targets, K components. Component weights mu (T, K).
@@ -110,40 +110,42 @@ class DepthSlices:
         slices = first[:, None] + np.arange(self.K) * width[:, None]
         x[..., 2] = sonar.pose.position[2] + slices
         P[..., 2, 2] = np.square(0.5 * width)[:, None]
-        fresh = self._nailed(Mixture(x, P, np.full((B, self.K), 1.0 / self.K)), sonar)
+        fresh = self._clamp_to_seafloor(Mixture(x, P, np.full((B, self.K), 1.0 / self.K)), sonar)
         for _ in range(2 if sonar.late else 0):  # the shift hardly depends on where it starts
             fresh.x[..., :2] += z[:, None] - self._echo(fresh, sonar)
         return fresh
 
     def advance(
-        self, known: Mixture, before: Sonar, after: Sonar, dt: float
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
-        known = self._nailed(known, before)
+        mixture = self._clamp_to_seafloor(mixture, before)
         noise = np.array(self._noise) * dt
         x, P, repaired = kernels.advance(
-            known.x, known.P, *before.pose, *after.pose, noise, self.cone
+            mixture.x, mixture.P, *before.pose, *after.pose, noise, self.cone
         )
-        return Mixture(x, P, known.mu), int(repaired.sum())
+        return Mixture(x, P, mixture.mu), int(repaired.sum())
 
-    def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
         without the sonar's own error."""
-        return self._echo(known, sonar), np.ascontiguousarray(known.P[..., :2, :2])
+        return self._echo(mixture, sonar), np.ascontiguousarray(mixture.P[..., :2, :2])
 
     def update(
-        self, known: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
+        self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray, int]:
         """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,), and how
         many covariances had to be repaired."""
-        wild = self.config.outlier_probability
-        *after, nis, repaired = kernels.soft_update(*known, h, z, R, wild, self.outlier_density)
+        outlier = self.config.outlier_probability
+        *after, nis, repaired = kernels.soft_update(
+            *mixture, h, z, R, outlier, self.outlier_density
+        )
         return Mixture(*after), nis, int(repaired.sum())
 
-    def view(self, known: Mixture, sonar: Sonar) -> View:
+    def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
-        x, P, mu = known
+        x, P, mu = mixture
         offset = x[..., 2] - sonar.pose.position[2]
         three = np.concatenate([x[..., :2], offset[..., None]], axis=-1)
         mean = np.einsum('tk,tki->ti', mu, three)
@@ -155,30 +157,30 @@ class DepthSlices:
         place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
         return View(mean, symmetrise(covariance), low, high, above, *place)
 
-    def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+    def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
-        m = kernels.points(known.x, *sonar.pose, self.cone)
-        spread = np.sqrt(known.P[..., 2, 2]) / known.x[..., 0]
-        inside = np.einsum('tk,tk->t', known.mu, _in_beam(m, spread, self.config))
-        return inside, _ahead(np.einsum('tk,tki->ti', known.mu, m))
+        m = kernels.points(mixture.x, *sonar.pose, self.cone)
+        spread = np.sqrt(mixture.P[..., 2, 2]) / mixture.x[..., 0]
+        inside = np.einsum('tk,tk->t', mixture.mu, _in_beam(m, spread, self.config))
+        return inside, _ahead(np.einsum('tk,tki->ti', mixture.mu, m))
 
-    def _echo(self, known: Mixture, sonar: Sonar) -> FloatArray:
+    def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
         arrives, and the mean of the ranges out and back."""
         if sonar.late is None:
-            return np.ascontiguousarray(known.x[..., :2])
-        out = kernels.points(known.x, *sonar.pose, self.cone)
+            return np.ascontiguousarray(mixture.x[..., :2])
+        out = kernels.points(mixture.x, *sonar.pose, self.cone)
         return _two_way(out, sonar, self.config)
 
-    def _nailed(self, known: Mixture, sonar: Sonar) -> Mixture:
+    def _clamp_to_seafloor(self, mixture: Mixture, sonar: Sonar) -> Mixture:
         """For `seafloor`: the depth is the sea floor's, whatever was measured."""
         if not self.seafloor or not np.isfinite(sonar.altitude):
-            return known
-        x, P = known.x.copy(), known.P.copy()
+            return mixture
+        x, P = mixture.x.copy(), mixture.P.copy()
         x[..., 2] = sonar.pose.position[2] + sonar.altitude
         P[..., 2, :] = P[..., :, 2] = 0.0
         P[..., 2, 2] = self.config.altitude_std**2
-        return Mixture(x, P, known.mu)
+        return Mixture(x, P, mixture.mu)
 
 
 class Landmark:
@@ -213,32 +215,34 @@ class Landmark:
         return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
 
     def advance(
-        self, known: Mixture, before: Sonar, after: Sonar, dt: float
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
     ) -> tuple[Mixture, int]:
         """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
         level, depth = (part * dt for part in self._noise)
         F = np.eye(4)
         F[:2, 3] = (before.pose.position - after.pose.position)[:2]
-        x, P, repaired = kalman.predict(known.x, known.P, F, np.diag([level, level, depth, 0.0]))
-        return Mixture(x, P, known.mu), int(repaired.sum())
+        x, P, repaired = kalman.predict(
+            mixture.x, mixture.P, F, np.diag([level, level, depth, 0.0])
+        )
+        return Mixture(x, P, mixture.mu), int(repaired.sum())
 
-    def expected(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         seen = unscented.unscented_transform(
-            lambda points: self._echo(points, sonar), known.x, known.P, angles=_ANGLES
+            lambda points: self._echo(points, sonar), mixture.x, mixture.P, angles=_ANGLES
         )
         return seen.mean, seen.covariance
 
     def update(
-        self, known: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
+        self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
     ) -> tuple[Mixture, FloatArray, int]:
         after = unscented.update(
-            known.x, known.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
+            mixture.x, mixture.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
             angles=_ANGLES,
         )  # fmt: skip
-        return Mixture(after.x, after.P, known.mu), after.nis[:, 0], int(after.repaired.sum())
+        return Mixture(after.x, after.P, mixture.mu), after.nis[:, 0], int(after.repaired.sum())
 
-    def view(self, known: Mixture, sonar: Sonar) -> View:
-        x, P = known.x[:, 0], known.P[:, 0]
+    def view(self, mixture: Mixture, sonar: Sonar) -> View:
+        x, P = mixture.x[:, 0], mixture.P[:, 0]
 
         def words(points: FloatArray) -> FloatArray:
             m = geometry.to_body(sonar.pose, points[..., :3])
@@ -248,13 +252,13 @@ class Landmark:
         seen = unscented.unscented_transform(words, x, P, angles=np.array([False, True, False]))
         std = np.sqrt(seen.covariance[:, 2:, 2])
         low, high, above = kernels.bands(
-            np.ascontiguousarray(seen.mean[:, 2:]), std, known.mu, 0.5 * (1.0 - BAND)
+            np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)
         )
         return View(seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3])
 
-    def outlook(self, known: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
-        m = geometry.to_body(sonar.pose, known.x[:, 0, :3])
-        spread = np.sqrt(known.P[:, 0, 2, 2]) / np.linalg.norm(m, axis=-1)
+    def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+        m = geometry.to_body(sonar.pose, mixture.x[:, 0, :3])
+        spread = np.sqrt(mixture.P[:, 0, 2, 2]) / np.linalg.norm(m, axis=-1)
         return _in_beam(m, spread, self.config), _ahead(m)
 
     def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:

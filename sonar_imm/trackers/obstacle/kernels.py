@@ -204,19 +204,19 @@ def soft_update(
     outlier_probability: float,
     outlier_density: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Update with one detection a target that may be an outlier; range and azimuth are states.
+    """Update with one detection per target that may be an outlier; range and azimuth are states.
 
     h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). With probability beta the detection is
     the target's, else it says nothing; both cases together are matched in mean and covariance.
-    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where P
-    (T, K) was repaired (`estimation.covariance`).
+    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where
+    P (T, K) was repaired (`estimation.covariance`).
     """
     T, K, n = x.shape
     x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
     repaired = np.zeros((T, K), dtype=np.bool_)
     g0, g1, k0, k1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     L, v = np.empty((n, n)), np.empty(2)
-    wild = outlier_probability * outlier_density
+    outlier = outlier_probability * outlier_density
     for t in range(T):
         total = 0.0
         v0 = v1 = 0.0
@@ -240,8 +240,8 @@ def soft_update(
             distance = (s11 * r0 * r0 - 2.0 * s01 * r0 * r1 + s00 * r1 * r1) / determinant
             own = (1.0 - outlier_probability) * math.exp(-0.5 * distance)
             own /= 2.0 * math.pi * math.sqrt(determinant)
-            likelihood = own + wild
-            beta = own / (own + wild) if own + wild > 0.0 else 0.0
+            likelihood = own + outlier
+            beta = own / (own + outlier) if own + outlier > 0.0 else 0.0
             for a in range(n):
                 g0[a], g1[a] = P[t, j, a, 0], P[t, j, a, 1]
                 k0[a] = (s11 * g0[a] - s01 * g1[a]) / determinant
@@ -249,9 +249,9 @@ def soft_update(
                 x1[t, j, a] = x[t, j, a] + beta * (k0[a] * r0 + k1[a] * r1)
             for a in range(n):
                 for b in range(a + 1):
-                    known = k0[a] * g0[b] + k1[a] * g1[b]
+                    gained = k0[a] * g0[b] + k1[a] * g1[b]
                     spread = (k0[a] * r0 + k1[a] * r1) * (k0[b] * r0 + k1[b] * r1)
-                    value = P[t, j, a, b] - beta * known + beta * (1.0 - beta) * spread
+                    value = P[t, j, a, b] - beta * gained + beta * (1.0 - beta) * spread
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
             trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
@@ -260,7 +260,7 @@ def soft_update(
                 repaired[t, j] = True
                 v[0], v[1] = r0, r1
                 likelihood = _careful_soft_update(
-                    x[t, j], P[t, j], v, R[t], outlier_probability, wild, x1[t, j], P1[t, j]
+                    x[t, j], P[t, j], v, R[t], outlier_probability, outlier, x1[t, j], P1[t, j]
                 )
             mu1[t, j] = mu[t, j] * likelihood
             total += mu1[t, j]
@@ -276,7 +276,7 @@ def _careful_soft_update(
     v: FloatArray,
     R: FloatArray,
     outlier_probability: float,
-    wild: float,
+    outlier: float,
     x1: FloatArray,
     P1: FloatArray,
 ) -> float:
@@ -285,22 +285,22 @@ def _careful_soft_update(
     n = len(x)
     L, K, H, w = np.zeros((2, 2)), np.empty((n, 2)), np.eye(2, n), np.empty(2)
     x1[:], P1[:] = x, P
-    known = np.empty((n, n))
-    if not careful_update(P, H, R, L, K, known):
-        return wild
+    updated = np.empty((n, n))
+    if not careful_update(P, H, R, L, K, updated):
+        return outlier
     own = (1.0 - outlier_probability) * math.exp(-0.5 * whitened_square(L, v, w))
     own /= 2.0 * math.pi * L[0, 0] * L[1, 1]
-    beta = own / (own + wild) if own + wild > 0.0 else 0.0
+    beta = own / (own + outlier) if own + outlier > 0.0 else 0.0
     for a in range(n):
         w[0] = K[a, 0] * v[0] + K[a, 1] * v[1]
         x1[a] += beta * w[0]
         for b in range(a + 1):
             w[1] = K[b, 0] * v[0] + K[b, 1] * v[1]
             spread = beta * (1.0 - beta) * w[0] * w[1]
-            P1[a, b] = (1.0 - beta) * P[a, b] + beta * known[a, b] + spread
+            P1[a, b] = (1.0 - beta) * P[a, b] + beta * updated[a, b] + spread
             P1[b, a] = P1[a, b]
-    lift(P1, known)
-    return own + wild
+    lift(P1, updated)
+    return own + outlier
 
 
 @kernel

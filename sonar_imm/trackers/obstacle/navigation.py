@@ -11,22 +11,23 @@ from .config import ObstacleConfig
 
 
 class Mount:
-    """Where the sonar sits on the vehicle, and what the navigation's axes mean."""
+    """Where the sonar sits on the vehicle.
+
+    Here, and only here, the tracker changes between the axes of ROS and those of the papers: poses
+    come in as ENU and FLU, the filters work in NED and FRD (`acoustics.geometry`), places go out
+    as ENU.
+    """
 
     def __init__(self, config: ObstacleConfig):
-        mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
         self.lever = np.array(config.sonar_lever)
-        self.R = mount
-        self.ned = config.world_frame_convention == 'ned'
+        self.R = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
 
     def sonar(self, vehicle: Pose) -> Pose:
-        """The sonar in NED and FRD, from a vehicle pose as the navigation states it."""
-        ros = geometry.flip_pose(vehicle) if self.ned else vehicle
-        return geometry.flip_pose(geometry.mounted(ros, self.lever, self.R))
+        """The sonar in NED and FRD, from a vehicle in ENU and FLU."""
+        return geometry.flip_pose(geometry.mounted(vehicle, self.lever, self.R))
 
-    def to_navigation(self, points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
-        """NED points (T, 3) and covariances (T, 3, 3) in the axes of the navigation."""
-        if self.ned:
-            return points, covariance
+    @staticmethod
+    def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
+        """Points (T, 3) and covariances (T, 3, 3) in ENU, from NED."""
         halfway = np.swapaxes(geometry.flip_world(covariance), -1, -2)
         return geometry.flip_world(points), geometry.flip_world(halfway)

@@ -245,8 +245,7 @@ class ObstacleTracker:
         """z (D, 2) and R (D, 2, 2) of the rows that are echoes, azimuth positive to starboard. A
         row that is as uncertain as it is far says nothing and is left out."""
         config = self.config
-        side = -1.0 if config.bearing_positive == 'port' else 1.0
-        z = np.column_stack([ping.range, side * ping.bearing])
+        z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         stated = np.column_stack([ping.var_range, ping.var_bearing])
         own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
         own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
@@ -321,7 +320,7 @@ class ObstacleTracker:
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
-        place, place_covariance = self.mount.to_navigation(view.place, view.place_covariance)
+        place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
             'track_id': ping.life.track_id,
             'track_state': ping.life.status,

@@ -11,7 +11,8 @@ from sonar_imm.measurements import Altitude, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.kernels import drift, log_likelihoods, PingLikelihood, sines_of
+from sonar_imm.trackers.bathymetry.grid_kernels import _log_likelihoods as log_likelihoods
+from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
 from sonar_imm.trackers.bathymetry.swath import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
 
@@ -224,23 +225,6 @@ def test_without_navigation_nothing_changes_and_with_it_the_columns_say_more():
         'beam_angle',
         'side',
     ]
-
-
-def test_axes_of_ned_navigation_give_the_same_heights_and_ned_places():
-    estimates, _ = track(sea_config(CASE, particles_per_model=20))
-    config = sea_config(CASE, particles_per_model=20, world_frame_convention='ned')
-    tracker = BathymetryTracker(config)
-    for one in navigation(CASE):
-        x, y, z, w = one.orientation
-        # ENU from FLU to NED from FRD, as a quaternion: half a turn about east plus north.
-        turn = np.array([w + z, x + y, x - y, w - z])  # w x y z of q_world * q * q_body
-        q = np.array([turn[1], turn[2], turn[3], turn[0]]) / np.sqrt(2.0)
-        place = [one.position[1], one.position[0], -one.position[2]]
-        tracker.process(evolve(one, position=place, orientation=q))
-    for ping, expected in zip(snapshots(CASE), estimates):
-        found = tracker.process(ping)[0]
-        assert found.state[:, 0] == pytest.approx(expected.state[:, 0], abs=1e-6)
-        assert found.xyz[:, [1, 0, 2]] * [1, 1, -1] == pytest.approx(expected.xyz, abs=1e-4)
 
 
 def test_a_clock_set_back_forgets_the_poses():

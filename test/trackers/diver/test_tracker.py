@@ -210,6 +210,55 @@ def test_optimistic_covariances_can_be_found_out():
     assert 5.0 < tracker.health()['scale_fixes'] < 14.0
 
 
+@pytest.mark.parametrize('adaptation', ['counts', 'paper'])
+def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns(adaptation):
+    """Probabilities move by prediction alone then: learnt from, they would confirm the prior."""
+    tracker = DiverTracker(DiverConfig(adaptation=adaptation))
+    for second in range(1, 8):
+        tracker.process(fix(second, 0.75 * second, 0.2 * second))
+    before = tracker._stream.state
+    learnt, mu = before.learnt[0].copy(), before.mu[0].copy()
+    tracker.process(fix(8, 500.0, 500.0))  # a false detection far away
+    missed = tracker._stream.state
+    assert missed.life.track_id[0] == 1 and missed.nis_dof[0] == 0
+    assert not np.array_equal(missed.mu[0], mu)
+    assert np.array_equal(missed.learnt[0], learnt)
+    tracker.process(fix(9, 0.75 * 9, 0.2 * 9))
+    assert not np.array_equal(tracker._stream.state.learnt[0], learnt)
+
+
+def test_no_more_divers_are_confirmed_than_there_can_be():
+    """Of three divers, two that are fixed exactly and one that is often missed, the two stay."""
+    rng = np.random.default_rng(12)
+
+    def confirmed(max_tracks):
+        tracker = DiverTracker(DiverConfig(max_tracks=max_tracks, delete_misses=8))
+        found = []
+        for second in range(1, 40):
+            for place in (-40.0, 0.0, 40.0):
+                if place != 40.0 or second % 3:
+                    spread = 0.1 * rng.normal(size=2)
+                    z = (0.3 * second + spread[0], place + spread[1])
+                    last = tracker.process(fix(second, *z, 0.04 * np.eye(2)))[-1]
+            sure = last.extras['track_state'] > 0
+            found.append(np.sort(np.round(last.state[sure, 1], -1)).tolist())
+        return found
+
+    assert confirmed(3)[-1] == [-40.0, 0.0, 40.0]
+    limited = confirmed(2)
+    assert max(map(len, limited)) == 2
+    assert limited[-1] == [-40.0, 0.0]
+
+
+def test_false_detections_do_not_pile_up_tracks():
+    """Room for tentative tracks is ten, and five for each diver there can be."""
+    tracker = DiverTracker(DiverConfig(max_tracks=2, delete_misses=100, confirm_window=50))
+    for second in range(1, 5):
+        for k in range(40):
+            last = tracker.process(fix(second, 100.0 * k, 1000.0 * second))[-1]
+    assert len(last) == 20
+
+
 def test_polled_divers_are_not_missed_when_another_one_answers():
     tracker = DiverTracker(DiverConfig(fixes_are_scans=False, confirm_hits=2))
     for second in range(1, 80):

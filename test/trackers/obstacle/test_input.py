@@ -67,6 +67,32 @@ def test_the_seafloor_method_needs_an_altitude():
     assert all(len(one) == 0 for one in run(tracker, measurements).values())
 
 
+@pytest.mark.parametrize('age, begins', [(0.0, True), (1.9, True), (2.1, False), (60.0, False)])
+def test_an_altitude_serves_until_it_is_too_old(age, begins):
+    """The sea-floor method knows nothing of an echo when the last altitude is older than told."""
+    config = ObstacleConfig(method='seafloor', max_altitude_age=2.0, confirm_hits=1)
+    tracker, stamp = ObstacleTracker(config), 100 * SECOND
+    tracker.process(Altitude(stamp_ns=stamp - round(age * SECOND), altitude=15.0))
+    tracker.process(navigation(rows(NAME)[0], stamp))
+    (estimate,) = tracker.process(Detections(stamp_ns=stamp, range=[60.0], bearing=[0.1]))
+    assert len(estimate) == begins
+    if begins:
+        assert estimate.state[0, 2] == pytest.approx(15.0, abs=0.5)
+
+
+def test_an_old_altitude_no_longer_bounds_the_offset():
+    """Obstacles lie above the sea floor: a fresh altitude of 3 m cuts off what lies deeper."""
+
+    def deepest(age):
+        tracker, stamp = ObstacleTracker(ObstacleConfig(max_altitude_age=2.0)), 100 * SECOND
+        tracker.process(Altitude(stamp_ns=stamp - round(age * SECOND), altitude=3.0))
+        tracker.process(navigation(rows(NAME)[0], stamp))
+        (estimate,) = tracker.process(Detections(stamp_ns=stamp, range=[60.0], bearing=[0.1]))
+        return estimate.extras['vertical_offset_hi'][0]
+
+    assert deepest(1.0) < 4.5 < 6.0 < deepest(3.0)
+
+
 def test_parameters_are_checked_together():
     with pytest.raises(ConfigError, match='confirm_hits'):
         ObstacleConfig(confirm_hits=7, confirm_window=6)
@@ -89,7 +115,7 @@ def test_rules_may_change_while_running():
 @pytest.mark.parametrize('method', ['gaussian_sum', 'seafloor', 'landmark'])
 @pytest.mark.filterwarnings('error')
 def test_nonsense_gives_finite_numbers(method, model, timing):
-    """A vehicle that tumbles and leaps, wild ranges, bearings and variances."""
+    """A vehicle that tumbles and leaps, absurd ranges, bearings and variances."""
     rng = np.random.default_rng(1)
     tracker = ObstacleTracker(
         ObstacleConfig(

@@ -1,4 +1,4 @@
-"""Memory: each of these once wrote outside of an array; NUMBA_BOUNDSCHECK=1 shows where."""
+"""What once wrote outside of its arrays; NUMBA_BOUNDSCHECK=1 shows where."""
 
 import math
 

@@ -1,0 +1,96 @@
+"""What `check` says of a node that does not do what the offline tracker does: the node is played
+by estimates that are changed on purpose."""
+
+from attrs import evolve
+from helpers.dive_bags import write_dive
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from sonar_imm.cli import checking  # noqa: E402
+from sonar_imm.evaluation.run_folder import RunFolder  # noqa: E402
+from sonar_imm.nodes.harness import LockstepResult  # noqa: E402
+from sonar_imm.nodes.lockstep import Counts  # noqa: E402
+
+
+@pytest.fixture(scope='module')
+def dive(tmp_path_factory):
+    return write_dive(tmp_path_factory.mktemp('bags') / 'dive', count=40, spoilt=(30,))
+
+
+@pytest.fixture
+def check(dive, tmp_path, monkeypatch):
+    """Check `dive` against a node that publishes `change` of the offline estimates."""
+
+    def check(change=lambda estimates: estimates, **said):
+        def played(bag, system, **options):
+            estimates = change(list(RunFolder(tmp_path / 'offline').read_estimates()))
+            counts = Counts(40, 1, len(estimates))
+            return LockstepResult(
+                **{
+                    'estimates': estimates,
+                    'counts': counts,
+                    'delays': (0.001,),
+                    'exit_code': 0,
+                    'log': '',
+                    'problems': (),
+                    **said,
+                }
+            )
+
+        monkeypatch.setattr(checking, 'run_lockstep', played)
+        checked = checking.check_recording(dive, 'diver', tmp_path, quiet=True)
+        return {one.name: one for one in checked.checks}, checked.good
+
+    return check
+
+
+EQUAL = 'estimates of the node against offline'
+
+
+def test_a_node_that_does_the_same_passes(check):
+    checks, good = check()
+    assert good and checks[EQUAL].result == 'equal bytes'
+
+
+def nudged(estimates):
+    """The last bit of one number in one estimate."""
+    state = estimates[20].state.copy()
+    state[0, 1] = np.nextafter(state[0, 1], np.inf)
+    estimates[20] = evolve(estimates[20], state=state)
+    return estimates
+
+
+def renamed(estimates):
+    return [evolve(one, frame_id='odom') for one in estimates]
+
+
+@pytest.mark.parametrize(
+    'change, rows',
+    [
+        (nudged, 1),
+        (lambda estimates: estimates[:-1], 1),
+        (lambda estimates: [], 40),
+        (renamed, 0),  # the frame stands in the bag, not in the CSV
+    ],
+    ids=['one bit', 'one missing', 'silent', 'other frame'],
+)
+def test_a_node_that_does_otherwise_is_found_out(check, change, rows):
+    checks, good = check(change)
+    assert not good and not checks[EQUAL].good
+    assert checks[EQUAL].result == f'{rows} rows differ'
+
+
+@pytest.mark.parametrize(
+    'said, name',
+    [
+        ({'counts': Counts(39, 1, 39)}, 'messages taken / refused by the node'),
+        ({'counts': Counts(40, 0, 39)}, 'messages taken / refused by the node'),
+        ({'exit_code': 1}, 'end of the node after Ctrl-C'),
+        ({'log': 'Traceback (most recent call last):'}, 'end of the node after Ctrl-C'),
+    ],
+)
+def test_a_node_that_loses_messages_or_dies_is_found_out(check, said, name):
+    checks, good = check(**said)
+    assert not good and [one.name for one in checks.values() if not one.good] == [name]

@@ -1,0 +1,67 @@
+"""A publisher in NED and FRD, and one in ENU and FLU, get the same answer: in ENU."""
+
+from pathlib import Path
+
+from attrs import evolve
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from msg_adapters.inputs import inputs_of
+from sonar_imm.cli import main
+from sonar_imm.measurements import Detections, Navigation
+from sonar_imm.recordings.measurements import fitting_topics, measurements_of
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.writer import BagWriter
+
+BAG = Path(__file__).resolve().parents[2] / 'bags' / 'obstacle_tethers'
+TO_NED, TO_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+
+
+def other_way(measurement):
+    """As a vehicle in NED and FRD and a sonar that counts to starboard would state it."""
+    if isinstance(measurement, Detections):
+        return evolve(measurement, bearing=-measurement.bearing)
+    if isinstance(measurement, Navigation):
+        R = TO_NED @ Rotation.from_quat(measurement.orientation).as_matrix() @ TO_FRD
+        return evolve(
+            measurement,
+            frame_id=measurement.frame_id + '_ned',
+            position=TO_NED @ measurement.position,
+            orientation=Rotation.from_matrix(R).as_quat(),
+            pose_covariance=None,
+            twist_covariance=None,
+        )
+    return measurement
+
+
+@pytest.fixture
+def ned_bag(tmp_path):
+    write = {entry.measurement: (entry.name, entry.write) for entry in inputs_of('obstacle')}
+    with BagReader(BAG) as bag, BagWriter(tmp_path / 'ned') as out:
+        topics = {name: entry.name for name, entry in fitting_topics(bag, 'obstacle').items()}
+        for heard in measurements_of(bag, 'obstacle', topics):
+            name, written = write[type(heard.measurement)]
+            message = written(other_way(heard.measurement), ros_message)
+            out.write(f'/{name}', message, heard.measurement.stamp_ns)
+    return tmp_path / 'ned'
+
+
+def estimates(path):
+    table = np.genfromtxt(path / 'estimate.csv', delimiter=',', names=True)
+    return np.column_stack([table[name] for name in table.dtype.names])
+
+
+def test_both_conventions_give_the_same_places(ned_bag, tmp_path):
+    assert main(['track', str(BAG), str(tmp_path / 'enu_run'), '--order', 'stamp']) == 0
+    told = ('--set', 'world_frame_convention=ned', '--set', 'bearing_positive=starboard')
+    assert main(['track', str(ned_bag), str(tmp_path / 'ned_run'), '--order', 'stamp', *told]) == 0
+    enu, ned = estimates(tmp_path / 'enu_run'), estimates(tmp_path / 'ned_run')
+    assert len(enu) > 500
+    np.testing.assert_allclose(ned, enu, rtol=1e-5, atol=1e-5)
+
+
+def test_a_ned_frame_that_nobody_told_of_is_refused(ned_bag, tmp_path, capsys):
+    assert main(['track', str(ned_bag), str(tmp_path / 'run')]) == 0
+    assert 'north-east-down but east-north-up is expected' in capsys.readouterr().out
