@@ -33,10 +33,11 @@ from ...estimation.association import (
 )
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
+from ..navigation import NavigationBuffer
 from ..stream import ReplayStream, StreamRules
 from .config import ObstacleConfig
 from .filters import build_filter, Mixture, Sonar
-from .navigation import Mount, NavigationBuffer
+from .navigation import Mount
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
