@@ -82,10 +82,15 @@ def banded_transition(orders: int, switch: float) -> FloatArray:
     return np.asarray(P + np.diag(1.0 - P.sum(axis=1)))
 
 
+def move_reach(std: float, *, reach: float = 4.0) -> float:
+    """How many cells `gaussian_move` reaches to either side."""
+    return max(1.0, math.floor(reach * std)) if math.isfinite(reach * std) else math.inf
+
+
 def gaussian_move(std: float, *, reach: float = 4.0) -> FloatArray:
     """Probabilities (2 r + 1,) of moving by -r .. r cells: Gaussian of `std` cells, cut at `reach`
     standard deviations."""
-    radius = max(1, int(reach * std))
+    radius = int(move_reach(std, reach=reach))
     K = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / std))
     return np.asarray(K / K.sum())
 

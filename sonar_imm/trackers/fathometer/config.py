@@ -17,6 +17,7 @@ live = partial(parameter, read_only=False)
 
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
+MAX_MEMBERS = 50_000_000
 
 
 @frozen(kw_only=True)
@@ -118,7 +119,10 @@ class FathometerConfig(StampParameters):
         300.0, 'end of the depths where noise is measured', unit='m', low=0.0, high=12000.0
     )
     noise_sigma: float = live(
-        0.0, 'standard deviation of the noise; 0: as the trace says, else measured', low=0.0
+        0.0,
+        'standard deviation of the noise; 0: as the trace says, else measured',
+        low=0.0,
+        high=1e30,
     )
     remove_background: bool = live(
         False, 'take the median of the noise off the trace first: for envelopes'
@@ -219,6 +223,10 @@ class FathometerConfig(StampParameters):
                 self.orders,
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
+            )
+        if self.particles * self.order_max > MAX_MEMBERS:
+            problems.append(
+                f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'
             )
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
