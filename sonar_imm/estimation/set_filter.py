@@ -116,9 +116,12 @@ class SetFilter:
         self.summary(step, step.w, step.sets)
 
     def summary(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-        """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
+        """PMF (orders,) of the order and sums (5, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
-        pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
+        pmf, sums = (
+            np.zeros(len(self.model.transition)),
+            np.zeros((kernels.SUMS, self.model.cells)),
+        )
         kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
         return pmf, sums
 

@@ -15,6 +15,9 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .set_particles import Proposals, Sets
 
+SUMS = 5
+"""Rows of what `moments` adds up."""
+
 
 class SetMotion(NamedTuple):
     """How sets change from record to record: order_min; separation in cells; most_changes, how
@@ -310,9 +313,9 @@ def moments(
     pmf: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Add to pmf (orders,) and to sums (4, n), the intensity, the first two moments of the
-    amplitude and the variance it had before the record, that lie on each cell. Both are zero
-    before."""
+    """Add to pmf (orders,) and to sums (5, n), the intensity, the first two moments of the
+    amplitude, the variance it had before the record, and the share of members that are the first
+    of their set, that lie on each cell. Both are zero before."""
     for i in range(w.shape[0]):
         if w[i] > 0.0:
             pmf[sets.order[i] - order_min] += w[i]
@@ -322,3 +325,5 @@ def moments(
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
                 sums[3, z] += w[i] * sets.prior_variance[i, k]
+            if sets.order[i] > 0:
+                sums[4, sets.cell[i, 0]] += w[i]

@@ -142,6 +142,25 @@ class FathometerConfig(StampParameters):
         '', 'file: a CSV of two columns, distance in m from 0 on, and value'
     )
 
+    # -- sediment ---------------------------------------------------------------------------------
+    sediment_sound_speed: float = live(
+        0.0,
+        'speed of sound just below the bottom, for sediment_depth; 0: as in the water',
+        unit='m/s',
+        low=0.0,
+        high=8000.0,
+    )
+    sediment_sound_speed_std: float = live(
+        0.0, 'error of sediment_sound_speed', unit='m/s', low=0.0, high=2000.0
+    )
+    sediment_sound_speed_gradient: float = live(
+        0.0,
+        'growth of the speed of sound with the depth below the bottom',
+        unit='1/s',
+        low=0.0,
+        high=10.0,
+    )
+
     # -- the set of reflectors --------------------------------------------------------------------
     order_min: int = parameter(1, 'least number of reflectors', low=0, high=64)
     order_max: int = parameter(12, 'greatest number of reflectors', low=1, high=64)
