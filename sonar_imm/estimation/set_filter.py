@@ -24,7 +24,7 @@ from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
-from .set_particles import gain, Proposals, propose_births, SetModel, Sets
+from .set_particles import gains, Proposals, propose_births, SetModel, Sets
 
 _STEP, _START, _RESAMPLE = range(3)
 
@@ -63,8 +63,8 @@ class SetFilter:
         self.model = model
         self.particles = particles
         self.threads = threads
-        n, width = model.cells, len(model.move)
-        self._move, self._move_ratio = np.empty((n, width)), np.empty((n, width))
+        shape = model.cells * len(model.signs), len(model.move)
+        self._move, self._move_ratio = np.empty(shape), np.empty(shape)
         self._motion = kernels.SetMotion(
             order_min=model.order_min,
             separation=model.separation,
@@ -81,7 +81,7 @@ class SetFilter:
         )
         self._charge = np.array(
             [
-                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(n)
+                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(model.cells)
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
@@ -146,9 +146,9 @@ class SetFilter:
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
-        filled = np.zeros(model.cells, np.bool_)
+        filled = np.zeros(len(self._move), np.bool_)
         proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
-        kernels.fill_moves(old, gain(b), model.move, model.move_share, filled, proposals)
+        kernels.fill_moves(old, gains(model, b), model.move, model.move_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first,

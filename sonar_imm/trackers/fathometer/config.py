@@ -17,6 +17,7 @@ live = partial(parameter, read_only=False)
 
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
+POLARITIES = ('positive', 'both')
 MAX_MEMBERS = 50_000_000
 
 
@@ -181,6 +182,15 @@ class FathometerConfig(StampParameters):
     min_separation: float = parameter(
         0.4, 'least distance of two reflectors', unit='m', low=1e-4, high=1000.0
     )
+    polarity: str = parameter(
+        'positive',
+        'sign of the reflectors looked for: where the impedance grows with depth they are '
+        'positive; envelopes (remove_background) have no negative ones',
+        choices=POLARITIES,
+    )
+    negative_probability: float = parameter(
+        0.05, 'polarity both: that a new reflector is negative', low=1e-6, high=0.999
+    )
     amplitude_prior: str = parameter(
         'marginal',
         'amplitudes integrated out, or the best ones with a penalty of log(N)/2 or log(N) each',
@@ -256,6 +266,13 @@ class FathometerConfig(StampParameters):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
+
+    @property
+    def negative_share(self) -> float:
+        """How many of the new reflectors are negative."""
+        if self.polarity == 'positive' or self.remove_background:
+            return 0.0
+        return self.negative_probability
 
     @property
     def orders(self) -> int:

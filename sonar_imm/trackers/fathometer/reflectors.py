@@ -172,6 +172,7 @@ def write_estimate(
         'track_id': np.zeros(rows, np.uint32),
         'existence': np.zeros(rows),
         'relative_amplitude': np.full(rows, np.nan),
+        'polarity': np.zeros(rows, np.int8),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
         'sediment_depth': np.full(rows, np.nan),
@@ -187,6 +188,7 @@ def write_estimate(
         extras['relative_amplitude'][:] = relative_amplitude(reflectors, response, config)
         height = reflectors.depth - response.reference_depth
         extras['two_way_time'][:] = 2.0 * height / config.sound_speed
+        extras['polarity'][:] = np.sign(reflectors.amplitude)
         extras['is_bottom'][:] = reflectors.is_bottom
         found = sediment_depths(reflectors, config)
         extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found

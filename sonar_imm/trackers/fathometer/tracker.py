@@ -292,5 +292,6 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         amplitude_std=config.amplitude_std_sigmas,
         independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
         amplitude_memory=config.amplitude_memory,
+        negative_probability=config.negative_share,
         **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )
