@@ -365,9 +365,8 @@ def _birth(
 
 def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
     """Oracle for tests: log likelihood (N,) of the record against that of an empty one, -inf where
-    an amplitude is
-    not of its member's sign, and the amplitudes (N, J), their mean given the set, in units of the
-    noise."""
+    an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
+    in units of the noise."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
     for m in np.unique(sets.order[sets.order > 0]):

@@ -171,11 +171,13 @@ class OfflineRun:
         entry.count += 1
 
     def outcomes(self) -> dict[str, int]:
-        """What happened to the messages: counts of the tracker, covariances it had to repair, and
-        messages refused before."""
+        """What happened to the messages: counts of the tracker, covariances it had to repair,
+        pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
-        if repairs := self.tracker.health().get('covariance_repairs'):
-            counts['covariance_repairs'] = int(repairs)
+        health = self.tracker.health()
+        for name in ('covariance_repairs', 'pings_moving_alike'):
+            if count := health.get(name):
+                counts[name] = int(count)
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
