@@ -21,9 +21,10 @@ from ...estimation.arrays import FloatArray
 from ...measurements import Arrivals, Fix
 from ...parameters import parameter
 from ..scene import Received, Scenario, Scene, TrueTrack
+from .crossing import CROSSING, crossing_paths, sense_scan, told_of_scans
 
-MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still')
-SENSORS = ('polar', 'multistatic_fixes', 'arrivals')
+MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
+SENSORS = ('polar', 'multistatic_fixes', 'arrivals', 'scans')
 
 TRANSMITTER = np.array([0.0, 0.0, 0.0])
 RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -64,6 +65,7 @@ class DiverScenario(Scenario):
     bearing_std_deg: float = parameter(
         2.0, 'bearing error of the polar sonar', unit='deg', low=1e-6
     )
+    fix_std: float = parameter(0.7, 'error on each axis of the fixes of scans', unit='m', low=1e-6)
     toa_std: float = parameter(
         2e-4, 'arrival-time error of the multistatic sonar', unit='s', low=1e-9
     )
@@ -88,6 +90,9 @@ class DiverScenario(Scenario):
         if self.leg_min > self.leg_max:
             problems.append('leg_min cannot exceed leg_max')
         return problems
+
+    def told(self) -> dict[str, Any]:
+        return told_of_scans(self) if self.sensor == 'scans' else {}
 
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -146,6 +151,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'speed': 0.75,
         },
     ),
+    'crossing': CROSSING,
 }
 """Name: (what it is, what differs from the defaults of `DiverScenario`)."""
 
@@ -161,7 +167,10 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
     times = _scan_times(config, rng)
     stamps = FIRST_STAMP_NS + np.round(times * 1e9).astype(np.int64)
     turn = rng.uniform(0.0, 2.0 * np.pi) if config.random_rotation else 0.0
-    paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
+    if config.motion == 'crossing':
+        paths = crossing_paths(config.divers, times, rng)
+    else:
+        paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
     truth = tuple(
         TrueTrack(
             number, stamps, np.column_stack([state[:, :2], np.zeros(len(times))]), state[:, 2:]
@@ -369,4 +378,5 @@ _SENSE = {
     'polar': _sense_polar,
     'arrivals': _sense_arrivals,
     'multistatic_fixes': _sense_multistatic_fixes,
+    'scans': sense_scan,
 }

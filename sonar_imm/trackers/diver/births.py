@@ -4,17 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice, product
+import math
+from typing import NamedTuple
 
 import numpy as np
 
 from ...acoustics import multistatic
 from ...estimation.arrays import FloatArray
-from ...measurements import Arrivals
+from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
 from .sensing import locate, Positions, toa_variance
 
-Birth = tuple[FloatArray, FloatArray]
-"""Position (2,) and covariance (2, 2)."""
+
+class Birth(NamedTuple):
+    """Where a track may begin: position (2,) and covariance (2, 2); the probability that there is
+    a diver, NaN where its hits will tell; whose track it is."""
+
+    position: FloatArray
+    covariance: FloatArray
+    existence: float = math.nan
+    target_id: int = NOBODY
+
 
 SEED_PAIRS = 3
 """Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
@@ -24,9 +34,15 @@ MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
 
 
-def births_from_fixes(group: Positions, free: np.ndarray) -> list[Birth]:
-    """Every fix that is `free` (D,) is a place to begin a track."""
-    return [(group.z[d], group.R[d]) for d in np.flatnonzero(free)]
+def births_from_fixes(
+    group: Positions, free: np.ndarray, existence: FloatArray | None = None
+) -> list[Birth]:
+    """Every fix that is `free` (D,) is a place to begin a track; existence: (D,) of those."""
+    names = np.full(len(free), NOBODY) if group.target_id is None else group.target_id
+    known = np.full(len(free), math.nan) if existence is None else existence
+    return [
+        Birth(group.z[d], group.R[d], float(known[d]), int(names[d])) for d in np.flatnonzero(free)
+    ]
 
 
 def births_from_ping(
@@ -64,8 +80,8 @@ def _fix(
     fix = locate(ping, rows, config, config.covariance_scale * factor)
     if fix is None:
         return [], rows[:0]
-    ghosts = [(other.position, other.covariance) for other in fix.alternatives]
-    return [(fix.position, fix.covariance), *ghosts], rows[fix.used]
+    ghosts = [Birth(other.position, other.covariance) for other in fix.alternatives]
+    return [Birth(fix.position, fix.covariance), *ghosts], rows[fix.used]
 
 
 def _best_combination(
@@ -89,7 +105,7 @@ def _agreeing(
     ping: Arrivals, pairs: Sequence[np.ndarray], birth: Birth, config: DiverConfig, factor: float
 ) -> np.ndarray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
-    position, covariance = birth
+    position, covariance = birth.position, birth.covariance
     expected = multistatic.range_sum(position, ping.tx, ping.rx, config.target_z)
     slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, config.target_z)
     variance = config.sound_speed**2 * toa_variance(

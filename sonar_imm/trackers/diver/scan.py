@@ -11,7 +11,7 @@ import numpy as np
 
 from ...estimation import imm, imm_kernels
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import (
     assign_by_rank,
     association_cost,
@@ -19,6 +19,7 @@ from ...estimation.association import (
     Tracks,
     TrackStatus,
 )
+from ...measurements import NOBODY
 from .config import DiverConfig
 from .models import ModelSet
 from .sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing
@@ -32,8 +33,14 @@ MOST_STEPS = 300
 EXCLUDED = -1
 """Rank of a track that takes no part in a message."""
 
+FIXES = 0
+"""The `Group.kind` of fixes."""
+
 SCORE_MEMORY = 0.9
 """Share of its score a track keeps from scan to scan."""
+
+LIFE = ('existence', 'evidence', 'target_id', 'near_to', 'near_for')
+"""What is known of the life of a track beside `Tracks`, by the names in `DiverState`."""
 
 SCALE_MEMORY = 400.0
 """Numbers measured over which the learnt scale forgets."""
@@ -47,8 +54,12 @@ class DiverState:
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite; repairs: covariances repaired
-    so far (`estimation.covariance`).
+    existence (T,): probability that there is a diver, NaN where hits are counted instead;
+    evidence (T,): sum of the probabilities of its detections; target_id (T,): whose track it is,
+    `NOBODY` where not known; near_to, near_for (T,): the older track it is near, 0 for none, and
+    for how many scans (`soft`);
+    broken: tracks ended so far because their numbers were not finite; repairs: covariances
+    repaired so far (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -61,6 +72,11 @@ class DiverState:
     nis_dof: np.ndarray
     score: FloatArray
     scale: FloatArray
+    existence: FloatArray
+    evidence: FloatArray
+    target_id: np.ndarray
+    near_to: IntArray
+    near_for: IntArray
     broken: int = 0
     repairs: int = 0
 
@@ -72,7 +88,7 @@ class DiverState:
         """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
         if kept.all():
             return self
-        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score')
+        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', *LIFE)
         return evolve(self, **{name: getattr(self, name)[kept] for name in names})
 
 
@@ -135,6 +151,9 @@ class Scan:
         self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
         self.rank = np.zeros(len(self.x), np.int64)
+        self.named = before.target_id != NOBODY
+        self.existence = before.existence * math.exp(-self.dt / config.survival_time)
+        self.evidence = before.evidence
 
     def associate_and_update(self, groups: Sequence[Group]) -> list[np.ndarray]:
         """Update the tracks with what one message holds for them, group after group. Gives for
@@ -146,7 +165,9 @@ class Scan:
         """
         before = self._copies()
         tentative = self.before.life.status == TrackStatus.TENTATIVE
-        explained = np.sum([self._fit(group).max(axis=1) > -np.inf for group in groups], axis=0)
+        explained = np.sum(
+            [self._fit(group).max(axis=1, initial=-np.inf) > -np.inf for group in groups], axis=0
+        )
         self.rank = 2 * (len(groups) - explained) + tentative
         chosen = [self._take_group(group) for group in groups]
         agreeing = np.sum([choice >= 0 for choice in chosen], axis=0)
@@ -156,6 +177,15 @@ class Scan:
             self.rank = np.where(doubtful, EXCLUDED, self.rank)
             chosen = [self._take_group(group) for group in groups]
         return [np.isin(np.arange(len(group.z)), choice) for group, choice in zip(groups, chosen)]
+
+    def take_named(self, group: Positions) -> BoolArray:
+        """Update each track by the fix that says it is its own, without association; True (D,)
+        where there is a track of that name."""
+        names = np.asarray(group.target_id)
+        track, row = np.nonzero(self.before.target_id[:, None] == names[None])
+        if len(track):
+            self._update(group, track, row)
+        return np.isin(np.arange(len(names)), row)
 
     def _copies(self) -> tuple[np.ndarray, ...]:
         return tuple(
@@ -201,6 +231,8 @@ class Scan:
             nis_dof=self.nis_dof,
             score=self.score,
             scale=self.scale,
+            existence=self.existence,
+            evidence=self.evidence,
             repairs=self.before.repairs + self.repairs,
         )
 
@@ -215,6 +247,8 @@ class Scan:
     def _associate(self, group: Group) -> np.ndarray:
         """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
         fit = self._fit(group)
+        if group.kind == FIXES:
+            fit[self.named] = -np.inf  # they know their own
         target, detection = imm.pairs_inside(fit)
         likelihood = fit[target, detection]
         if group.clutter == 0.0:
@@ -230,7 +264,8 @@ class Scan:
         """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""
         p_detection = self.config.detection_probability
         hit = np.flatnonzero(chosen >= 0)
-        self.score += np.log1p(-p_detection)
+        apart = self.named & (group.kind == FIXES)
+        self.score += np.where(apart, 0.0, np.log1p(-p_detection))
         self.score[hit] += fit[hit, chosen[hit]] + np.log(p_detection / (1.0 - p_detection))
         self.score[hit] -= np.log(group.clutter or self.config.clutter_density)
 

@@ -19,7 +19,7 @@ from ...acoustics import multistatic
 from ...acoustics.localisation import Localisation, localise
 from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray
-from ...measurements import Arrivals, Fix, Measurement
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of
 from .config import DiverConfig
 
 
@@ -52,7 +52,14 @@ class Group:
 
 @frozen(eq=False)
 class Positions(Group):
-    """Fixes: z is x and y."""
+    """Fixes: z is x and y.
+
+    target_id: (D,) whose they are, None when that is not known of any; whole: whether they are all
+    that there was to see, so that a diver without one was missed.
+    """
+
+    target_id: np.ndarray | None = None
+    whole: bool = True
 
     def linearise(self, x: FloatArray, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         H = E[:, :2]
@@ -126,8 +133,8 @@ class TagPing(Group):
 def groups_of(
     items: Sequence[Measurement], config: DiverConfig, factor: FloatArray
 ) -> list[Sequence[Group]]:
-    """The groups of one stamp, message by message (all fixes are one), in an order that depends on
-    content only.
+    """The groups of one stamp, message by message (all single fixes are one), in an order that
+    depends on content only.
 
     factor (2,): learnt factor on the covariances of fixes and of arrivals.
     """
@@ -136,6 +143,8 @@ def groups_of(
     fixes = [item for item in items if isinstance(item, Fix)]
     if fixes:
         said.append([_positions(fixes, config, scale[0])])
+    for scan in (item for item in items if isinstance(item, Fixes)):
+        said += [[group] for group in scan_groups(scan, config, scale[0])]
     for ping in (item for item in items if isinstance(item, Arrivals)):
         if ping.passive:
             usable = np.flatnonzero(np.isfinite(ping.toa))
@@ -191,16 +200,60 @@ def bearing_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
     return np.asarray(np.where(known, ping.var_bearing, np.deg2rad(config.bearing_std_deg) ** 2))
 
 
+def scan_groups(scan: Fixes, config: DiverConfig, factor: float) -> list[Positions]:
+    """The fixes that say whose they are, of each diver the first, and those that do not."""
+    R = _covariances(scan, config) * factor
+    if scan.target_id is None or not len(scan):
+        return [_group(scan.position, R, config, factor)]
+    groups = []
+    said = np.flatnonzero(scan.target_id != NOBODY)
+    if len(said):
+        names, first = np.unique(scan.target_id[said], return_index=True)
+        rows = said[first]
+        groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
+    if len(said) < len(scan):
+        rows = np.flatnonzero(scan.target_id == NOBODY)
+        groups.append(_group(scan.position[rows], R[rows], config, factor))
+    return groups
+
+
 def _positions(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
-    unknown = np.eye(2) * config.fix_std**2
-    R = np.stack([unknown if fix.covariance is None else fix.covariance for fix in fixes])
-    return Positions(
-        np.stack([fix.position[:2] for fix in fixes]),
-        R * factor,
-        config.clutter_density,
-        0,
+    scans = [scan_of(fix) for fix in fixes]
+    return _group(
+        np.concatenate([scan.position for scan in scans]),
+        np.concatenate([_covariances(scan, config) for scan in scans]) * factor,
+        config,
         factor,
+        whole=config.fixes_are_scans,
     )
+
+
+def _group(
+    position: FloatArray,
+    R: FloatArray,
+    config: DiverConfig,
+    factor: float,
+    target_id: np.ndarray | None = None,
+    whole: bool = True,
+) -> Positions:
+    return Positions(
+        z=np.ascontiguousarray(position[:, :2]),
+        R=R,
+        clutter=config.clutter_density,
+        kind=0,
+        factor=factor,
+        target_id=target_id,
+        whole=whole,
+    )
+
+
+def _covariances(scan: Fixes, config: DiverConfig) -> FloatArray:
+    """Covariances (n, 2, 2) as stated, else by `fix_std`."""
+    unknown = np.eye(2) * config.fix_std**2
+    if scan.covariance is None:
+        return np.tile(unknown, (len(scan), 1, 1))
+    known = np.isfinite(scan.covariance).all(axis=(1, 2))
+    return np.where(known[:, None, None], scan.covariance, unknown)
 
 
 def _range_sums(ping: Arrivals, config: DiverConfig, factor: float) -> Iterator[RangeSums]:
