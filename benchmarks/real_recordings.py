@@ -47,6 +47,7 @@ TAG = {
     'toa_std': 0.0009,
     'clutter_density': 1e-8,
 }
+BOATS = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
 SETS = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
@@ -200,12 +201,16 @@ def boats(folder: Path) -> None:
                 truth=folder / 'scenario13_groundTruth.json',
             )
             items, truth = load(out)
-            print(f'\n### Autoferry scenario 13, {sensor}: {len(items)} fixes\n')
+            print(
+                f'\n### Autoferry scenario 13, {sensor}: {len(items)} scans, '
+                f'{sum(map(len, items))} fixes\n'
+            )
             header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
             for name, values in {
                 'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
                 'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
-                'heading_speed': {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1},
+                'heading_speed': BOATS,
+                'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
             }.items():
                 config = DiverConfig(
                     fix_std=4.0 if sensor == 'radar' else 2.0,

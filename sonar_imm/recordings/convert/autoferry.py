@@ -122,7 +122,8 @@ def _json_list(path: str | Path) -> list[Any]:
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
     except (ValueError, RecursionError) as error:
-        raise BagError(f'{path} is not a JSON file: {error}') from None
+        where = f' from line {error.lineno} on' if isinstance(error, json.JSONDecodeError) else ''
+        raise BagError(f'{path} is not a JSON file{where}') from None
     if not isinstance(content, list):
         raise BagError(f'{path} holds no list of records; is it an Autoferry scenario?')
     return content
@@ -141,4 +142,6 @@ def _stamp_ns(seconds: Any, offset_ns: int = 0) -> int:
 def _why(error: Exception) -> str:
     if isinstance(error, (BadRow, Rejection)):
         return str(error)
-    return f'not a record of this data set ({type(error).__name__}: {error})'
+    if isinstance(error, KeyError) and error.args:
+        return f'it has no {error.args[0]}'
+    return 'it is not a record of this data set'

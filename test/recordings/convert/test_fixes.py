@@ -62,6 +62,20 @@ def test_rows_that_say_whose_they_are_become_scans_with_identities(convert):
     assert scans[0].covariance is None
 
 
+@pytest.mark.parametrize(
+    'header, words',
+    [
+        ('stamp,lat', 'no column for longitude'),
+        ('stamp,Longitude', 'no column for latitude'),
+        ('stamp,foo', 'nor for latitude and longitude; it has stamp, foo'),
+        ('stamp,x', 'no column for y'),
+    ],
+)
+def test_a_table_without_a_position_is_told_what_is_missing(convert, header, words):
+    with pytest.raises(BagError, match=words):
+        convert(header + '\n5,1\n')
+
+
 def test_numbers_of_divers_stay_and_numbers_of_rows_name_nobody(convert, tmp_path):
     report = convert('stamp,x,y,id,std\n5,1,2,17,.5\n6,1,2,17,.5\n7,3,4,4,\n8,3,4,4,.5\n')
     scans = fixes_of(report.path)
