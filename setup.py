@@ -88,8 +88,8 @@ setup(
     entry_points={
         'console_scripts': [
             'sonar-imm = sonar_imm.cli:main',
-            'fls_detector_node = sonar_imm.nodes.fls_detector:main',
-            *(f'{system}_node = sonar_imm.nodes.{system}:main' for system in SYSTEMS),
+            'fls_detector_node = sonar_imm.nodes.commands:main',
+            *(f'{system}_node = sonar_imm.nodes.commands:main' for system in SYSTEMS),
         ],
     },
 )

@@ -77,7 +77,7 @@ def write_envelope_pulse(file: Path, low: float, high: float, sound_speed: float
 def responses(spectra: CrossSpectra) -> dict[str, Trace]:
     """The record as MVDR (real part and envelope) and conventional traces."""
     depth = DEPTHS[0] + DEPTHS[1] * np.arange(DEPTHS[2])
-    w = steering(spectra.frequency, 0.18 * np.arange(spectra.phones), 1500.0)
+    w = steering(spectra.frequency, 0.18 * np.arange(spectra.hydrophones), 1500.0)
     reference = spectra.reference_depth
     assert reference is not None
     spacing = float(spectra.frequency[1] - spectra.frequency[0])

@@ -2,8 +2,8 @@
 
 Sources at the surface radiate as dipoles: what comes down at the angle whose sine is u has the
 power 2 u du, and goes past the array as exp(+i u k h). Layer l returns it with the amplitude a_l,
-flat in frequency and angle, as a_l exp(-i u k (h + 2 H_l)), H_l below phone 0. Every element of
-the cross-spectral density is then a sum of one integral,
+flat in frequency and angle, as a_l exp(-i u k (h + 2 H_l)), H_l below hydrophone 0. Every element
+of the cross-spectral density is then a sum of one integral,
 
     I(x) = 2 int_0^1 u exp(i u x) du
     R_ij = I(k (h_i - h_j)) + sum_lm a_l a_m I(-k (h_i - h_j + 2 (H_l - H_m)))
@@ -33,40 +33,42 @@ def noise_integral(x: ArrayLike) -> ComplexArray:
 
 def surface_noise_csdm(
     frequency: ArrayLike,
-    phones: int,
+    hydrophones: int,
     spacing: float,
     heights: ArrayLike,
     amplitudes: ArrayLike,
     sound_speed: float,
 ) -> ComplexArray:
-    """R (F, M, M) at `frequency` (F,) Hz, phones `spacing` m apart, phone 0 `heights` (K,) m above
-    layers of `amplitudes` (K,)."""
+    """R (F, M, M) at `frequency` (F,) Hz of so many `hydrophones`, `spacing` m apart, the deepest
+    `heights` (K,) m above layers of `amplitudes` (K,)."""
     k = 2.0 * np.pi * np.asarray(frequency, np.float64)[:, None] / sound_speed
     H, a = np.asarray(heights, np.float64), np.asarray(amplitudes, np.float64)
-    x = k * spacing * np.arange(phones)
+    x = k * spacing * np.arange(hydrophones)
     down = noise_integral(x) + np.sum(a * a) * noise_integral(-x)
     for m in range(len(a)):
         for n in range(m):
             apart = 2.0 * k * (H[m] - H[n])
             pair = noise_integral(-(x + apart)) + noise_integral(-(x - apart))
             down += a[m] * a[n] * pair
-    both = np.zeros((len(k), 2 * phones - 1))
+    both = np.zeros((len(k), 2 * hydrophones - 1))
     for one, strength in zip(H, a):
-        y = k * (spacing * np.arange(2 * phones - 1) + 2.0 * one)
+        y = k * (spacing * np.arange(2 * hydrophones - 1) + 2.0 * one)
         both += 2.0 * strength * noise_integral(y).real
-    i = np.arange(phones)
+    i = np.arange(hydrophones)
     lag = i[:, None] - i[None, :]
     table = np.concatenate([down[:, :0:-1].conj(), down], axis=1)
-    return np.asarray(table[:, lag + phones - 1] + both[:, i[:, None] + i[None, :]], np.complex128)
+    return np.asarray(
+        table[:, lag + hydrophones - 1] + both[:, i[:, None] + i[None, :]], np.complex128
+    )
 
 
 def horizontal_noise_csdm(
-    frequency: ArrayLike, phones: int, spacing: float, spread: float, sound_speed: float
+    frequency: ArrayLike, hydrophones: int, spacing: float, spread: float, sound_speed: float
 ) -> FloatArray:
     """R (F, M, M) of unit power from near the horizontal: the sine of its angle is Gaussian with
     standard deviation `spread`."""
     k = 2.0 * np.pi * np.asarray(frequency, np.float64) / sound_speed
-    apart = spacing * (np.arange(phones)[:, None] - np.arange(phones)[None, :])
+    apart = spacing * (np.arange(hydrophones)[:, None] - np.arange(hydrophones)[None, :])
     return np.exp(-0.5 * np.square(spread * k[:, None, None] * apart))
 
 
@@ -77,7 +79,7 @@ def sample_csdm(
 
     Wishart, by Bartlett's decomposition: R = C C^H, the average is (C A)(C A)^H / L with A lower
     triangular, its diagonal the roots of gamma variables, the rest normal. For fewer snapshots
-    than phones the snapshots themselves are drawn.
+    than hydrophones the snapshots themselves are drawn.
     """
     F, M, _ = csdm.shape
     C = np.linalg.cholesky(csdm).astype(np.complex64)

@@ -84,7 +84,7 @@ def largest_sine(spacing: float) -> float:
 
 
 def direction_grid(staves: int, spacing: float, *, oversampling: int = 8) -> FloatArray:
-    """Even grid (m,) of direction sines up to `largest_sine`, `oversampling` points a beam
+    """Even grid (m,) of direction sines up to `largest_sine`, `oversampling` points per beam
     width."""
     largest = largest_sine(spacing)
     points = math.ceil(2.0 * largest * spacing * staves * oversampling)

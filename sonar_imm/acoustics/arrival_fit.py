@@ -164,8 +164,8 @@ class ArrivalFit:
         """
         sensor, measured = self.rx[rows, :2] - self.centre, self.observed[rows]
         height = self.target_z - self.rx[rows, 2]
-        known = np.square(sensor).sum(axis=-1) + np.square(height) - np.square(measured)
-        sides = 0.5 * np.column_stack([np.ones(len(rows)), known])
+        constant = np.square(sensor).sum(axis=-1) + np.square(height) - np.square(measured)
+        sides = 0.5 * np.column_stack([np.ones(len(rows)), constant])
         (u, v) = np.linalg.lstsq(np.column_stack([sensor, -measured]), sides, rcond=None)[0].T
         metric = np.array([1.0, 1.0, -1.0])
         a, b, c = u @ (metric * u), 2.0 * u @ (metric * v) - 1.0, v @ (metric * v)
@@ -205,7 +205,7 @@ def minimise(fit: ArrivalFit, starts: FloatArray, weight: FloatArray) -> Minima:
 
     Runs towards a minimum with large residuals, a ghost or a ping with a reflection, would take
     hundreds of such steps. After `CURVED_AFTER` of them the Hessian therefore gets the second
-    derivative of the ranges too (Newton), which costs more a step.
+    derivative of the ranges too (Newton), which costs more per step.
     """
     weight = np.broadcast_to(weight, (len(starts), len(fit.weight)))
     position, damping = starts.copy(), np.full(len(starts), 1e-3)

@@ -5,17 +5,17 @@ In a shadow the staves hear independent noise; an echo is one plane wave. The **
     gamma = max_u |a(u)^H y|^2 / (P |y|^2)
 
 is 1 for a wave without noise. It does not depend on the level, so the heavy tails of the echo,
-which ruin energy detectors, cancel, and its law under noise is known: y / |y| is then uniform on
-the complex unit sphere. For one direction gamma would be Beta(1, P - 1). The maximum over all
-directions exceeds t when the path u -> gamma(u) starts above t or crosses it upwards, and the mean
-number of upcrossings follows from Rice's formula on the sphere::
+which ruin energy detectors, cancel, and its distribution under noise is known: y / |y| is then
+uniform on the complex unit sphere. For one direction gamma would be Beta(1, P - 1). The maximum
+over all directions exceeds t when the path u -> gamma(u) starts above t or crosses it upwards, and
+the mean number of upcrossings follows from Rice's formula on the sphere::
 
     Pr(gamma > t) <= (1 - t)^(P-1) [1 - s]+ + min(1, s) E(t)
     E(t) = 2 sqrt(pi) sqrt((P^2 - 1) / 12) Gamma(P) / Gamma(P - 1/2) sqrt(t) (1 - t)^(P - 3/2)
 
 where s = 2 spacing is the share of the circle of phases that directions reach. At levels that
 only one excursion can pass, which all useful thresholds are, this is an equality (for P = 2 at all
-levels). Thresholds for the mean of several bins come from convolving this law.
+levels). Thresholds for the mean of several bins come from convolving this distribution.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def coherence(
     peak, place = np.empty(len(iq)), np.empty(len(iq))
     row = np.empty(len(grid))
     beam_peaks(form, np.cos(phase), np.sin(phase), row, row.copy(), peak, place)
-    known = np.isfinite(power) & (power > 0.0)
-    peak = np.minimum(peak / (staves * np.where(known, power, 1.0)), 1.0)
+    usable = np.isfinite(power) & (power > 0.0)
+    peak = np.minimum(peak / (staves * np.where(usable, power, 1.0)), 1.0)
     sine = grid[0] + place * (grid[1] - grid[0])
-    return np.where(known, peak, np.nan), np.where(known, sine, np.nan)
+    return np.where(usable, peak, np.nan), np.where(usable, sine, np.nan)
 
 
 def refined_peak(spectrum: FloatArray, grid: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -5,11 +5,11 @@ and comes up again. Looking up and looking down with the array and correlating t
 echo at the two-way time of each layer.
 
 Conventions
-    Fourier transform exp(-i w t). Phone 0 is the deepest, phone m stands h_m above it; steering
-    vector w_m = exp(+i k h_m), k = w / c: noise going down is p = w, the echo of a layer H below
-    phone 0 is a exp(-i k (h_m + 2 H)), a phase that is exp(-i 2 k H) times conj(w). The echo then
-    lies at the time +2 H / c, so that depth is z = z_ref + c t / 2 with z_ref the depth of phone
-    0, and nothing else. Down is positive.
+    Fourier transform exp(-i w t). Hydrophone 0 is the deepest, hydrophone m stands h_m above it;
+    steering vector w_m = exp(+i k h_m), k = w / c: noise going down is p = w, the echo of a layer
+    H below hydrophone 0 is a exp(-i k (h_m + 2 H)), a phase that is exp(-i 2 k H) times conj(w).
+    The echo then lies at the time +2 H / c, so that depth is z = z_ref + c t / 2, where z_ref is
+    the depth of hydrophone 0. Down is positive.
 
 Processors, R (F, M, M) the cross-spectral density, w_+ = w, w_- = conj(w)
     conventional  C = w^T R w                   P_+- = w_+-^H R w_+-
@@ -49,7 +49,7 @@ _LOADINGS = (1e-6, 1e2)
 
 
 def steering(frequency: ArrayLike, heights: ArrayLike, sound_speed: float) -> ComplexArray:
-    """w (F, M) at `frequency` (F,) Hz for phones `heights` (M,) m above the deepest."""
+    """w (F, M) at `frequency` (F,) Hz for hydrophones `heights` (M,) m above the deepest."""
     k = 2.0 * np.pi * np.asarray(frequency, np.float64) / sound_speed
     return np.exp(1j * k[:, None] * np.asarray(heights, np.float64))
 
@@ -64,8 +64,9 @@ def conventional(csdm: ComplexArray, w: ComplexArray) -> tuple[ComplexArray, Flo
 def mvdr(
     csdm: ComplexArray, w: ComplexArray, loading: float | FloatArray
 ) -> tuple[ComplexArray, FloatArray]:
-    """C (F,) and sqrt(P_+ P_-) (F,) with `loading` in units of the mean phone power, a number or
-    one a frequency. Raises numpy.linalg.LinAlgError when a loaded matrix is singular."""
+    """C (F,) and sqrt(P_+ P_-) (F,) with `loading` in units of the mean power of a hydrophone, one
+    number or one per frequency. Raises numpy.linalg.LinAlgError when a loaded matrix is singular.
+    """
     M = csdm.shape[-1]
     power = np.einsum('fmm->f', csdm).real / M
     ridge = np.asarray(loading * power)[:, None, None].astype(csdm.dtype)
@@ -80,8 +81,9 @@ def mvdr(
 
 
 def white_noise_loading(csdm: ComplexArray, w: ComplexArray, gain_db: float) -> FloatArray:
-    """The least loading (F,), in units of the mean phone power, with which the white-noise gain
-    1 / |weights|^2 of both beams is within `gain_db` (negative) of its greatest value M.
+    """The least loading (F,), in units of the mean power of a hydrophone, with which the gain
+    against white noise 1 / |weights|^2 of both beams is within `gain_db` (negative) of its
+    greatest value M.
 
     The gain grows with the loading, which is bisected on a logarithmic scale from 1e-6 to 1e2, to
     one per cent.
@@ -176,11 +178,6 @@ def noise_sigma(b: FloatArray) -> float:
     if not len(finite):
         return float('nan')
     return float(np.median(np.abs(finite - np.median(finite)))) / _MAD_OF_UNIT_NORMAL
-
-
-def expected_noise_sigma(snapshots: float, frequencies: int) -> float:
-    """1 / sqrt(2 L F): what `noise_sigma` of the conventional processor should be."""
-    return 1.0 / float(np.sqrt(2.0 * snapshots * frequencies))
 
 
 def _form(left: ComplexArray, R: ComplexArray, right: ComplexArray) -> ComplexArray:

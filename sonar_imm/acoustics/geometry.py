@@ -214,10 +214,11 @@ class Rates(NamedTuple):
 def rates(
     m: FloatArray, velocity: FloatArray, turn_rate: FloatArray, R: FloatArray, model: str = 'plane'
 ) -> Rates:
-    """How the echo of a fixed point m (..., 3) changes while the sonar moves: eq. (3), (4).
+    """Oracle for tests of `predict`: how the echo of a fixed point m (..., 3) changes while the
+    sonar moves, eq. (3), (4).
 
     velocity (..., 3) and turn_rate (..., 3) are the sonar's own, in its frame: ``dm/dt = -V -
-    omega x m``. Kept as documentation and to test `predict`, with which it agrees to first order:
+    omega x m``. `predict` agrees with it to first order:
     the Euler step the paper takes with it is off by 0.003, 0.011, 0.07 and 0.27 degrees rms of
     azimuth at 0.1, 0.2, 0.5 and 1 s, which is more than an obstacle's vertical offset shows.
     """

@@ -1,4 +1,4 @@
-"""The observation law beside known interferers: echoes by way of the surface, other sonars.
+"""The likelihood beside known interferers: echoes by way of the surface, other sonars.
 
 An interferer of variance sb2 from a known direction b is noise with a structure. With several of
 them the noise covariance is R = sn2 I + sum_b sb2 a_b a_b^H, and Gamma = ss2 a a^H + R. Whitening
@@ -76,12 +76,12 @@ def interfered_log_likelihood(
     signal_variance: float,
     covariance: ComplexArray,
     step: float,
-    law: str = 'laplace',
+    likelihood: str = 'laplace',
 ) -> FloatArray:
-    """Log likelihood of direction sines (...) given one snapshot y (P,) and its noise covariance
-    (P, P), less what does not depend on the direction; -inf for NaN.
+    """Oracle for tests: log likelihood of direction sines (...) given one snapshot y (P,) and its
+    noise covariance (P, P), less what does not depend on the direction; -inf for NaN.
 
-    By linear algebra from the definition: slow, and what the kernels are tested against.
+    By linear algebra from the definition, which is slow.
     """
     y = np.asarray(y, np.complex128)
     u = np.asarray(sines, np.float64)
@@ -90,7 +90,8 @@ def interfered_log_likelihood(
     gamma = covariance + signal_variance * a[..., :, None] * a[..., None, :].conj()
     solved = np.linalg.solve(gamma, np.broadcast_to(y[:, None], (*u.shape, staves, 1)))[..., 0]
     q = (y.conj() * solved).sum(axis=-1).real
-    density = log_density(q, staves) if law == 'laplace' else gaussian_log_density(q, staves)
+    laplace = likelihood == 'laplace'
+    density = log_density(q, staves) if laplace else gaussian_log_density(q, staves)
     determinant = np.linalg.slogdet(gamma)[1] - np.linalg.slogdet(covariance)[1]
     return np.where(np.isnan(u), IMPOSSIBLE, density - determinant)
 
@@ -102,6 +103,6 @@ def coherence_beside(form: InterferenceForm, spacing: float) -> FloatArray:
     phase = phase_step(spacing) * direction_grid(staves, spacing)
     waves = np.exp(-1j * np.arange(staves)[:, None] * phase)
     beam, spread = (form.beam @ waves).real, (form.spread @ waves).real
-    known = np.isfinite(form.base) & (form.base > 0.0)
-    share = (beam / np.maximum(spread, 1e-300)).max(axis=1) / np.where(known, form.base, 1.0)
-    return np.where(known, np.minimum(share, 1.0), np.nan)
+    usable = np.isfinite(form.base) & (form.base > 0.0)
+    share = (beam / np.maximum(spread, 1e-300)).max(axis=1) / np.where(usable, form.base, 1.0)
+    return np.where(usable, np.minimum(share, 1.0), np.nan)

@@ -12,7 +12,7 @@ is laid along the measured line of sight, and what must vanish is the mean error
 *given the measurement*. There the true bearing scatters around the measured one, the truth
 averages to **lambda times** the measured position, and this is the conversion used here (modified
 unbiased conversion: Duan, Han, Li, "Comments on 'Unbiased converted measurements for tracking'",
-IEEE Trans. AES 40(4), 2004). Its covariance is that of the same conditional law, exact for
+IEEE Trans. AES 40(4), 2004). Its covariance is that of the same conditional density, exact for
 Gaussian noise and positive definite at any range.
 
 Angles in radians, counter-clockwise from +x. Everything is vectorised over leading axes.
@@ -49,8 +49,8 @@ def unbiased_polar_to_cartesian(
 def linearised_polar_to_cartesian(
     range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike, var_bearing: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """The conventional conversion, biased at long range: position (..., 2) and first-order
-    covariance (..., 2, 2)."""
+    """Oracle for tests: the conventional conversion, biased at long range, to position (..., 2)
+    and first-order covariance (..., 2, 2)."""
     r = np.asarray(range_, np.float64)
     return _along_bearing(
         r,

@@ -1,6 +1,6 @@
 """Directions without a tracker: what every array offers, and what tracking has to beat.
 
-Each estimator takes the snapshots iq (n, P) of one ping and gives one direction sine a bin, from
+Each estimator takes the snapshots iq (n, P) of one ping and gives one direction sine per bin, from
 the bin and its `half_width` neighbours to either side, which share one sample covariance
 R = mean y y^H:
 

@@ -1,4 +1,4 @@
-"""Cross-spectral density matrices from the pressure at many phones, as it streams in.
+"""Cross-spectral density matrices from the pressure at many hydrophones, as it streams in.
 
 Pressure arrives in blocks of any length. It is cut into snapshots of `length` samples that overlap
 by half (or as told), each is weighted by a window and Fourier transformed with exp(-i w t), and
@@ -8,7 +8,7 @@ the outer products of the snapshots at each frequency are averaged::
     average = BlockAverage(count)        # spectra -> R (F, M, M) once `count` are in, then anew
     average = SlidingAverage(count, step)  # the same over the last `count`, every `step`
 
-R_ij = <p_i conj(p_j)>. The average of one batch is one matrix product a frequency, which costs a
+R_ij = <p_i conj(p_j)>. The average of one batch is one matrix product per frequency, which costs a
 tenth of as many outer products.
 """
 
@@ -90,11 +90,12 @@ class SnapshotStream:
 
     def push(self, pressure: NDArray) -> ComplexArray:
         """Spectra (k, F, M) complex64 of the snapshots that `pressure` (n, M) completes; k may be
-        0. ValueError when the number of phones changes; call `restart` then, and after a gap."""
+        0. ValueError when the number of hydrophones changes; call `restart` then, and after a
+        gap."""
         block = np.asarray(pressure, np.float32)
         if self._left is not None:
             if self._left.shape[1] != block.shape[1]:
-                raise ValueError('the number of phones changed')
+                raise ValueError('the number of hydrophones changed')
             block = np.concatenate([self._left, block])
         count = max(0, (len(block) - self.length) // self.hop + 1)
         self._left = block[count * self.hop :].copy()
@@ -115,13 +116,13 @@ class SnapshotStream:
     def _transform(self, snapshot: NDArray[np.float32]) -> ComplexArray:
         import scipy.fft  # unlike numpy's, it stays in single precision
 
-        # One phone after the other: transforms of contiguous rows are twice as fast.
+        # One hydrophone after the other: transforms of contiguous rows are twice as fast.
         rows = np.ascontiguousarray((snapshot * self._window).T)
         return np.asarray(scipy.fft.rfft(rows, axis=1).T[self.rows])
 
 
 def outer_sum(spectra: ComplexArray) -> ComplexArray:
-    """sum_k p p^H (F, M, M) of spectra (k, F, M): one matrix product a frequency."""
+    """sum_k p p^H (F, M, M) of spectra (k, F, M): one matrix product per frequency."""
     columns = np.ascontiguousarray(spectra.transpose(1, 2, 0))
     return np.matmul(columns, columns.conj().swapaxes(1, 2))
 

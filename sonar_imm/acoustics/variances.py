@@ -1,4 +1,4 @@
-"""How strong echo and noise are in each range bin: the two numbers the observation law needs.
+"""How strong echo and noise are in each range bin: the two numbers the likelihood needs.
 
 The noise is best measured where no echo can be, in the water above the first return
 (`noise_variance`); failing that, the smaller eigenvalues of local sample covariances give it
@@ -7,7 +7,7 @@ the window. The signal is what a moving mean of the power has above the noise. A
 error in the signal hardly matter; the noise sets the width of the likelihood and does.
 
 Conventions
-    iq (n, P) complex, one row a range bin; usable (n,) bool; variances are per stave, in the
+    iq (n, P) complex, one row per range bin; usable (n,) bool; variances are per stave, in the
     squared units of iq: E|y_p|^2 = signal + noise.
 """
 

@@ -18,6 +18,7 @@ from typing import NoReturn
 import click
 
 from .. import __version__
+from ..threads import one_blas_thread
 from .lazy import LazyGroup, READER_GONE
 
 PROGRAM = 'sonar-imm'
@@ -55,6 +56,7 @@ def command(ctx: click.Context) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and give its exit code. The only place that prints errors."""
+    one_blas_thread()
     with _signals_unwind():
         return _run(arguments)
 

@@ -60,32 +60,10 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
     return float(low) / count, float(high) / count
 
 
-def normal_interval(
-    mean: FloatArray, standard_deviation: FloatArray, probability: float
-) -> tuple[FloatArray, FloatArray]:
-    """Ends of the central interval that holds a Gaussian with `probability`."""
-    from scipy.stats import norm
-
-    half = float(norm.ppf(0.5 * (1.0 + probability))) * standard_deviation
-    return mean - half, mean + half
-
-
 def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> float:
     """Share of `truth` inside [low, high], NaN when there is none."""
     inside = (low <= truth) & (truth <= high)
     return float(np.mean(inside)) if inside.size else math.nan
-
-
-def coverage_bounds(
-    count: int, probability: float, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Two-sided bounds of `interval_coverage` for `count` independent intervals that each hold the
-    truth with `probability` (binomial)."""
-    from scipy.stats import binom
-
-    tail = 0.5 * (1.0 - confidence)
-    low, high = binom.ppf(tail, count, probability), binom.ppf(1.0 - tail, count, probability)
-    return float(low) / count, float(high) / count
 
 
 class Whiteness(NamedTuple):

@@ -6,10 +6,10 @@ formulas give a matrix with negative eigenvalues. Joseph's form is no cure: it s
 rounding did to the gain.
 
 So every covariance keeps to one stated limit. It is *sound* when no eigenvalue of its correlation
-matrix is below `LIMIT`: then Cholesky's method finds a factor in whatever order it rounds. (A
-component without variance is sound when it has no covariance either.)
-`propagate` and `correct` compute in covariance form, which is the fastest, and try Cholesky's
-method on what they get. Where the limit is passed they repair, which is told, so that callers can count:
+matrix is below `LIMIT`: then Cholesky's method finds a factor, in whatever order it rounds. (A
+component without variance is sound when it has no covariance either.) `propagate` and `correct`
+compute in covariance form, which is the fastest, and try Cholesky's method on what they get. Where
+the limit is passed they repair, and tell, so that callers can count:
 
 1. The step is computed again in square-root form, from ``P = L L'``. The result is a sum of
    squares whose rounding is small beside its *own* diagonal, however small that has become.
@@ -33,8 +33,9 @@ import numpy as np
 from .arrays import BoolArray, FloatArray
 
 LIMIT = 1e-14
-"""Least eigenvalue of a correlation matrix. Cholesky's method is sure of n (n + 1) / 2^53 of it, 2e-15
-for four states, so that up to eight states a sound covariance has a factor."""
+"""Least eigenvalue of a correlation matrix. Rounding in Cholesky's method changes it by at most
+n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a sound covariance has a
+factor."""
 
 LIFT = 1e-13
 """What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
@@ -174,8 +175,9 @@ def _correct_root(
     [[R^1/2, H L], [0, L]] is turned into [[S^1/2, 0], [K S^1/2, L']] by an orthogonal matrix.
     """
     m, n = H.shape[-2:]
-    finite = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2))
-    finite &= np.isfinite(R).all(axis=(1, 2))
+    finite: BoolArray = np.ones(len(P), np.bool_)
+    for each in (P, H, R):
+        finite &= np.isfinite(each).all(axis=(1, 2))
     safe = [np.where(finite[:, None, None], each, 0.0) for each in (P, H, R)]
     root, noise = semidefinite_root(safe[0]), semidefinite_root(safe[2])
     seen = safe[1] @ root
@@ -206,5 +208,5 @@ def _triangular(
     A = np.zeros((len(root), m + n, m + n + m))
     A[:, :m, :m], A[:, :m, m : m + n], A[:, m:, m : m + n] = noise, seen, root
     A[:, range(m), range(m + n, m + n + m)] = np.sqrt(lifted)
-    T = transpose(np.linalg.qr(transpose(A), 'r'))
+    T = transpose(np.asarray(np.linalg.qr(transpose(A), 'r')))
     return np.asarray(T * np.where(_diagonal(T) < 0.0, -1.0, 1.0)[:, None])

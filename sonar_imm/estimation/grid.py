@@ -1,6 +1,6 @@
 """Point masses: the exact filter and smoother for a jump Markov system of one state.
 
-With one state the densities need no approximation but a fine ruler. Probability sits on the cells
+With one state the densities need no approximation but a fine grid. Probability sits on the cells
 x_g = x_0 + g step; ``p (M, G)`` is the joint probability of model j and cell g, all models
 together summing to one. A cycle is that of every multiple-model filter, with sums for integrals::
 
@@ -39,8 +39,8 @@ class Filtered(NamedTuple):
 
 
 def walk_matrix(cells: int, sigma: float) -> FloatArray:
-    """W[h, g] (G, G): probability of going from cell h to g, `sigma` in cells. Rows far from the
-    ends sum to one; near them probability leaves the grid."""
+    """Oracle for tests: W[h, g] (G, G), the probability of going from cell h to g, `sigma` in
+    cells. Rows far from the ends sum to one; near them probability leaves the grid."""
     if not sigma > 0.0:
         return np.eye(cells)
     lag = np.arange(cells)
@@ -51,8 +51,8 @@ def walk_matrix(cells: int, sigma: float) -> FloatArray:
 def filter_densities(
     start: FloatArray, transition: FloatArray, sigma: FloatArray, log_likelihood: FloatArray
 ) -> Filtered:
-    """Filter T steps. start (M, G) before the first step; sigma (T, M) in cells; log_likelihood
-    (T, G)."""
+    """Oracle for tests: filter T steps. start (M, G) before the first step; sigma (T, M) in cells;
+    log_likelihood (T, G)."""
     T, G = log_likelihood.shape
     density, log_sums = np.empty((T, *start.shape)), np.empty(T)
     p = start
@@ -70,7 +70,7 @@ def filter_densities(
 def smooth_densities(
     density: FloatArray, transition: FloatArray, sigma: FloatArray, log_likelihood: FloatArray
 ) -> FloatArray:
-    """Smoothed densities (T, M, G) from the filtered ones; arguments as in
+    """Oracle for tests: smoothed densities (T, M, G) from the filtered ones; arguments as in
     `filter_densities`."""
     T, M, G = density.shape
     smoothed, beta = density.copy(), np.ones((M, G))

@@ -7,7 +7,7 @@ are garbage and never read.
 A walk with a large sigma would cost cells times sigma. It is smooth, so it is computed on every
 c-th cell only: probability is handed to the coarse cells with the weights of cubic interpolation,
 which keep its first four moments, walks there, and is interpolated back. With at least
-`COARSE_SIGMA` coarse cells a sigma the error is below 1e-4 of the peak.
+`COARSE_SIGMA` coarse cells per sigma the error is below 1e-4 of the peak.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ def walk(
     out_low: int,
     out_high: int,
 ) -> None:
-    """Spread source [low, high) by a normal law of `sigma` cells into out [out_low, out_high),
-    which is overwritten. scratch (7, max(G, 128) + 16) for a grid of G cells, whatever sigma is.
+    """Spread source [low, high) by a normal distribution of `sigma` cells into out [out_low,
+    out_high), which is overwritten. scratch (7, max(G, 128) + 16) for a grid of G cells, whatever
+    sigma is.
     """
     sigma = sigma if sigma < WIDEST else WIDEST  # NaN too
     for g in range(out_low, out_high):

@@ -30,8 +30,8 @@ from .small_matrices import (
 
 LOG_2PI = math.log(2.0 * math.pi)
 
-MOST_CANCELLED = 1e8
-"""A second moment this much larger than the variance it leaves has lost half of its digits."""
+CANCELLED, MOST_CANCELLED = 10.0, 1e8
+"""A second moment so many times the variance it leaves has lost a digit, or half of all digits."""
 
 
 @kernel
@@ -77,13 +77,15 @@ def mix(
                     e[a] += w * d[i, a]
                 for k in range(n * n):
                     total[k] += w * moment[i, k]
-            exact = True
+            most = 0.0
             for a in range(n):
                 x0[t, j, a] = centre[a] + e[a]
                 for b in range(n):
                     P0[t, j, a, b] = total[a * n + b] - e[a] * e[b]
-                exact = exact and total[a * n + a] <= MOST_CANCELLED * P0[t, j, a, a]
-            if not (exact and sound(P0[t, j], L)):
+                if not total[a * n + a] <= most * P0[t, j, a, a]:
+                    positive = P0[t, j, a, a] > 0.0
+                    most = total[a * n + a] / P0[t, j, a, a] if positive else np.inf
+            if not (most <= CANCELLED or (most <= MOST_CANCELLED and sound(P0[t, j], L))):
                 _mix_directly(x[t], P[t], W, mu[t], reach, x0[t, j], P0[t, j])
     return x0, P0, c
 

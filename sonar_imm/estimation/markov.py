@@ -5,6 +5,14 @@ Convention: ``P[i, j] = Pr(model j at k | model i at k-1)``; rows sum to one.
 A chain is stated at a reference step, but measurements of a sonar come at irregular times.
 `RateChain` turns the matrix into a generator once, ``P(step) = expm(G step)``, and gives ``P(dt)``
 for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation` corrects a chain by data.
+
+``P(dt)`` is computed by uniformisation: with the largest rate q, ``U = I + G / q`` is itself a
+transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` is a mixture of its powers, which are
+kept. No term is negative, so there is nothing to cancel, and no eigenvector is asked for, so a
+defective generator is nothing special. A long step is halved until ``q h <= 1`` and the result
+squared.
+
+Reference: Stewart, *Introduction to the Numerical Solution of Markov Chains* (1994), ch. 8.
 """
 
 from __future__ import annotations
@@ -18,6 +26,8 @@ from numpy.typing import ArrayLike
 from .arrays import FloatArray
 
 _CACHED_STEPS = 256
+_TERMS = 24
+"""Of the series for at most one event a step, whose tail is then below 1e-24."""
 
 
 def check_transition_matrix(
@@ -38,7 +48,8 @@ def check_transition_matrix(
 
 
 def stationary_law(P: FloatArray) -> FloatArray:
-    """The stationary distribution (M,): pi P = pi. ValueError when there is more than one."""
+    """Oracle for tests: the stationary distribution (M,), pi P = pi. ValueError when there is more
+    than one."""
     M = len(P)
     system = np.vstack([P.T - np.eye(M), np.ones(M)])
     if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
@@ -64,14 +75,16 @@ class RateChain:
         self.matrix = check_transition_matrix(matrix)
         self.step = float(step)
         self.generator = _generator(self.matrix, self.step)
-        self.residual = float(np.abs(_expm(self.generator * self.step) - self.matrix).max())
+        self._fastest = float(np.abs(self.generator).max())
+        self._powers = _powers(self.generator, self._fastest)
         self._cache: OrderedDict[float, FloatArray] = OrderedDict()
+        self.residual = float(np.abs(self._exponential(self.step) - self.matrix).max())
 
     def transition(self, dt: float) -> FloatArray:
         """P(dt), (M, M), read-only. The matrix as given when dt is the reference step and it is
         embeddable."""
-        if not dt >= 0.0:
-            raise ValueError(f'a time step cannot be negative, got {dt}')
+        if not 0.0 <= dt < math.inf:
+            raise ValueError(f'a time step is finite and cannot be negative, got {dt}')
         found = self._cache.get(dt)
         if found is None:
             found = self._compute(dt)
@@ -84,26 +97,37 @@ class RateChain:
     def _compute(self, dt: float) -> FloatArray:
         if dt == self.step and self.residual < 1e-9:
             return self.matrix.copy()
-        # The exponential of a short step is accurate for any rates. Squaring it leads to the full
-        # step; rows are kept at a sum of one so that they cannot drift.
-        rate = float(np.abs(self.generator).max()) * dt
-        halvings = max(0, math.ceil(math.log2(rate))) if rate > 1.0 else 0
-        P = _stochastic(_expm(self.generator * (dt / 2.0**halvings)))
+        return self._exponential(dt)
+
+    def _exponential(self, dt: float) -> FloatArray:
+        events = self._fastest * dt
+        halvings = max(0, math.ceil(math.log2(events))) if events > 1.0 else 0
+        mixture = _poisson(events / 2.0**halvings) @ self._powers
+        P = _stochastic(mixture.reshape(self.matrix.shape))
         for _ in range(halvings):
             P = _stochastic(P @ P)
         return P
 
 
 def _stochastic(P: FloatArray) -> FloatArray:
-    P = np.clip(P, 0.0, None)
-    return np.asarray(P / P.sum(axis=1, keepdims=True))
+    """Rows that add up to one but for rounding, made to: an error kept would grow with P @ P."""
+    return np.asarray(P / P.sum(axis=-1, keepdims=True))
 
 
-def _expm(matrix: FloatArray) -> FloatArray:
-    # Imported late: scipy.linalg costs start-up time that fixed steps do not need.
-    from scipy.linalg import expm
+def _powers(generator: FloatArray, fastest: float) -> FloatArray:
+    """U^0, U^1, ... as rows (_TERMS, M M), U = I + G / fastest."""
+    M = len(generator)
+    U = np.eye(M) + generator / fastest if fastest > 0.0 else np.eye(M)
+    U = _stochastic(np.clip(U, 0.0, None))
+    powers = [np.eye(M)]
+    for _ in range(_TERMS - 1):
+        powers.append(_stochastic(powers[-1] @ U))
+    return np.reshape(powers, (_TERMS, M * M))
 
-    return np.asarray(expm(matrix), dtype=np.float64)
+
+def _poisson(mean: float) -> FloatArray:
+    """Pr(k events), k = 0 .. _TERMS - 1, but for a factor that all have."""
+    return np.cumprod(np.concatenate([[1.0], mean / np.arange(1, _TERMS)]))
 
 
 def _generator(P: FloatArray, step: float) -> FloatArray:

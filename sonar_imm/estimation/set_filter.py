@@ -1,8 +1,8 @@
 """The filter of `set_particles`, run: one record after the other, on any number of threads.
 
-`SetFilter.step` is pure: it takes what was known before a record and gives what is known after,
-so that a record can be tried without being committed to (a preview), and what is known at one
-record can be looked at again when later ones are in (`LagSmoother`).
+`SetFilter.step` is pure: it takes the weighted sets before a record and gives those after it. A
+record can therefore be tried without being taken in (a preview), and the sets at one record can be
+weighted again when later records are in (`LagSmoother`).
 
 Random numbers are counter based: those of a record come from a Philox generator whose key is the
 seed and the record's own name (its stamp), and each particle has its row of them. The result is
@@ -30,14 +30,14 @@ _STEP, _START, _RESAMPLE = range(3)
 
 
 class Weighted(NamedTuple):
-    """Sets with log weights (N,) that need not be normalised: what is known between records."""
+    """Sets with log weights (N,) that need not be normalised: the state between records."""
 
     sets: Sets
     log_weight: FloatArray
 
 
 @frozen(eq=False)
-class Step:
+class SetStep:
     """One record taken in.
 
     sets: weighted by w (N,), summing to one; amplitude (N, J) given each set, in units of the
@@ -87,7 +87,7 @@ class SetFilter:
         )
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> Step:
+    def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> SetStep:
         """Take in the record b (n,), in units of its noise. before: None before the first record.
         key: seed and name of the record, each in 0 .. 2^64 - 1."""
         if before is None:
@@ -105,7 +105,7 @@ class SetFilter:
             log_weight = np.zeros(self.particles)
         after = self._remembered(sets.take(source), amplitude[source])
         evidence = float(log_sum - log_before)
-        return Step(
+        return SetStep(
             sets, w, amplitude, Weighted(after, log_weight), source, evidence, effective, ok
         )
 
@@ -115,7 +115,7 @@ class SetFilter:
         step = SetFilter(self.model, 8).step(None, b, (0, 0))
         self.summary(step, step.w, step.sets)
 
-    def summary(self, step: Step, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
+    def summary(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
         """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
         pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
@@ -189,14 +189,14 @@ class SetFilter:
 
 
 class LagSmoother:
-    """What was known `lag` records ago, seen with all that came since: each particle of today is
-    traced to its ancestor of then (fixed-lag smoothing by surviving lines)."""
+    """Fixed-lag smoothing by surviving lines: each of the newest particles is traced to its
+    ancestor `lag` records ago, which gets its weight."""
 
     def __init__(self, lag: int):
         self.lag = lag
-        self._steps: deque[Step] = deque(maxlen=lag + 1)
+        self._steps: deque[SetStep] = deque(maxlen=lag + 1)
 
-    def push(self, step: Step) -> tuple[Step, FloatArray] | None:
+    def push(self, step: SetStep) -> tuple[SetStep, FloatArray] | None:
         """The step `lag` records before this one and the weights (N,) its sets now have; None
         while there is none, and after a record that nothing explained."""
         if not step.ok:

@@ -1,4 +1,4 @@
-"""From many weighted sets to one list of members, each with what is known of it.
+"""From many weighted sets to one list of members, each with its moments and its existence.
 
 The **intensity** of the particles, how many members are expected on each cell, has a hill for each
 member. No set has two members closer than the separation, so the intensity summed over a window

@@ -38,17 +38,17 @@ The record
 
     A set that needs an amplitude that is not positive is impossible.
 
-Proposals look at the record first
+Data-driven proposals
     A move is drawn from ``share * K(z' - z) exp(g(z')) / Z(z) + (1 - share) * K(z' - z)``, with
     ``g = max(b, 0)^2 / 2`` (what one thing alone would be worth); of the births a share is drawn
     in proportion to ``exp(min(g, cap))`` and the rest uniformly, at the places that those already
     there leave free. The cap lets a weak peak have births beside a strong one; the uniform rest
-    bounds the weight of a birth nobody looked for. Each draw is paid for by the exact ratio of
-    model to proposal, so proposals change how many particles are needed and nothing else. Shares
-    of zero make the bootstrap filter: with eight sharp peaks in a record, all but a handful of its
-    particles are lost at every step.
+    bounds the weight of a birth where the record shows nothing. Each draw is weighted by the exact
+    ratio of model to proposal, so proposals change how many particles are needed and nothing else.
+    Shares of zero make the bootstrap filter: with eight sharp peaks in a record, all but a handful
+    of its particles are lost at every step.
 
-The random numbers, uniform in [0, 1), are given, one row a particle: ``uniform (N, 1 + c + J)``
+The random numbers, uniform in [0, 1), are given, one row per particle: ``uniform (N, 1 + c + J)``
 for the order, the c things that can come or go at once, and the J things that can move. Row i is
 all that particle i uses, so that particles may be worked on in any order, by any number of
 threads.
@@ -207,7 +207,7 @@ def gain(b: FloatArray) -> FloatArray:
 
 
 def propose(model: SetModel, b: FloatArray) -> Proposals:
-    """The tables for the record b (n,)."""
+    """Oracle for tests: the tables for the record b (n,)."""
     n, radius = model.cells, len(model.move) // 2
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
@@ -232,7 +232,8 @@ def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
-    """Sets before the first record, drawn where it will want them, and the log ratio (N,).
+    """Oracle for tests: sets before the first record, drawn where it will want them, and the log
+    ratio (N,).
 
     uniform (N, 1 + J): the order, and one for each member.
     """
@@ -256,8 +257,8 @@ def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[S
 def propagate(
     model: SetModel, proposals: Proposals, sets: Sets, uniform: FloatArray
 ) -> tuple[Sets, FloatArray]:
-    """Steps 1 to 5 of the model: the new sets and the log ratio (N,) of model to proposal, -inf
-    for impossible sets (whose members mean nothing)."""
+    """Oracle for tests: steps 1 to 5 of the model, the new sets and the log ratio (N,) of model to
+    proposal, -inf for impossible sets (whose members mean nothing)."""
     N, changes = len(uniform), model.most_changes
     cumulative = np.cumsum(model.transition, axis=1)
     new = Sets.empty(model, N)
@@ -320,8 +321,9 @@ def _birth(model: SetModel, proposals: Proposals, places: list[int], uniform: fl
 
 
 def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-    """log likelihood (N,) of the record against that of an empty one, -inf where an amplitude is
-    not positive, and the amplitudes (N, J), their mean given the set, in units of the noise."""
+    """Oracle for tests: log likelihood (N,) of the record against that of an empty one, -inf where
+    an amplitude is not positive, and the amplitudes (N, J), their mean given the set, in units of
+    the noise."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
     for m in np.unique(sets.order[sets.order > 0]):

@@ -39,24 +39,22 @@ def cholesky(S: FloatArray, L: FloatArray) -> bool:
 @kernel
 def sound(P: FloatArray, L: FloatArray) -> bool:
     """`covariance.sound` of one P (n, n); L (n, n) is scratch."""
+    # L D L' without square roots: L below the diagonal, L D above it, 1 / D on it.
     n = P.shape[0]
     for a in range(n):
+        rest = P[a, a] - LIMIT * P[a, a]
         for b in range(a):
             value = P[a, b]
             for k in range(b):
-                value -= L[a, k] * L[b, k]
-            if L[b, b] > 0.0:
-                L[a, b] = value / L[b, b]
-            elif P[a, b] == 0.0:
-                L[a, b] = 0.0
-            else:
+                value -= L[k, a] * L[b, k]
+            if L[b, b] == 0.0 and value != 0.0:
                 return False
-        value = P[a, a] - LIMIT * P[a, a]
-        for k in range(a):
-            value -= L[a, k] * L[a, k]
-        if value > 0.0 and value < np.inf:
-            L[a, a] = math.sqrt(value)
-        elif P[a, a] == 0.0 and value == 0.0:
+            L[b, a] = value
+            L[a, b] = value * L[b, b]
+            rest -= value * L[a, b]
+        if rest > 0.0 and rest < np.inf:
+            L[a, a] = 1.0 / rest
+        elif P[a, a] == 0.0 and rest == 0.0:
             L[a, a] = 0.0
         else:
             return False
@@ -107,6 +105,8 @@ def semidefinite_root(P: FloatArray, L: FloatArray) -> None:
             pivot -= L[b, k] * L[b, k]
         known = pivot <= LIMIT * P[b, b] or not pivot > 0.0
         L[b, b] = 0.0 if known else math.sqrt(pivot)
+        for a in range(b):
+            L[a, b] = 0.0
         for a in range(b + 1, n):
             value = P[a, b]
             for k in range(b):

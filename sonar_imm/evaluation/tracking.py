@@ -178,6 +178,10 @@ class OfflineRun:
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
+    def warnings(self) -> list[str]:
+        """What of the input cannot be true, as the tracker says it at the end."""
+        return list(getattr(self.tracker, 'warnings', list)())
+
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""
         return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
@@ -213,6 +217,7 @@ def write_run(
         **written,
         counts=offline.outcomes(),
         refused=offline.refusals(),
+        warnings=offline.warnings(),
         problems=list(offline.bag.problems),
         parameters=offline.tracker.config.as_dict(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},

@@ -1,7 +1,8 @@
-"""What the fathometer takes in: pressure at the phones of a vertical array, their cross-spectra,
-or ready-made traces; and the depth of the array, which a companion instrument may tell.
+"""What the fathometer takes in: pressure at the hydrophones of a vertical array, their
+cross-spectra, or ready-made traces; and the depth of the array, which a companion instrument may
+tell.
 
-Phones fail at sea. A phone that is silent, constant or not finite is *dead*: it is left out by
+Hydrophones fail at sea. One that is silent, constant or not finite is *dead*: it is left out by
 whoever uses the measurement (`alive`), and only when too few are left is the measurement refused.
 """
 
@@ -16,13 +17,13 @@ from numpy.typing import NDArray
 from ..estimation.arrays import FloatArray
 from .checks import check_stamp, complexes, floats, positives, Rejection
 
-MAX_SAMPLES, MAX_PHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
-LEAST_PHONES = 3
+MAX_SAMPLES, MAX_HYDROPHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
+LEAST_HYDROPHONES = 3
 DEEPEST = 12_000.0
 _SILENT = 1e-9
-"""A phone with so little of the median power of the others is dead."""
+"""A hydrophone with so little of the median power of the others is dead."""
 _HERMITIAN = 1e-3
-"""Largest asymmetry of a matrix, against the powers of the two phones."""
+"""Largest asymmetry of a matrix, against the powers of the two hydrophones."""
 
 
 def _depth(value: Any) -> float | None:
@@ -48,7 +49,7 @@ def _samples(value: Any) -> NDArray[np.float32]:
 
 @frozen(eq=False, kw_only=True)
 class ArrayDepth:
-    """How deep phone 0, the deepest, was at one instant: depth in m, down positive."""
+    """How deep hydrophone 0, the deepest, was at one instant: depth in m, down positive."""
 
     FRAME: ClassVar[str] = 'none'
 
@@ -119,12 +120,13 @@ class Trace:
 
 @frozen(eq=False, kw_only=True)
 class CrossSpectra:
-    """Cross-spectral density of the phones, averaged over snapshots.
+    """Cross-spectral density of the hydrophones, averaged over snapshots.
 
     frequency (F,) Hz, multiples of one spacing, increasing, some may be missing; csdm (F, M, M),
-    Hermitian, ``<p_i conj(p_j)>`` for exp(-i w t), phone 0 the deepest; snapshots: how many were
-    averaged, 0 when not known; reference_depth: of phone 0, m, None when not known.
-    alive (M,): phones that heard something; usable (F,): rows whose living phones are all finite.
+    Hermitian, ``<p_i conj(p_j)>`` for exp(-i w t), hydrophone 0 the deepest; snapshots: how many
+    were averaged, 0 when not known; reference_depth: of hydrophone 0, m, None when not known.
+    alive (M,): hydrophones that heard something; usable (F,): rows whose living hydrophones are
+    all finite.
     """
 
     stamp_ns: int
@@ -156,7 +158,7 @@ class CrossSpectra:
         return len(self.frequency)
 
     @property
-    def phones(self) -> int:
+    def hydrophones(self) -> int:
         return self.csdm.shape[-1]
 
     def _check_size(self) -> None:
@@ -170,7 +172,7 @@ class CrossSpectra:
             raise Rejection('too_short', f'the cross-spectra have {F} frequencies; 2 are needed')
         if F > MAX_FREQUENCIES:
             raise Rejection('too_large', f'{F} frequencies; at most {MAX_FREQUENCIES} are read')
-        _check_phones(M)
+        _check_hydrophones(M)
 
     def _check_frequencies(self) -> None:
         if not np.isfinite(self.frequency).all():
@@ -193,17 +195,17 @@ class CrossSpectra:
             if np.abs(normalised).max() > 1.0 + _HERMITIAN:
                 raise Rejection(
                     'not_positive',
-                    'the cross-spectra claim a coherence between phones above one',
+                    'the cross-spectra claim a coherence between hydrophones above one',
                 )
 
 
 @frozen(eq=False, kw_only=True)
 class Pressure:
-    """A block of samples of all phones.
+    """A block of samples of all hydrophones.
 
-    pressure (n, M) in any linear unit, phone 0 the deepest, samples that are not finite made zero;
-    sample_rate Hz; the stamp is that of the first sample; reference_depth: of phone 0, m, None
-    when not known. alive (M,): phones that are finite throughout and not constant.
+    pressure (n, M) in any linear unit, hydrophone 0 the deepest, samples that are not finite made
+    zero; sample_rate Hz; the stamp is that of the first sample; reference_depth: of hydrophone 0,
+    m, None when not known. alive (M,): hydrophones that are finite throughout and not constant.
     """
 
     stamp_ns: int
@@ -216,13 +218,15 @@ class Pressure:
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
         if self.pressure.ndim != 2:
-            raise Rejection('bad_shape', 'pressure needs a row a sample and a column a phone')
+            raise Rejection(
+                'bad_shape', 'pressure needs a row per sample and a column per hydrophone'
+            )
         n, M = self.pressure.shape
         if n < 2:
             raise Rejection('too_short', f'the block of pressure has {n} samples; 2 are needed')
         if n > MAX_SAMPLES:
             raise Rejection('too_large', f'{n} samples in a block; at most {MAX_SAMPLES} are read')
-        _check_phones(M)
+        _check_hydrophones(M)
         if not 1.0 <= self.sample_rate <= 1e7:
             raise Rejection(
                 'out_of_range',
@@ -240,7 +244,7 @@ class Pressure:
         return len(self.pressure)
 
     @property
-    def phones(self) -> int:
+    def hydrophones(self) -> int:
         return self.pressure.shape[1]
 
     @property
@@ -249,26 +253,28 @@ class Pressure:
         return round(len(self) * 1e9 / self.sample_rate)
 
 
-def _check_phones(M: int) -> None:
-    if not LEAST_PHONES <= M <= MAX_PHONES:
+def _check_hydrophones(M: int) -> None:
+    if not LEAST_HYDROPHONES <= M <= MAX_HYDROPHONES:
         raise Rejection(
-            'bad_phones', f'the array has {M} phones; {LEAST_PHONES} to {MAX_PHONES} are needed'
+            'bad_hydrophones',
+            f'the array has {M} hydrophones; {LEAST_HYDROPHONES} to {MAX_HYDROPHONES} are needed',
         )
 
 
 def _alive(power: FloatArray, what: str) -> NDArray[np.bool_]:
-    """Which phones live, from powers (rows, M), NaN where not finite. A phone of which more than
-    half of the rows are not finite is dead; of single rows the row is at fault."""
+    """Which hydrophones live, from powers (rows, M), NaN where not finite. A hydrophone of which
+    more than half of the rows are not finite is dead; of single rows the row is at fault."""
     lost = np.isnan(power).mean(axis=0) > 0.5
     total = np.nansum(power, axis=0)
     total[lost] = np.nan
     if lost.all():
-        raise Rejection('nan', f'{what}: no phone is finite')
+        raise Rejection('nan', f'{what}: no hydrophone is finite')
     if not np.nanmax(total) > 0.0:
-        raise Rejection('silent', f'{what}: every phone is silent')
+        raise Rejection('silent', f'{what}: every hydrophone is silent')
     alive = ~lost & (np.nan_to_num(total) > _SILENT * np.nanmedian(total[total > 0.0]))
-    if alive.sum() < LEAST_PHONES:
+    if alive.sum() < LEAST_HYDROPHONES:
         raise Rejection(
-            'dead_phones', f'{what}: {int(alive.sum())} phones live; {LEAST_PHONES} are needed'
+            'dead_hydrophones',
+            f'{what}: {int(alive.sum())} hydrophones live; {LEAST_HYDROPHONES} are needed',
         )
     return np.asarray(alive)

@@ -300,6 +300,7 @@ class TrackerNode(Node):
                 stale_after=self._node_config.stale_after,
                 counts=counts,
                 health=self.tracker.health(),
+                warnings=getattr(self.tracker, 'warnings', list)(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
             )

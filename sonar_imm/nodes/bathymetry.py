@@ -18,6 +18,11 @@ longer than ``max_wait``, and says so in /diagnostics, rather than show the floo
 
 from __future__ import annotations
 
+if __name__ == '__main__':
+    from ..threads import one_blas_thread
+
+    one_blas_thread()  # before numpy is imported
+
 import sys
 from typing import Any
 

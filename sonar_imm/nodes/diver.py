@@ -12,6 +12,11 @@ Hears ``fix`` and ``arrivals``. Besides ``~/estimate`` it publishes, for the new
 
 from __future__ import annotations
 
+if __name__ == '__main__':
+    from ..threads import one_blas_thread
+
+    one_blas_thread()  # before numpy is imported
+
 import sys
 from typing import Any
 

@@ -11,6 +11,11 @@ Besides, for the newest record or preview:
 
 from __future__ import annotations
 
+if __name__ == '__main__':
+    from ..threads import one_blas_thread
+
+    one_blas_thread()  # before numpy is imported
+
 import sys
 from typing import Any
 

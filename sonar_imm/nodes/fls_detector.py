@@ -6,6 +6,11 @@ what the obstacle node hears. It is a convenience: a detector that knows the son
 
 from __future__ import annotations
 
+if __name__ == '__main__':
+    from ..threads import one_blas_thread
+
+    one_blas_thread()  # before numpy is imported
+
 from collections import Counter
 import sys
 from typing import Any

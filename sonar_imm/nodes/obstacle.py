@@ -10,6 +10,11 @@ state only and of confirmed obstacles (also those that have left the beam):
 
 from __future__ import annotations
 
+if __name__ == '__main__':
+    from ..threads import one_blas_thread
+
+    one_blas_thread()  # before numpy is imported
+
 import sys
 from typing import Any
 

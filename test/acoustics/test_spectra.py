@@ -14,13 +14,13 @@ from sonar_imm.acoustics.spectra import (
     window_overlap,
 )
 
-LENGTH, PHONES = 64, 4
+LENGTH, HYDROPHONES = 64, 4
 
 
 def pressure(samples=1000, seed=0):
     rng = np.random.default_rng(seed)
     shared = rng.standard_normal((samples, 1))
-    return (shared + rng.standard_normal((samples, PHONES))).astype(np.float32)
+    return (shared + rng.standard_normal((samples, HYDROPHONES))).astype(np.float32)
 
 
 def spectra_of(p, cuts=()):
@@ -53,7 +53,7 @@ def test_a_restart_forgets_half_a_snapshot():
     stream.restart()
     assert len(stream.push(pressure(LENGTH - 1))) == 0
     with pytest.raises(ValueError):
-        stream.push(np.zeros((5, PHONES + 1)))
+        stream.push(np.zeros((5, HYDROPHONES + 1)))
 
 
 def test_block_averages_share_no_sample():

@@ -58,7 +58,7 @@ def test_the_drift_of_the_vectors_is_tracked_as_well_as_can_be(call, tmp_path):
 
 
 def test_hostile_records_of_a_bag_are_named_and_counted_and_the_rest_is_tracked(call, tmp_path):
-    """One dead phone in every other record, and of each kind of useless record one."""
+    """One dead hydrophone in every other record, and of each kind of useless record one."""
     scene = simulate(scenario('small', {'records': 6, 'fading': (), 'depth_companion': False}), 2)
     good = [one.measurement for one in scene.measurements]
     one = np.arange(6, dtype=np.float32)
@@ -96,8 +96,8 @@ def test_hostile_records_of_a_bag_are_named_and_counted_and_the_rest_is_tracked(
         'too_short': 1,
     }
     counts = run['counts']
-    assert counts['singular'] == 1 and counts['wrong_phones'] == 1
-    assert counts['dead_phones_masked'] == 3 and counts['used'] == 6
+    assert counts['singular'] == 1 and counts['wrong_hydrophones'] == 1
+    assert counts['dead_hydrophones_masked'] == 3 and counts['used'] == 6
     last = RunFolder(tmp_path / 'out').read_estimates()[-1]
     assert last.stamp_ns == good[-1].stamp_ns
     offset = np.abs(last.state[:, :1] - scene.truth[-1].depth)

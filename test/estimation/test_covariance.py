@@ -160,9 +160,9 @@ def test_a_perfect_component_and_one_repeated(engine):
 def test_models_that_are_sharp_and_far_apart_mix():
     """The compiled mix sums about the common mean; 1e7 m from it, nothing is left of 1e-6 m^2."""
     rng = np.random.default_rng(5)
-    x = rng.uniform(-1e7, 1e7, (4, 6, 3))
-    P = np.tile(1e-6 * np.eye(3), (4, 6, 1, 1))
-    mu, stay = np.full((4, 6), 1.0 / 6.0), np.eye(6)[None]
+    x = rng.uniform(-1e7, 1e7, (40, 6, 3))
+    P = np.tile(1e-6 * np.eye(3), (40, 6, 1, 1))
+    mu, stay = np.full((40, 6), 1.0 / 6.0), np.eye(6)[None]
     got, want = imm_kernels.mix(x, P, mu, stay), imm.mix(x, P, mu, stay)
     for P0 in (got[1], want.P):
         assert is_covariance(P0)

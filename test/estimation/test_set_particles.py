@@ -47,11 +47,11 @@ def model():
 
 def run(model, records, particles, seed, threads=1):
     """PMFs (T, orders), intensities (T, n), log evidence."""
-    tracker, known = SetFilter(model, particles, threads), None
+    tracker, before = SetFilter(model, particles, threads), None
     pmfs, intensities, evidence = [], [], 0.0
     for name, b in enumerate(records):
-        step = tracker.step(known, b, (seed, name))
-        known = step.after
+        step = tracker.step(before, b, (seed, name))
+        before = step.after
         pmf, sums = tracker.summary(step, step.w, step.sets)
         pmfs.append(pmf)
         intensities.append(sums[0])
@@ -107,7 +107,7 @@ def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch)
 
 
 def test_amplitudes_that_are_not_drawn_anew_at_random_are_paid_for(model, exact):
-    """Best amplitudes without a fine make too many members; with the paper's fine, too few."""
+    """Best amplitudes without a penalty make too many members; with the paper's, too few."""
     orders = np.arange(1, 4)
     mean = {
         name: (run(changed, exact['B'], 3000, seed=1)[0] @ orders).mean()
@@ -129,9 +129,9 @@ def test_threads_do_not_change_a_byte(model, exact):
 
 def test_a_record_has_random_numbers_of_its_own(model, exact):
     tracker = SetFilter(model, 500)
-    known = tracker.step(None, exact['B'][0], (3, 7)).after
-    again = [tracker.step(known, exact['B'][1], (3, 8)) for _ in range(2)]
-    other = tracker.step(known, exact['B'][1], (3, 9))
+    before = tracker.step(None, exact['B'][0], (3, 7)).after
+    again = [tracker.step(before, exact['B'][1], (3, 8)) for _ in range(2)]
+    other = tracker.step(before, exact['B'][1], (3, 9))
     assert again[0].w.tobytes() == again[1].w.tobytes() != other.w.tobytes()
 
 
@@ -151,21 +151,21 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     tracker, N = SetFilter(changed, 400), 400
     rng = np.random.default_rng(1)
     b = exact['B'][3]
-    known = tracker._start(b, (1, 2))
+    before = tracker._start(b, (1, 2))
     uniform = np.random.Generator(
         np.random.Philox(
             key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64)
         )
     ).random((N, 1 + changed.order_max))
     sets, ratio = start(changed, propose(changed, b), uniform)
-    assert np.allclose(known.log_weight, ratio)
+    assert np.allclose(before.log_weight, ratio)
     possible = np.isfinite(ratio)
-    assert np.array_equal(known.sets.cell[possible], sets.cell[possible])
+    assert np.array_equal(before.sets.cell[possible], sets.cell[possible])
 
     sets = Sets(
-        *known.sets[:2],
-        rng.uniform(-1.0, 3.0, known.sets.cell.shape),
-        rng.uniform(0.5, 4.0, known.sets.cell.shape),
+        *before.sets[:2],
+        rng.uniform(-1.0, 3.0, before.sets.cell.shape),
+        rng.uniform(0.5, 4.0, before.sets.cell.shape),
     )
     moved, ratio = tracker._propagate(sets, b, np.random.default_rng(8))
     expected, wanted = propagate(
@@ -243,12 +243,12 @@ def test_marginal_amplitudes_are_integrated_out():
 
 
 def test_what_came_later_corrects_what_was_known(model, exact):
-    tracker, smoother, known = SetFilter(model, 5000), LagSmoother(3), None
+    tracker, smoother, before = SetFilter(model, 5000), LagSmoother(3), None
     right_then, right_later = [], []
     pmfs = []
     for name, b in enumerate(exact['B']):
-        step = tracker.step(known, b, (4, name))
-        known = step.after
+        step = tracker.step(before, b, (4, name))
+        before = step.after
         pmfs.append(tracker.summary(step, step.w, step.sets)[0])
         found = smoother.push(step)
         if found:
@@ -294,12 +294,12 @@ def test_a_record_nothing_explains_is_said_so(model):
 
 @pytest.mark.parametrize('value', [1e200, np.inf, np.nan])
 def test_a_record_beyond_numbers_keeps_members_on_the_lattice(model, exact, value):
-    tracker, known = SetFilter(model, 50), None
+    tracker, before = SetFilter(model, 50), None
     for name, b in enumerate(exact['B'][:6]):
         b = b.copy()
         b[[0, 17, 59]] = value if name % 2 else b[[0, 17, 59]]
-        step = tracker.step(known, b, (1, name))
-        known = step.after
+        step = tracker.step(before, b, (1, name))
+        before = step.after
         assert ((step.sets.cell >= 0) & (step.sets.cell < model.cells)).all()
 
 

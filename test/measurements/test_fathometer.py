@@ -80,9 +80,9 @@ def overcoherent(R):
         (lambda R: np.zeros_like(R), 'silent'),
         (lambda R: R[:3], 'bad_shape'),
         (lambda R: R[:, :2], 'bad_shape'),
-        (lambda R: R[:, :2, :2], 'bad_phones'),
+        (lambda R: R[:, :2, :2], 'bad_hydrophones'),
         (lambda R: R[0], 'bad_shape'),
-        (lambda R: R * (np.arange(M) < 2)[:, None] * (np.arange(M) < 2), 'dead_phones'),
+        (lambda R: R * (np.arange(M) < 2)[:, None] * (np.arange(M) < 2), 'dead_hydrophones'),
     ],
 )
 def test_cross_spectra_that_cannot_be_used(change, reason):
@@ -110,7 +110,7 @@ def test_one_frequency_is_too_few():
 
 
 @pytest.mark.parametrize('value', [0.0, np.nan])
-def test_a_dead_phone_is_masked(value):
+def test_a_dead_hydrophone_is_masked(value):
     fields = spectra()
     fields['csdm'][:, 2] = value
     fields['csdm'][:, :, 2] = value
@@ -135,20 +135,20 @@ def samples():
     'pressure, rate, reason',
     [
         (samples()[:1], 100.0, 'too_short'),
-        (samples()[:, :2], 100.0, 'bad_phones'),
+        (samples()[:, :2], 100.0, 'bad_hydrophones'),
         (samples()[:, 0], 100.0, 'bad_shape'),
         (samples(), np.nan, 'out_of_range'),
         (samples(), 0.0, 'out_of_range'),
         (samples() * np.nan, 100.0, 'nan'),
         (samples() * 0.0, 100.0, 'silent'),
-        (samples() * (np.arange(M) < 2), 100.0, 'dead_phones'),
+        (samples() * (np.arange(M) < 2), 100.0, 'dead_hydrophones'),
     ],
 )
 def test_pressure_that_cannot_be_used(pressure, rate, reason):
     assert reason_of(Pressure, pressure=pressure, sample_rate=rate) == reason
 
 
-def test_a_phone_with_a_lost_sample_is_masked():
+def test_a_hydrophone_with_a_lost_sample_is_masked():
     p = samples()
     p[7, 1] = np.nan
     p[:, 3] = 2.5

@@ -103,7 +103,7 @@ def test_the_depth_of_the_elements_tells_that_of_the_deepest():
         (lambda R: R * np.nan, 'nan'),
         (lambda R: R * 0.0, 'silent'),
         (lambda R: R + 5.0 * (np.ones((N, N)) - np.eye(N)), 'not_positive'),
-        (lambda R: R[:, :2, :2], 'bad_phones'),
+        (lambda R: R[:, :2, :2], 'bad_hydrophones'),
         (lambda R: R[:1], 'too_short'),
         (lambda R: R[:0], 'too_short'),
     ],
@@ -112,7 +112,7 @@ def test_hostile_matrices_are_named(spoil, expected):
     assert reason(read_csdm, csdm_table(spoil(spectra().csdm))) == expected
 
 
-def test_a_dead_phone_and_a_phone_of_nan_are_masked():
+def test_a_dead_hydrophone_and_a_hydrophone_of_nan_are_masked():
     R = spectra().csdm.copy()
     R[:, 2], R[:, :, 2] = 0.0, 0.0
     assert list(read_csdm(csdm_table(R)).alive) == [True, True, False, True]
@@ -165,7 +165,7 @@ def test_pressure_comes_back_as_floats_or_as_scaled_whole_numbers():
         ({'p': np.ones((50, N), np.int16), 'scale': np.zeros(50, np.float32)}, 'bad_scale'),
         ({'p': np.zeros((50, N), np.float32)}, 'silent'),
         ({'p': np.full((50, N), np.nan, np.float32)}, 'nan'),
-        ({'p': np.ones((50, 2), np.float32)}, 'bad_phones'),
+        ({'p': np.ones((50, 2), np.float32)}, 'bad_hydrophones'),
         ({'sample_rate': np.zeros(50, np.float32)}, 'out_of_range'),
         ({'sample_rate': np.linspace(1e4, 2e4, 50, dtype=np.float32)}, 'not_constant'),
     ],
@@ -178,11 +178,11 @@ def test_pressure_of_one_row_is_too_short():
     assert reason(read_pressure, pressure_table(rows=1)) == 'too_short'
 
 
-def test_a_dead_phone_does_not_spoil_the_block():
+def test_a_dead_hydrophone_does_not_spoil_the_block():
     p = np.random.default_rng(3).normal(size=(50, N)).astype(np.float32)
     p[:, 1] = 0.25
     p[7, 3] = np.inf
-    with pytest.raises(Rejection, match='2 phones live'):
+    with pytest.raises(Rejection, match='2 hydrophones live'):
         read_pressure(pressure_table(p=p))
     p[7, 3] = 0.0
     assert list(read_pressure(pressure_table(p=p)).alive) == [True, False, True, True]

@@ -113,14 +113,14 @@ def test_cross_spectra_use_the_depth_that_a_companion_tells(rig):
     assert (distance.min(axis=1) < 0.2).all()
 
 
-def blocks_of(seconds, *, phones=8, rate=4000.0, block=0.5, seed=5):
+def blocks_of(seconds, *, hydrophones=8, rate=4000.0, block=0.5, seed=5):
     rng = np.random.default_rng(seed)
     n = round(block * rate)
     return [
         Pressure(
             stamp_ns=START + round(k * block * 1e9),
             frame_id='array',
-            pressure=rng.normal(size=(n, phones)),
+            pressure=rng.normal(size=(n, hydrophones)),
             sample_rate=rate,
             reference_depth=70.0,
         )
@@ -221,11 +221,11 @@ def follow(messages, count):
 
 
 def test_blocks_of_a_whole_array_arrive_without_loss(make_bench):
-    """1.4 s of 32 phones at 12 kHz, 2 MB each, ten times as fast, as a driver publishes them."""
+    """1.4 s of 32 hydrophones at 12 kHz, 2 MB each, ten times as fast as a driver publishes."""
     rig = rig_of(make_bench, 'particles:=200', 'record_seconds:=28.0')
     driver = rig.bench.peer.create_publisher(PointCloud2, '/pressure', input_qos(50))
     rig.bench.spin_until(driver.get_subscription_count)
-    blocks = blocks_of(28.0, phones=32, rate=12000.0, block=1.4)
+    blocks = blocks_of(28.0, hydrophones=32, rate=12000.0, block=1.4)
     for message in [write_pressure(one, make) for one in blocks]:
         driver.publish(message)
         rig.bench.executor.spin_once(timeout_sec=0.02)
@@ -292,27 +292,27 @@ def test_diagnostics_name_what_was_wrong_and_tracking_goes_on(make_bench):
 
     rig.bench.spin_until(lambda: told().get('refused: not_hermitian') == '1')
     values = told()
-    assert values['count: singular'] == '1' and values['count: dead_phones_masked'] == '3'
+    assert values['count: singular'] == '1' and values['count: dead_hydrophones_masked'] == '3'
     assert values['count: used'] == '4' and len(rig.tables) == 4
     offset = np.abs(read_estimate(rig.tables[-1]).state[:, :1] - scene.truth[-1].depth)
     assert (offset.min(axis=1) < 0.2).all()
 
 
-def test_an_array_of_another_size_is_counted_and_a_dead_phone_masked(rig):
+def test_an_array_of_another_size_is_counted_and_a_dead_hydrophone_masked(rig):
     scene = simulate(scenario('small', {'records': 2, 'fading': (), 'depth_companion': False}), 2)
     first, second = (item.measurement for item in scene.measurements)
     wrong = simulate(
         scenario('small', {'records': 1, 'fading': (), 'phones': 6, 'depth_companion': False}), 2
     )
     rig.send('csdm', write_csdm(wrong.measurements[0].measurement, make))
-    assert rig.node.tracker.counts['wrong_phones'] == 1 and not rig.tables
+    assert rig.node.tracker.counts['wrong_hydrophones'] == 1 and not rig.tables
     dead = np.array(second.csdm)
     dead[:, 5], dead[:, :, 5] = 0.0, 0.0
 
     rig.send('csdm', write_csdm(attrs.evolve(second, csdm=dead), make))
-    assert rig.node.tracker.counts['dead_phones_masked'] == 1
+    assert rig.node.tracker.counts['dead_hydrophones_masked'] == 1
     assert len(rig.tables) == 1 and not rig.node._errors
-    assert first.phones == 8
+    assert first.hydrophones == 8
 
 
 def test_offline_says_the_same_to_the_bit(rig):

@@ -36,4 +36,4 @@ def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out
     bag = share_folder() / 'bags' / 'fathometer_array'
     assert main(['track', str(bag), str(tmp_path / 'out'), '--set', 'phones=32', '--json']) == 0
     run = json.loads(capsys.readouterr().out)
-    assert run['counts']['wrong_phones'] == 12 and run['estimates'] == 0
+    assert run['counts']['wrong_hydrophones'] == 12 and run['estimates'] == 0

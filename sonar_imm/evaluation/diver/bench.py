@@ -17,11 +17,15 @@ import numpy as np
 from ...estimation import imm, imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign, association_cost, gate_threshold
+from ...measurements import Fix
+from ...trackers.diver.config import DiverConfig
+from ...trackers.diver.tracker import DiverTracker
 from ..benches import Bench
 
 MODELS, STATES, STEP = 16, 4, 1.0
 RATIO_WANTED = 100.0
 SCAN_WANTED_MS = 25.0
+STAMPS_WANTED = 1.5
 
 
 @frozen(eq=False)
@@ -169,6 +173,55 @@ def _scan(
     return x, P, mu, int((chosen >= 0).sum())
 
 
+def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
+    """CPU milliseconds that a whole tracker takes for a fix, with stamps every second and with
+    stamps that never have the same distance twice, and their ratio in paired rounds. CPU time,
+    because threads that nobody asked for show in nothing else."""
+    DiverTracker(DiverConfig()).warm()
+    regular, irregular = (
+        _fixes(np.ones(fixes)),
+        _fixes(np.random.default_rng(2).uniform(0.5, 1.5, fixes)),
+    )
+    pairs = np.array(
+        [[_cpu_of_tracking(regular), _cpu_of_tracking(irregular)] for _ in range(rounds)]
+    )
+    pairs *= 1e3 / fixes
+    ratio = pairs[:, 1] / pairs[:, 0]
+    return {
+        'fixes': fixes,
+        'rounds': rounds,
+        'regular_cpu_ms': float(np.median(pairs[:, 0])),
+        'irregular_cpu_ms': float(np.median(pairs[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'ratio_highest': float(ratio.max()),
+        'ratio_wanted': STAMPS_WANTED,
+        'good': bool(np.median(ratio) <= STAMPS_WANTED),
+    }
+
+
+def _fixes(steps: FloatArray) -> list[Fix]:
+    """A diver at .4 m/s, seen after each of `steps` (K,) seconds."""
+    noise = np.random.default_rng(3).normal(0.0, 0.5, (len(steps), 2))
+    time_s = np.cumsum(steps)
+    return [
+        Fix(
+            stamp_ns=10**9 + round(1e9 * seconds),
+            position=np.array([0.4 * seconds + dx, dy, 0.0]),
+            covariance=0.25 * np.eye(2),
+        )
+        for seconds, (dx, dy) in zip(time_s.tolist(), noise)
+    ]
+
+
+def _cpu_of_tracking(fixes: list[Fix]) -> float:
+    """CPU seconds of this process, all its threads, for a new tracker."""
+    tracker = DiverTracker(DiverConfig())
+    begin = time.process_time()
+    for fix in fixes:
+        tracker.process(fix)
+    return time.process_time() - begin
+
+
 def _seconds(function: Callable[[Problem], Any], p: Problem) -> float:
     begin = time.perf_counter()
     function(p)
@@ -193,7 +246,17 @@ def _scan_sentence(scan: Mapping[str, Any]) -> str:
     )
 
 
+def _stamps_sentence(stamps: Mapping[str, Any]) -> str:
+    return (
+        f'tracker, CPU for a fix: {stamps["regular_cpu_ms"]:.2f} ms every second, '
+        f'{stamps["irregular_cpu_ms"]:.2f} ms at irregular stamps: {stamps["ratio"]:.2f} times as '
+        f'much (wanted at most {stamps["ratio_wanted"]:.1f}; highest of {stamps["rounds"]} paired '
+        f'rounds {stamps["ratio_highest"]:.2f})'
+    )
+
+
 BENCHES = (
     Bench('step', bench_step, _step_sentence),
     Bench('scan', lambda rounds: bench_scan(), _scan_sentence),
+    Bench('stamps', bench_stamps, _stamps_sentence),
 )

@@ -87,12 +87,12 @@ def bench_threads(threads: int = 4, records: int = 9) -> dict[str, Any]:
 
 
 def bench_array(
-    rounds: int = 7, snapshots: int = 64, length: int = 16_800, phones: int = 32
+    rounds: int = 7, snapshots: int = 64, length: int = 16_800, hydrophones: int = 32
 ) -> dict[str, Any]:
     """Milliseconds from pressure to depth responses, for `snapshots` of `length` samples (90 s of
     a real array): transforms, cross-spectra, the checks of their measurement, the processors."""
     rng = np.random.default_rng(0)
-    blocks = rng.standard_normal((snapshots, length, phones), np.float32)
+    blocks = rng.standard_normal((snapshots, length, hydrophones), np.float32)
     band = slice(length // 240, length // 3)
 
     def transform() -> np.ndarray:
@@ -102,7 +102,7 @@ def bench_array(
     spectra = transform()
     R = outer_sum(spectra) / np.float32(snapshots)
     frequency = np.arange(band.start, band.stop) / 1.4
-    w = steering(frequency, 0.18 * np.arange(phones), 1500.0)
+    w = steering(frequency, 0.18 * np.arange(hydrophones), 1500.0)
     works: dict[str, Callable[[], Any]] = {
         'transforms': transform,
         'cross-spectra': lambda: outer_sum(spectra),
@@ -213,7 +213,7 @@ def _threads_sentence(result: Mapping[str, Any]) -> str:
 
 def _array_sentence(result: Mapping[str, Any]) -> str:
     each = ', '.join(f'{name} {spent:,.0f} ms' for name, spent in result['ms'].items())
-    return f'{result["snapshots"]} snapshots of 32 phones: {each}'
+    return f'{result["snapshots"]} snapshots of 32 hydrophones: {each}'
 
 
 BENCHES = (

@@ -31,6 +31,7 @@ CROSSING = (
         'divers': 4,
         'duration': 119.0,
         'detection_probability': 0.9,
+        'fix_std': 0.7,
         'clutter': 10.0,
         'clutter_range': 80.0,
     },
@@ -59,10 +60,10 @@ def crossing_paths(divers: int, times: FloatArray, rng: np.random.Generator) -> 
 def sense_scan(
     config: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
 ) -> list[Fixes]:
-    """All fixes of one scan in no particular order: of divers at `present` (n, 2), and false ones
+    """All fixes of one scan in no particular order: of divers at `present` (n, 3), and false ones
     in the square; config: a `DiverScenario`."""
     half, std = config.clutter_range, config.fix_std
-    seen = present[rng.uniform(size=len(present)) < config.detection_probability]
+    seen = present[:, :2][rng.uniform(size=len(present)) < config.detection_probability]
     false = rng.uniform(-half, half, (rng.poisson(config.clutter), 2))
     points = rng.permutation(np.vstack([seen + std * rng.normal(size=seen.shape), false]))
     return [

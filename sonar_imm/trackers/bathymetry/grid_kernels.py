@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...acoustics import likelihood_kernels
 from ...estimation import grid_kernels as grid
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.jit import kernel
-from .kernels import log_likelihoods, PingLikelihood, Track
+from .kernels import PingLikelihood, sines_of, Track
 
 
 class GridMotion(NamedTuple):
@@ -65,7 +66,7 @@ def filter_ping(
         n = high - low
         here = value[:n]
         if heard:
-            log_likelihoods(cells[low:high], ping, t, sines[:n], work, here)
+            _log_likelihoods(cells[low:high], ping, t, sines[:n], work, here)
         else:
             for g in range(n):
                 here[g] = 0.0
@@ -116,7 +117,7 @@ def smooth_ping(
         heard = ping.heard[t + 1]
         if heard:
             n = high - low
-            log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
+            _log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
             grid.update(beta, low, high, value[:n], work)
         new_low, new_high = window[t, 0], window[t, 1]
         for j in range(M):
@@ -142,3 +143,28 @@ def smooth_ping(
         track.mean[t, 0], track.covariance[t, 0, 0] = grid.combine(
             p, low, high, cells, track.probability[t]
         )
+
+
+@kernel
+def _log_likelihoods(
+    state: FloatArray,
+    ping: PingLikelihood,
+    t: int,
+    sines: FloatArray,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Log likelihood of states (n,) given bin t into out (n,); sines (n,) and work (4, n or more)
+    are scratch."""
+    sines_of(state, ping.ranges[t], ping.geometry, work, sines)
+    likelihood_kernels.log_likelihoods(
+        sines,
+        ping.geometry.spacing,
+        ping.form[t],
+        ping.base[t],
+        ping.spread[t],
+        ping.signal[t],
+        ping.table,
+        work,
+        out,
+    )

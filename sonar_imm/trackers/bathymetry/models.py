@@ -16,7 +16,7 @@ angle_two_rw
     The angle theta is a random walk, the second one growing linearly along the swath.
 
 variant `paper` uses the formulas as printed: F_NCS has dS^2/2 where the slope should persist (it
-forgets the slope at once and is a random walk in disguise), and b is zeroed, not redrawn.
+forgets the slope at once and is a random walk in disguise), and b is zeroed, not drawn anew.
 
 Source: Saucan, Chonavel, Sintes, Le Caillec, OCEANS 2013, equations 7 to 12; see docs.
 """
@@ -63,9 +63,9 @@ class TerrainModels:
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
         """Particles (M, n, N) of the state before the first bin.
 
-        One draw in each of N equal slices of the normal law, the slices of further states in
-        random order: a set of a hundred independent draws could leave holes as wide as the floor
-        is thick in the likelihood.
+        One draw in each of N equal slices of the normal distribution, the slices of further states
+        in random order: among a hundred independent draws there could be gaps wider than the
+        likelihood.
         """
         M, n = len(self.names), len(self.state_names)
         x = np.empty((M, n, particles))

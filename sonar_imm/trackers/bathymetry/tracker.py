@@ -6,7 +6,7 @@ few terrain models (`models`). So the filter runs *along the ping*: range is its
 
     snapshot -> likelihood of each bin (`likelihood`)
              -> mix, predict, update, combine, bin after bin (`engines`)
-             -> optional smoothing -> one row a bin
+             -> optional smoothing -> one row per bin
 
 Nothing is carried from one ping to the next: a floor that was taken over wrongly would do more
 harm than a floor that is taken over rightly does good. Late, shuffled or repeated pings therefore

@@ -10,18 +10,22 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics import multistatic
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import FloatArray, IndexArray
 from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
-from .sensing import locate, Positions, toa_variance
+from .model_set import heights_of
+from .sensing import locate, Positions, systematic_variance, toa_variance
 
 
 class Birth(NamedTuple):
-    """Where a track may begin: position (2,) and covariance (2, 2); the probability that there is
-    a diver, NaN where its hits will tell; whose track it is."""
+    """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
+    which it is, None for a fix; the probability that there is a diver, NaN where its hits will
+    tell; whose track it is."""
 
     position: FloatArray
     covariance: FloatArray
+    ping: Arrivals | None = None
+    rows: IndexArray | None = None
     existence: float = math.nan
     target_id: int = NOBODY
 
@@ -41,7 +45,8 @@ def births_from_fixes(
     names = np.full(len(free), NOBODY) if group.target_id is None else group.target_id
     known = np.full(len(free), math.nan) if existence is None else existence
     return [
-        Birth(group.z[d], group.R[d], float(known[d]), int(names[d])) for d in np.flatnonzero(free)
+        Birth(group.z[d], group.R[d], existence=float(known[d]), target_id=int(names[d]))
+        for d in np.flatnonzero(free)
     ]
 
 
@@ -80,8 +85,10 @@ def _fix(
     fix = locate(ping, rows, config, config.covariance_scale * factor)
     if fix is None:
         return [], rows[:0]
-    ghosts = [Birth(other.position, other.covariance) for other in fix.alternatives]
-    return [Birth(fix.position, fix.covariance), *ghosts], rows[fix.used]
+    used = rows[fix.used | fix.used_bearing]
+    return [
+        Birth(one.position, one.covariance, ping, used) for one in (fix, *fix.alternatives)
+    ], rows[fix.used]
 
 
 def _best_combination(
@@ -106,10 +113,12 @@ def _agreeing(
 ) -> np.ndarray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
     position, covariance = birth.position, birth.covariance
-    expected = multistatic.range_sum(position, ping.tx, ping.rx, config.target_z)
-    slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, config.target_z)
-    variance = config.sound_speed**2 * toa_variance(
-        ping, config, config.covariance_scale * factor
+    height = float(np.mean(heights_of(config)))
+    expected = multistatic.range_sum(position, ping.tx, ping.rx, height)
+    slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, height)
+    variance = config.sound_speed**2 * (
+        toa_variance(ping, config, config.covariance_scale * factor)
+        + systematic_variance(ping, config)
     ) + np.einsum('na,ab,nb->n', slope, covariance, slope)
     nis = np.square(config.sound_speed * ping.toa - expected) / variance
     nearest = np.array([rows[np.argmin(nis[rows])] for rows in pairs])

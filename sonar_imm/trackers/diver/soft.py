@@ -18,7 +18,8 @@ from .config import DiverConfig
 from .sensing import Positions
 
 if TYPE_CHECKING:
-    from .scan import DiverState, Scan
+    from .scan import Scan
+    from .state import DiverState
 
 CONFIRMS = 0.9
 """Existence above which a track may be confirmed."""
@@ -43,10 +44,9 @@ NEAR_CONFIRMED, SCANS_CONFIRMED = 0.3, 8
 def take_softly(scan: Scan, group: Positions) -> FloatArray:
     """Update the tracks of `scan` by all fixes they may have caused; gives the probability (D,)
     that a fix is of a diver that is tracked already."""
-    config, matrix = scan.config, scan.models.E[:, :2]
+    config = scan.config
     z, R = np.ascontiguousarray(group.z), np.ascontiguousarray(group.R)
-    H = np.ascontiguousarray(matrix[None])
-    h = np.ascontiguousarray(np.einsum('jma,tja->tjm', matrix, scan.x))
+    H, h = (np.ascontiguousarray(one) for one in scan.expected_fixes())
     mixture, nis = jipda_kernels.likelihoods(h, H, scan.P, scan.mu, z, R)
     nis[scan.named] = np.inf
     threshold = gate_threshold(config.gate_probability, 2)
@@ -59,12 +59,13 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
         np.where(seen, config.detection_probability, 0.0),
         threshold,
     )
-    considered = np.zeros(scan.x.shape[-1], np.bool_)
     detected = beta.sum(axis=1)
     hit = np.flatnonzero(detected > 0.5 * after)
     if len(hit):
-        mean, covariance = imm_kernels.combine(scan.x[hit], scan.P[hit], scan.mu[hit], H[0])
         best = beta[hit].argmax(axis=1)
+        x, P, mu = scan.x[hit], scan.P[hit], scan.mu[hit]
+        scan.watch(x, P, mu, z[best], H, R[best], hit)
+        mean, covariance = imm_kernels.combine(x, P, mu, H[0])
         innovation = z[best] - mean
         scan.nis[hit] += np.einsum(
             'ta,ta->t',
@@ -73,7 +74,7 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
         )
         scan.nis_dof[hit] += np.uint16(2)
     scan.x, scan.P, scan.mu, repairs = jipda_kernels.update(
-        scan.x, scan.P, scan.mu, h, H, z, R, beta, missed, considered
+        scan.x, scan.P, scan.mu, h, H, z, R, beta, missed, ~scan.layout.mask
     )
     scan.repairs += repairs
     scan.existence = np.where(scan.named, scan.existence, after)
@@ -128,7 +129,9 @@ def judge(now: DiverState, hit: BoolArray, looked: BoolArray, E: FloatArray) -> 
     status = np.where(confirmed, seen, TrackStatus.TENTATIVE).astype(np.uint8)
     if not looked.any():
         return Judged(status, alive, now.near_to, now.near_for)
-    mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, np.ascontiguousarray(E))
+    n = E.shape[-1]
+    x, P = np.ascontiguousarray(now.x[..., :n]), np.ascontiguousarray(now.P[..., :n, :n])
+    mean, covariance = imm_kernels.combine(x, P, now.mu, np.ascontiguousarray(E))
     near_to, near_for = coalescence(now, was, mean, covariance)
     patience = np.where(was, SCANS_CONFIRMED, SCANS_TENTATIVE)
     return Judged(status, alive & (near_for < patience), near_to, near_for)

@@ -4,7 +4,7 @@ A diver swims slowly and turns often. The tracker runs one motion model for each
 headings (`models`) in an interacting multiple model filter, and lets the data correct the
 probabilities of turning. A scan of the world goes through
 
-    predict -> for each group of detections: gate, associate, update -> learn -> prune -> spawn
+    predict -> fixes: gate, associate, update; pings: explain -> learn -> prune -> spawn
 
 and the whole of what is known after it is one value, `DiverState`, so that a late measurement is
 put in its place by computing the scans after it again (`trackers.stream`).
@@ -22,16 +22,22 @@ import numpy as np
 from ...estimates import Estimate
 from ...estimation import imm_kernels, jipda_kernels
 from ...estimation.adaptation import AdaptiveChain
+from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
 from . import soft
-from .births import Birth, births_from_fixes, births_from_ping
+from .births import Birth, births_from_ping
 from .config import DiverConfig
-from .models import build_models, OUTPUTS
-from .scan import DiverState, Scan
-from .sensing import Group, groups_of, Positions
+from .fix_consistency import FixConsistency
+from .fix_scans import each_name_once, shows_all, take_fixes
+from .instruments import Instruments
+from .models import build_models
+from .pings import begin_from_ping, FAR, ping_numbers
+from .scan import Scan
+from .sensing import position_groups
+from .state import DiverState
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
@@ -67,13 +73,28 @@ class DiverTracker:
     def warm(self) -> None:
         imm_kernels.warm()
         jipda_kernels.warm()
-        # A contested scan and a ping, in which nothing is left to be loaded at the first real one.
+        # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
+        rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+        leg = np.linalg.norm(rx - [20.0, 30.0, -5.0], axis=1)
         for second in (1, 2):
             for x in (0.0, 0.1):
                 position = np.array([x, 0.0, 0.0])
                 fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
                 tracker.process(fix)
+            for tx in (rx[0], np.full(3, np.nan)):
+                ping = Arrivals(
+                    stamp_ns=second * 10**9,
+                    tx_id=np.zeros(4),
+                    rx_id=np.arange(4),
+                    tx=np.tile(tx, (4, 1)),
+                    rx=rx,
+                    toa=(leg + leg[0]) / self.config.sound_speed,
+                    var_toa=np.full(4, 1e-8),
+                    bearing=np.full(4, np.nan),
+                    var_bearing=np.full(4, np.nan),
+                )
+                tracker.process(ping)
 
     def health(self) -> dict[str, float]:
         now = self._stream.state
@@ -86,9 +107,15 @@ class DiverTracker:
             else float('nan'),
             'broken_tracks': now.broken,
             'covariance_repairs': now.repairs,
+            'fixes_mean_nis': now.fixes.mean_nis,
+            'fixes_lag_1': now.fixes.lag_1,
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
+
+    def warnings(self) -> list[str]:
+        """What of the input cannot be true, in sentences for the user."""
+        return self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -99,7 +126,7 @@ class DiverTracker:
 
     def _nobody(self, life: Tracks) -> DiverState:
         """The state without a track; `life` has none, but the next identity."""
-        M, n = len(self.models.names), self.models.n
+        M, n = self.models.copies * len(self.models.names), self.models.n
         return DiverState(
             stamp_ns=0,
             life=life,
@@ -110,10 +137,12 @@ class DiverTracker:
             nis=np.empty(0),
             nis_dof=np.empty(0, np.uint16),
             score=np.empty(0),
+            white=np.empty((0, 2)),
+            fixes=FixConsistency(),
             scale=np.zeros((2, 2)),
             existence=np.empty(0),
             evidence=np.empty(0),
-            target_id=np.empty(0, np.int32),
+            target_id=np.empty(0, np.int64),
             near_to=np.empty(0, np.int64),
             near_for=np.empty(0, np.int64),
         )
@@ -125,40 +154,17 @@ class DiverTracker:
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
         scan = self._predict(before, stamp_ns)
         births: list[Birth] = []
-        unassigned = []
-        for groups in groups_of(items, self.config, factor):
-            if isinstance(groups[0], Positions):
-                births += self._take_fixes(scan, groups[0])
-            else:
-                taken = scan.associate_and_update(groups)
-                unassigned += [(group, ~one) for group, one in zip(groups, taken)]
+        fix_factor = float(self.config.covariance_scale * factor[0])
+        for group in position_groups(items, self.config, fix_factor):
+            births += take_fixes(scan, group)
+        for ping in (item.in_order() for item in items if isinstance(item, Arrivals)):
+            taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
+            births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
         now = self._prune(scan.learn(), items)
-        return self._spawn(now, births + self._births(items, unassigned, float(factor[1])))
-
-    def _take_fixes(self, scan: Scan, group: Positions) -> list[Birth]:
-        """Update the tracks by fixes; gives where they put new divers."""
-        if group.target_id is not None:
-            return births_from_fixes(group, ~scan.take_named(group))
-        if self.config.association == 'gnn':
-            return births_from_fixes(group, ~scan.associate_and_update([group])[0])
-        claimed = soft.take_softly(scan, group)
-        return births_from_fixes(group, claimed < 0.5, soft.birth_existence(self.config, claimed))
+        return self._spawn(now, births)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
         return Scan(self.config, self.models, self._chain, before, stamp_ns)
-
-    def _births(
-        self, items: Sequence[Measurement], left: Sequence[tuple[Group, np.ndarray]], factor: float
-    ) -> list[Birth]:
-        """Where the detections no track took put new divers."""
-        births: list[Birth] = []
-        for ping in (item for item in items if isinstance(item, Arrivals)):
-            rows = np.zeros(len(ping), bool)
-            for group, free in left:
-                if group.ping is ping:
-                    rows[group.rows] = free
-            births += births_from_ping(ping, rows, self.config, factor)
-        return births
 
     def _prune(self, now: DiverState, items: Sequence[Measurement]) -> DiverState:
         """End the tracks that are over, broken, or too many."""
@@ -166,7 +172,7 @@ class DiverTracker:
         sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
         broken = now.broken + int((~sound).sum())
         hit = now.nis_dof > 0
-        looked = any(_shows_all(item, config) for item in items) & (now.target_id == NOBODY)
+        looked = any(shows_all(item, config) for item in items) & (now.target_id == NOBODY)
         by_existence = np.isfinite(now.existence)
         life, kept = now.life.scan(
             hit, now.stamp_ns, track_rules(config), looked=looked & ~by_existence
@@ -191,11 +197,11 @@ class DiverTracker:
     def _spawn(self, now: DiverState, births: list[Birth]) -> DiverState:
         """Begin a tentative track at each birth, as long as there is room."""
         config = self.config
-        births = _each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
+        births = each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
         if not births:
             return now
-        new = [self.models.new_track(birth.position, birth.covariance) for birth in births]
-        M, n, count = len(self.models.names), self.models.n, len(new)
+        new = [self._new_track(birth, now.instruments) for birth in births]
+        M, n, count = now.x.shape[1], now.x.shape[2], len(new)
         return evolve(
             now,
             life=now.life.born(count, now.stamp_ns, track_rules(config)),
@@ -206,52 +212,59 @@ class DiverTracker:
             nis=np.append(now.nis, np.full(count, np.nan)),
             nis_dof=np.append(now.nis_dof, np.zeros(count, np.uint16)),
             score=np.append(now.score, np.zeros(count)),
+            white=np.concatenate([now.white, np.full((count, 2), np.nan)]),
             existence=np.append(now.existence, [birth.existence for birth in births]),
             evidence=np.append(now.evidence, np.ones(count)),
-            target_id=np.append(
-                now.target_id, np.array([birth.target_id for birth in births], np.int32)
-            ),
+            target_id=np.append(now.target_id, [birth.target_id for birth in births]),
             near_to=np.append(now.near_to, np.zeros(count, np.int64)),
             near_for=np.append(now.near_for, np.zeros(count, np.int64)),
         )
 
+    def _new_track(
+        self, birth: Birth, instruments: Instruments
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x, P and mu of a track that begins."""
+        layout = instruments.layout(self.config, self.models.n)
+        plain = self.models.height < 0 and layout.size == self.models.n
+        if birth.ping is None or birth.rows is None or plain:
+            x, P, mu = self.models.new_track(birth.position, birth.covariance, birth.ping is None)
+            return *layout.widened(x, P), mu
+        x, P, mu = self.models.new_track(birth.position, np.eye(2) * FAR**2, False)
+        x, P = layout.widened(x, P)
+        factor = self.config.covariance_scale
+        ping = ping_numbers(birth.ping, birth.rows, self.config, factor, self.models, layout)
+        # All models of a copy begin alike: one of each is enough to ask.
+        M = len(self.models.names)
+        first = begin_from_ping(x[::M], P[::M], ping, birth.position, self.config, layout)
+        share = np.exp(first[2] - first[2].max())
+        mu = mu * np.repeat(share / share.sum() * len(share), M)
+        return np.repeat(first[0], M, axis=0), np.repeat(first[1], M, axis=0), mu
+
     def _estimate(self, state: DiverState) -> Estimate:
-        shown = soft.published(state.existence)
+        n, shown = self.models.n, soft.published(state.existence)
         state = evolve(state.rows(shown), life=state.life.only(shown))
-        mean, covariance = imm_kernels.combine(state.x, state.P, state.mu, self.models.E)
+        x, P = state.x, state.P
+        if x.shape[-1] > n:
+            x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
+        mean, covariance = imm_kernels.combine(x, P, state.mu, self.models.E)
         depth = np.full(len(mean), self.config.target_z)
+        if self.models.height >= 0:
+            depth = mean[:, 2]
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._stream.frame_id,
             xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
-            state_names=OUTPUTS,
+            state_names=self.models.outputs,
             state=mean,
             covariance=covariance,
             model_names=self.models.names,
-            probabilities=state.mu,
+            probabilities=self.models.by_model(state.mu),
             extras={
                 'track_id': state.life.track_id,
                 'track_state': state.life.status,
                 'nis': state.nis,
                 'nis_dof': state.nis_dof,
                 'existence': state.existence,
-                'target_id': state.target_id,
+                'target_id': state.target_id.astype(np.int32),
             },
         )
-
-
-def _shows_all(item: Measurement, config: DiverConfig) -> bool:
-    """Whether a diver of whom `item` says nothing was missed by it."""
-    if isinstance(item, Fixes):
-        return item.target_id is None or not len(item) or bool((item.target_id == NOBODY).any())
-    return config.fixes_are_scans
-
-
-def _each_name_once(births: Sequence[Birth]) -> list[Birth]:
-    """Without a second birth of the same name."""
-    names = [birth.target_id for birth in births]
-    return [
-        birth
-        for place, birth in enumerate(births)
-        if birth.target_id == NOBODY or names.index(birth.target_id) == place
-    ]

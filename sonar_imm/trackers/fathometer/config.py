@@ -25,16 +25,16 @@ class FathometerConfig(StampParameters):
 
     # -- array and sound --------------------------------------------------------------------------
     phones: int = parameter(
-        32, 'phones of the array; 0: as many as the first record has', low=0, high=256
+        32, 'hydrophones of the array; 0: as many as the first record has', low=0, high=256
     )
     element_spacing: float = parameter(
-        0.18, 'distance between phones', unit='m', low=1e-4, high=100.0
+        0.18, 'distance between hydrophones', unit='m', low=1e-4, high=100.0
     )
     sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
     array_depth: float = parameter(
         0.0,
-        'depth of the deepest phone, where neither the record nor a companion instrument tells; '
-        '0: depths are counted from it',
+        'depth of the deepest hydrophone, where neither the record nor a companion instrument '
+        'tells; 0: depths are counted from it',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -71,7 +71,10 @@ class FathometerConfig(StampParameters):
     # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
     loading: float = live(
-        1e-2, 'mvdr: diagonal loading, in units of the mean phone power', low=0.0, high=1e6
+        1e-2,
+        'mvdr: diagonal loading, in units of the mean power of a hydrophone',
+        low=0.0,
+        high=1e6,
     )
     white_noise_gain_db: float = live(
         -3.0,
@@ -157,7 +160,7 @@ class FathometerConfig(StampParameters):
     )
     amplitude_prior: str = parameter(
         'marginal',
-        'amplitudes integrated out, or the best ones with a fine of log(N)/2 or log(N) for each',
+        'amplitudes integrated out, or the best ones with a penalty of log(N)/2 or log(N) each',
         choices=PRIORS,
     )
     amplitude_std_sigmas: float = parameter(

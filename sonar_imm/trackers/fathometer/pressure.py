@@ -30,7 +30,7 @@ class PressureStream:
 
     def push(self, block: Pressure) -> tuple[list[CrossSpectra], list[CrossSpectra]]:
         """Records and previews that `block` completes, each with the stamp of the block. Raises
-        `Rejection` for one without a living phone in common with the record."""
+        `Rejection` for one without a living hydrophone in common with the record."""
         self._follow(block)
         self._alive &= block.alive
         spectra = self._snapshots.push(block.pressure)
@@ -48,7 +48,7 @@ class PressureStream:
 
     def _follow(self, block: Pressure) -> None:
         """Begin anew when the array is another one or time has leapt."""
-        shape = block.phones, block.sample_rate
+        shape = block.hydrophones, block.sample_rate
         gap_ns = block.stamp_ns - self._next_ns
         if shape != self._shape:
             if self._shape is not None:
@@ -82,12 +82,12 @@ class PressureStream:
         self._blocks = BlockAverage(count, straddling)
         step = round(config.preview_seconds * rate / hop)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
-        self._alive: NDArray[np.bool_] = np.ones(block.phones, np.bool_)
-        self._shape = block.phones, rate
+        self._alive: NDArray[np.bool_] = np.ones(block.hydrophones, np.bool_)
+        self._shape = block.hydrophones, rate
 
     def _record(self, average: Average, block: Pressure) -> CrossSpectra:
         csdm = average.csdm.copy()
-        # A phone that failed in any of the blocks is out for the whole record.
+        # A hydrophone that failed in any of the blocks is out for the whole record.
         csdm[:, ~self._alive] = 0.0
         csdm[:, :, ~self._alive] = 0.0
         return CrossSpectra(

@@ -25,7 +25,7 @@ from .response import Lattice, Response
 IdArray = NDArray[np.uint32]
 
 
-class Known(NamedTuple):
+class Identified(NamedTuple):
     """A reflector that has an id: where it was last seen, and for how many records it was not."""
 
     track_id: int
@@ -37,40 +37,43 @@ class Known(NamedTuple):
 class Identities:
     """The ids given so far. A value: naming the reflectors of a record makes a new one."""
 
-    known: tuple[Known, ...] = ()
+    reflectors: tuple[Identified, ...] = ()
     next_id: int = 1
 
     def name(self, depth: FloatArray, config: FathometerConfig) -> tuple[Identities, IdArray]:
         """Ids (K,) for reflectors at `depth` (K,) of the next record."""
-        ids = nearest_ids(depth, self.known, config)
+        ids = nearest_ids(depth, self.reflectors, config)
         new = np.flatnonzero(ids == 0)
         ids[new] = self.next_id + np.arange(len(new))
-        seen = [Known(int(i), float(z), 0) for i, z in zip(ids, depth)]
+        seen = [Identified(int(i), float(z), 0) for i, z in zip(ids, depth)]
         missed = [
             one._replace(missed=one.missed + 1)
-            for one in self.known
+            for one in self.reflectors
             if one.track_id not in ids and one.missed < config.track_memory
         ]
         return Identities((*seen, *missed), self.next_id + len(new)), ids
 
     def forget(self) -> Identities:
-        """No reflector is known any more; ids go on."""
-        return evolve(self, known=())
+        """Ids given so far belong to no reflector any more; later ones go on counting."""
+        return evolve(self, reflectors=())
 
 
-def nearest_ids(depth: FloatArray, known: Sequence[Known], config: FathometerConfig) -> IdArray:
-    """Ids (K,) of the known reflectors that are near enough, the nearest pairs first; 0: none."""
+def nearest_ids(
+    depth: FloatArray, earlier: Sequence[Identified], config: FathometerConfig
+) -> IdArray:
+    """Ids (K,) for reflectors at `depth` (K,): those of the `earlier` ones that are near enough,
+    the nearest pairs first; 0: none."""
     ids = np.zeros(len(depth), np.uint32)
-    taken = np.zeros(len(known), np.bool_)
-    if not len(depth) or not known:
+    taken = np.zeros(len(earlier), np.bool_)
+    if not len(depth) or not earlier:
         return ids
-    distance = np.abs(depth[:, None] - np.array([one.depth for one in known]))
-    records = 1.0 + np.array([one.missed for one in known])
+    distance = np.abs(depth[:, None] - np.array([one.depth for one in earlier]))
+    records = 1.0 + np.array([one.missed for one in earlier])
     reach = np.maximum(config.min_separation, 4.0 * config.depth_std * np.sqrt(records))
     for place in np.argsort(distance, axis=None, kind='stable'):
-        row, column = divmod(int(place), len(known))
+        row, column = divmod(int(place), len(earlier))
         if not ids[row] and not taken[column] and distance[row, column] <= reach[column]:
-            ids[row], taken[column] = known[column].track_id, True
+            ids[row], taken[column] = earlier[column].track_id, True
     return ids
 
 
@@ -110,8 +113,8 @@ def reflectors_of(
 def _conditional_variance(
     depth: FloatArray, prior_variance: FloatArray, pulse: Pulse, config: FathometerConfig
 ) -> FloatArray:
-    """Of amplitudes (K,) in units of the noise, all places given; prior_variance (K,) from a
-    memory, or of amplitudes drawn anew."""
+    """Variance (K,) of amplitudes in units of the noise, given all places; prior_variance (K,):
+    before the record."""
     ridge = 1.0 / prior_variance if config.amplitude_prior == 'marginal' else 1e-9
     precision = gram(pulse, depth) + ridge * np.eye(len(depth))
     return np.diag(np.linalg.pinv(precision, hermitian=True)).clip(min=0.0)
@@ -139,7 +142,7 @@ def write_estimate(
     *,
     preview: bool = False,
 ) -> Estimate:
-    """One row a reflector; without any, one row whose depth is NaN, for the PMF's sake."""
+    """One row per reflector; without any, one row whose depth is NaN, for the PMF's sake."""
     rows = max(1, len(ids))
     state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
     extras = {

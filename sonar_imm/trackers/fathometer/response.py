@@ -110,8 +110,8 @@ def trace_response(
     sigma = np.full(len(depth), config.noise_sigma)
     if not config.noise_sigma:
         if trace.sigma is not None:
-            known = np.isfinite(trace.sigma)
-            sigma = np.interp(depth, trace.depth[known], trace.sigma[known])
+            finite = np.isfinite(trace.sigma)
+            sigma = np.interp(depth, trace.depth[finite], trace.sigma[finite])
         else:
             sigma[:] = _measured_sigma(amplitude[quiet])
     return Response(
@@ -208,7 +208,7 @@ def array_coherence(
 
 def rank_deficient(record: CrossSpectra) -> bool:
     """True when the matrix in the middle of the band says less than its size: fewer snapshots than
-    phones, or phones that hear the same."""
+    hydrophones, or hydrophones that hear the same."""
     middle = np.flatnonzero(record.usable)[record.usable.sum() // 2]
     values = np.linalg.eigvalsh(record.csdm[middle][np.ix_(record.alive, record.alive)])
     return bool(values[0] < 1e-6 * values[-1])

@@ -3,7 +3,7 @@
     pressure -> cross-spectra (`pressure`)
              -> depth response (`response`): traces come in here
              -> multiple-model particle filter (`estimation.set_filter`)
-             -> reflectors with ids (`reflectors`) -> one estimate a record
+             -> reflectors with ids (`reflectors`) -> one estimate per record
 
 Records are minutes of averaging apart, so that each is taken in once and for good: one that is
 late or repeated is counted and dropped. The random numbers of a record come from its own stamp.
@@ -29,14 +29,21 @@ import numpy as np
 from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.set_filter import LagSmoother, SetFilter, Step, Weighted
+from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
 from .pressure import PressureStream
-from .reflectors import Identities, Known, nearest_ids, Reflectors, reflectors_of, write_estimate
+from .reflectors import (
+    Identified,
+    Identities,
+    nearest_ids,
+    Reflectors,
+    reflectors_of,
+    write_estimate,
+)
 from .response import (
     array_response,
     Lattice,
@@ -58,7 +65,7 @@ class _Taken:
     """A record that was taken in: what was seen and how it was named."""
 
     response: Response
-    named: tuple[Known, ...]
+    named: tuple[Identified, ...]
 
 
 class FathometerTracker:
@@ -84,7 +91,7 @@ class FathometerTracker:
 
     def _forget(self) -> None:
         """Begin anew, but for counts and ids."""
-        self._phones = self.config.phones
+        self._hydrophones = self.config.phones
         self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
         self._lattice: Lattice | None = None
@@ -111,7 +118,7 @@ class FathometerTracker:
 
     def health(self) -> dict[str, float]:
         """Numbers of the last record: effective sample size, log evidence against an empty one,
-        noise, most probable number of reflectors; and phones left out, snapshots waiting."""
+        noise, most probable number of reflectors; and hydrophones left out, snapshots waiting."""
         return {**self._health, 'snapshots_waiting': float(self._pressure.waiting)}
 
     def process(self, measurement: Any) -> list[Estimate]:
@@ -139,7 +146,7 @@ class FathometerTracker:
             assert self._lattice is not None
             reference = math.nan if depth is None else depth
             return self._record(trace_response(item, self._lattice, self.config, reference))
-        self._count_phones(item)
+        self._count_hydrophones(item)
         if isinstance(item, CrossSpectra):
             return self._record(self._hear(item, 0))
         records, previews = self._pressure.push(item)
@@ -148,15 +155,16 @@ class FathometerTracker:
         estimates = [one for each in records for one in self._record(self._hear(each, span_ns))]
         return estimates + [self._preview(self._hear(each, span_ns)) for each in previews]
 
-    def _count_phones(self, item: Pressure | CrossSpectra) -> None:
-        if self._phones and item.phones != self._phones:
+    def _count_hydrophones(self, item: Pressure | CrossSpectra) -> None:
+        if self._hydrophones and item.hydrophones != self._hydrophones:
             raise Rejection(
-                'wrong_phones', f'the array has {item.phones} phones, not {self._phones}'
+                'wrong_hydrophones',
+                f'the array has {item.hydrophones} hydrophones, not {self._hydrophones}',
             )
-        self._phones = item.phones
+        self._hydrophones = item.hydrophones
         if not item.alive.all():
-            self.counts['dead_phones_masked'] += 1
-        self._health['dead_phones'] = float((~item.alive).sum())
+            self.counts['dead_hydrophones_masked'] += 1
+        self._health['dead_hydrophones'] = float((~item.alive).sum())
 
     # -- where the array is -----------------------------------------------------------------------
 
@@ -203,7 +211,7 @@ class FathometerTracker:
             raise Rejection('too_crowded', str(error)) from None
         self._lattice = lattice
 
-    def _try(self, response: Response) -> Step:
+    def _try(self, response: Response) -> SetStep:
         """What this record would change."""
         assert self._filter is not None
         b = np.ascontiguousarray(response.amplitude / response.sigma)
@@ -217,7 +225,7 @@ class FathometerTracker:
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
         self._ids, ids = self._ids.name(reflectors.depth, self.config)
-        self._taken.append(_Taken(response, self._ids.known))
+        self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
             log_evidence=step.log_evidence,
@@ -234,7 +242,7 @@ class FathometerTracker:
         self.counts['previews'] += 1
         return write_estimate(reflectors, ids, pmf, response, self.config, preview=True)
 
-    def _smoothed(self, newest: Step) -> list[Estimate]:
+    def _smoothed(self, newest: SetStep) -> list[Estimate]:
         """The record `smoothing_lag` ago, seen with all since."""
         found = self._smoother.push(newest)
         if found is None:
@@ -251,7 +259,7 @@ class FathometerTracker:
         return [write_estimate(reflectors, ids, pmf, response, self.config)]
 
     def _reflectors(
-        self, step: Step, w: FloatArray, sets: Sets, response: Response
+        self, step: SetStep, w: FloatArray, sets: Sets, response: Response
     ) -> tuple[Reflectors, FloatArray]:
         """Those of the most probable number, and the PMF (orders,) of the number."""
         assert self._filter is not None and self._lattice is not None

@@ -204,12 +204,12 @@ def soft_update(
     outlier_probability: float,
     outlier_density: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Update with one detection a target that may be an outlier; range and azimuth are states.
+    """Update with one detection per target that may be an outlier; range and azimuth are states.
 
     h (T, K, 2) expected, z (T, 2) measured, R (T, 2, 2). With probability beta the detection is
     the target's, else it says nothing; both cases together are matched in mean and covariance.
-    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where P
-    (T, K) was repaired (`estimation.covariance`).
+    Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where
+    P (T, K) was repaired (`estimation.covariance`).
     """
     T, K, n = x.shape
     x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
@@ -249,9 +249,9 @@ def soft_update(
                 x1[t, j, a] = x[t, j, a] + beta * (k0[a] * r0 + k1[a] * r1)
             for a in range(n):
                 for b in range(a + 1):
-                    known = k0[a] * g0[b] + k1[a] * g1[b]
+                    gained = k0[a] * g0[b] + k1[a] * g1[b]
                     spread = (k0[a] * r0 + k1[a] * r1) * (k0[b] * r0 + k1[b] * r1)
-                    value = P[t, j, a, b] - beta * known + beta * (1.0 - beta) * spread
+                    value = P[t, j, a, b] - beta * gained + beta * (1.0 - beta) * spread
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
             trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
@@ -285,8 +285,8 @@ def _careful_soft_update(
     n = len(x)
     L, K, H, w = np.zeros((2, 2)), np.empty((n, 2)), np.eye(2, n), np.empty(2)
     x1[:], P1[:] = x, P
-    known = np.empty((n, n))
-    if not careful_update(P, H, R, L, K, known):
+    updated = np.empty((n, n))
+    if not careful_update(P, H, R, L, K, updated):
         return outlier
     own = (1.0 - outlier_probability) * math.exp(-0.5 * whitened_square(L, v, w))
     own /= 2.0 * math.pi * L[0, 0] * L[1, 1]
@@ -297,9 +297,9 @@ def _careful_soft_update(
         for b in range(a + 1):
             w[1] = K[b, 0] * v[0] + K[b, 1] * v[1]
             spread = beta * (1.0 - beta) * w[0] * w[1]
-            P1[a, b] = (1.0 - beta) * P[a, b] + beta * known[a, b] + spread
+            P1[a, b] = (1.0 - beta) * P[a, b] + beta * updated[a, b] + spread
             P1[b, a] = P1[a, b]
-    lift(P1, known)
+    lift(P1, updated)
     return own + outlier
 
 

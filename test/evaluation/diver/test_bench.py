@@ -23,3 +23,10 @@ def test_both_programs_do_the_same_sums():
 def test_a_scan_hits_its_targets():
     result = bench.bench_scan(targets=40, scans=3)
     assert result['assigned'] > 0.9
+
+
+def test_both_kinds_of_stamps_are_tracked():
+    result = bench.bench_stamps(rounds=1, fixes=30)
+    assert result['regular_cpu_ms'] > 0.0 and result['irregular_cpu_ms'] > 0.0
+    fixes = bench._fixes(np.array([1.0, 0.6, 1.4]))
+    np.testing.assert_array_equal(np.diff([fix.stamp_ns for fix in fixes]), [6e8, 14e8])

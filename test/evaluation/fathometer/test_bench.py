@@ -21,7 +21,7 @@ def test_threads_do_not_change_the_bytes():
 
 
 def test_every_step_from_pressure_to_response_is_timed():
-    result = bench.bench_array(rounds=1, snapshots=3, length=960, phones=6)
+    result = bench.bench_array(rounds=1, snapshots=3, length=960, hydrophones=6)
     assert set(result['ms']) == {
         'transforms',
         'cross-spectra',

@@ -20,7 +20,7 @@ ODD = {
     'ship_noise': 1.7,
 }
 LAYERS = np.array([9.0, 12.5]), np.array([0.4, 0.2])
-"""Heights of the lowest phone above the layers, m, and their amplitudes."""
+"""Heights of the lowest hydrophone above the layers, m, and their amplitudes."""
 
 
 def floor(heights, amplitudes, array_depth=60.0):
@@ -30,8 +30,8 @@ def floor(heights, amplitudes, array_depth=60.0):
 
 def expected(frequency, config, heights, amplitudes, ships=True):
     """R (F, M, M): plane waves of power 2 u du that come down at the angle of sine u and go up
-    again from each layer, by Gauss-Legendre; then ships from near the horizon, phone noise and
-    the colour of all."""
+    again from each layer, by Gauss-Legendre; then ships from near the horizon, noise of the
+    hydrophones and the colour of all."""
     nodes, weights = np.polynomial.legendre.leggauss(400)
     u, power = 0.5 * (nodes + 1.0), 0.5 * weights * (nodes + 1.0)
     up = config.element_spacing * np.arange(config.phones)
@@ -62,7 +62,7 @@ def drawn(snapshots, seed=1, **overrides):
 
 
 def relative(csdm, R):
-    """Deviation of each element in units of the root of the product of its phones' powers."""
+    """Deviation of each element in units of the root of the product of its hydrophones' powers."""
     power = np.sqrt(np.einsum('fii->fi', R).real)
     return (csdm - R) / power[:, :, None] / power[:, None, :]
 

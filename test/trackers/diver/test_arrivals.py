@@ -2,6 +2,7 @@
 
 from helpers.diver_runs import errors, run, SECOND
 import numpy as np
+import pytest
 
 from sonar_imm.measurements import Arrivals
 from sonar_imm.simulation.diver.simulator import RECEIVERS, scenario, simulate
@@ -81,7 +82,7 @@ def test_a_late_reflection_in_a_tag_ping_is_left_out():
                 frame_id='map',
             )
         estimate = tracker.process(ping)[-1]
-    assert estimate.extras['nis_dof'][0] == 2  # the fix of the five others
+    assert estimate.extras['nis_dof'][0] == 4  # five of the six, less the time of emission
     assert np.hypot(*(estimate.state[0, :2] - [14.5, 30.0])) < 0.5
 
 
@@ -113,6 +114,54 @@ def test_bearings_help_a_single_receiver():
         return np.hypot(*(tracker_out[-1].state[0, :2] - p))
 
     assert final_error(True) < 0.4 < final_error(False) + 0.4
+
+
+def one_receiver_with_bearings(turn, **parameters):
+    """The estimates of a diver east of a receiver that hears ranges and bearings, where the
+    diver ends, and the health; the whole scene turned about the receiver by `turn` rad."""
+    errors = 0.02 * np.random.default_rng(13).normal(size=60)
+    errors[3::9] += 0.4  # 20 m at that range, at second 30 on the jump: for the gate to keep out
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    tracker, estimates = DiverTracker(DiverConfig(max_tracks=1, **parameters)), []
+    for second in range(1, 60):
+        diver = R @ [50.0, 0.6 * second - 18.0]
+        # Four receivers until the track is there, then one.
+        rx = (RECEIVERS if second < 8 else RECEIVERS[:1])[:, :2] @ R.T
+        bearing = np.arctan2(*(diver - rx).T[::-1]) + errors[second]
+        path, n = np.linalg.norm(diver) + np.linalg.norm(diver - rx, axis=1), len(rx)
+        ping = Arrivals(
+            stamp_ns=second * SECOND,
+            tx_id=np.zeros(n),
+            rx_id=np.arange(n),
+            tx=np.zeros((n, 3)),
+            rx=np.column_stack([rx, np.zeros(n)]),
+            toa=path / 1500.0,
+            var_toa=np.full(n, 1e-8),
+            bearing=np.mod(bearing + np.pi, 2.0 * np.pi) - np.pi,
+            var_bearing=np.full(n, 0.02**2),
+            frame_id='map',
+        )
+        estimates.append(tracker.process(ping)[-1])
+    return estimates, diver, tracker.health()
+
+
+@pytest.mark.parametrize('learn_scale', [False, True])
+@pytest.mark.parametrize('turn', [0.25, 1.0])
+def test_bearings_across_half_a_turn_are_bearings(turn, learn_scale):
+    """Turned by pi, the diver crosses the direction in which bearings jump from pi to -pi."""
+    turn *= np.pi
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    plain, _, health = one_receiver_with_bearings(0.0, estimate_covariance_scale=learn_scale)
+    other, diver, same = one_receiver_with_bearings(turn, estimate_covariance_scale=learn_scale)
+    with_bearing = 0
+    for one, two in zip(plain[7:], other[7:]):
+        assert two.extras['nis_dof'].tolist() == one.extras['nis_dof'].tolist()
+        assert two.extras['nis'] == pytest.approx(one.extras['nis'], abs=1e-5)
+        assert two.state[0, :2] == pytest.approx(R @ one.state[0, :2], abs=1e-5)
+        with_bearing += one.extras['nis_dof'][0] > 1
+    assert with_bearing == 52 - 6  # all but the six wild ones
+    assert np.hypot(*(two.state[0, :2] - diver)) < 1.0
+    assert same['scale_arrivals'] == pytest.approx(health['scale_arrivals'], rel=1e-5)
 
 
 def test_echoes_of_two_divers_at_each_receiver_are_told_apart():

@@ -218,15 +218,15 @@ def test_a_scan_that_misses_a_diver_teaches_nothing_of_its_turns(adaptation):
     tracker = DiverTracker(DiverConfig(adaptation=adaptation))
     for second in range(1, 8):
         tracker.process(fix(second, 0.75 * second, 0.2 * second))
-    known = tracker._history.state
-    learnt, mu = known.learnt[0].copy(), known.mu[0].copy()
+    before = tracker._stream.state
+    learnt, mu = before.learnt[0].copy(), before.mu[0].copy()
     tracker.process(fix(8, 500.0, 500.0))  # a false detection far away
-    missed = tracker._history.state
+    missed = tracker._stream.state
     assert missed.life.track_id[0] == 1 and missed.nis_dof[0] == 0
     assert not np.array_equal(missed.mu[0], mu)
     assert np.array_equal(missed.learnt[0], learnt)
     tracker.process(fix(9, 0.75 * 9, 0.2 * 9))
-    assert not np.array_equal(tracker._history.state.learnt[0], learnt)
+    assert not np.array_equal(tracker._stream.state.learnt[0], learnt)
 
 
 def test_no_more_divers_are_confirmed_than_there_can_be():

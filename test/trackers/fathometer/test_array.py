@@ -1,4 +1,4 @@
-"""The fathometer tracker with arrays: pressure, cross-spectra, dead phones, lost blocks."""
+"""The fathometer tracker with arrays: pressure, cross-spectra, dead hydrophones, lost blocks."""
 
 from attrs import evolve
 from helpers.fathometer_runs import run
@@ -159,7 +159,7 @@ def changed(spectra, csdm=None, **fields):
 
 
 @pytest.mark.parametrize('dead', [0, 3, 7])
-def test_a_dead_phone_is_left_out_and_changes_little(spectra, dead):
+def test_a_dead_hydrophone_is_left_out_and_changes_little(spectra, dead):
     csdm = spectra.csdm.copy()
     csdm[:, dead], csdm[:, :, dead] = np.nan, np.nan
     config = FathometerConfig(**SMALL, depth_min=122.0, depth_max=172.0)
@@ -171,14 +171,14 @@ def test_a_dead_phone_is_left_out_and_changes_little(spectra, dead):
     assert masked.amplitude[peak] > 0.5 * whole.amplitude[peak]
     assert np.corrcoef(whole.amplitude, masked.amplitude)[0, 1] > 0.5
     tracker, found = run([changed(spectra, csdm)], **SMALL)
-    assert found and tracker.counts['dead_phones_masked'] == 1
+    assert found and tracker.counts['dead_hydrophones_masked'] == 1
 
 
 def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
     one = np.ones((len(spectra), 8, 8), np.complex64)
     cases = {
         'singular': ([changed(spectra, one)], {'loading': 0.0}),
-        'wrong_phones': ([changed(spectra, spectra.csdm[:, :7, :7])], {}),
+        'wrong_hydrophones': ([changed(spectra, spectra.csdm[:, :7, :7])], {}),
         'bad_band': ([spectra], {'frequency_min': 5000.0, 'frequency_max': 6000.0}),
         'bad_frequency': (
             [

@@ -1,0 +1,31 @@
+"""One thread of algebra in the programs of this package.
+
+The BLAS that numpy brings starts a thread for each core as soon as it is loaded, and wakes them
+for products that one core has done before they are awake. So the command and the nodes call
+`one_blas_thread` before anything imports numpy. Whoever uses the package as a library keeps the
+process as they made it: nothing here runs on import.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# What is set for a library, and what else of the user's own has a say in it.
+_SETTINGS = {
+    'OPENBLAS_NUM_THREADS': ('GOTO_NUM_THREADS', 'OMP_NUM_THREADS'),
+    'MKL_NUM_THREADS': ('OMP_NUM_THREADS',),
+    'BLIS_NUM_THREADS': ('OMP_NUM_THREADS',),
+    'VECLIB_MAXIMUM_THREADS': (),
+}
+
+
+def one_blas_thread() -> bool:
+    """Let this process and its children do algebra in one thread, unless the user's environment
+    says otherwise. False, and nothing done, when numpy is loaded: then it is too late."""
+    if 'numpy' in sys.modules:
+        return False
+    for name, others in _SETTINGS.items():
+        if not any(os.environ.get(each) for each in (name, *others)):
+            os.environ[name] = '1'
+    return True

@@ -1,0 +1,124 @@
+"""One thread of algebra, in real processes: counted by the operating system."""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SETTINGS = ('OPENBLAS', 'GOTO', 'OMP', 'MKL', 'BLIS')
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else 0
+
+# A module that Python imports at start; it tells at the end how many threads there were.
+WITNESS = """
+import atexit, sys
+def tell():
+    import numpy
+    status = open('/proc/self/status').read()
+    print('threads', status.split('Threads:')[1].split()[0], file=sys.stderr)
+atexit.register(tell)
+"""
+
+pytestmark = pytest.mark.skipif(
+    CORES < 2 or not Path('/proc/self/status').exists(),
+    reason='one core: nobody would start a second thread',
+)
+
+
+@pytest.fixture
+def threads_of(tmp_path):
+    """Run Python with `arguments`; how many threads the process has at its end, with nothing said
+    of threads in its environment but `said`."""
+    (tmp_path / 'sitecustomize.py').write_text(WITNESS)
+
+    def run(*arguments, **said):
+        kept = {
+            name: value
+            for name, value in os.environ.items()
+            if not name.startswith(tuple(f'{each}_NUM_THREADS' for each in SETTINGS))
+        }
+        paths = os.pathsep.join([str(tmp_path), str(ROOT), str(ROOT / 'test')])
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            env={**kept, 'PYTHONPATH': paths, **said},
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+        )
+        assert 'threads ' in done.stderr, done.stderr
+        return int(done.stderr.rsplit('threads ', 1)[1].split()[0])
+
+    return run
+
+
+@pytest.fixture
+def loaded_alone(threads_of):
+    """Threads of a process that only loads numpy."""
+    count = threads_of('-c', 'import numpy')
+    if count == 1:
+        pytest.skip('the BLAS of this numpy starts no thread when it is loaded')
+    return count
+
+
+INSTALLED = """
+import sys
+sys.argv[0] = '/opt/lib/sonar_imm/{}_node'
+from sonar_imm.nodes.commands import main
+main()
+"""
+INFO = ('-m', 'sonar_imm.cli', 'info', str(ROOT / 'bags' / 'diver_table1'))
+
+
+def test_the_command_has_one_thread(threads_of, loaded_alone):
+    assert threads_of(*INFO) == 1
+
+
+@pytest.mark.parametrize('name', ['OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS'])
+def test_what_the_user_says_wins(threads_of, loaded_alone, name):
+    assert threads_of(*INFO, **{name: '2'}) == 2
+
+
+def test_the_library_leaves_the_process_alone(threads_of, loaded_alone):
+    imports = (
+        'import sonar_imm, sonar_imm.cli, sonar_imm.estimation.imm, sonar_imm.trackers; '
+        'from sonar_imm.trackers.diver.tracker import DiverTracker'
+    )
+    assert threads_of('-c', imports) >= loaded_alone > 1  # scipy brings a BLAS of its own
+    late = (
+        'import os, numpy; from sonar_imm.threads import one_blas_thread; '
+        'assert not one_blas_thread() and "OPENBLAS_NUM_THREADS" not in os.environ'
+    )
+    assert threads_of('-c', late) == loaded_alone
+
+
+@pytest.mark.parametrize(
+    'start',
+    [
+        ('-m', 'sonar_imm.nodes.diver'),
+        ('-c', INSTALLED.format('diver')),
+        ('-c', INSTALLED.format('obstacle')),
+    ],
+)
+def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone, start):
+    """Its parameters are refused, so it ends by itself; the middleware has threads of its own, and
+    so has the BLAS of scipy."""
+    pytest.importorskip('rclpy')
+    arguments = ('--ros-args', '-p', 'history:=-1.0')
+    alone = threads_of(*start, *arguments, OPENBLAS_NUM_THREADS='1')
+    assert threads_of(*start, *arguments) == alone
+    assert threads_of(*start, *arguments, OPENBLAS_NUM_THREADS='2') > alone
+
+
+def test_every_node_has_its_command():
+    from sonar_imm.trackers import SYSTEMS
+
+    text = (ROOT / 'setup.py').read_text(encoding='utf-8')
+    assert "f'{system}_node = sonar_imm.nodes.commands:main'" in text
+    assert "'fls_detector_node = sonar_imm.nodes.commands:main'" in text
+    for name in (*SYSTEMS, 'fls_detector'):
+        module = (ROOT / 'sonar_imm' / 'nodes' / f'{name}.py').read_text(encoding='utf-8')
+        assert '\ndef main(' in module
+        start = module.index("if __name__ == '__main__':")
+        assert 'one_blas_thread()' in module[start : module.index('import sys')]
