@@ -24,7 +24,7 @@ from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
-from .set_particles import gain, Proposals, propose_births, SetModel, Sets
+from .set_particles import gains, Proposals, propose_births, SetModel, Sets
 
 _STEP, _START, _RESAMPLE = range(3)
 
@@ -63,8 +63,8 @@ class SetFilter:
         self.model = model
         self.particles = particles
         self.threads = threads
-        n, width = model.cells, len(model.move)
-        self._move, self._move_ratio = np.empty((n, width)), np.empty((n, width))
+        shape = model.cells * len(model.signs), len(model.move)
+        self._move, self._move_ratio = np.empty(shape), np.empty(shape)
         self._motion = kernels.SetMotion(
             order_min=model.order_min,
             separation=model.separation,
@@ -81,7 +81,7 @@ class SetFilter:
         )
         self._charge = np.array(
             [
-                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(n)
+                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(model.cells)
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
@@ -116,9 +116,12 @@ class SetFilter:
         self.summary(step, step.w, step.sets)
 
     def summary(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-        """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
+        """PMF (orders,) of the order and sums (5, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
-        pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
+        pmf, sums = (
+            np.zeros(len(self.model.transition)),
+            np.zeros((kernels.SUMS, self.model.cells)),
+        )
         kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
         return pmf, sums
 
@@ -143,9 +146,9 @@ class SetFilter:
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
-        filled = np.zeros(model.cells, np.bool_)
+        filled = np.zeros(len(self._move), np.bool_)
         proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
-        kernels.fill_moves(old, gain(b), model.move, model.move_share, filled, proposals)
+        kernels.fill_moves(old, gains(model, b), model.move, model.move_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first,

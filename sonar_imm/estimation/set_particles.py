@@ -36,13 +36,15 @@ The record
     ``paper``      the best a, and a penalty of log(N) for each. The prior of births already
                    charges for the place, so this charges twice: too much.
 
-    A set that needs an amplitude that is not positive is impossible.
+    Each member has a sign for life, drawn at its birth: negative with ``negative_probability``. A
+    set that needs an amplitude of another sign is impossible.
 
 Data-driven proposals
     A move is drawn from ``share * K(z' - z) exp(g(z')) / Z(z) + (1 - share) * K(z' - z)``, with
-    ``g = max(b, 0)^2 / 2`` (what one thing alone would be worth); of the births a share is drawn
-    in proportion to ``exp(min(g, cap))`` and the rest uniformly, at the places that those already
-    there leave free. The cap lets a weak peak have births beside a strong one; the uniform rest
+    ``g = max(s b, 0)^2 / 2`` (what one thing of sign s alone would be worth); of the births a
+    share is drawn in proportion to the sign's probability times ``exp(min(g, cap))`` and the rest
+    uniformly, at the places that those already there leave free. The cap lets a weak peak have
+    births beside a strong one; the uniform rest
     bounds the weight of a birth where the record shows nothing. Each draw is weighted by the exact
     ratio of model to proposal, so proposals change how many particles are needed and nothing else.
     Shares of zero make the bootstrap filter: with eight sharp peaks in a record, all but a handful
@@ -67,6 +69,7 @@ from typing import NamedTuple
 
 from attrs import field, frozen
 import numpy as np
+from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
 from .markov import check_transition_matrix
@@ -82,10 +85,15 @@ def banded_transition(orders: int, switch: float) -> FloatArray:
     return np.asarray(P + np.diag(1.0 - P.sum(axis=1)))
 
 
+def move_reach(std: float, *, reach: float = 4.0) -> float:
+    """How many cells `gaussian_move` reaches to either side."""
+    return max(1.0, math.floor(reach * std)) if math.isfinite(reach * std) else math.inf
+
+
 def gaussian_move(std: float, *, reach: float = 4.0) -> FloatArray:
     """Probabilities (2 r + 1,) of moving by -r .. r cells: Gaussian of `std` cells, cut at `reach`
     standard deviations."""
-    radius = max(1, int(reach * std))
+    radius = int(move_reach(std, reach=reach))
     K = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / std))
     return np.asarray(K / K.sum())
 
@@ -98,7 +106,8 @@ class SetModel:
     smallest set; transition (orders, orders); move (2 r + 1,); gram (n,) by lag in cells, one at
     0; amplitude_prior: one of PRIORS, with amplitude_std: s, and independent_samples: N;
     move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
-    noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record.
+    noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
+    negative_probability: that a member is negative.
     """
 
     cells: int
@@ -114,12 +123,15 @@ class SetModel:
     birth_share: float = 0.75
     birth_cap: float = 8.0
     amplitude_memory: float = 0.0
+    negative_probability: float = 0.0
 
     def __attrs_post_init__(self) -> None:
         if self.amplitude_prior not in PRIORS:
             raise ValueError(f'amplitude_prior is one of {PRIORS}, not {self.amplitude_prior!r}')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
             raise ValueError('only marginal amplitudes can have a memory')
+        if not 0.0 <= self.negative_probability < 1.0:
+            raise ValueError('negative_probability lies in [0, 1)')
         if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:
             raise ValueError('a set model needs order_min >= 0, separation >= 1, gram (n,)')
         if self.room(self.order_max) == 0:
@@ -144,6 +156,12 @@ class SetModel:
         return 1 + self.most_changes + self.order_max
 
     @property
+    def signs(self) -> dict[int, float]:
+        """The signs that members can have, and how probable each is at a birth."""
+        negative = self.negative_probability
+        return {1: 1.0 - negative, -1: negative} if negative else {1: 1.0}
+
+    @property
     def ridge(self) -> float:
         """What is added to the diagonal of G: 1 / s^2, or nothing."""
         return self.amplitude_std**-2 if self.amplitude_prior == 'marginal' else 0.0
@@ -164,12 +182,14 @@ class SetModel:
 
 class Sets(NamedTuple):
     """N sets: order (N,), cell (N, J) of which the first `order` count, ascending; prior_mean and
-    prior_variance (N, J) of the amplitudes in units of the noise, used with a memory only."""
+    prior_variance (N, J) of the amplitudes in units of the noise, used with a memory only; sign
+    (N, J) of the amplitudes, 1 or -1."""
 
     order: IntArray
     cell: IntArray
     prior_mean: FloatArray
     prior_variance: FloatArray
+    sign: NDArray[np.int8]
 
     @classmethod
     def empty(cls, model: SetModel, count: int) -> Sets:
@@ -179,31 +199,35 @@ class Sets(NamedTuple):
             np.zeros(shape, np.int64),
             np.zeros(shape),
             np.full(shape, model.amplitude_std**2),
+            np.ones(shape, np.int8),
         )
 
     def take(self, index: IntArray) -> Sets:
-        return Sets(
-            self.order[index],
-            self.cell[index],
-            self.prior_mean[index],
-            self.prior_variance[index],
-        )
+        return Sets._make(column[index] for column in self)
 
 
 class Proposals(NamedTuple):
-    """Tables of one record: move (n, 2 r + 1) cumulative, move_ratio (n, 2 r + 1) log of model to
-    proposal, for cells from which something moves (others are not filled in); birth (n + 1,)
-    running sum of the birth weights, birth_ratio (n,) log of uniform to weight."""
+    """Tables of one record, for S signs: move (S n, 2 r + 1) cumulative, move_ratio (S n, 2 r + 1)
+    log of model to proposal, for cells from which something moves (others are not filled in),
+    negative members in the second n rows; birth (n + 1,) running sum of the birth weights of both
+    signs, birth_ratio (S, n) log of model to weight, birth_positive (n,) the weight of positive
+    births."""
 
     move: FloatArray
     move_ratio: FloatArray
     birth: FloatArray
     birth_ratio: FloatArray
+    birth_positive: FloatArray
 
 
 def gain(b: FloatArray) -> FloatArray:
     """g (n,): the best log likelihood ratio of one thing alone at each cell."""
     return np.asarray(0.5 * np.square(np.maximum(b, 0.0)))
+
+
+def gains(model: SetModel, b: FloatArray) -> FloatArray:
+    """g (S, n) for each sign."""
+    return np.stack([gain(sign * b) for sign in model.signs])
 
 
 def propose(model: SetModel, b: FloatArray) -> Proposals:
@@ -212,7 +236,9 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
     K = np.where(there, model.move, 0.0)
-    g = np.where(there, gain(b)[np.clip(to, 0, n - 1)], -np.inf)
+    signs = len(model.signs)
+    g = np.where(there, gains(model, b)[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
+    K = np.tile(K, (signs, 1))
     data_driven = K * np.exp(g - g.max(axis=1, keepdims=True))
     q = model.move_share * data_driven / data_driven.sum(axis=1, keepdims=True)
     q += (1.0 - model.move_share) * K / K.sum(axis=1, keepdims=True)
@@ -221,14 +247,16 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, b))
 
 
-def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """birth (n + 1,) and birth_ratio (n,) of `Proposals`."""
-    data_driven = np.exp(np.minimum(gain(b), model.birth_cap))
+def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """birth (n + 1,), birth_ratio (S, n) and birth_positive (n,) of `Proposals`."""
+    prior = np.array(list(model.signs.values()))[:, None]
+    data_driven = prior * np.exp(np.minimum(gains(model, b), model.birth_cap))
     weight = (
         model.birth_share * data_driven / data_driven.sum()
-        + (1.0 - model.birth_share) / model.cells
+        + (1.0 - model.birth_share) * prior / model.cells
     )
-    return np.append(0.0, np.cumsum(weight)), -np.log(model.cells * weight)
+    running = np.append(0.0, np.cumsum(weight.sum(axis=0)))
+    return running, -np.log(model.cells * weight / prior), weight[0]
 
 
 def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
@@ -245,9 +273,11 @@ def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[S
     for i in range(N):
         m = int(sets.order[i])
         members: list[int] = []
+        sign: dict[int, int] = {}
         for k in range(m):
-            log_ratio[i] += _birth(model, proposals, members, uniform[i, 1 + k])
-        sets.cell[i, :m] = members
+            log_ratio[i] += _birth(model, proposals, members, sign, uniform[i, 1 + k])
+        sets.cell[i, : len(members)] = members
+        sets.sign[i, : len(members)] = [sign[z] for z in members]
         # Births charge 1/n each; possible sets of one size are equally likely in any order.
         charge = math.log(math.factorial(m) * model.room(m)) - m * math.log(model.cells)
         log_ratio[i] -= charge
@@ -272,20 +302,23 @@ def propagate(
             del members[min(int(uniform[i, 1 + k] * len(members)), len(members) - 1)]
         survivors = []
         for k, (z, j) in enumerate(members):
-            table = proposals.move[z]
+            row = z if sets.sign[i, j] > 0 else z + model.cells
+            table = proposals.move[row]
             point = uniform[i, 1 + changes + k] * table[-1]
             step = min(int(np.searchsorted(table, point, 'right')), 2 * radius)
-            log_ratio[i] += proposals.move_ratio[z, step]
+            log_ratio[i] += proposals.move_ratio[row, step]
             survivors.append((z + step - radius, j))
         places = sorted(z for z, _ in survivors)
+        sign = {z: int(sets.sign[i, j]) for z, j in survivors}
         if any(b - a < model.separation for a, b in zip(places, places[1:])):
             log_ratio[i] = IMPOSSIBLE
         for k in range(m - len(survivors)):
             if log_ratio[i] > IMPOSSIBLE:
-                log_ratio[i] += _birth(model, proposals, places, uniform[i, 1 + k])
+                log_ratio[i] += _birth(model, proposals, places, sign, uniform[i, 1 + k])
         new.order[i] = m
         if log_ratio[i] > IMPOSSIBLE:
             new.cell[i, :m] = places
+            new.sign[i, :m] = [sign[z] for z in places]
             parents = dict(survivors)
             for k, z in enumerate(places):
                 if model.amplitude_memory and z in parents:
@@ -294,9 +327,15 @@ def propagate(
     return new, log_ratio
 
 
-def _birth(model: SetModel, proposals: Proposals, places: list[int], uniform: float) -> float:
-    """Insert one more place into ascending `places`, as far from them as it must be; the log ratio
-    of a uniform birth to this one, -inf when there is no room."""
+def _birth(
+    model: SetModel,
+    proposals: Proposals,
+    places: list[int],
+    sign: dict[int, int],
+    uniform: float,
+) -> float:
+    """Insert one more place into ascending `places`, as far from them as it must be, and its sign
+    into `sign`; the log ratio of the model's birth to this one, -inf when there is no room."""
     edges = [-model.separation, *places, model.cells - 1 + model.separation]
     gaps = [
         (low + model.separation, high - model.separation + 1)
@@ -315,15 +354,19 @@ def _birth(model: SetModel, proposals: Proposals, places: list[int], uniform: fl
             found = int(np.searchsorted(proposals.birth, point, 'right')) - 1
             place = min(max(found, low), high - 1)
             places.insert(k, place)
-            return float(proposals.birth_ratio[place] + math.log(total))
+            # What is left of the random number within the cell chooses the sign.
+            negative = point - proposals.birth[place] >= proposals.birth_positive[place]
+            sign[place] = -1 if negative and len(model.signs) > 1 else 1
+            row = int(sign[place] < 0)
+            return float(proposals.birth_ratio[row, place] + math.log(total))
         left -= weight
     raise AssertionError('a gap that has weight is always found')
 
 
 def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
     """Oracle for tests: log likelihood (N,) of the record against that of an empty one, -inf where
-    an amplitude is not positive, and the amplitudes (N, J), their mean given the set, in units of
-    the noise."""
+    an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
+    in units of the noise."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
     for m in np.unique(sets.order[sets.order > 0]):
@@ -344,5 +387,5 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
             value -= 0.5 * np.sum(precision * np.square(sets.prior_mean[at, :m]), axis=1)
             value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
         amplitude[at, :m] = a
-        log_likelihood[at] = np.where((a > 0.0).all(axis=1), value, IMPOSSIBLE)
+        log_likelihood[at] = np.where((a * sets.sign[at, :m] > 0.0).all(axis=1), value, IMPOSSIBLE)
     return log_likelihood, amplitude

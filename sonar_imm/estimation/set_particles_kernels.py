@@ -15,6 +15,9 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .set_particles import Proposals, Sets
 
+SUMS = 5
+"""Rows of what `moments` adds up."""
+
 
 class SetMotion(NamedTuple):
     """How sets change from record to record: order_min; separation in cells; most_changes, how
@@ -43,23 +46,24 @@ class AmplitudeModel(NamedTuple):
 @kernel
 def fill_moves(
     sets: Sets,
-    g: FloatArray,
+    gain: FloatArray,
     move: FloatArray,
     share: float,
     filled: BoolArray,
     proposals: Proposals,
 ) -> None:
     """The rows of `set_particles.propose` from which some particle moves, into move and
-    move_ratio of `proposals`; filled (n,) is False throughout before, and says which rows after.
-    """
-    n, width = proposals.move.shape
+    move_ratio of `proposals`; g (S, n) for each sign; filled (S n,) is False throughout before,
+    and says which rows after."""
+    n, width = gain.shape[1], proposals.move.shape[1]
     radius = width // 2
     for i in range(sets.order.shape[0]):
         for k in range(sets.order[i]):
-            z = sets.cell[i, k]
-            if filled[z]:
+            z, negative = sets.cell[i, k], int(sets.sign[i, k] < 0)
+            row, g = z + n * negative, gain[negative]
+            if filled[row]:
                 continue
-            filled[z] = True
+            filled[row] = True
             low, high = max(0, radius - z), min(width, n + radius - z)
             best, inside = -math.inf, 0.0
             for step in range(low, high):
@@ -75,8 +79,9 @@ def fill_moves(
                     q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
                     q += (1.0 - share) * move[step] / inside
                 total += q
-                proposals.move[z, step] = total
-                proposals.move_ratio[z, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
+                proposals.move[row, step] = total
+                ratio = math.log(move[step] / q) if q > 0.0 else -math.inf
+                proposals.move_ratio[row, step] = ratio
 
 
 @kernel
@@ -98,8 +103,8 @@ def _birth(
     separation: int,
     proposals: Proposals,
     uniform: float,
-) -> tuple[int, int, float]:
-    """(position in cells, cell, log ratio) of one more member of cells[:m]; position -1 when
+) -> tuple[int, int, int, float]:
+    """(position in cells, cell, sign, log ratio) of one more member of cells[:m]; position -1 when
     there is no room."""
     birth = proposals.birth
     n = birth.shape[0] - 1
@@ -111,7 +116,7 @@ def _birth(
             total += birth[high] - birth[low]
             last = k
     if last < 0:
-        return -1, 0, -math.inf
+        return -1, 0, 1, -math.inf
     left = uniform * total
     for k in range(last + 1):
         low = 0 if k == 0 else cells[k - 1] + separation
@@ -121,9 +126,15 @@ def _birth(
             if left < weight or k == last:
                 place = _search(birth, low, high, birth[low] + left) - 1
                 place = max(low, min(place, high - 1))
-                return k, place, proposals.birth_ratio[place] + math.log(total)
+                negative = 0
+                if proposals.birth_ratio.shape[0] > 1:
+                    # What is left of the random number within the cell chooses the sign.
+                    inside = birth[low] + left - birth[place]
+                    negative = int(inside >= proposals.birth_positive[place])
+                paid = proposals.birth_ratio[negative, place] + math.log(total)
+                return k, place, 1 - 2 * negative, paid
             left -= weight
-    return -1, 0, -math.inf
+    return -1, 0, 1, -math.inf
 
 
 @kernel
@@ -143,15 +154,15 @@ def start(
     for i in range(first, last):
         chosen = min(int(uniform[i, 0] * orders), orders - 1)
         m = motion.order_min + chosen
-        ratio, here = 0.0, sets.cell[i]
+        ratio, here, sign = 0.0, sets.cell[i], sets.sign[i]
         for k in range(m):
-            at, place, paid = _birth(here, k, separation, proposals, uniform[i, 1 + k])
+            at, place, drawn, paid = _birth(here, k, separation, proposals, uniform[i, 1 + k])
             ratio += paid
             if at < 0:
                 break
             for j in range(k, at, -1):
-                here[j] = here[j - 1]
-            here[at] = place
+                here[j], sign[j] = here[j - 1], sign[j - 1]
+            here[at], sign[at] = place, drawn
         sets.order[i] = m
         log_ratio[i] = ratio - charge[chosen]
 
@@ -170,10 +181,14 @@ def propagate(
 ) -> None:
     """See `set_particles.propagate`: from the sets `old` to `new` and log_ratio (N,)."""
     order_min, separation, changes, cumulative = motion
-    orders, (cells, width) = cumulative.shape[0], proposals.move.shape
+    orders, width, cells = (
+        cumulative.shape[0],
+        proposals.move.shape[1],
+        proposals.birth_ratio.shape[1],
+    )
     parent = np.empty(new.cell.shape[1], np.int64)
     for i in range(first, last):
-        before, u, here = old.order[i], uniform[i], new.cell[i]
+        before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
         m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
         left, ratio = before, 0.0
         for k in range(before):
@@ -186,9 +201,10 @@ def propagate(
         for k in range(left):
             source = parent[k]
             z = old.cell[i, source]
-            table = proposals.move[z]
+            row = z if old.sign[i, source] > 0 else z + cells
+            table = proposals.move[row]
             step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
-            ratio += proposals.move_ratio[z, step]
+            ratio += proposals.move_ratio[row, step]
             # What leaves the lattice is impossible already; its number must stay an index.
             z = min(max(z + step - width // 2, 0), cells - 1)
             j = k
@@ -196,18 +212,20 @@ def propagate(
                 here[j], parent[j] = here[j - 1], parent[j - 1]
                 j -= 1
             here[j], parent[j] = z, source
+        for k in range(left):
+            sign[k] = old.sign[i, parent[k]]
         for k in range(1, left):
             if here[k] - here[k - 1] < separation:
                 ratio = -math.inf
         for k in range(m - left):
             if ratio > -math.inf:
                 count = left + k
-                at, place, paid = _birth(here, count, separation, proposals, u[1 + k])
+                at, place, drawn, paid = _birth(here, count, separation, proposals, u[1 + k])
                 ratio += paid
                 if at >= 0:
                     for j in range(count, at, -1):
-                        here[j], parent[j] = here[j - 1], parent[j - 1]
-                    here[at], parent[at] = place, -1
+                        here[j], parent[j], sign[j] = here[j - 1], parent[j - 1], sign[j - 1]
+                    here[at], parent[at], sign[at] = place, -1, drawn
         new.order[i], log_ratio[i] = m, ratio
         if amplitudes.memory > 0.0 and ratio > -math.inf:
             for k in range(m):
@@ -229,7 +247,7 @@ def weigh(
 ) -> None:
     """See `set_particles.weigh`: adds the log likelihood to log_weight (N,), whose -inf are left
     alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
-    order, cell, mean, variance = sets
+    order, cell, mean, variance, sign = sets
     gram, memory = amplitudes.gram, amplitudes.memory > 0.0
     J = cell.shape[1]
     L, y = np.empty((J, J)), np.empty(J)
@@ -274,7 +292,7 @@ def weigh(
                 for k in range(r + 1, m):
                     rest -= L[k, r] * a[k]
                 a[r] = rest * L[r, r]
-                if not a[r] > 0.0:
+                if not a[r] * sign[i, r] > 0.0:
                     value = -math.inf
                     break
         log_weight[i] += value
@@ -310,9 +328,9 @@ def moments(
     pmf: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Add to pmf (orders,) and to sums (4, n), the intensity, the first two moments of the
-    amplitude and the variance it had before the record, that lie on each cell. Both are zero
-    before."""
+    """Add to pmf (orders,) and to sums (5, n), the intensity, the first two moments of the
+    amplitude, the variance it had before the record, and the share of members that are the first
+    of their set, that lie on each cell. Both are zero before."""
     for i in range(w.shape[0]):
         if w[i] > 0.0:
             pmf[sets.order[i] - order_min] += w[i]
@@ -322,3 +340,5 @@ def moments(
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
                 sums[3, z] += w[i] * sets.prior_variance[i, k]
+            if sets.order[i] > 0:
+                sums[4, sets.cell[i, 0]] += w[i]

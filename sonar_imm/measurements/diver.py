@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,6 +52,23 @@ class Fix:
         return content_key('fix', self.position, self.covariance)
 
 
+OPTIONAL_ARRIVALS = ('elevation', 'var_elevation', 'depth', 'var_depth')
+"""Columns of `Arrivals` that may be left out."""
+
+ARRIVAL_COLUMNS = (
+    'tx_id',
+    'rx_id',
+    'toa',
+    'var_toa',
+    'tx',
+    'rx',
+    'bearing',
+    'var_bearing',
+    *OPTIONAL_ARRIVALS,
+)
+"""Columns of `Arrivals`, in the order in which they sort its rows."""
+
+
 @frozen(eq=False, kw_only=True)
 class Arrivals:
     """Arrival times of one ping, one row a transmitter-receiver pair.
@@ -61,7 +78,9 @@ class Arrivals:
     emits at an unknown time near the stamp (an acoustic tag) and only differences between
     receivers carry information. tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where
     unknown; bearing: (n,) rad at the receiver, counter-clockwise from +x, NaN where not measured;
-    var_bearing: (n,) rad^2.
+    var_bearing: (n,) rad^2. elevation: (n,) rad at the receiver, up positive, with var_elevation,
+    and depth: (n,) m, down positive, the target's own report, with var_depth m^2; each NaN or left
+    out where not measured.
     """
 
     stamp_ns: int
@@ -73,12 +92,20 @@ class Arrivals:
     var_toa: FloatArray = field(converter=floats(None))
     bearing: FloatArray = field(converter=floats(None))
     var_bearing: FloatArray = field(converter=floats(None))
+    elevation: FloatArray = field(default=(), converter=floats(None))
+    var_elevation: FloatArray = field(default=(), converter=floats(None))
+    depth: FloatArray = field(default=(), converter=floats(None))
+    var_depth: FloatArray = field(default=(), converter=floats(None))
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
         n = len(self.toa)
-        for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing'):
+        for name in OPTIONAL_ARRIVALS:
+            if n and not len(getattr(self, name)):
+                object.__setattr__(self, name, floats(None)(np.full(n, np.nan)))
+        columns = ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing')
+        for name in (*columns, *OPTIONAL_ARRIVALS):
             if len(getattr(self, name)) != n:
                 raise Rejection(
                     'bad_shape',
@@ -92,9 +119,17 @@ class Arrivals:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        where = (self.tx_id, self.rx_id, self.tx, self.rx)
-        heard = (self.toa, self.var_toa, self.bearing, self.var_bearing)
-        return content_key('arrivals', *where, *heard)
+        one = self.in_order()
+        return content_key('arrivals', *(getattr(one, name) for name in ARRIVAL_COLUMNS))
+
+    def in_order(self) -> Arrivals:
+        """The same ping with its rows in the order of their content."""
+        keys = [getattr(self, name) for name in reversed(ARRIVAL_COLUMNS)]
+        columns = [column for key in keys for column in np.atleast_2d(key.T)[::-1]]
+        order = np.lexsort(columns) if len(self) else np.arange(0)
+        if (np.diff(order) == 1).all():
+            return self
+        return evolve(self, **{name: getattr(self, name)[order] for name in ARRIVAL_COLUMNS})
 
     @property
     def passive(self) -> bool:

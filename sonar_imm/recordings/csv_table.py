@@ -72,6 +72,11 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'amplitude': ('amplitude', 'amp', 'response', 'value'),
     'var_bearing': ('var_bearing',),
     'std_bearing': ('std_bearing', 'sigma_bearing'),
+    'elevation': ('elevation', 'elevation_angle'),
+    'var_elevation': ('var_elevation',),
+    'std_elevation': ('std_elevation', 'sigma_elevation'),
+    'var_depth': ('var_depth',),
+    'std_depth': ('std_depth', 'sigma_depth'),
 }
 _UNIT = re.compile(r'_(m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
 _TIME = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')

@@ -101,7 +101,9 @@ def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch)
     else:
         births = set_filter.propose_births
         monkeypatch.setattr(
-            set_filter, 'propose_births', lambda *a: (births(*a)[0], np.zeros(model.cells))
+            set_filter,
+            'propose_births',
+            lambda *a: (births(*a)[0], np.zeros((1, model.cells)), births(*a)[2]),
         )
     assert variation(run(model, exact['B'], 5000, seed=1)[0], exact) > 0.03
 
@@ -143,6 +145,7 @@ def test_a_record_has_random_numbers_of_its_own(model, exact):
         {'amplitude_prior': 'bic_half'},
         {'amplitude_prior': 'paper'},
         {'amplitude_memory': 0.9},
+        {'negative_probability': 0.3},
         {'transition': banded_transition(3, 0.3), 'order_min': 0},
     ],
 )
@@ -161,11 +164,12 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     assert np.allclose(before.log_weight, ratio)
     possible = np.isfinite(ratio)
     assert np.array_equal(before.sets.cell[possible], sets.cell[possible])
+    assert np.array_equal(before.sets.sign[possible], sets.sign[possible])
+    assert (len(np.unique(sets.sign)) == 2) == (changed.negative_probability > 0.0)
 
-    sets = Sets(
-        *before.sets[:2],
-        rng.uniform(-1.0, 3.0, before.sets.cell.shape),
-        rng.uniform(0.5, 4.0, before.sets.cell.shape),
+    sets = before.sets._replace(
+        prior_mean=rng.uniform(-1.0, 3.0, before.sets.cell.shape),
+        prior_variance=rng.uniform(0.5, 4.0, before.sets.cell.shape),
     )
     moved, ratio = tracker._propagate(sets, b, np.random.default_rng(8))
     expected, wanted = propagate(
@@ -181,6 +185,7 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     for i in np.flatnonzero(possible):
         m = moved.order[i]
         assert np.array_equal(moved.cell[i, :m], expected.cell[i, :m])
+        assert np.array_equal(moved.sign[i, :m], expected.sign[i, :m])
         if changed.amplitude_memory:
             assert np.array_equal(moved.prior_mean[i, :m], expected.prior_mean[i, :m])
 
@@ -307,6 +312,7 @@ def test_models_that_cannot_be_are_refused(model):
     for change in (
         {'amplitude_prior': 'flat'},
         {'separation': 40},
+        {'negative_probability': 1.0},
         {'amplitude_prior': 'paper', 'amplitude_memory': 0.5},
         {'transition': np.ones((3, 3))},
     ):

@@ -17,6 +17,8 @@ live = partial(parameter, read_only=False)
 
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
+POLARITIES = ('positive', 'both')
+MAX_MEMBERS = 50_000_000
 
 
 @frozen(kw_only=True)
@@ -118,7 +120,10 @@ class FathometerConfig(StampParameters):
         300.0, 'end of the depths where noise is measured', unit='m', low=0.0, high=12000.0
     )
     noise_sigma: float = live(
-        0.0, 'standard deviation of the noise; 0: as the trace says, else measured', low=0.0
+        0.0,
+        'standard deviation of the noise; 0: as the trace says, else measured',
+        low=0.0,
+        high=1e30,
     )
     remove_background: bool = live(
         False, 'take the median of the noise off the trace first: for envelopes'
@@ -136,6 +141,25 @@ class FathometerConfig(StampParameters):
     )
     pulse_file: str = parameter(
         '', 'file: a CSV of two columns, distance in m from 0 on, and value'
+    )
+
+    # -- sediment ---------------------------------------------------------------------------------
+    sediment_sound_speed: float = live(
+        0.0,
+        'speed of sound just below the bottom, for sediment_depth; 0: as in the water',
+        unit='m/s',
+        low=0.0,
+        high=8000.0,
+    )
+    sediment_sound_speed_std: float = live(
+        0.0, 'error of sediment_sound_speed', unit='m/s', low=0.0, high=2000.0
+    )
+    sediment_sound_speed_gradient: float = live(
+        0.0,
+        'growth of the speed of sound with the depth below the bottom',
+        unit='1/s',
+        low=0.0,
+        high=10.0,
     )
 
     # -- the set of reflectors --------------------------------------------------------------------
@@ -157,6 +181,15 @@ class FathometerConfig(StampParameters):
     )
     min_separation: float = parameter(
         0.4, 'least distance of two reflectors', unit='m', low=1e-4, high=1000.0
+    )
+    polarity: str = parameter(
+        'positive',
+        'sign of the reflectors looked for: where the impedance grows with depth they are '
+        'positive; envelopes (remove_background) have no negative ones',
+        choices=POLARITIES,
+    )
+    negative_probability: float = parameter(
+        0.05, 'polarity both: that a new reflector is negative', low=1e-6, high=0.999
     )
     amplitude_prior: str = parameter(
         'marginal',
@@ -220,6 +253,10 @@ class FathometerConfig(StampParameters):
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
             )
+        if self.particles * self.order_max > MAX_MEMBERS:
+            problems.append(
+                f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'
+            )
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
@@ -229,6 +266,13 @@ class FathometerConfig(StampParameters):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
+
+    @property
+    def negative_share(self) -> float:
+        """How many of the new reflectors are negative."""
+        if self.polarity == 'positive' or self.remove_background:
+            return 0.0
+        return self.negative_probability
 
     @property
     def orders(self) -> int:

@@ -14,6 +14,7 @@ from attrs import evolve, frozen
 import numpy as np
 from numpy.typing import NDArray
 
+from ...acoustics.fathometer import sediment_thickness
 from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
@@ -80,12 +81,14 @@ def nearest_ids(
 @frozen(eq=False)
 class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
-    covariance (K, 2, 2) of both, existence (K,)."""
+    covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
+    above it."""
 
     depth: FloatArray
     amplitude: FloatArray
     covariance: FloatArray
     existence: FloatArray
+    is_bottom: FloatArray
 
 
 def reflectors_of(
@@ -107,7 +110,9 @@ def reflectors_of(
     # The particles know depths as they follow from the depth told with this record: it alone fixes
     # them to some centimetres, so that the errors of earlier records have no say.
     covariance[:, 0, 0] += config.array_depth_std**2
-    return Reflectors(depth, sigma * members.amplitude, covariance, members.existence)
+    return Reflectors(
+        depth, sigma * members.amplitude, covariance, members.existence, members.foremost
+    )
 
 
 def _conditional_variance(
@@ -133,6 +138,24 @@ def relative_amplitude(
         return np.asarray(reflectors.amplitude * (2.0 * height + response.aperture) / taper)
 
 
+def sediment_depths(
+    reflectors: Reflectors, config: FathometerConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Depths (K,) with the sediment's own speed of sound below the bottom, m, and their standard
+    deviations (K,), m. The bottom is the reflector that is it most probably; what lies above it
+    keeps its depth."""
+    if not len(reflectors.depth):
+        return np.empty(0), np.empty(0)
+    bottom = reflectors.depth[np.argmax(reflectors.is_bottom)]
+    time = 2.0 * np.maximum(reflectors.depth - bottom, 0.0) / config.sound_speed
+    speed = config.sediment_sound_speed or config.sound_speed
+    thickness = sediment_thickness(time, speed, config.sediment_sound_speed_gradient)
+    variance = reflectors.covariance[:, 0, 0]
+    variance = variance + np.square(thickness * config.sediment_sound_speed_std / speed)
+    depth = np.where(time > 0.0, bottom + thickness, reflectors.depth)
+    return depth, np.sqrt(variance)
+
+
 def write_estimate(
     reflectors: Reflectors,
     ids: IdArray,
@@ -149,6 +172,11 @@ def write_estimate(
         'track_id': np.zeros(rows, np.uint32),
         'existence': np.zeros(rows),
         'relative_amplitude': np.full(rows, np.nan),
+        'polarity': np.zeros(rows, np.int8),
+        'two_way_time': np.full(rows, np.nan),
+        'is_bottom': np.zeros(rows),
+        'sediment_depth': np.full(rows, np.nan),
+        'sediment_depth_std': np.full(rows, np.nan),
         'sigma': np.full(rows, float(np.median(response.sigma))),
         'preview': np.full(rows, int(preview), np.uint8),
     }
@@ -158,6 +186,12 @@ def write_estimate(
         extras['track_id'][:] = ids
         extras['existence'][:] = reflectors.existence
         extras['relative_amplitude'][:] = relative_amplitude(reflectors, response, config)
+        height = reflectors.depth - response.reference_depth
+        extras['two_way_time'][:] = 2.0 * height / config.sound_speed
+        extras['polarity'][:] = np.sign(reflectors.amplitude)
+        extras['is_bottom'][:] = reflectors.is_bottom
+        found = sediment_depths(reflectors, config)
+        extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found
     zero = np.zeros(rows)
     return Estimate(
         stamp_ns=response.stamp_ns,

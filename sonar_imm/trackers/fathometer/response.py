@@ -16,11 +16,16 @@ from ...acoustics import fathometer
 from ...acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
+from ...estimation.set_particles import move_reach
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError
 from .config import FathometerConfig
 
 MAX_CELLS = 100_000
+MAX_MOVES = 8_000_000
+"""Of a lattice: cells times the cells that a reflector can move to. Each takes 16 bytes in the
+tables of moves, 32 where reflectors of either sign are looked for."""
+MAX_SIGMAS = 1e6
 _LEAST_NOISE_SAMPLES = 50
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
 
@@ -82,14 +87,14 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
     if not step:
         step = trace.step / np.ceil(0.5 * trace.step / config.depth_std)
     first = trace.depth[0] + step * np.ceil((low - trace.depth[0]) / step - 1e-6)
-    return _checked(float(first), float(step), min(high, float(trace.depth[-1])))
+    return _checked(float(first), float(step), min(high, float(trace.depth[-1])), config)
 
 
 def lattice_of_array(reference_depth: float, config: FathometerConfig) -> Lattice:
     """The depths in the window. Raises `Rejection` when there are none."""
     low, high = _window(config, (reference_depth + 10.0, reference_depth + 110.0))
     step = config.depth_step or config.sound_speed / (12.0 * config.frequency_max)
-    return _checked(low, step, high)
+    return _checked(low, step, high, config)
 
 
 def trace_response(
@@ -145,9 +150,10 @@ def array_response(
     b[lattice.depth - reference_depth < aperture] = 0.0
     sigma = np.full(lattice.cells, config.noise_sigma)
     if not config.noise_sigma:
-        count = int((config.noise_depth_max - config.noise_depth_min) / lattice.step)
+        span = config.noise_depth_max - config.noise_depth_min
+        step = max(lattice.step, span / MAX_CELLS)
         low = max(config.noise_depth_min, reference_depth + 2.0 * aperture)
-        quiet = Lattice(low, lattice.step, max(count, _LEAST_NOISE_SAMPLES))
+        quiet = Lattice(low, step, max(int(span / step), _LEAST_NOISE_SAMPLES))
         # The deeper, the less is left of the noise, too: it is measured deeper than it is needed.
         flat = at(quiet.first, quiet.step, quiet.cells) / taper(quiet.depth)
         sigma = _measured_sigma(flat) * taper(lattice.depth)
@@ -243,13 +249,22 @@ def _window(config: FathometerConfig, otherwise: tuple[float, float]) -> tuple[f
     return (config.depth_min, config.depth_max) if config.depth_max else otherwise
 
 
-def _checked(first: float, step: float, high: float) -> Lattice:
-    cells = int(np.floor((high - first) / step + 1e-6)) + 1
-    if cells < 2:
+def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:
+    wanted = (high - first) / step + 1.0 + 1e-6
+    if not wanted >= 2.0:
         raise Rejection('other_depths', 'the record does not reach the depths to be tracked')
-    if cells > MAX_CELLS:
+    if wanted > MAX_CELLS:
         raise Rejection(
             'too_large',
-            f'the depths to be tracked make {cells} steps of {step:g} m; {MAX_CELLS} at most',
+            f'the depths to be tracked make {wanted:.0f} steps of {step:g} m; {MAX_CELLS} at most',
+        )
+    cells = int(wanted)
+    reach = move_reach(config.depth_std / step)
+    if cells * (2.0 * reach + 1.0) > MAX_MOVES:
+        raise Rejection(
+            'too_large',
+            f'{cells} steps of {step:g} m, from each of which a reflector can move by {reach:.0f} '
+            f'(depth_std {config.depth_std:g} m), are {cells * (2.0 * reach + 1.0):.3g} moves; '
+            f'{MAX_MOVES} at most: use a greater depth_step or fewer depths',
         )
     return Lattice(first, step, cells)

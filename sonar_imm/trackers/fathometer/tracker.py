@@ -49,6 +49,7 @@ from .response import (
     Lattice,
     lattice_of_array,
     lattice_of_trace,
+    MAX_SIGMAS,
     pulse_of,
     rank_deficient,
     Response,
@@ -214,7 +215,10 @@ class FathometerTracker:
     def _try(self, response: Response) -> SetStep:
         """What this record would change."""
         assert self._filter is not None
-        b = np.ascontiguousarray(response.amplitude / response.sigma)
+        # Beyond a million sigmas the numbers say nothing more, and their squares would overflow.
+        with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
+            b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
+        b = np.ascontiguousarray(np.nan_to_num(b))
         self.response = response
         return self._filter.step(self._before, b, (self.config.seed, response.stamp_ns))
 
@@ -288,5 +292,6 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         amplitude_std=config.amplitude_std_sigmas,
         independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
         amplitude_memory=config.amplitude_memory,
+        negative_probability=config.negative_share,
         **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )
