@@ -78,13 +78,13 @@ def subset_update(
         grown = []
         for one in left:
             expected, gradient = measure(one.x)
-            S = gradient @ one.P @ gradient + variance
+            S = float(gradient @ one.P @ gradient) + variance
             innovation = value - expected
             fit = -0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
             row, noise = gradient[None], np.array([[variance]])
-            state = consider_update(one.x, one.P, row, noise, np.array([innovation]), mask)
+            x_b, P_b = consider_update(one.x, one.P, row, noise, np.array([innovation]), mask)
             grown.append(Explanation((*one.good, False), one.x, one.P, one.log_weight + log_bad))
-            grown.append(Explanation((*one.good, True), *state, one.log_weight + log_good + fit))
+            grown.append(Explanation((*one.good, True), x_b, P_b, one.log_weight + log_good + fit))
         best = max(one.log_weight for one in grown)
         left = [one for one in grown if one.log_weight >= best - prune]
     return _together(left, len(observations))
