@@ -10,7 +10,6 @@ ROOMS = ('sonar_imm.estimation.', 'sonar_imm.acoustics.')
 ORACLE = 'Oracle for tests'
 
 LIBRARY = {
-    'sonar_imm.acoustics.geometry.euler_angles': 'the inverse of rotation',
     'sonar_imm.acoustics.geometry.vertical_offset': 'equation (7), which reconstruct turns round',
     'sonar_imm.acoustics.multistatic.crlb': 'what a geometry of receivers can attain',
     'sonar_imm.estimation.consistency.innovation_autocorrelation': 'finds unmodelled dynamics',
