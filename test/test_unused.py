@@ -12,7 +12,6 @@ ORACLE = 'Oracle for tests'
 LIBRARY = {
     'sonar_imm.acoustics.arrivals_3d.arrival_angles': 'angles of many receivers at once',
     'sonar_imm.acoustics.arrivals_3d.arrival_paths': 'paths of many receivers at once',
-    'sonar_imm.acoustics.geometry.euler_angles': 'the inverse of rotation',
     'sonar_imm.acoustics.geometry.vertical_offset': 'equation (7), which reconstruct turns round',
     'sonar_imm.acoustics.multistatic.crlb': 'what a geometry of receivers can attain',
     'sonar_imm.acoustics.multistatic.difference_measurement': 'a tag, without its emission',
