@@ -8,7 +8,7 @@ from attrs import frozen
 
 from ...acoustics.fathometer import PROCESSORS
 from ...acoustics.spectra import WINDOWS
-from ...estimation.set_particles import PRIORS
+from ...estimation.set_model import PRIORS
 from ...parameters import inherited, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
@@ -18,6 +18,7 @@ live = partial(parameter, read_only=False)
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
 POLARITIES = ('positive', 'both')
+HEAVES = ('none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
 
 
@@ -51,6 +52,17 @@ class FathometerConfig(StampParameters):
         unit='m',
         low=0.0,
         high=1000.0,
+    )
+
+    heave: str = parameter(
+        'none',
+        'whether the error of the told depth, of standard deviation array_depth_std, is a state '
+        'that all reflectors share: none; independent, wrong anew in each record; memory, by '
+        'heave_memory',
+        choices=HEAVES,
+    )
+    heave_memory: float = parameter(
+        0.9, 'memory: how much of the error stays from record to record', low=0.01, high=0.99
     )
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
@@ -253,6 +265,8 @@ class FathometerConfig(StampParameters):
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
             )
+        if self.heave != 'none' and not self.array_depth_std:
+            problems.append(f'heave {self.heave} needs array_depth_std')
         if self.particles * self.order_max > MAX_MEMBERS:
             problems.append(
                 f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'

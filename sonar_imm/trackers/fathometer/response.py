@@ -16,7 +16,8 @@ from ...acoustics import fathometer
 from ...acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
-from ...estimation.set_particles import move_reach
+from ...estimation.set_model import move_reach
+from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError
 from .config import FathometerConfig
@@ -41,6 +42,10 @@ class Lattice:
     @property
     def depth(self) -> FloatArray:
         return self.first + self.step * np.arange(self.cells)
+
+    def padded(self, cells: int) -> Lattice:
+        """With so many more cells at either end."""
+        return Lattice(self.first - cells * self.step, self.step, self.cells + 2 * cells)
 
 
 @frozen(eq=False)
@@ -249,22 +254,35 @@ def _window(config: FathometerConfig, otherwise: tuple[float, float]) -> tuple[f
     return (config.depth_min, config.depth_max) if config.depth_max else otherwise
 
 
+def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
+    """The heave as a shift in cells of `step` m: on a grid that is finer than reflectors move and
+    than the heave changes."""
+    if config.heave == 'none':
+        return None
+    memory = config.heave_memory if config.heave == 'memory' else 0.0
+    std = config.array_depth_std / step
+    fine = min(config.depth_std / step / 3.0, 0.5 * std * np.sqrt(1.0 - memory**2))
+    return Shift(std=std, memory=memory, step=int(max(1.0, fine, np.ceil(4.0 * std / 200.0))))
+
+
 def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:
     wanted = (high - first) / step + 1.0 + 1e-6
     if not wanted >= 2.0:
         raise Rejection('other_depths', 'the record does not reach the depths to be tracked')
-    if wanted > MAX_CELLS:
+    # With heave the record is looked at further up and down.
+    heard = wanted + (9.0 * config.array_depth_std / step if config.heave != 'none' else 0.0)
+    if heard > MAX_CELLS:
         raise Rejection(
             'too_large',
-            f'the depths to be tracked make {wanted:.0f} steps of {step:g} m; {MAX_CELLS} at most',
+            f'the depths to be tracked make {heard:.0f} steps of {step:g} m; {MAX_CELLS} at most',
         )
-    cells = int(wanted)
     reach = move_reach(config.depth_std / step)
-    if cells * (2.0 * reach + 1.0) > MAX_MOVES:
+    if heard * (2.0 * reach + 1.0) > MAX_MOVES:
         raise Rejection(
             'too_large',
-            f'{cells} steps of {step:g} m, from each of which a reflector can move by {reach:.0f} '
-            f'(depth_std {config.depth_std:g} m), are {cells * (2.0 * reach + 1.0):.3g} moves; '
-            f'{MAX_MOVES} at most: use a greater depth_step or fewer depths',
+            f'{heard:.0f} steps of {step:g} m, from each of which a reflector can move by '
+            f'{reach:.0f} (depth_std {config.depth_std:g} m), are '
+            f'{heard * (2.0 * reach + 1.0):.3g} moves; {MAX_MOVES} at most: use a greater '
+            'depth_step or fewer depths',
         )
-    return Lattice(first, step, cells)
+    return Lattice(first, step, int(wanted))
