@@ -123,7 +123,9 @@ class FathometerConfig(StampParameters):
     noise_depth_min: float = live(
         180.0,
         'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
-        'the whole trace when it does not reach there',
+        'the whole trace when it does not reach there. 0 together with noise_depth_max: where '
+        'the depths tracked have their mirror image at the array, or in what reflectors leave of '
+        'a trace',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -248,12 +250,10 @@ class FathometerConfig(StampParameters):
 
     def check(self) -> list[str]:
         problems = super().check()
-        for low, high in (
-            ('frequency_min', 'frequency_max'),
-            ('noise_depth_min', 'noise_depth_max'),
-        ):
-            if getattr(self, low) >= getattr(self, high):
-                problems.append(f'{high} must exceed {low}')
+        if self.frequency_min >= self.frequency_max:
+            problems.append('frequency_max must exceed frequency_min')
+        if self.noise_depth_min >= self.noise_depth_max and not self.noise_from_mirror:
+            problems.append('noise_depth_max must exceed noise_depth_min')
         if self.depth_max <= self.depth_min and (self.depth_min or self.depth_max):
             problems.append('depth_max must exceed depth_min')
         if self.order_max < self.order_min:
@@ -280,6 +280,11 @@ class FathometerConfig(StampParameters):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
+
+    @property
+    def noise_from_mirror(self) -> bool:
+        """True when no depths of noise are given."""
+        return not (self.noise_depth_min or self.noise_depth_max)
 
     @property
     def negative_share(self) -> float:

@@ -6,9 +6,10 @@ was, is put onto it: its `Response` is what the particles see.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,7 +55,7 @@ class Response:
 
     depth, amplitude, sigma (n,): on the lattice, with the standard deviation of the noise.
     reference_depth: of the array, m, NaN when not known. aperture: length of the array, m, 0 for
-    traces.
+    traces. noise_unknown: sigma is that of the whole trace, reflectors included.
     """
 
     stamp_ns: int
@@ -64,6 +65,7 @@ class Response:
     sigma: FloatArray = field(repr=False)
     reference_depth: float = np.nan
     aperture: float = 0.0
+    noise_unknown: bool = False
 
 
 def pulse_of(config: FathometerConfig) -> Pulse:
@@ -108,6 +110,7 @@ def trace_response(
     """Put a trace onto the lattice; where it does not reach, the response is zero. Raises
     `Rejection` when it has no noise to compare with, or lies elsewhere."""
     amplitude = np.where(np.isfinite(trace.amplitude), trace.amplitude, 0.0)
+    noise_unknown = False
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)
     quiet &= np.isfinite(trace.amplitude)
     if np.count_nonzero(quiet) < _LEAST_NOISE_SAMPLES:
@@ -124,6 +127,7 @@ def trace_response(
             sigma = np.interp(depth, trace.depth[finite], trace.sigma[finite])
         else:
             sigma[:] = _measured_sigma(amplitude[quiet])
+            noise_unknown = config.noise_from_mirror
     return Response(
         trace.stamp_ns,
         trace.frame_id,
@@ -131,6 +135,7 @@ def trace_response(
         np.interp(depth, trace.depth, amplitude, left=0.0, right=0.0),
         sigma,
         reference_depth,
+        noise_unknown=noise_unknown,
     )
 
 
@@ -154,7 +159,9 @@ def array_response(
     # Nearer than its own length the array hears itself.
     b[lattice.depth - reference_depth < aperture] = 0.0
     sigma = np.full(lattice.cells, config.noise_sigma)
-    if not config.noise_sigma:
+    if not config.noise_sigma and config.noise_from_mirror:
+        sigma[:] = mirror_sigma(at, lattice, reference_depth, aperture)
+    elif not config.noise_sigma:
         span = config.noise_depth_max - config.noise_depth_min
         step = max(lattice.step, span / MAX_CELLS)
         low = max(config.noise_depth_min, reference_depth + 2.0 * aperture)
@@ -171,6 +178,38 @@ def array_response(
         reference_depth,
         aperture,
     )
+
+
+def mirror_sigma(
+    at: Callable[[float, float, int], FloatArray],
+    lattice: Lattice,
+    reference_depth: float,
+    aperture: float,
+) -> float:
+    """Noise of a response where it holds no echo: at the lags of the lattice, negative, that is at
+    the depths 2 reference_depth - z. It fades there as it does on the lattice. Left out: what is
+    nearer than the aperture. at(first, step, count): the response."""
+    # A short lattice is made longer.
+    count = max(lattice.cells, 4 * _LEAST_NOISE_SAMPLES)
+    first = 2.0 * reference_depth - lattice.first - lattice.step * (count - 1)
+    depth = first + lattice.step * np.arange(count)
+    quiet = reference_depth - depth >= aperture
+    if np.count_nonzero(quiet) < _LEAST_NOISE_SAMPLES:
+        raise Rejection('no_noise', 'nothing of the mirrored depths is free of the array itself')
+    noise = at(first, lattice.step, count)[quiet]
+    # The noise of a coherence has mean zero: no median of it is taken off.
+    return _measured_sigma(np.append(noise, -noise))
+
+
+def residual_sigma(response: Response, fitted: FloatArray) -> Response:
+    """`response` with the noise that is left where the reflectors' own response `fitted` (n,) is
+    taken off; as it was when that has no noise."""
+    heard = response.amplitude != 0.0
+    try:
+        sigma = _measured_sigma((response.amplitude - fitted)[heard])
+    except Rejection:
+        return response
+    return evolve(response, sigma=np.full(len(response.depth), sigma))
 
 
 def array_coherence(

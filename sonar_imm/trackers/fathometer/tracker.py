@@ -53,6 +53,7 @@ from .response import (
     MAX_SIGMAS,
     pulse_of,
     rank_deficient,
+    residual_sigma,
     Response,
     trace_response,
 )
@@ -224,18 +225,28 @@ class FathometerTracker:
         self._lattice = lattice
         self._heard = lattice.padded(self._filter.model.pad)
 
-    def _try(self, response: Response) -> SetStep:
-        """What this record would change."""
+    def _try(self, response: Response) -> tuple[Response, SetStep]:
+        """What this record would change. Where its noise is not known, it is measured in what the
+        reflectors of a first round leave."""
+        step = self._step(response)
+        if response.noise_unknown:
+            found, _ = self._reflectors(step, step.w, step.sets, response)
+            away = response.depth[:, None] - (found.depth + found.heave)
+            response = residual_sigma(response, self.pulse(away) @ found.amplitude)
+            step = self._step(response)
+        self.response = response
+        return response, step
+
+    def _step(self, response: Response) -> SetStep:
         assert self._filter is not None
         # Beyond a million sigmas the numbers say nothing more, and their squares would overflow.
         with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
             b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
         b = np.ascontiguousarray(np.nan_to_num(b))
-        self.response = response
         return self._filter.step(self._before, b, (self.config.seed, response.stamp_ns))
 
     def _record(self, response: Response) -> list[Estimate]:
-        step = self._try(response)
+        response, step = self._try(response)
         self._before = step.after if step.ok else None
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
@@ -252,7 +263,7 @@ class FathometerTracker:
         return [*self._smoothed(step), newest]
 
     def _preview(self, response: Response) -> Estimate:
-        step = self._try(response)
+        response, step = self._try(response)
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
         _, ids = self._ids.name(reflectors.depth, self.config)
         self.counts['previews'] += 1
