@@ -33,7 +33,7 @@ def find_members(sums: FloatArray, separation: int, most: int, least_existence: 
     """At most `most` members whose existence is at least `least_existence`.
 
     sums (5, n): intensity, first and second moment of the amplitude, its prior variance, and the
-    share of first members on each cell (see `SetFilter.summary`).
+    share of first members on each cell, and with a shift three more (see `SetFilter.summary`).
     """
     n, half = sums.shape[1], max(0, (separation - 1) // 2)
     left = sums.copy()
@@ -59,6 +59,14 @@ def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, fl
     cells = first + np.arange(sums.shape[1])
     total = sums[0].sum()
     place, amplitude = float(sums[0] @ cells) / total, float(sums[1].sum()) / total
+    foremost, prior = min(1.0, float(sums[4].sum())), float(sums[3].sum()) / total
+    if len(sums) > 5:
+        place, second = float(sums[5].sum()) / total, float(sums[6].sum()) / total
+        cross = float(sums[7].sum()) / total - place * amplitude
+        spread_of = max(0.0, second - place**2), cross
+        left = float(sums[2].sum()) / total - amplitude**2
+        left = max(left, cross**2 / spread_of[0] if spread_of[0] else 0.0)
+        return place, amplitude, np.array([spread_of, (cross, left)]), prior, foremost
     spread = cells - place
     cross = float(sums[1] @ spread) / total
     covariance = np.array(
@@ -67,8 +75,7 @@ def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, fl
             [cross, max(0.0, float(sums[2].sum()) / total - amplitude**2)],
         ]
     )
-    foremost = min(1.0, float(sums[4].sum()))
-    return place, amplitude, covariance, float(sums[3].sum()) / total, foremost
+    return place, amplitude, covariance, prior, foremost
 
 
 def _windowed(intensity: FloatArray, half: int) -> FloatArray:

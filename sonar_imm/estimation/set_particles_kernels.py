@@ -13,10 +13,12 @@ import numpy as np
 
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
-from .set_particles import Proposals, Sets
+from .set_model import Sets
+from .set_particles import Proposals
+from .set_shifts import draw_shift
 
-SUMS = 5
-"""Rows of what `moments` adds up."""
+SUMS, SHIFTED_SUMS = 5, 8
+"""Rows of what `moments` adds up, without a shift and with one."""
 
 
 class SetMotion(NamedTuple):
@@ -44,6 +46,33 @@ class AmplitudeModel(NamedTuple):
 
 
 @kernel
+def _fill_row(
+    row: int, z: int, g: FloatArray, move: FloatArray, share: float, proposals: Proposals
+) -> float:
+    """Row `row` of move and move_ratio of `proposals`, from the cell z; log Z of it."""
+    n, width = len(g), len(move)
+    radius = width // 2
+    low, high = max(0, radius - z), min(width, n + radius - z)
+    best, inside = -math.inf, 0.0
+    for step in range(low, high):
+        best = max(best, g[z + step - radius])
+        inside += move[step]
+    data_driven = 0.0
+    for step in range(low, high):
+        data_driven += move[step] * math.exp(g[z + step - radius] - best)
+    total = 0.0
+    for step in range(width):
+        q = 0.0
+        if low <= step < high:
+            q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
+            q += (1.0 - share) * move[step] / inside
+        total += q
+        proposals.move[row, step] = total
+        proposals.move_ratio[row, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
+    return best + math.log(data_driven)
+
+
+@kernel
 def fill_moves(
     sets: Sets,
     gain: FloatArray,
@@ -53,35 +82,25 @@ def fill_moves(
     proposals: Proposals,
 ) -> None:
     """The rows of `set_particles.propose` from which some particle moves, into move and
-    move_ratio of `proposals`; g (S, n) for each sign; filled (S n,) is False throughout before,
+    move_ratio of `proposals`; gain (S, n) for each sign; filled (S n,) is False throughout before,
     and says which rows after."""
-    n, width = gain.shape[1], proposals.move.shape[1]
-    radius = width // 2
     for i in range(sets.order.shape[0]):
         for k in range(sets.order[i]):
             z, negative = sets.cell[i, k], int(sets.sign[i, k] < 0)
-            row, g = z + n * negative, gain[negative]
-            if filled[row]:
-                continue
-            filled[row] = True
-            low, high = max(0, radius - z), min(width, n + radius - z)
-            best, inside = -math.inf, 0.0
-            for step in range(low, high):
-                best = max(best, g[z + step - radius])
-                inside += move[step]
-            data_driven = 0.0
-            for step in range(low, high):
-                data_driven += move[step] * math.exp(g[z + step - radius] - best)
-            total = 0.0
-            for step in range(width):
-                q = 0.0
-                if low <= step < high:
-                    q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
-                    q += (1.0 - share) * move[step] / inside
-                total += q
-                proposals.move[row, step] = total
-                ratio = math.log(move[step] / q) if q > 0.0 else -math.inf
-                proposals.move_ratio[row, step] = ratio
+            row = z + gain.shape[1] * negative
+            if not filled[row]:
+                filled[row] = True
+                _fill_row(row, z, gain[negative], move, share, proposals)
+
+
+@kernel
+def fill_all_moves(gain: FloatArray, move: FloatArray, share: float, proposals: Proposals) -> None:
+    """All rows of `set_particles.propose`, and log_sum of its shifts."""
+    for negative in range(gain.shape[0]):
+        for z in range(gain.shape[1]):
+            row = z + gain.shape[1] * negative
+            found = _fill_row(row, z, gain[negative], move, share, proposals)
+            proposals.shifts.log_sum[negative, z] = found
 
 
 @kernel
@@ -103,11 +122,12 @@ def _birth(
     separation: int,
     proposals: Proposals,
     uniform: float,
+    offset: int,
 ) -> tuple[int, int, int, float]:
     """(position in cells, cell, sign, log ratio) of one more member of cells[:m]; position -1 when
-    there is no room."""
-    birth = proposals.birth
-    n = birth.shape[0] - 1
+    there is no room. offset: from cells of the lattice to those of the record."""
+    birth = proposals.birth[offset:]
+    n = proposals.birth.shape[0] - 1 - proposals.shifts.step * (len(proposals.shifts.start) - 1)
     total, last = 0.0, -1
     for k in range(m + 1):
         low = 0 if k == 0 else cells[k - 1] + separation
@@ -130,8 +150,8 @@ def _birth(
                 if proposals.birth_ratio.shape[0] > 1:
                     # What is left of the random number within the cell chooses the sign.
                     inside = birth[low] + left - birth[place]
-                    negative = int(inside >= proposals.birth_positive[place])
-                paid = proposals.birth_ratio[negative, place] + math.log(total)
+                    negative = int(inside >= proposals.birth_positive[place + offset])
+                paid = proposals.birth_ratio[negative, place + offset] + math.log(total)
                 return k, place, 1 - 2 * negative, paid
             left -= weight
     return -1, 0, 1, -math.inf
@@ -154,9 +174,16 @@ def start(
     for i in range(first, last):
         chosen = min(int(uniform[i, 0] * orders), orders - 1)
         m = motion.order_min + chosen
-        ratio, here, sign = 0.0, sets.cell[i], sets.sign[i]
+        ratio, here, sign, offset = 0.0, sets.cell[i], sets.sign[i], 0
+        if len(proposals.shifts.start) > 1:
+            G, drawn_at = len(proposals.shifts.start), uniform[i, 1 + sets.cell.shape[1]]
+            offset = min(_search(proposals.shifts.start, 0, G, drawn_at), G - 1)
+            offset *= proposals.shifts.step
+        sets.shift[i] = offset
         for k in range(m):
-            at, place, drawn, paid = _birth(here, k, separation, proposals, uniform[i, 1 + k])
+            at, place, drawn, paid = _birth(
+                here, k, separation, proposals, uniform[i, 1 + k], offset
+            )
             ratio += paid
             if at < 0:
                 break
@@ -186,7 +213,9 @@ def propagate(
         proposals.move.shape[1],
         proposals.birth_ratio.shape[1],
     )
-    parent = np.empty(new.cell.shape[1], np.int64)
+    J, G = new.cell.shape[1], len(proposals.shifts.start)
+    last_cell = cells - 1 - proposals.shifts.step * (G - 1)
+    parent, rows, q = np.empty(J, np.int64), np.empty(J, np.int64), np.empty(G)
     for i in range(first, last):
         before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
         m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
@@ -198,15 +227,27 @@ def propagate(
             left -= 1
             for j in range(gone, left):
                 parent[j] = parent[j + 1]
+        offset = 0
+        for k in range(left):
+            negative = int(old.sign[i, parent[k]] < 0)
+            rows[k] = old.cell[i, parent[k]] + negative * cells
+        if G > 1:
+            offset, ratio = draw_shift(
+                proposals.shifts, old.shift[i], rows, left, cells, u[1 + changes + J], q
+            )
+        new.shift[i] = offset
         for k in range(left):
             source = parent[k]
             z = old.cell[i, source]
-            row = z if old.sign[i, source] > 0 else z + cells
+            row = rows[k] + offset
             table = proposals.move[row]
             step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
             ratio += proposals.move_ratio[row, step]
             # What leaves the lattice is impossible already; its number must stay an index.
-            z = min(max(z + step - width // 2, 0), cells - 1)
+            z += step - width // 2
+            if not 0 <= z <= last_cell:
+                ratio = -math.inf
+            z = min(max(z, 0), last_cell)
             j = k
             while j > 0 and here[j - 1] > z:
                 here[j], parent[j] = here[j - 1], parent[j - 1]
@@ -220,7 +261,9 @@ def propagate(
         for k in range(m - left):
             if ratio > -math.inf:
                 count = left + k
-                at, place, drawn, paid = _birth(here, count, separation, proposals, u[1 + k])
+                at, place, drawn, paid = _birth(
+                    here, count, separation, proposals, u[1 + k], offset
+                )
                 ratio += paid
                 if at >= 0:
                     for j in range(count, at, -1):
@@ -247,7 +290,7 @@ def weigh(
 ) -> None:
     """See `set_particles.weigh`: adds the log likelihood to log_weight (N,), whose -inf are left
     alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
-    order, cell, mean, variance, sign = sets
+    order, cell, mean, variance, sign, shift = sets
     gram, memory = amplitudes.gram, amplitudes.memory > 0.0
     J = cell.shape[1]
     L, y = np.empty((J, J)), np.empty(J)
@@ -257,7 +300,7 @@ def weigh(
             continue
         value = 0.0
         for r in range(m):
-            z, h, precision = cell[i, r], b[cell[i, r]], amplitudes.ridge
+            z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
             if memory:
                 precision = 1.0 / variance[i, r]
                 h += precision * mean[i, r]
@@ -330,15 +373,24 @@ def moments(
 ) -> None:
     """Add to pmf (orders,) and to sums (5, n), the intensity, the first two moments of the
     amplitude, the variance it had before the record, and the share of members that are the first
-    of their set, that lie on each cell. Both are zero before."""
+    of their set, that lie on each cell. Both are zero before. With a shift, cells are those of
+    the record, where members that share an error are not blurred by it, and sums (8, n + 2 pad)
+    has the first two moments of the cell on the lattice and its product with the amplitude
+    besides."""
+    shifted = sums.shape[0] > SUMS
     for i in range(w.shape[0]):
         if w[i] > 0.0:
             pmf[sets.order[i] - order_min] += w[i]
             for k in range(sets.order[i]):
-                z, a = sets.cell[i, k], amplitude[i, k]
+                place, a = sets.cell[i, k], amplitude[i, k]
+                z = place + sets.shift[i]
                 sums[0, z] += w[i]
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
                 sums[3, z] += w[i] * sets.prior_variance[i, k]
+                if shifted:
+                    sums[5, z] += w[i] * place
+                    sums[6, z] += w[i] * place * place
+                    sums[7, z] += w[i] * place * a
             if sets.order[i] > 0:
-                sums[4, sets.cell[i, 0]] += w[i]
+                sums[4, sets.cell[i, 0] + sets.shift[i]] += w[i]

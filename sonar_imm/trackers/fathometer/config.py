@@ -8,7 +8,7 @@ from attrs import frozen
 
 from ...acoustics.fathometer import PROCESSORS
 from ...acoustics.spectra import WINDOWS
-from ...estimation.set_particles import PRIORS
+from ...estimation.set_model import PRIORS
 from ...parameters import inherited, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
@@ -18,6 +18,7 @@ live = partial(parameter, read_only=False)
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
 POLARITIES = ('positive', 'both')
+HEAVES = ('none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
 
 
@@ -51,6 +52,17 @@ class FathometerConfig(StampParameters):
         unit='m',
         low=0.0,
         high=1000.0,
+    )
+
+    heave: str = parameter(
+        'none',
+        'whether the error of the told depth, of standard deviation array_depth_std, is a state '
+        'that all reflectors share: none; independent, wrong anew in each record; memory, by '
+        'heave_memory',
+        choices=HEAVES,
+    )
+    heave_memory: float = parameter(
+        0.9, 'memory: how much of the error stays from record to record', low=0.01, high=0.99
     )
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
@@ -111,7 +123,9 @@ class FathometerConfig(StampParameters):
     noise_depth_min: float = live(
         180.0,
         'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
-        'the whole trace when it does not reach there',
+        'the whole trace when it does not reach there. 0 together with noise_depth_max: where '
+        'the depths tracked have their mirror image at the array, or in what reflectors leave of '
+        'a trace',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -236,12 +250,10 @@ class FathometerConfig(StampParameters):
 
     def check(self) -> list[str]:
         problems = super().check()
-        for low, high in (
-            ('frequency_min', 'frequency_max'),
-            ('noise_depth_min', 'noise_depth_max'),
-        ):
-            if getattr(self, low) >= getattr(self, high):
-                problems.append(f'{high} must exceed {low}')
+        if self.frequency_min >= self.frequency_max:
+            problems.append('frequency_max must exceed frequency_min')
+        if self.noise_depth_min >= self.noise_depth_max and not self.noise_from_mirror:
+            problems.append('noise_depth_max must exceed noise_depth_min')
         if self.depth_max <= self.depth_min and (self.depth_min or self.depth_max):
             problems.append('depth_max must exceed depth_min')
         if self.order_max < self.order_min:
@@ -253,6 +265,8 @@ class FathometerConfig(StampParameters):
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
             )
+        if self.heave != 'none' and not self.array_depth_std:
+            problems.append(f'heave {self.heave} needs array_depth_std')
         if self.particles * self.order_max > MAX_MEMBERS:
             problems.append(
                 f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'
@@ -266,6 +280,11 @@ class FathometerConfig(StampParameters):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
+
+    @property
+    def noise_from_mirror(self) -> bool:
+        """True when no depths of noise are given."""
+        return not (self.noise_depth_min or self.noise_depth_max)
 
     @property
     def negative_share(self) -> float:

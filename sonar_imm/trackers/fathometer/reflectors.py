@@ -82,13 +82,16 @@ def nearest_ids(
 class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
     covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
-    above it."""
+    above it; heave and heave_std: told minus true depth of the array, m, 0 where it is no state.
+    """
 
     depth: FloatArray
     amplitude: FloatArray
     covariance: FloatArray
     existence: FloatArray
     is_bottom: FloatArray
+    heave: float = 0.0
+    heave_std: float = 0.0
 
 
 def reflectors_of(
@@ -97,10 +100,12 @@ def reflectors_of(
     lattice: Lattice,
     pulse: Pulse,
     config: FathometerConfig,
+    heave: tuple[float, float] | None = None,
 ) -> Reflectors:
-    """Members of the set in cells and units of the noise, as reflectors in m and amplitudes."""
+    """Members of the set in cells and units of the noise, as reflectors in m and amplitudes.
+    heave: its mean and standard deviation, m, where it is a state."""
     depth = lattice.first + lattice.step * members.place
-    sigma = np.interp(depth, response.depth, response.sigma)
+    sigma = np.interp(depth + (heave[0] if heave else 0.0), response.depth, response.sigma)
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
     covariance[:, 0, 0] += 1.0 / 12.0
@@ -109,9 +114,16 @@ def reflectors_of(
     covariance *= scale[:, :, None] * scale[:, None, :]
     # The particles know depths as they follow from the depth told with this record: it alone fixes
     # them to some centimetres, so that the errors of earlier records have no say.
-    covariance[:, 0, 0] += config.array_depth_std**2
+    # Where it is a state, the places of the particles are spread by what is not known of it.
+    if heave is None:
+        covariance[:, 0, 0] += config.array_depth_std**2
     return Reflectors(
-        depth, sigma * members.amplitude, covariance, members.existence, members.foremost
+        depth,
+        sigma * members.amplitude,
+        covariance,
+        members.existence,
+        members.foremost,
+        *(heave or (0.0, 0.0)),
     )
 
 
@@ -131,7 +143,7 @@ def relative_amplitude(
     """Amplitudes (K,) freed of spreading and of the window, in m: A (2 H + L) / taper(tau / T), H
     below the array of length L, tau = 2 H / c, T the length of a snapshot. NaN when the depth of
     the array is not known."""
-    height = reflectors.depth - response.reference_depth
+    height = reflectors.depth - response.reference_depth + reflectors.heave
     share = 2.0 * height / (config.sound_speed * config.snapshot_seconds)
     with np.errstate(divide='ignore', invalid='ignore'):
         taper = window_overlap(config.window, share) if response.aperture else 1.0
@@ -173,6 +185,8 @@ def write_estimate(
         'existence': np.zeros(rows),
         'relative_amplitude': np.full(rows, np.nan),
         'polarity': np.zeros(rows, np.int8),
+        'heave': np.full(rows, reflectors.heave),
+        'heave_std': np.full(rows, reflectors.heave_std),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
         'sediment_depth': np.full(rows, np.nan),

@@ -9,7 +9,8 @@ import pytest
 
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.set_filter import SetFilter
-from sonar_imm.estimation.set_particles import SetModel, Sets, weigh
+from sonar_imm.estimation.set_model import SetModel, Sets
+from sonar_imm.estimation.set_particles import weigh
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 
