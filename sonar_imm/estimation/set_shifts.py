@@ -94,8 +94,8 @@ def shift_tables(shift: Shift | None, log_sum: FloatArray, share: float) -> Shif
 def propose_shift(
     tables: ShiftTables, before: int, cells: IntArray, negative: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """q (G,) and log of model to proposal (G,) for members at `cells` (k,), with `negative` (k,)
-    1 for negative ones; before: the shift of the record before plus pad."""
+    """Oracle for tests: q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
+    `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
     prior = tables.log_prior[before // tables.step]
     at = cells[:, None] + tables.step * np.arange(len(prior))
     score = prior + tables.log_sum[negative[:, None], at].sum(axis=0)
