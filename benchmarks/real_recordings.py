@@ -40,6 +40,7 @@ TAG = {
 """What a user knows: one tag, silent for half a minute at a time, a metre deep, in water of this
 sound speed, with receivers of this accuracy. Everything else is at its default."""
 
+BOATS = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
 SETS = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
@@ -218,12 +219,16 @@ def boats(folder: Path) -> None:
                 truth=folder / 'scenario13_groundTruth.json',
             )
             items, truth = load(out)
-            print(f'\n### Autoferry scenario 13, {sensor}: {len(items)} fixes\n')
+            print(
+                f'\n### Autoferry scenario 13, {sensor}: {len(items)} scans, '
+                f'{sum(map(len, items))} fixes\n'
+            )
             header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
             for name, values in {
                 'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
                 'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
-                'heading_speed': {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1},
+                'heading_speed': BOATS,
+                'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
             }.items():
                 config = DiverConfig(
                     fix_std=4.0 if sensor == 'radar' else 2.0,

@@ -159,13 +159,33 @@ def _match(
 
 
 def identity_switches(track_id: IntArray) -> int:
-    """How often a target is taken over by another track.
+    """How often a target is taken over by another track: `switches_by_scan` summed."""
+    return int(switches_by_scan(track_id).sum())
+
+
+def switches_by_scan(track_id: IntArray) -> IntArray:
+    """How many targets are taken over by another track at each of K scans, (K,).
 
     track_id: (K, T) id of the track on each target over time, -1 where it is missed. A gap is no
-    switch; coming back under another identity is one.
+    switch; coming back under another identity is one, at the scan where it comes back.
     """
-    switches = 0
-    for column in np.asarray(track_id).T:
-        followed = column[column != -1]
-        switches += int(np.count_nonzero(np.diff(followed)))
+    followed = np.asarray(track_id)
+    switches = np.zeros(len(followed), np.int64)
+    for column in followed.T:
+        scans = np.flatnonzero(column != -1)
+        changed = np.flatnonzero(np.diff(column[scans])) + 1
+        np.add.at(switches, scans[changed], 1)
     return switches
+
+
+def switching_gospa(distance: FloatArray, switches: IntArray, penalty: float) -> float:
+    """One number of a whole run: ``sqrt(mean over scans of (d^2 + penalty^2 s))``, with the GOSPA
+    distance d (K,) of second order and the identity switches s (K,) of each scan.
+
+    It is the metric on trajectories of Garcia-Fernandez, Rahmathullah and Svensson (*A metric on
+    the space of finite sets of trajectories*, IEEE TSP 68, 2020), but with the pairing of each
+    scan by itself, so that it is an upper bound of theirs.
+    """
+    if not len(distance):
+        return math.nan
+    return float(np.sqrt(np.mean(np.square(distance) + penalty**2 * np.asarray(switches))))

@@ -65,7 +65,7 @@ def subset_update(
     estimated: BoolArray | None = None,
     prune: float = PRUNE,
 ) -> SubsetUpdate:
-    """Update x (n,), P (n, n) with numbers each of which may be wild.
+    """Oracle for tests: update x (n,), P (n, n) with numbers each of which may be wild.
 
     A number is linearised where the explanation so far stands. outlier_density is per unit of the
     numbers; estimated (n,): see `consider.consider_update`, None for all.

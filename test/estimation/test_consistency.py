@@ -20,6 +20,8 @@ from sonar_imm.estimation.consistency import (
     nis,
     ospa,
     rmse,
+    switches_by_scan,
+    switching_gospa,
 )
 
 
@@ -198,3 +200,16 @@ def test_nonsense_is_refused(arguments):
 )
 def test_identity_switches(ids, switches):
     assert identity_switches(np.array(ids)) == switches
+
+
+def test_a_switch_counts_at_the_scan_where_the_other_track_appears():
+    ids = np.array([[1, 5], [-1, 5], [2, 5], [2, 6], [1, -1]])
+    assert switches_by_scan(ids).tolist() == [0, 0, 1, 1, 1]
+    assert switches_by_scan(np.empty((0, 2), int)).tolist() == []
+
+
+def test_switching_gospa_is_the_root_mean_square_with_a_penalty_for_each_switch():
+    distance, switches = np.array([3.0, 4.0]), np.array([0, 2])
+    assert switching_gospa(distance, switches * 0, 5.0) == pytest.approx(np.sqrt(12.5))
+    assert switching_gospa(distance, switches, 5.0) == pytest.approx(np.sqrt(37.5))
+    assert np.isnan(switching_gospa(np.empty(0), np.empty(0, int), 5.0))

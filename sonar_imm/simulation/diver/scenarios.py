@@ -10,9 +10,10 @@ import numpy as np
 
 from ...parameters import parameter
 from ..scene import Scenario
+from .crossing import CROSSING, told_of_scans
 
-MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still')
-SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals')
+MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
+SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals', 'scans')
 
 TRANSMITTER = np.array([0.0, 0.0, 0.0])
 RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -91,7 +92,7 @@ class DiverScenario(Scenario):
         0.0, 'the sound speed differs by this from the one given', unit='m/s', low=0.0
     )
     fix_std: float = parameter(
-        1.0, 'white error on each axis of the sensor `positions`', unit='m', low=1e-6
+        1.0, 'white error on each axis of the sensors `positions` and `scans`', unit='m', low=1e-6
     )
     fix_bias_std: float = parameter(
         0.0, 'lasting error on each axis of the sensor `positions`', unit='m', low=0.0
@@ -117,6 +118,9 @@ class DiverScenario(Scenario):
         if self.leg_min > self.leg_max:
             problems.append('leg_min cannot exceed leg_max')
         return problems
+
+    def told(self) -> dict[str, Any]:
+        return told_of_scans(self) if self.sensor == 'scans' else super().told()
 
 
 MULTISTATIC = {
@@ -206,6 +210,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'speed': 0.75,
         },
     ),
+    'crossing': CROSSING,
 }
 """Name: (what it is, what differs from the defaults of `DiverScenario`)."""
 

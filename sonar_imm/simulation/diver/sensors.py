@@ -10,6 +10,7 @@ from ...acoustics.polar import unbiased_polar_to_cartesian
 from ...estimation.arrays import FloatArray
 from ...estimation.gauss_markov import gauss_markov
 from ...measurements import Arrivals, Fix
+from .crossing import sense_scan
 from .scenarios import DiverScenario, RECEIVERS, TRANSMITTER
 
 
@@ -199,4 +200,5 @@ SENSE = {
     'positions': _sense_positions,
     'arrivals': _sense_arrivals,
     'multistatic_fixes': _sense_multistatic_fixes,
+    'scans': lambda config, errors, *rest: sense_scan(config, *rest),
 }

@@ -12,6 +12,7 @@ import numpy as np
 
 from ...estimation.arrays import FloatArray
 from ..scene import Received, Scene, TrueTrack
+from .crossing import crossing_paths
 from .scenarios import (
     DiverScenario,
     FIRST_STAMP_NS,
@@ -39,7 +40,10 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
     times = _scan_times(config, rng)
     stamps = FIRST_STAMP_NS + np.round(times * 1e9).astype(np.int64)
     turn = rng.uniform(0.0, 2.0 * np.pi) if config.random_rotation else 0.0
-    paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
+    if config.motion == 'crossing':
+        paths = crossing_paths(config.divers, times, rng)
+    else:
+        paths = [_path(config, times, diver, turn, rng) for diver in range(config.divers)]
     errors = draw_errors(config, times, np.random.default_rng([seed, 1]))
     truth = tuple(
         TrueTrack(

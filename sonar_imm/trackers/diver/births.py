@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice, product
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ...acoustics import multistatic
 from ...estimation.arrays import FloatArray, IndexArray
-from ...measurements import Arrivals
+from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
 from .model_set import heights_of
 from .sensing import locate, Positions, systematic_variance, toa_variance
@@ -18,12 +19,15 @@ from .sensing import locate, Positions, systematic_variance, toa_variance
 
 class Birth(NamedTuple):
     """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
-    which it is, None for a fix."""
+    which it is, None for a fix; the probability that there is a diver, NaN where its hits will
+    tell; whose track it is."""
 
     position: FloatArray
     covariance: FloatArray
     ping: Arrivals | None = None
     rows: IndexArray | None = None
+    existence: float = math.nan
+    target_id: int = NOBODY
 
 
 SEED_PAIRS = 3
@@ -34,9 +38,16 @@ MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
 
 
-def births_from_fixes(group: Positions, free: np.ndarray) -> list[Birth]:
-    """Every fix that is `free` (D,) is a place to begin a track."""
-    return [Birth(group.z[d], group.R[d]) for d in np.flatnonzero(free)]
+def births_from_fixes(
+    group: Positions, free: np.ndarray, existence: FloatArray | None = None
+) -> list[Birth]:
+    """Every fix that is `free` (D,) is a place to begin a track; existence: (D,) of those."""
+    names = np.full(len(free), NOBODY) if group.target_id is None else group.target_id
+    known = np.full(len(free), math.nan) if existence is None else existence
+    return [
+        Birth(group.z[d], group.R[d], existence=float(known[d]), target_id=int(names[d]))
+        for d in np.flatnonzero(free)
+    ]
 
 
 def births_from_ping(

@@ -20,7 +20,7 @@ from ...estimation.association import (
     TrackStatus,
 )
 from ...estimation.consider import consider_models
-from ...measurements import Arrivals
+from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
 from .expectation_kernels import fit_numbers
 from .model_set import ModelSet
@@ -76,6 +76,9 @@ class Scan:
         self.tentative = before.life.status == TrackStatus.TENTATIVE
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
+        self.named = before.target_id != NOBODY
+        self.existence = before.existence * math.exp(-self.dt / config.survival_time)
+        self.evidence = before.evidence
 
     def learn(self) -> DiverState:
         """What is known now; the transitions have learnt from the tracks that were hit."""
@@ -100,6 +103,8 @@ class Scan:
             nis_dof=self.nis_dof,
             score=self.score,
             scale=self.scale,
+            existence=self.existence,
+            evidence=self.evidence,
             white=self.white,
             fixes=self.fixes,
             instruments=self.instruments,
@@ -110,10 +115,10 @@ class Scan:
 
     def associate_and_update(self, group: Positions) -> BoolArray:
         """Associate and update; True (D,) where a fix was taken. Confirmed tracks choose first."""
-        H = self._fix_matrix()
-        h = np.einsum('jma,tja->tjm', H[0], self.x)
+        H, h = self.expected_fixes()
         threshold = gate_threshold(self.config.gate_probability, 2)
         fit = imm_kernels.gate(h, H, self.P, self.mu, group.z, group.R, threshold)
+        fit[self.named] = -np.inf  # they know their own
         rank = 2 * ~(fit.max(axis=1, initial=-np.inf) > -np.inf) + self.tentative
         chosen = self._associate(fit, rank, group.clutter)
         self._keep_score(fit, chosen, group.clutter)
@@ -122,13 +127,18 @@ class Scan:
             self._update(group, tracks, chosen[tracks], H, h[tracks])
         return np.isin(np.arange(len(group.z)), chosen)
 
-    def _fix_matrix(self) -> FloatArray:
-        """(1, M, 2, n + q): what a fix measures of the whole state."""
-        fix = self.models.fix
-        extra = self.layout.size - self.models.n
+    def update_by_fixes(self, group: Positions, tracks: IndexArray, detection: IntArray) -> None:
+        """Update `tracks` (t,), each with its `detection` (t,), without association."""
+        H, h = self.expected_fixes()
+        self._update(group, tracks, detection, H, h[tracks])
+
+    def expected_fixes(self) -> tuple[FloatArray, FloatArray]:
+        """H (1, M, 2, n + q), what a fix measures of the whole state, and the fix h (T, M, 2) that
+        each model expects."""
+        fix, extra = self.models.fix, self.layout.size - self.models.n
         if extra:
             fix = np.concatenate([fix, np.zeros((*fix.shape[:2], extra))], axis=2)
-        return np.ascontiguousarray(fix[None])
+        return np.ascontiguousarray(fix[None]), np.einsum('jma,tja->tjm', fix, self.x)
 
     def _associate(self, fit: FloatArray, rank: IntArray, clutter: float) -> IntArray:
         """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
@@ -140,7 +150,7 @@ class Scan:
         """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""
         p_detection = self.config.detection_probability
         hit = np.flatnonzero(chosen >= 0)
-        self.score += np.log1p(-p_detection)
+        self.score += np.where(self.named, 0.0, np.log1p(-p_detection))
         self.score[hit] += fit[hit, chosen[hit]] + np.log(p_detection / (1.0 - p_detection))
         self.score[hit] -= np.log(clutter)
 
@@ -156,7 +166,7 @@ class Scan:
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
         R = np.ascontiguousarray(group.R[detection])
         innovation = group.z[detection][:, None, :] - h
-        self._watch(x, P, mu, group.z[detection], H, R, tracks)
+        self.watch(x, P, mu, group.z[detection], H, R, tracks)
         mask = self.layout.mask
         if mask.all():
             x, P, mu, _, nis, ok, repaired = imm_kernels.update(x, P, mu, innovation, H, R)
@@ -172,7 +182,7 @@ class Scan:
             stated = group.R[detection] / group.factor
             self._learn_scale(FIXES, residual, covariance, stated)
 
-    def _watch(
+    def watch(
         self,
         x: FloatArray,
         P: FloatArray,

@@ -9,8 +9,8 @@ from attrs import frozen
 import numpy as np
 
 from ...acoustics.localisation import Localisation, localise
-from ...estimation.arrays import FloatArray, IndexArray
-from ...measurements import Arrivals, Fix
+from ...estimation.arrays import FloatArray, IndexArray, IntArray
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of
 from .config import DiverConfig
 from .model_set import heights_of
 
@@ -19,24 +19,62 @@ from .model_set import heights_of
 class Positions:
     """D fixes of one stamp, of which each target causes at most one: z (D, 2), R (D, 2, 2);
     clutter: density of false ones; factor: what the stated covariances were multiplied by to give
-    R."""
+    R. target_id: (D,) whose they are, None when that is not known of any; whole: whether they are
+    all that there was to see, so that a diver without one was missed."""
 
     z: FloatArray
     R: FloatArray
     clutter: float
     factor: float = 1.0
+    target_id: IntArray | None = None
+    whole: bool = True
 
 
-def positions(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
-    """All fixes of one stamp; factor: on their covariances."""
+def position_groups(
+    items: Sequence[Measurement], config: DiverConfig, factor: float
+) -> list[Positions]:
+    """The fixes of one stamp: all single ones together, then scan by scan those that say whose
+    they are, of each diver the first, and those that do not. factor: on their covariances."""
+    groups = []
+    single = [scan_of(item) for item in items if isinstance(item, Fix)]
+    if single:
+        position = np.concatenate([scan.position for scan in single])
+        R = np.concatenate([_covariances(scan, config) for scan in single])
+        groups.append(_group(position, R * factor, config, factor, whole=config.fixes_are_scans))
+    for scan in (item for item in items if isinstance(item, Fixes)):
+        R = _covariances(scan, config) * factor
+        said = np.empty(0, np.intp)
+        if scan.target_id is not None:
+            said = np.flatnonzero(scan.target_id != NOBODY)
+            names, first = np.unique(scan.target_id[said], return_index=True)
+            rows = said[first]
+            if len(rows):
+                groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
+        if len(said) < len(scan) or not len(scan):
+            rows = np.setdiff1d(np.arange(len(scan)), said)
+            groups.append(_group(scan.position[rows], R[rows], config, factor))
+    return groups
+
+
+def _group(
+    position: FloatArray,
+    R: FloatArray,
+    config: DiverConfig,
+    factor: float,
+    target_id: IntArray | None = None,
+    whole: bool = True,
+) -> Positions:
+    z = np.ascontiguousarray(position[:, :2])
+    return Positions(z, R, config.clutter_density, factor, target_id, whole)
+
+
+def _covariances(scan: Fixes, config: DiverConfig) -> FloatArray:
+    """Covariances (n, 2, 2) as stated, else by `fix_std`."""
     unknown = np.eye(2) * config.fix_std**2
-    R = np.stack([unknown if fix.covariance is None else fix.covariance for fix in fixes])
-    return Positions(
-        np.stack([fix.position[:2] for fix in fixes]),
-        R * factor,
-        config.clutter_density,
-        factor,
-    )
+    if scan.covariance is None:
+        return np.tile(unknown, (len(scan), 1, 1))
+    known = np.isfinite(scan.covariance).all(axis=(1, 2))
+    return np.where(known[:, None, None], scan.covariance, unknown)
 
 
 def locate(

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import Tracks
 from .fix_consistency import FixConsistency
 from .instruments import Instruments
@@ -22,6 +22,9 @@ SCALE_PRIOR = 20.0
 
 MOST_STEPS = 300
 """A gap is crossed in no more steps than this, however long it is."""
+
+LIFE = ('existence', 'evidence', 'target_id', 'near_to', 'near_for')
+"""What is known of the life of a track beside `Tracks`, by the names in `DiverState`."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -34,8 +37,11 @@ class DiverState:
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
     white (T, 2): whitened innovation of the last fix, NaN for none; fixes: what innovations say of
-    the stated covariances; broken: tracks ended so far because their numbers were not finite;
-    repairs: covariances repaired so far (`estimation.covariance`).
+    the stated covariances; existence (T,): probability that there is a diver, NaN where hits are
+    counted instead; evidence (T,): sum of the probabilities of its detections; target_id (T,):
+    whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older track it is
+    near, 0 for none, and for how many scans (`soft`); broken: tracks ended so far because their
+    numbers were not finite; repairs: covariances repaired so far (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -48,6 +54,11 @@ class DiverState:
     nis_dof: np.ndarray
     score: FloatArray
     scale: FloatArray
+    existence: FloatArray
+    evidence: FloatArray
+    target_id: IntArray
+    near_to: IntArray
+    near_for: IntArray
     white: FloatArray
     fixes: FixConsistency
     broken: int = 0
@@ -62,7 +73,7 @@ class DiverState:
         """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
         if kept.all():
             return self
-        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', 'white')
+        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', 'white', *LIFE)
         return evolve(self, **{name: getattr(self, name)[kept] for name in names})
 
 

@@ -20,28 +20,30 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...estimation import imm_kernels
+from ...estimation import imm_kernels, jipda_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
-from ...measurements import Arrivals, Fix, Measurement
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
-from .births import Birth, births_from_fixes, births_from_ping
+from . import soft
+from .births import Birth, births_from_ping
 from .config import DiverConfig
 from .fix_consistency import FixConsistency
+from .fix_scans import each_name_once, shows_all, take_fixes
 from .instruments import Instruments
 from .models import build_models
 from .pings import begin_from_ping, FAR, ping_numbers
 from .scan import Scan
-from .sensing import positions
+from .sensing import position_groups
 from .state import DiverState
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
 
 class DiverTracker:
-    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix` and `Arrivals`."""
+    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`."""
 
     def __init__(self, config: DiverConfig):
         self.config = config
@@ -56,7 +58,7 @@ class DiverTracker:
 
     def reset(self) -> None:
         self._stream = ReplayStream(
-            (Fix, Arrivals),
+            (Fix, Fixes, Arrivals),
             StreamRules.of(self.config),
             step=self._scan,
             initial=self._nobody(Tracks.none(track_rules(self.config))),
@@ -70,6 +72,7 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
+        jipda_kernels.warm()
         # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
         rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -137,6 +140,11 @@ class DiverTracker:
             white=np.empty((0, 2)),
             fixes=FixConsistency(),
             scale=np.zeros((2, 2)),
+            existence=np.empty(0),
+            evidence=np.empty(0),
+            target_id=np.empty(0, np.int64),
+            near_to=np.empty(0, np.int64),
+            near_for=np.empty(0, np.int64),
         )
 
     # -- one scan ------------------------------------------------------------------------------
@@ -146,44 +154,50 @@ class DiverTracker:
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
         scan = self._predict(before, stamp_ns)
         births: list[Birth] = []
-        fixes = [item for item in items if isinstance(item, Fix)]
-        if fixes:
-            group = positions(fixes, self.config, self.config.covariance_scale * factor[0])
-            births += births_from_fixes(group, ~scan.associate_and_update(group))
+        fix_factor = float(self.config.covariance_scale * factor[0])
+        for group in position_groups(items, self.config, fix_factor):
+            births += take_fixes(scan, group)
         for ping in (item.in_order() for item in items if isinstance(item, Arrivals)):
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
-        now = self._prune(scan.learn())
+        now = self._prune(scan.learn(), items)
         return self._spawn(now, births)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
         return Scan(self.config, self.models, self._chain, before, stamp_ns)
 
-    def _prune(self, now: DiverState) -> DiverState:
+    def _prune(self, now: DiverState, items: Sequence[Measurement]) -> DiverState:
         """End the tracks that are over, broken, or too many."""
         config = self.config
         sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
+        broken = now.broken + int((~sound).sum())
+        hit = now.nis_dof > 0
+        looked = any(shows_all(item, config) for item in items) & (now.target_id == NOBODY)
+        by_existence = np.isfinite(now.existence)
         life, kept = now.life.scan(
-            now.nis_dof > 0,
-            now.stamp_ns,
-            track_rules(config),
-            looked=np.full(len(sound), config.fixes_are_scans),
+            hit, now.stamp_ns, track_rules(config), looked=looked & ~by_existence
         )
+        if by_existence.any():
+            judged = soft.judge(now, hit, looked, self.models.E[:, :2])
+            status = np.where(by_existence[kept], judged.status[kept], life.status)
+            life = evolve(life, status=status)
+            now = evolve(now, near_to=judged.near_to, near_for=judged.near_for)
+            sound = sound & (judged.alive | ~by_existence)
         life, kept = life.only(sound[kept]), kept & sound
         confirmed = np.flatnonzero(life.status != TrackStatus.TENTATIVE)
         if len(confirmed) > config.max_tracks:
-            best = np.argsort(-now.score[kept][confirmed], kind='stable')[: config.max_tracks]
+            known = np.where(now.target_id == NOBODY, now.score, np.inf)[kept][confirmed]
+            best = np.argsort(-known, kind='stable')[: config.max_tracks]
             room = life.status == TrackStatus.TENTATIVE
             room[confirmed[best]] = True
             kept[kept] = room
             life = life.only(room)
-        broken = now.broken + int((~sound).sum())
         return evolve(now.rows(kept), life=life, broken=broken)
 
     def _spawn(self, now: DiverState, births: list[Birth]) -> DiverState:
         """Begin a tentative track at each birth, as long as there is room."""
         config = self.config
-        births = births[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
+        births = each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
         if not births:
             return now
         new = [self._new_track(birth, now.instruments) for birth in births]
@@ -199,6 +213,11 @@ class DiverTracker:
             nis_dof=np.append(now.nis_dof, np.zeros(count, np.uint16)),
             score=np.append(now.score, np.zeros(count)),
             white=np.concatenate([now.white, np.full((count, 2), np.nan)]),
+            existence=np.append(now.existence, [birth.existence for birth in births]),
+            evidence=np.append(now.evidence, np.ones(count)),
+            target_id=np.append(now.target_id, [birth.target_id for birth in births]),
+            near_to=np.append(now.near_to, np.zeros(count, np.int64)),
+            near_for=np.append(now.near_for, np.zeros(count, np.int64)),
         )
 
     def _new_track(
@@ -222,7 +241,8 @@ class DiverTracker:
         return np.repeat(first[0], M, axis=0), np.repeat(first[1], M, axis=0), mu
 
     def _estimate(self, state: DiverState) -> Estimate:
-        n = self.models.n
+        n, shown = self.models.n, soft.published(state.existence)
+        state = evolve(state.rows(shown), life=state.life.only(shown))
         x, P = state.x, state.P
         if x.shape[-1] > n:
             x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
@@ -244,5 +264,7 @@ class DiverTracker:
                 'track_state': state.life.status,
                 'nis': state.nis,
                 'nis_dof': state.nis_dof,
+                'existence': state.existence,
+                'target_id': state.target_id.astype(np.int32),
             },
         )
