@@ -18,6 +18,7 @@ live = partial(parameter, read_only=False)
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
 POLARITIES = ('positive', 'both')
+MULTIPLES = ('mark', 'off')
 HEAVES = ('none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
 
@@ -239,6 +240,12 @@ class FathometerConfig(StampParameters):
     # -- output -----------------------------------------------------------------------------------
     existence_min: float = live(
         0.5, 'least probability with which a reflector is reported', low=0.0, high=1.0
+    )
+    multiples: str = live(
+        'mark',
+        'whether reflectors get a probability of being multiples of others, by depths from the '
+        'surface; they are never left out',
+        choices=MULTIPLES,
     )
     track_memory: int = live(
         5, 'a reflector not seen for so many records gets a new id', low=0, high=10_000

@@ -21,6 +21,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_members import Members
 from .config import FathometerConfig
+from .multiples import Seen
 from .response import Lattice, Response
 
 IdArray = NDArray[np.uint32]
@@ -168,16 +169,26 @@ def sediment_depths(
     return depth, np.sqrt(variance)
 
 
+def seen_as(reflectors: Reflectors, ids: IdArray, config: FathometerConfig) -> Seen:
+    """What `multiples` needs to know of a record."""
+    shared = config.array_depth_std if config.heave == 'none' else reflectors.heave_std
+    variance = np.maximum(reflectors.covariance[:, 0, 0] - shared**2, 1e-6)
+    sign = np.sign(reflectors.amplitude)
+    return Seen(ids, reflectors.depth, variance, sign, shared**2)
+
+
 def write_estimate(
     reflectors: Reflectors,
     ids: IdArray,
     pmf: FloatArray,
+    multiple: FloatArray,
     response: Response,
     config: FathometerConfig,
     *,
     preview: bool = False,
 ) -> Estimate:
-    """One row per reflector; without any, one row whose depth is NaN, for the PMF's sake."""
+    """One row per reflector, multiple (K,) the probability that it is a multiple; without any, one
+    row whose depth is NaN, for the PMF's sake."""
     rows = max(1, len(ids))
     state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
     extras = {
@@ -189,6 +200,7 @@ def write_estimate(
         'heave_std': np.full(rows, reflectors.heave_std),
         'two_way_time': np.full(rows, np.nan),
         'is_bottom': np.zeros(rows),
+        'multiple_probability': np.full(rows, np.nan),
         'sediment_depth': np.full(rows, np.nan),
         'sediment_depth_std': np.full(rows, np.nan),
         'sigma': np.full(rows, float(np.median(response.sigma))),
@@ -203,6 +215,7 @@ def write_estimate(
         height = reflectors.depth - response.reference_depth
         extras['two_way_time'][:] = 2.0 * height / config.sound_speed
         extras['polarity'][:] = np.sign(reflectors.amplitude)
+        extras['multiple_probability'][:] = multiple
         extras['is_bottom'][:] = reflectors.is_bottom
         found = sediment_depths(reflectors, config)
         extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found

@@ -35,13 +35,16 @@ from ...estimation.set_model import banded_transition, gaussian_move, SetModel, 
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
+from .multiples import Multiples
 from .pressure import PressureStream
 from .reflectors import (
+    IdArray,
     Identified,
     Identities,
     nearest_ids,
     Reflectors,
     reflectors_of,
+    seen_as,
     write_estimate,
 )
 from .response import (
@@ -97,6 +100,7 @@ class FathometerTracker:
         self._hydrophones = self.config.phones
         self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
+        self._multiples = Multiples()
         self._lattice: Lattice | None = None
         self._heard: Lattice | None = None
         self._filter: SetFilter | None = None
@@ -259,7 +263,8 @@ class FathometerTracker:
             sigma=float(np.median(response.sigma)),
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
-        newest = write_estimate(reflectors, ids, pmf, response, self.config)
+        newest = self._write(reflectors, ids, pmf, response)
+        self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config))
         return [*self._smoothed(step), newest]
 
     def _preview(self, response: Response) -> Estimate:
@@ -267,7 +272,7 @@ class FathometerTracker:
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
         _, ids = self._ids.name(reflectors.depth, self.config)
         self.counts['previews'] += 1
-        return write_estimate(reflectors, ids, pmf, response, self.config, preview=True)
+        return self._write(reflectors, ids, pmf, response, preview=True)
 
     def _smoothed(self, newest: SetStep) -> list[Estimate]:
         """The record `smoothing_lag` ago, seen with all since."""
@@ -283,7 +288,26 @@ class FathometerTracker:
             free = [one for one in taken.named if one.track_id not in ids]
             missing = np.flatnonzero(ids == 0)
             ids[missing] = nearest_ids(reflectors.depth[missing], free, self.config)
-        return [write_estimate(reflectors, ids, pmf, response, self.config)]
+        return [self._write(reflectors, ids, pmf, response)]
+
+    def _write(
+        self,
+        reflectors: Reflectors,
+        ids: IdArray,
+        pmf: FloatArray,
+        response: Response,
+        *,
+        preview: bool = False,
+    ) -> Estimate:
+        multiple = np.full(len(ids), np.nan)
+        if self.config.multiples == 'mark':
+            assert self._lattice is not None
+            span = self._lattice.step * self._lattice.cells
+            seen = seen_as(reflectors, ids, self.config)
+            multiple = self._multiples.probabilities(seen, self.config, span)
+        return write_estimate(
+            reflectors, ids, pmf, multiple, response, self.config, preview=preview
+        )
 
     def _reflectors(
         self, step: SetStep, w: FloatArray, sets: Sets, response: Response
