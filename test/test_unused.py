@@ -10,9 +10,11 @@ ROOMS = ('sonar_imm.estimation.', 'sonar_imm.acoustics.')
 ORACLE = 'Oracle for tests'
 
 LIBRARY = {
-    'sonar_imm.acoustics.geometry.euler_angles': 'the inverse of rotation',
+    'sonar_imm.acoustics.arrivals_3d.arrival_angles': 'angles of many receivers at once',
+    'sonar_imm.acoustics.arrivals_3d.arrival_paths': 'paths of many receivers at once',
     'sonar_imm.acoustics.geometry.vertical_offset': 'equation (7), which reconstruct turns round',
     'sonar_imm.acoustics.multistatic.crlb': 'what a geometry of receivers can attain',
+    'sonar_imm.acoustics.multistatic.difference_measurement': 'a tag, without its emission',
     'sonar_imm.estimation.consistency.innovation_autocorrelation': 'finds unmodelled dynamics',
     'sonar_imm.estimation.consistency.nis': 'nees, by its name for innovations',
     'sonar_imm.estimation.consistency.rmse': 'accuracy of one target',

@@ -50,8 +50,8 @@ def arrival_paths(
     tx: ArrayLike | None,
     rx: ArrayLike,
     *,
-    offset: ArrayLike = 0.0,
-    clock: ArrayLike = 0.0,
+    offset: FloatArray | float = 0.0,
+    clock: FloatArray | float = 0.0,
     sound: float = 0.0,
 ) -> Paths:
     """Path lengths for a diver at `position` (3,): tx (3,) or (n, 3), None for a tag; rx (n, 3).

@@ -64,7 +64,8 @@ class Association(NamedTuple):
 def likelihoods(
     h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray
 ) -> Likelihoods:
-    """How each detection (D, m) with covariance R (D, m, m) fits each model of each track.
+    """Oracle for tests: how each detection (D, m) with covariance R (D, m, m) fits each model of
+    each track.
 
     h (T, M, m): what the models expect; H (T or 1, M, m, n); P (T, M, n, n) and c (T, M),
     predicted.
@@ -89,7 +90,7 @@ def associate(
     detection_probability: FloatArray,
     threshold: float,
 ) -> Association:
-    """The sums over all joint events.
+    """Oracle for tests: the sums over all joint events.
 
     ratio (T, D): f / lambda; nis (T, D): a pair is possible where it is below `threshold`, and
     below less in a cluster that is too large; existence, detection_probability (T,).
@@ -182,7 +183,7 @@ def update(
     missed: float,
     considered: BoolArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """One track by all its detections: x (M, n), P (M, n, n) and mu (M,).
+    """Oracle for tests: one track by all its detections, x (M, n), P (M, n, n) and mu (M,).
 
     innovation (D, M, m); H (M, m, n); R (D, m, m); beta (D,), missed: given that the target
     exists, so that they sum to one; considered: (n,) states that have an influence but are not

@@ -55,7 +55,8 @@ def student_t_maximum(
     starts: Sequence[FloatArray],
     degrees: float = DEGREES,
 ) -> Maximum:
-    """The best maximum reached from `starts` (n,) each, for a prior `mean` (n,), P (n, n)."""
+    """Oracle for tests: the best maximum reached from `starts` (n,) each, for a prior `mean` (n,),
+    P (n, n)."""
     best: tuple[float, FloatArray] | None = None
     for start in starts:
         x = np.array(start, np.float64)

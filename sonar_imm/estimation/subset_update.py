@@ -65,7 +65,7 @@ def subset_update(
     estimated: BoolArray | None = None,
     prune: float = PRUNE,
 ) -> SubsetUpdate:
-    """Update x (n,), P (n, n) with numbers each of which may be wild.
+    """Oracle for tests: update x (n,), P (n, n) with numbers each of which may be wild.
 
     A number is linearised where the explanation so far stands. outlier_density is per unit of the
     numbers; estimated (n,): see `consider.consider_update`, None for all.
@@ -78,13 +78,13 @@ def subset_update(
         grown = []
         for one in left:
             expected, gradient = measure(one.x)
-            S = gradient @ one.P @ gradient + variance
+            S = float(gradient @ one.P @ gradient) + variance
             innovation = value - expected
             fit = -0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
             row, noise = gradient[None], np.array([[variance]])
-            state = consider_update(one.x, one.P, row, noise, np.array([innovation]), mask)
+            x_b, P_b = consider_update(one.x, one.P, row, noise, np.array([innovation]), mask)
             grown.append(Explanation((*one.good, False), one.x, one.P, one.log_weight + log_bad))
-            grown.append(Explanation((*one.good, True), *state, one.log_weight + log_good + fit))
+            grown.append(Explanation((*one.good, True), x_b, P_b, one.log_weight + log_good + fit))
         best = max(one.log_weight for one in grown)
         left = [one for one in grown if one.log_weight >= best - prune]
     return _together(left, len(observations))

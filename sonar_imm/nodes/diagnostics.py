@@ -165,6 +165,8 @@ class Reporter:
             )
         elif rate * p50 > 1000.0:
             level, text = DiagnosticStatus.WARN, 'input comes faster than it can be processed'
+        elif health.get('moving_alike'):
+            level, text = DiagnosticStatus.WARN, 'most obstacles move alike: navigation may drift'
         if counts.get('internal_error'):
             level, text = DiagnosticStatus.ERROR, 'an internal error was caught, see the log'
         return self._status('tracker', level, text, values)

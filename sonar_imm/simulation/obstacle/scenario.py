@@ -11,6 +11,7 @@ from ...parameters import parameter
 from ..scene import Scenario
 
 PLACEMENTS = ('offset', 'tether', 'seabed', 'surface')
+MOTIONS = ('fixed', 'swaying', 'moving')
 
 
 @frozen(kw_only=True)
@@ -168,6 +169,24 @@ class ObstacleScenario(Scenario):
     passing_distance: float = parameter(
         6.0, 'obstacles are passed at up to this on either side', unit='m', low=0.0, high=100.0
     )
+    obstacle_motion: str = parameter(
+        'fixed', 'whether they stay, sway about their place, or move', choices=MOTIONS
+    )
+    obstacle_sway: float = parameter(
+        0.5, 'swaying: standard deviation along each axis', unit='m', low=0.0, high=100.0
+    )
+    obstacle_sway_time: float = parameter(
+        20.0, 'swaying: time over which the place is forgotten', unit='s', low=0.1, high=3600.0
+    )
+    obstacle_speed: tuple[float, ...] = parameter(
+        (0.3, 1.5), 'moving: least and greatest speed', unit='m/s', low=0.0, high=20.0
+    )
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if len(self.obstacle_speed) != 2 or self.obstacle_speed[0] > self.obstacle_speed[-1]:
+            problems.append('obstacle_speed needs two values, the least and the greatest')
+        return problems
 
 
 _LEVEL = {'roll_rms_deg': 0.0, 'pitch_rms_deg': 0.0, 'heave_rms': 0.0}
@@ -246,6 +265,25 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'first_range': 55.0,
             'last_range': 0.0,
             **_FIELD,
+        },
+    ),
+    'swaying': (
+        'an obstacle 3 m below that sways half a metre about its mooring',
+        {'obstacle_motion': 'swaying'},
+    ),
+    'mover': ('an obstacle 3 m below that moves', {'obstacle_motion': 'moving'}),
+    'movers': (
+        'three obstacles that move, at different depths, in clutter',
+        {
+            'obstacle_motion': 'moving',
+            'obstacles': 3,
+            'spacing': 12.0,
+            'vertical_offset': 0.0,
+            'offset_spread': 5.0,
+            'first_range': 70.0,
+            'detection_probability': 0.9,
+            'clutter': 2.0,
+            'passing_distance': 12.0,
         },
     ),
     'late': (

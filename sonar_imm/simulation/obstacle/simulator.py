@@ -23,6 +23,7 @@ from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...measurements import Altitude, Detections, nanoseconds, Navigation
 from ..scene import Received, Scene, TruthTable
+from .paths import Path, paths
 from .scenario import ObstacleScenario, SCENARIOS
 
 __all__ = ['ObstacleScenario', 'SCENARIOS', 'TrueObstacle', 'scenario', 'simulate']
@@ -41,7 +42,8 @@ _FINE = 0.02
 class TrueObstacle:
     """True position of one obstacle relative to the sonar at each ping.
 
-    stamp_ns (n,); position (3,) ENU; range m, bearing rad (to port), vertical_offset m (below), in
+    stamp_ns (n,); position (n, 3) and velocity (n, 2) m/s, ENU, the latter of what moves and 0 of
+    what sways; range m, bearing rad (to port), vertical_offset m (below), in
     the sonar's frame, each (n,); in_beam (n,) True where a ping can show it.
     """
 
@@ -52,16 +54,20 @@ class TrueObstacle:
     bearing: FloatArray
     vertical_offset: FloatArray
     in_beam: np.ndarray
+    velocity: FloatArray
 
     def tables(self, frame_id: str) -> Iterator[TruthTable]:
-        """Give one row per ping: ``x y z range bearing vertical_offset in_beam track_id``."""
+        """Give one row per ping: ``x y z range bearing vertical_offset in_beam track_id
+        vx vy``."""
         columns = {
-            **dict(zip('xyz', np.tile(self.position, (len(self.range), 1)).astype(np.float32).T)),
+            **dict(zip('xyz', self.position.astype(np.float32).T)),
             'range': self.range,
             'bearing': self.bearing,
             'vertical_offset': self.vertical_offset,
             'in_beam': self.in_beam,
             'track_id': np.full(len(self.range), self.track_id, np.uint32),
+            'vx': self.velocity[:, 0],
+            'vy': self.velocity[:, 1],
         }
         for k, stamp in enumerate(self.stamp_ns):
             row = {name: column[k : k + 1] for name, column in columns.items()}
@@ -79,15 +85,15 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     vehicle = _Vehicle(config, rng)
     stamps = FIRST_STAMP_NS + np.round(_ping_times(config, rng) * 1e9).astype(np.int64)
     times = (stamps - FIRST_STAMP_NS) * 1e-9
-    obstacles = _place(config, vehicle, rng)
+    obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
     sound = 1.0 + config.sound_speed_error * rng.normal()
     received = _navigate(config, vehicle, rng)
-    echoes = [_echoes(config, vehicle, times, place, sound) for place in obstacles]
+    echoes = [_echoes(config, vehicle, times, path, sound) for path in obstacles]
     received += _pings(config, stamps, echoes, rng)
     received.sort(key=lambda one: one.received_ns)
     truth = tuple(
-        _truth(config, number, place, vehicle, stamps, times)
-        for number, place in enumerate(obstacles, start=1)
+        _truth(config, number, path, vehicle, stamps, times)
+        for number, path in enumerate(obstacles, start=1)
     )
     return Scene(tuple(received), truth)
 
@@ -279,16 +285,17 @@ def _echoes(
     config: ObstacleScenario,
     vehicle: _Vehicle,
     times: FloatArray,
-    place: FloatArray,
+    path: Path,
     sound: float,
 ) -> tuple[FloatArray, np.ndarray]:
     """Range and azimuth (n, 2) of an obstacle at each ping without noise, and whether it is inside
     the beam (n,)."""
-    out = geometry.to_body(vehicle.sonar(times), place)
+    out = geometry.to_body(vehicle.sonar(times), path.at(times))
     d, azimuth = geometry.project(out, config.azimuth_model)
     if config.ping_timing == 'two_way':
         for _ in range(3):
-            back = geometry.to_body(vehicle.sonar(times + 2.0 * d / 1500.0), place)
+            arrival = times + 2.0 * d / 1500.0
+            back = geometry.to_body(vehicle.sonar(arrival), path.at(times + d / 1500.0))
             d_back, azimuth = geometry.project(back, config.azimuth_model)
             d = 0.5 * (np.linalg.norm(out, axis=-1) + d_back)
     elevation = np.arcsin(np.clip(out[:, 2] / np.linalg.norm(out, axis=-1), -1.0, 1.0))
@@ -339,12 +346,12 @@ def _pings(
 def _truth(
     config: ObstacleScenario,
     number: int,
-    place: FloatArray,
+    path: Path,
     vehicle: _Vehicle,
     stamps: np.ndarray,
     times: FloatArray,
 ) -> TrueObstacle:
-    sonar = vehicle.sonar(times)
+    sonar, place = vehicle.sonar(times), path.at(times)
     d, azimuth = geometry.project(geometry.to_body(sonar, place), config.azimuth_model)
     return TrueObstacle(
         track_id=number,
@@ -352,8 +359,9 @@ def _truth(
         position=geometry.flip_world(place),
         range=d,
         bearing=-azimuth,
-        vertical_offset=place[2] - sonar.position[:, 2],
-        in_beam=_echoes(config, vehicle, times, place, 1.0)[1],
+        vertical_offset=place[:, 2] - sonar.position[:, 2],
+        in_beam=_echoes(config, vehicle, times, path, 1.0)[1],
+        velocity=geometry.flip_world(path.velocity(times))[:, :2],
     )
 
 

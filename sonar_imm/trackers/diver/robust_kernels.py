@@ -65,10 +65,9 @@ def _weighted(
     x: FloatArray,
     Px: FloatArray,
     weights: FloatArray,
-    g: FloatArray,
-    w: FloatArray,
 ) -> None:
     """The weighted Kalman update of the prior, linearised `at` a state, into x, Px and weights."""
+    g, w = np.empty(len(x)), np.empty(len(x))
     x[:] = mean
     Px[:, :] = P
     for c in range(len(numbers.value)):
@@ -98,7 +97,7 @@ def climb(
     x, trial, target = start.copy(), np.empty(n), np.empty(n)
     value = _log_density(x, mean, L, numbers, height, degrees, g, w)
     for _ in range(MOST_ITERATIONS):
-        _weighted(x, mean, P, every, numbers, height, degrees, 1.0, target, Px, weights, g, w)
+        _weighted(x, mean, P, every, numbers, height, degrees, 1.0, target, Px, weights)
         length, gain = 1.0, -1.0
         while length > 1e-3:
             trial[:] = x + length * (target - x)
@@ -175,7 +174,7 @@ def student_t_ping(
     x1, P1, evidence = x.copy(), P.copy(), np.full(M, -np.inf)
     weights = np.zeros((M, C))
     L, Lc = np.zeros((n, n)), np.zeros((n, n))
-    g, w, state = np.empty(n), np.empty(n), np.empty(n)
+    state = np.empty(n)
     every = np.ones(n, np.bool_)
     widen = (degrees + 3.0) / (degrees + 1.0)
     for j in range(M):
@@ -195,9 +194,7 @@ def student_t_ping(
             other, value = climb(start, x[j], P[j], L, numbers, height, degrees)
             if value > best + SMALLEST_GAIN:
                 at, best = other, value
-        _weighted(
-            at, x[j], P[j], every, numbers, height, degrees, 1.0, state, P1[j], weights[j], g, w
-        )
+        _weighted(at, x[j], P[j], every, numbers, height, degrees, 1.0, state, P1[j], weights[j])
         if not cholesky(P1[j], Lc):
             P1[j, :, :] = P[j]
             continue
@@ -217,8 +214,6 @@ def student_t_ping(
             x1[j],
             P1[j],
             weights[j],
-            g,
-            w,
         )
         _weighted(
             at,
@@ -232,7 +227,5 @@ def student_t_ping(
             state,
             P1[j],
             weights[j],
-            g,
-            w,
         )
     return x1, P1, evidence, weights

@@ -14,6 +14,7 @@ from ..shared_parameters import DetectionParameters, StreamParameters, TrackLife
 live = partial(parameter, read_only=False)
 
 METHODS = ('gaussian_sum', 'seafloor', 'landmark')
+BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 
 
 @frozen(kw_only=True)
@@ -28,6 +29,46 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
         choices=METHODS,
     )
     components: int = parameter(9, 'depth slices of gaussian_sum', low=1, high=201)
+
+    # -- what an obstacle may do, gaussian_sum only ----------------------------------------------
+    behaviours: tuple[str, ...] = parameter(
+        BEHAVIOURS,
+        'what gaussian_sum holds possible of an obstacle: fixed, swaying on its mooring, moving, '
+        'lying on the sea floor; the last is left out while no altitude is known, and needs '
+        'another beside it',
+        choices=BEHAVIOURS,
+    )
+    sway_std: float = parameter(
+        0.5, 'swaying: standard deviation along each axis', unit='m', low=0.001, high=100.0
+    )
+    sway_time: float = parameter(
+        20.0, 'swaying: time over which it forgets where it was', unit='s', low=0.1, high=3600.0
+    )
+    max_speed: float = parameter(
+        1.5,
+        'moving: twice the standard deviation of the velocity along each axis before anything is '
+        'known of it',
+        unit='m/s',
+        low=0.01,
+        high=50.0,
+    )
+    speed_noise: float = parameter(
+        0.05, 'moving: random walk of the velocity', unit='m/s/sqrt(s)', low=0.0, high=10.0
+    )
+    behaviour_time: float = parameter(
+        1000.0,
+        'mean time for which an obstacle keeps its behaviour',
+        unit='s',
+        low=1.0,
+        high=1e6,
+    )
+    seabed_std: float = parameter(
+        1.0,
+        'seabed: error of the depth of the sea floor at the obstacle, against below the vehicle',
+        unit='m',
+        low=0.01,
+        high=100.0,
+    )
 
     # -- where the sonar sits and how things are written -----------------------------------------
     sonar_lever: tuple[float, ...] = parameter(
@@ -183,4 +224,8 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
             for name in ('sonar_lever', 'sonar_mount_rpy_deg')
             if len(getattr(self, name)) != 3
         ]
+        if not set(self.behaviours) & set(BEHAVIOURS[:3]):
+            problems.append('behaviours needs one of fixed, swaying, moving at least')
+        if len(set(self.behaviours)) < len(self.behaviours):
+            problems.append('behaviours names one of them twice')
         return problems

@@ -38,12 +38,18 @@ BEAM_MARGIN = 1.6
 
 class Sonar(NamedTuple):
     """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
-    when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise."""
+    when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise.
+    reference: how far below the navigation reference, whose altitude it is, the sonar lies, m."""
 
     pose: Pose
     altitude: float = np.nan
     late: Pose | None = None
     late_by: float = 0.0
+    reference: float = 0.0
+
+    def seabed_below(self) -> float:
+        """Depth of the sea floor below the sonar, m, NaN when unknown."""
+        return self.altitude - self.reference
 
 
 class Mixture(NamedTuple):
@@ -63,7 +69,8 @@ class Mixture(NamedTuple):
 class View(NamedTuple):
     """A mixture in words a user knows, all (T, ...): range, azimuth and vertical offset with their
     covariance; the interval of the offset; probability that the obstacle is above; its place in
-    the world with covariance."""
+    the world with covariance; the probability of each behaviour (T, B) of the filter's; north and
+    east velocity (T, 2), m/s, with covariance."""
 
     state: FloatArray
     covariance: FloatArray
@@ -72,12 +79,16 @@ class View(NamedTuple):
     above: FloatArray
     place: FloatArray
     place_covariance: FloatArray
+    behaviour: FloatArray
+    velocity: FloatArray
+    velocity_covariance: FloatArray
 
 
 class DepthSlices:
     """A Gaussian sum over depth slices, states (d, delta, z, s)."""
 
     n = 4
+    behaviours: tuple[str, ...] = ('fixed',)
 
     def __init__(self, config: ObstacleConfig):
         self.config = config
@@ -98,19 +109,24 @@ class DepthSlices:
 
     def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
         """New targets from detections z (B, 2), R (B, 2, 2)."""
+        fresh = self._begin(z, R, sonar, self.K)
+        return self._unshift(self._clamp_to_seafloor(fresh, sonar), z, sonar)
+
+    def _begin(self, z: FloatArray, R: FloatArray, sonar: Sonar, K: int) -> Mixture:
+        """New targets in K slices of equal weight, four states."""
         B = len(z)
-        x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
+        x, P = np.zeros((B, K, 4)), np.zeros((B, K, 4, 4))
         x[..., :2] = z[:, None]
         P[..., :2, :2] = R[:, None]
         P[..., 3, 3] = self.scale**2
-        lowest, highest = depth_span(z, sonar, self.config)
-        width = (highest - lowest) / self.K
-        # Slices above and below the sonar in pairs: on a level path they stay equally probable.
-        first = np.round((2.0 * lowest + width) / width) * 0.5 * width
-        slices = first[:, None] + np.arange(self.K) * width[:, None]
-        x[..., 2] = sonar.pose.position[2] + slices
-        P[..., 2, 2] = np.square(0.5 * width)[:, None]
-        fresh = self._clamp_to_seafloor(Mixture(x, P, np.full((B, self.K), 1.0 / self.K)), sonar)
+        span = depth_span(z, sonar, self.config)
+        centre, sigma = depth_slices(*span, K)
+        x[..., 2] = sonar.pose.position[2] + centre
+        P[..., 2, 2] = np.square(sigma)[:, None]
+        return Mixture(x, P, np.full((B, K), 1.0 / K))
+
+    def _unshift(self, fresh: Mixture, z: FloatArray, sonar: Sonar) -> Mixture:
+        """Two-way timing: the state at the transmission of which z would be measured."""
         for _ in range(2 if sonar.late else 0):  # the shift hardly depends on where it starts
             fresh.x[..., :2] += z[:, None] - self._echo(fresh, sonar)
         return fresh
@@ -155,7 +171,13 @@ class DepthSlices:
         std = np.sqrt(P[..., 2, 2])
         low, high, above = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
         place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
-        return View(mean, symmetrise(covariance), low, high, above, *place)
+        still = self.motion(mixture)
+        return View(mean, symmetrise(covariance), low, high, above, *place, *still)
+
+    def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Probability of each behaviour (T, B), north and east velocity (T, 2), m/s, and its
+        covariance (T, 2, 2)."""
+        return _still(len(mixture.mu))
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
@@ -189,6 +211,7 @@ class Landmark:
 
     n = 4
     K = 1
+    behaviours: tuple[str, ...] = ('fixed',)
 
     def __init__(self, config: ObstacleConfig):
         self.config = config
@@ -254,7 +277,12 @@ class Landmark:
         low, high, above = kernels.bands(
             np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)
         )
-        return View(seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3])
+        place = x[:, :3], P[:, :3, :3]
+        still = self.motion(mixture)
+        return View(seen.mean, seen.covariance, low, high, above, *place, *still)
+
+    def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return _still(len(mixture.mu))
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         m = geometry.to_body(sonar.pose, mixture.x[:, 0, :3])
@@ -271,9 +299,9 @@ class Landmark:
 Filter = DepthSlices | Landmark
 
 
-def build_filter(config: ObstacleConfig) -> Filter:
-    """The filter `config.method` names."""
-    return Landmark(config) if config.method == 'landmark' else DepthSlices(config)
+def _still(T: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Behaviour, velocity and its covariance of T obstacles that are fixed for certain."""
+    return np.ones((T, 1)), np.zeros((T, 2)), np.zeros((T, 2, 2))
 
 
 def depth_span(
@@ -301,6 +329,15 @@ def depth_span(
     middle = 0.5 * (lowest + highest)
     half = np.maximum(0.5 * (highest - lowest), least)
     return middle - half, middle + half
+
+
+def depth_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
+    """Centres (B, K) of K equal slices of the spans (B,), and half their width (B,). Slices above
+    and below the sonar are in pairs: on a level path they stay equally probable. For that they
+    reach out of the span by up to a quarter of a slice."""
+    width = (highest - lowest) / K
+    first = np.round((2.0 * lowest + width) / width) * 0.5 * width
+    return first[:, None] + np.arange(K) * width[:, None], 0.5 * width
 
 
 _ANGLES = np.array([False, True])

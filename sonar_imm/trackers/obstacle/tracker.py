@@ -33,10 +33,12 @@ from ...estimation.association import (
 )
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
+from ..navigation import NavigationBuffer
 from ..stream import ReplayStream, StreamRules
+from .behaviours import behaviour_columns, build_filter, moving_alike
 from .config import ObstacleConfig
-from .filters import build_filter, Mixture, Sonar
-from .navigation import Mount, NavigationBuffer
+from .filters import Mixture, Sonar
+from .navigation import Mount
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -53,7 +55,8 @@ nothing."""
 
 @frozen(eq=False, kw_only=True)
 class PingState:
-    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired."""
+    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
+    alike: whether most obstacles move alike (`behaviours.moving_alike`)."""
 
     stamp_ns: int
     sonar: Sonar
@@ -61,6 +64,7 @@ class PingState:
     mixture: Mixture
     nis: FloatArray
     repairs: int = 0
+    alike: bool = False
 
     def rows(self, kept: np.ndarray) -> PingState:
         """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
@@ -78,7 +82,7 @@ class ObstacleState:
     """All that is known at a stamp. last: after the newest ping used, None before the first; done:
     the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
     skipped: pings so far for which navigation had a gap; broken: tracks ended so far because their
-    numbers were not finite."""
+    numbers were not finite; alike: pings so far in which most obstacles moved alike."""
 
     last: PingState | None = None
     done: tuple[PingState, ...] = ()
@@ -87,6 +91,7 @@ class ObstacleState:
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
     skipped: int = 0
     broken: int = 0
+    alike: int = 0
 
 
 class ObstacleTracker:
@@ -138,6 +143,8 @@ class ObstacleTracker:
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
             'broken_tracks': state.broken,
+            'moving_alike': int(state.last.alike) if state.last else 0,
+            'pings_moving_alike': state.alike,
             'covariance_repairs': state.last.repairs if state.last else 0,
         }
 
@@ -161,6 +168,7 @@ class ObstacleTracker:
         pings = [item for item in items if isinstance(item, Detections)]
         waiting = [*before.waiting, *((ping, altitude) for ping in pings)]
         last, done, skipped, broken = before.last, [], before.skipped, before.broken
+        alike = before.alike
         while waiting:
             ready = self._readiness(buffer, waiting[0][0])
             if ready == 'wait':
@@ -171,6 +179,7 @@ class ObstacleTracker:
                 continue
             last, lost = self._ping(last, ping, self._sonar(buffer, ping, height))
             broken += lost
+            alike += last.alike
             done.append(last)
         oldest = waiting[0][0].stamp_ns if waiting else stamp_ns
         return ObstacleState(
@@ -181,6 +190,7 @@ class ObstacleTracker:
             waiting=tuple(waiting),
             skipped=skipped,
             broken=broken,
+            alike=alike,
         )
 
     def _readiness(self, buffer: NavigationBuffer, ping: Detections) -> str:
@@ -200,7 +210,9 @@ class ObstacleTracker:
     def _sonar(
         self, buffer: NavigationBuffer, ping: Detections, altitude: Altitude | None
     ) -> Sonar:
-        pose = self.mount.sonar(buffer.pose(ping.stamp_ns))
+        vehicle = buffer.pose(ping.stamp_ns)
+        pose = self.mount.sonar(vehicle)
+        reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
         height = np.nan
         if altitude is not None:
             age = ping.stamp_ns - altitude.stamp_ns
@@ -208,9 +220,9 @@ class ObstacleTracker:
                 height = altitude.altitude
         late_ns = self._late_ns()
         if not late_ns:
-            return Sonar(pose, height)
+            return Sonar(pose, height, reference=reference)
         late = self.mount.sonar(buffer.pose(ping.stamp_ns + late_ns))
-        return Sonar(pose, height, late, late_ns * 1e-9)
+        return Sonar(pose, height, late, late_ns * 1e-9, reference)
 
     def _ping(
         self, before: PingState | None, ping: Detections, sonar: Sonar
@@ -223,7 +235,9 @@ class ObstacleTracker:
         now = self._prune(now, chosen >= 0)
         free = np.ones(len(z), bool)
         free[chosen[chosen >= 0]] = False
-        return self._spawn(now, z[free], R[free]), broken
+        now = self._spawn(now, z[free], R[free])
+        confirmed = now.life.status != TrackStatus.TENTATIVE
+        return evolve(now, alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
     def _predict(self, before: PingState, stamp_ns: int, sonar: Sonar) -> tuple[PingState, int]:
         """The tracks as this ping should show them, and how many had numbers not finite."""
@@ -321,6 +335,7 @@ class ObstacleTracker:
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
+            **behaviour_columns(view, self.filter.behaviours),
             'track_id': ping.life.track_id,
             'track_state': ping.life.status,
             'vertical_offset_lo': view.low,

@@ -66,16 +66,16 @@ def test_an_echo_is_where_the_navigation_says_the_obstacle_is(model, timing):
     vehicle, truth, checked = Vehicle(scene), scene.truth[0], 0
     for ping in of(scene, Detections):
         seconds = (ping.stamp_ns - vehicle.first) * 1e-9
-        out, sonar = vehicle.sees(truth.position, seconds)
+        out, sonar = vehicle.sees(truth.position[0], seconds)
         k = int(np.searchsorted(truth.stamp_ns, ping.stamp_ns))
         assert truth.range[k] == pytest.approx(np.linalg.norm(out), abs=1e-3)
-        assert truth.vertical_offset[k] == pytest.approx(sonar[2] - truth.position[2], abs=1e-3)
+        assert truth.vertical_offset[k] == pytest.approx(sonar[2] - truth.position[0, 2], abs=1e-3)
         if not len(ping):
             continue
         d, bearing = np.linalg.norm(out), bearing_of(out, model)
         if timing == 'two_way':
             for _ in range(4):  # the echo comes back to where the sonar is by then
-                back, _ = vehicle.sees(truth.position, seconds + 2.0 * d / 1500.0)
+                back, _ = vehicle.sees(truth.position[0], seconds + 2.0 * d / 1500.0)
                 d = 0.5 * (np.linalg.norm(out) + np.linalg.norm(back))
                 bearing = bearing_of(back, model)
         assert ping.range[0] == pytest.approx(d, abs=1e-3)
@@ -102,7 +102,7 @@ def test_a_beam_is_a_box_of_elevation_azimuth_and_range():
     vehicle, inside = Vehicle(scene), 0
     for truth in scene.truth:
         for stamp, seen in zip(truth.stamp_ns, truth.in_beam):
-            m, _ = vehicle.sees(truth.position, (int(stamp) - vehicle.first) * 1e-9)
+            m, _ = vehicle.sees(truth.position[0], (int(stamp) - vehicle.first) * 1e-9)
             d = np.linalg.norm(m)
             margins = np.array([
                 np.radians(7.5) - abs(np.arcsin(m[2] / d)),

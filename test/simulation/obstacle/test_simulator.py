@@ -68,13 +68,13 @@ def test_detections_point_at_the_obstacle_from_the_navigation(model):
         sonar = geometry.mounted(
             vehicle, np.array(config.sonar_lever), geometry.rotation(roll, pitch, yaw)
         )
-        seen = geometry.to_body(sonar, truth.position)
+        seen = geometry.to_body(sonar, truth.position[0])
         d, bearing = geometry.project(seen, model)
         assert ping.range[0] == pytest.approx(d, abs=1e-9)
         assert ping.bearing[0] == pytest.approx(bearing, abs=1e-9)
         k = int(np.searchsorted(truth.stamp_ns, ping.stamp_ns))
         assert truth.vertical_offset[k] == pytest.approx(
-            sonar.position[2] - truth.position[2], abs=1e-9
+            sonar.position[2] - truth.position[0, 2], abs=1e-9
         )
         checked += 1
     assert checked > 40
@@ -90,10 +90,10 @@ def test_the_offset_is_the_one_asked_for():
 def test_tethers_stand_on_the_sea_floor():
     config = scenario('tethers')
     for truth, tether in zip(simulate(config, 2).truth, (15.0, 12.0)):
-        assert -truth.position[2] == pytest.approx(20.0 + 15.5 - tether)
+        assert -truth.position[0, 2] == pytest.approx(20.0 + 15.5 - tether)
     seabed, surface = (simulate(scenario(name), 1).truth for name in ('seabed', 'surface'))
-    assert all(-truth.position[2] == pytest.approx(25.5) for truth in seabed)
-    assert all(-truth.position[2] == pytest.approx(0.5) for truth in surface)
+    assert all(-truth.position[0, 2] == pytest.approx(25.5) for truth in seabed)
+    assert all(-truth.position[0, 2] == pytest.approx(0.5) for truth in surface)
 
 
 def test_the_beam_has_the_stated_size():

@@ -4,6 +4,7 @@ from attrs import evolve
 from helpers.obstacle_runs import (
     approach,
     FAITHFUL,
+    FIXED,
     follow,
     lever,
     meta,
@@ -78,12 +79,24 @@ def sonar_rotation(row):
 @pytest.mark.parametrize('kind', ['noisy', 'noisefree'])
 def test_a_level_path_cannot_tell_above_from_below(kind, values):
     """From the first ping on, although the prior reaches further up than down."""
-    estimates = track_approach(f'approach_level_mirror_{kind}', max_tracks=1, **values)
+    estimates = track_approach(f'approach_level_mirror_{kind}', max_tracks=1, **FIXED, **values)
     for ping, estimate in enumerate(estimates):
         assert estimate.probabilities[0, 0] == pytest.approx(0.5, abs=0.005)
         if ping > 40:
             assert estimate.extras['vertical_offset_lo'][0] < -3.0
             assert estimate.extras['vertical_offset_hi'][0] > 3.0
+
+
+@pytest.mark.parametrize('kind', ['noisy', 'noisefree'])
+def test_nor_can_it_with_all_behaviours(kind):
+    """The sea floor lies on one side only; it is ruled out soon, and does not last."""
+    name = f'approach_level_mirror_{kind}'
+    moving = track_approach(name, max_tracks=1, behaviours=('fixed', 'swaying', 'moving'))
+    assert_allclose([one.probabilities[0, 0] for one in moving], 0.5, atol=0.005)
+    everything = track_approach(name, max_tracks=1)
+    assert_allclose([one.probabilities[0, 0] for one in everything[24:]], 0.5, atol=0.01)
+    assert everything[-1].extras['vertical_offset_lo'][0] < -3.0
+    assert everything[-1].extras['vertical_offset_hi'][0] > 3.0
 
 
 def test_estimates_are_where_the_obstacle_is():
@@ -141,7 +154,7 @@ MISTAKES = {
 def test_a_wrong_direction_shows_in_the_innovations(mistake):
     side, change = MISTAKES[mistake]
     name = 'approach_dst+3_noisy'
-    config = ObstacleConfig(sonar_lever=lever(name))
+    config = ObstacleConfig(sonar_lever=lever(name), **FIXED)
     wrong = [mistaken(one, change, side) for one in approach(name)]
     assert follow(wrong, config)[0].mean() > 30.0
     right = follow(approach(name), config)[0]
@@ -161,7 +174,7 @@ def test_outliers_are_taken_for_what_they_are():
     true = rows(name)['true_dst'][-1]
 
     def squared(probability, seed):
-        config = ObstacleConfig(sonar_lever=lever(name), outlier_probability=probability)
+        config = ObstacleConfig(sonar_lever=lever(name), outlier_probability=probability, **FIXED)
         view = follow(with_outliers(approach(name), seed), config)[1]
         return (view.state[0, 2] - true) ** 2 / view.covariance[0, 2, 2]
 

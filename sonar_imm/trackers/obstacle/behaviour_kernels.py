@@ -1,0 +1,220 @@
+"""The arithmetic of `behaviours`, compiled: mixing inside a depth slice, and the prediction.
+
+A target is C components of six states (d, delta, z, s, e_N, e_E): those of `kernels`, and what the
+behaviour adds, m or m/s along north and east. Component `k M + a` is behaviour `a` of slice `k`;
+components after the last slice are on their own. A behaviour without e has zeros there, and its
+sigma points are those of the first four states, so that it costs and says what it does without the
+others. A component of weight 0 is dropped: it takes no further part.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.jit import kernel
+from ...estimation.small_matrices import lift, semidefinite_root
+from .kernels import _sigma_point, _to_world, echo, KAPPA, point
+
+STATES = 6
+COMMON = 4
+"""The states d, delta, z, s that all behaviours have."""
+
+
+class Motion(NamedTuple):
+    """What the components do in a step, each (C,): ``e' = keep e + w``, ``w ~ N(0, noise I)``, and
+    the obstacle goes by ``step e + push w`` along north and east. prior: variance of e before
+    anything is known, 0 for a behaviour without e."""
+
+    keep: FloatArray
+    step: FloatArray
+    push: FloatArray
+    noise: FloatArray
+    prior: FloatArray
+
+
+class Step(NamedTuple):
+    """Sonar poses before and after, position (3,) and rotation (3, 3), NED and FRD; noise (3,):
+    variances the time adds to horizontal position, azimuth and depth; cone: which azimuth."""
+
+    p0: FloatArray
+    R0: FloatArray
+    p1: FloatArray
+    R1: FloatArray
+    noise: FloatArray
+    cone: bool
+
+
+@kernel
+def mix(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    prior: FloatArray,
+    slices: int,
+    M: int,
+    stay: float,
+    floor: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The components before a step in which an obstacle may change what it does.
+
+    prior (C,): see `Motion`. The M components of a slice interact: a behaviour is kept with
+    probability `stay`, the others share the rest. States that all have are mixed. A displacement
+    is no velocity: to e, a behaviour brings its own, any other its prior, uncorrelated. Slices
+    below the weight `floor` are dropped.
+    """
+    T, C, n = x.shape
+    x1, P1, mu1 = x.copy(), P.copy(), mu.copy()
+    change = (1.0 - stay) / (M - 1) if M > 1 else 0.0
+    share, off = np.empty(M), np.empty((M, n))
+    for t in range(T):
+        for j in range(slices * M, C):
+            if mu[t, j] < floor:
+                mu1[t, j] = 0.0
+        for k in range(slices):
+            first = k * M
+            weight = 0.0
+            for i in range(M):
+                weight += mu[t, first + i]
+            if weight < floor:
+                for i in range(M):
+                    mu1[t, first + i] = 0.0
+                continue
+            if M == 1:
+                continue
+            for a in range(M):
+                j = first + a
+                total = 0.0
+                for i in range(M):
+                    share[i] = mu[t, first + i] * (stay if i == a else change)
+                    total += share[i]
+                mu1[t, j] = total
+                for b in range(n):
+                    x1[t, j, b] = 0.0
+                for i in range(M):
+                    share[i] = share[i] / total if total > 0.0 else (1.0 if i == a else 0.0)
+                    for b in range(n):
+                        off[i, b] = x[t, first + i, b] if b < COMMON or i == a else 0.0
+                        x1[t, j, b] += share[i] * off[i, b]
+                for i in range(M):
+                    for b in range(n):
+                        off[i, b] -= x1[t, j, b]
+                for b in range(n):
+                    for d in range(b + 1):
+                        value = 0.0
+                        for i in range(M):
+                            own = P[t, first + i, b, d]
+                            if i != a and b >= COMMON:
+                                own = prior[j] if b == d else 0.0
+                            value += share[i] * (own + off[i, b] * off[i, d])
+                        P1[t, j, b, d] = value
+                        P1[t, j, d, b] = value
+        total = 0.0
+        for j in range(C):
+            total += mu1[t, j]
+        for j in range(C):
+            mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
+    return x1, P1, mu1
+
+
+@kernel
+def slopes(m: FloatArray, R: FloatArray, cone: bool, J: FloatArray) -> None:
+    """How range and azimuth of m (3,), seen by a sonar turned by R, change with the obstacle's
+    north and east: J (2, 2)."""
+    d = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    level = m[0] * m[0] + m[1] * m[1]
+    for i in range(2):
+        J[0, i] = (R[i, 0] * m[0] + R[i, 1] * m[1] + R[i, 2] * m[2]) / d
+        if cone:
+            J[1, i] = (R[i, 1] - m[1] / d * J[0, i]) / math.sqrt(d * d - m[1] * m[1])
+        else:
+            J[1, i] = (R[i, 1] * m[0] - R[i, 0] * m[1]) / level
+
+
+@kernel
+def advance(
+    x: FloatArray, P: FloatArray, mu: FloatArray, motion: Motion, step: Step
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Predict what the sonar will see of components that move: `kernels.advance` with e.
+
+    Gives x, P and where P (T, C) was repaired. Dropped components are given the numbers of the
+    most probable one, so that all stay finite.
+    """
+    T, C, size = x.shape
+    p0, R0, p1, R1, noise, cone = step
+    x1, P1 = np.zeros((T, C, size)), np.zeros((T, C, size, size))
+    repaired = np.zeros((T, C), dtype=np.bool_)
+    whole, images = np.zeros((size, size)), np.empty((2 * size + 1, size))
+    y, m, world, J = np.empty(size), np.empty(3), np.empty(3), np.empty((2, 2))
+    scratch = np.empty((size, size))
+    for t in range(T):
+        best = 0
+        for j in range(C):
+            if mu[t, j] > mu[t, best]:
+                best = j
+            if mu[t, j] <= 0.0:
+                continue
+            n = size if motion.prior[j] > 0.0 else COMMON
+            weight = 0.5 / (n + KAPPA)
+            centre = KAPPA / (n + KAPPA)
+            L = whole[:n, :n]
+            semidefinite_root(P[t, j, :n, :n], L)
+            for number in range(2 * n + 1):
+                _sigma_point(x[t, j, :n], L, number, y)
+                point(y[0], y[1], y[2] - p0[2], R0, cone, m)
+                _to_world(R0, m, world)
+                for i in range(2):
+                    world[i] += (p0[i] - p1[i]) * (1.0 + y[3])
+                    if n > COMMON:
+                        world[i] += motion.step[j] * y[COMMON + i]
+                        images[number, COMMON + i] = motion.keep[j] * y[COMMON + i]
+                world[2] += p0[2] - p1[2]
+                for i in range(3):
+                    m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
+                images[number, 0], images[number, 1] = echo(m, cone)
+                images[number, 2], images[number, 3] = y[2], y[3]
+                if number == 0 and n > COMMON:
+                    slopes(m, R1, cone, J)
+                turns = (images[number, 1] - images[0, 1]) / (2.0 * math.pi)
+                images[number, 1] -= 2.0 * math.pi * np.round(turns)
+            for a in range(n):
+                total = centre * images[0, a]
+                for number in range(1, 2 * n + 1):
+                    total += weight * images[number, a]
+                x1[t, j, a] = total
+            for a in range(n):
+                for b in range(a + 1):
+                    total = 0.0
+                    for number in range(2 * n + 1):
+                        share = centre if number == 0 else weight
+                        total += (
+                            share
+                            * (images[number, a] - x1[t, j, a])
+                            * (images[number, b] - x1[t, j, b])
+                        )
+                    P1[t, j, a, b] = total
+                    P1[t, j, b, a] = total
+            P1[t, j, 0, 0] += noise[0]
+            P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
+            P1[t, j, 2, 2] += noise[2]
+            if n > COMMON:
+                _add_push(P1[t, j], J, motion.push[j], motion.noise[j])
+            repaired[t, j] = lift(P1[t, j, :n, :n], scratch[:n, :n])
+        for j in range(C):
+            if mu[t, j] <= 0.0:
+                x1[t, j], P1[t, j] = x1[t, best], P1[t, best]
+    return x1, P1, repaired
+
+
+@kernel
+def _add_push(P: FloatArray, J: FloatArray, push: float, noise: float) -> None:
+    """Add what w brings to P (6, 6): to range and azimuth, to e, and to both together."""
+    for a in range(2):
+        for b in range(2):
+            P[a, b] += push * push * noise * (J[a, 0] * J[b, 0] + J[a, 1] * J[b, 1])
+            P[a, COMMON + b] += push * noise * J[a, b]
+            P[COMMON + b, a] += push * noise * J[a, b]
+        P[COMMON + a, COMMON + a] += noise

@@ -1,0 +1,187 @@
+"""What an obstacle does, as an interacting multiple model filter inside each depth slice.
+
+fixed     nothing
+swaying   moored, it swings about its place: e is the displacement, m, which forgets itself over
+          `sway_time` and has the standard deviation `sway_std`
+moving    e is the velocity, m/s, a random walk of `speed_noise`; horizontal only
+seabed    fixed, and as deep as the sea floor below the vehicle when it was seen first: a slice of
+          its own
+
+The depth of an obstacle never changes, so slices do not interact. What it does may: within a slice
+the behaviours are mixed (`behaviour_kernels.mix`) before each step. The cycle is mix, predict,
+update, combine. The probability of a behaviour is its weight summed over the slices.
+
+Source: docs/obstacle.md, section Behaviours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...estimation.arrays import FloatArray
+from ...estimation.covariance import symmetrise
+from . import behaviour_kernels
+from .behaviour_kernels import COMMON, Motion, Step
+from .config import BEHAVIOURS, ObstacleConfig
+from .filters import depth_slices, depth_span, DepthSlices, Filter, Landmark, Mixture, Sonar, View
+
+PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
+"""Probability of each behaviour of a new obstacle, among those asked for."""
+DROPPED = 1e-6
+"""A slice that weighs less takes no further part."""
+OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
+"""1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
+density as high as inside the gate of a fixed obstacle would make an outlier of the echo by which
+one that starts to move shows that it does."""
+SWITCHING = BEHAVIOURS[:3]
+ALIKE_AT_LEAST = 3
+ALIKE = 0.05
+"""m/s by which velocities that are alike may differ, beside three times their standard
+deviation."""
+
+
+class BehaviourSlices(DepthSlices):
+    """A Gaussian sum over depth slices and behaviours, states (d, delta, z, s, e_N, e_E)."""
+
+    n = behaviour_kernels.STATES
+
+    def __init__(self, config: ObstacleConfig):
+        super().__init__(config)
+        self.behaviours = tuple(name for name in BEHAVIOURS if name in config.behaviours)
+        switching = [name for name in self.behaviours if name in SWITCHING]
+        self.outlier_density = OUTLIER_DENSITY
+        self.slices, self.M = config.components, len(switching)
+        names = switching * self.slices + ['seabed'] * ('seabed' in self.behaviours)
+        self.K = len(names)
+        self._is = {name: np.array([one == name for one in names]) for name in BEHAVIOURS}
+
+    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+        B, M, last = len(z), self.M, self.slices * self.M
+        floor, known = sonar.seabed_below(), 'seabed' in self.behaviours
+        known = known and bool(np.isfinite(floor))
+        lowest, highest = depth_span(z, sonar, self.config)
+        if known:
+            # What lies deeper than the sea floor below the vehicle is left to its own slice.
+            highest = np.minimum(highest, np.maximum(floor, lowest + 0.5 * (highest - lowest)))
+        centre, sigma = _cut_slices(lowest, highest, self.slices)
+        x, P = np.zeros((B, self.K, self.n)), np.zeros((B, self.K, self.n, self.n))
+        x[..., :2] = z[:, None]
+        P[..., :2, :2] = R[:, None]
+        P[..., 3, 3] = self.scale**2
+        x[:, :last, 2] = sonar.pose.position[2] + np.repeat(centre, M, axis=1)
+        P[:, :last, 2, 2] = np.square(np.repeat(sigma, M, axis=1))
+        prior = {name: PRIOR[name] for name in self.behaviours if name != 'seabed' or known}
+        total = sum(prior.values())
+        mu = np.zeros((B, self.K))
+        for name in prior:
+            mu[:, self._is[name]] = prior[name] / total / self._is[name].sum()
+        if 'seabed' in self.behaviours:
+            x[:, last, 2] = sonar.pose.position[2] + (floor if known else 0.0)
+            P[:, last, 2, 2] = self.config.seabed_std**2
+        # e is unknown and uncorrelated with the rest.
+        for i in (COMMON, COMMON + 1):
+            P[:, :, i, i] = self._motion(0.0).prior
+        return self._unshift(Mixture(x, P, mu), z, sonar)
+
+    def advance(
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+    ) -> tuple[Mixture, int]:
+        motion = self._motion(dt)
+        mixed = behaviour_kernels.mix(
+            *mixture, motion.prior, self.slices, self.M, self._stay(dt), DROPPED
+        )
+        noise = np.array(self._noise) * dt
+        step = Step(*before.pose, *after.pose, noise, self.cone)
+        x, P, repaired = behaviour_kernels.advance(*mixed, motion, step)
+        return Mixture(x, P, mixed[2]), int(repaired.sum())
+
+    def view(self, mixture: Mixture, sonar: Sonar) -> View:
+        x, P, mu = mixture
+        common = Mixture(
+            np.ascontiguousarray(x[..., :COMMON]),
+            np.ascontiguousarray(P[..., :COMMON, :COMMON]),
+            mu,
+        )
+        behaviour, velocity, covariance = self.motion(mixture)
+        return (
+            super()
+            .view(common, sonar)
+            ._replace(behaviour=behaviour, velocity=velocity, velocity_covariance=covariance)
+        )
+
+    def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
+        x, P, mu = mixture
+        probability = np.stack([mu @ self._is[name] for name in self.behaviours], axis=-1)
+        moving = self._is['moving']
+        v, weight = x[:, moving, COMMON:], mu[:, moving]
+        mean = np.einsum('tk,tki->ti', weight, v)
+        # What does not move has velocity 0, without spread.
+        square = np.einsum('tk,tkij->tij', weight, P[:, moving, COMMON:, COMMON:])
+        square += np.einsum('tk,tki,tkj->tij', weight, v, v)
+        return probability, mean, symmetrise(square - mean[:, :, None] * mean[:, None, :])
+
+    def _stay(self, dt: float) -> float:
+        """Probability that an obstacle does the same `dt` seconds later."""
+        if self.M == 1:
+            return 1.0
+        rate = self.M / ((self.M - 1) * self.config.behaviour_time)
+        return float(1.0 / self.M + (1.0 - 1.0 / self.M) * np.exp(-rate * dt))
+
+    def _motion(self, dt: float) -> Motion:
+        config = self.config
+        keep, step, push, noise, prior = np.zeros((5, self.K))
+        swaying, moving = self._is['swaying'], self._is['moving']
+        phi = np.exp(-dt / config.sway_time)
+        keep[swaying], step[swaying], push[swaying] = phi, phi - 1.0, 1.0
+        noise[swaying] = config.sway_std**2 * -np.expm1(-2.0 * dt / config.sway_time)
+        prior[swaying] = config.sway_std**2
+        keep[moving], step[moving], push[moving] = 1.0, dt, 0.5 * dt
+        noise[moving] = config.speed_noise**2 * dt
+        prior[moving] = (0.5 * config.max_speed) ** 2
+        return Motion(keep, step, push, noise, prior)
+
+
+def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:
+    """`depth_slices` with the outermost ones ending where the span does: centres and half widths,
+    (B, K). The others keep their place, in pairs about the sonar."""
+    centre, half = depth_slices(lowest, highest, K)
+    ends = np.concatenate([centre - half[:, None], centre[:, -1:] + half[:, None]], axis=1)
+    ends[:, 0], ends[:, -1] = lowest, highest
+    width = np.diff(ends, axis=1)
+    return 0.5 * (ends[:, 1:] + ends[:, :-1]), 0.5 * width
+
+
+def build_filter(config: ObstacleConfig) -> Filter:
+    """The filter `config.method` names, for the behaviours it asks for."""
+    if config.method == 'landmark':
+        return Landmark(config)
+    alone = config.method == 'seafloor' or set(config.behaviours) == {'fixed'}
+    return DepthSlices(config) if alone else BehaviourSlices(config)
+
+
+def moving_alike(filter_: Filter, mixture: Mixture, confirmed: np.ndarray) -> bool:
+    """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
+    is more probably the navigation that drifts: an error of its velocity moves all alike."""
+    if 'moving' not in filter_.behaviours or confirmed.sum() < ALIKE_AT_LEAST:
+        return False
+    probability, velocity, covariance = filter_.motion(mixture)
+    moves = confirmed & (probability[:, filter_.behaviours.index('moving')] > 0.5)
+    v = velocity[moves]
+    if len(v) < ALIKE_AT_LEAST:
+        return False
+    off = v - np.median(v, axis=0)
+    variance = np.trace(covariance[moves], axis1=-2, axis2=-1)
+    alike = np.einsum('ti,ti->t', off, off) <= 9.0 * variance + ALIKE**2
+    return bool(alike.sum() >= ALIKE_AT_LEAST and alike.sum() > 0.5 * confirmed.sum())
+
+
+def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:
+    """``prob_<behaviour>``, and the velocity with its covariance, east then north (ENU)."""
+    columns = {f'prob_{name}': view.behaviour[:, i] for i, name in enumerate(behaviours)}
+    columns |= {'vx': view.velocity[:, 1], 'vy': view.velocity[:, 0]}
+    covariance = view.velocity_covariance
+    return columns | {
+        'vel_cov_x_x': covariance[:, 1, 1],
+        'vel_cov_x_y': covariance[:, 0, 1],
+        'vel_cov_y_y': covariance[:, 0, 0],
+    }

@@ -1,0 +1,47 @@
+"""Obstacles that sway and move."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+
+
+def test_a_swaying_obstacle_stays_about_its_place():
+    moved = []
+    for seed in range(40):
+        scene = simulate(scenario('swaying', {'last_range': -60.0}), seed)
+        place = simulate(scenario('approach', {'last_range': -60.0}), seed).truth[0].position
+        truth = scene.truth[0]
+        moved.append((truth.position - place)[:, :2])
+        assert_allclose(truth.position[:, 2], place[:, 2])
+        assert_allclose(truth.velocity, 0.0)
+    moved = np.array(moved)
+    assert moved.std() == pytest.approx(0.5, rel=0.1)
+    lag = 20  # 10 s of a memory of 20 s
+    together = np.mean(moved[:, lag:] * moved[:, :-lag]) / np.mean(moved**2)
+    assert together == pytest.approx(np.exp(-0.5), abs=0.12)
+
+
+def test_a_mover_moves_as_its_velocity_says_and_is_seen():
+    seen = []
+    for seed in range(12):
+        truth = simulate(scenario('mover'), seed).truth[0]
+        dt = np.diff(truth.stamp_ns) * 1e-9
+        step = np.diff(truth.position, axis=0)[:, :2] / dt[:, None]
+        assert_allclose(step, truth.velocity[1:], atol=1e-5)
+        assert 0.3 <= np.linalg.norm(truth.velocity[0]) <= 1.5
+        seen.append(truth.in_beam.mean())
+    assert np.mean(seen) > 0.5
+
+
+def test_truth_tables_say_the_velocity():
+    truth = simulate(scenario('mover'), 1).truth[0]
+    table = next(iter(truth.tables('odom')))
+    assert_allclose([table.columns['vx'][0], table.columns['vy'][0]], truth.velocity[0])
+
+
+def test_speeds_in_the_wrong_order_are_refused():
+    with pytest.raises(ConfigError, match='obstacle_speed'):
+        scenario('mover', {'obstacle_speed': [2.0, 1.0]})

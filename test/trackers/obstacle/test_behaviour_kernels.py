@@ -1,0 +1,212 @@
+"""Mixing and prediction of obstacles that move, against plain numpy and sampling."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.trackers.obstacle import behaviour_kernels as behave
+from sonar_imm.trackers.obstacle import kernels
+from sonar_imm.trackers.obstacle.behaviours import BehaviourSlices
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.filters import Sonar
+
+MODELS = {'plane': False, 'cone': True}
+
+
+def poses(rng):
+    angles = rng.normal(0.0, 0.1, 3)
+    before = Pose(rng.normal(0.0, 20.0, 3), geometry.rotation(*angles))
+    turned = angles + rng.normal(0.0, 0.03, 3)
+    after = Pose(before.position + rng.normal(0.0, 1.0, 3), geometry.rotation(*turned))
+    return before, after
+
+
+def targets(rng, before, slices=2, T=2):
+    """Components fixed, swaying, moving of each slice, and one more that is fixed."""
+    C = 3 * slices + 1
+    x = np.zeros((T, C, 6))
+    x[..., 0] = rng.uniform(30.0, 90.0, (T, C))
+    x[..., 1] = rng.uniform(-0.3, 0.3, (T, C))
+    x[..., 2] = before.position[2] + rng.uniform(-6.0, 6.0, (T, C))
+    x[..., 3] = rng.normal(0.0, 0.003, (T, C))
+    x[..., 4:] = rng.normal(0.0, 0.5, (T, C, 2))
+    scale = np.array([0.2, 0.004, 1.5, 0.003, 0.3, 0.3])
+    A = rng.normal(size=(T, C, 6, 6)) * scale[:, None]
+    P = A @ np.swapaxes(A, -1, -2)
+    fixed = np.arange(C) % 3 == 0
+    x[:, fixed, 4:] = 0.0
+    P[:, fixed, 4:, :] = P[:, fixed, :, 4:] = 0.0
+    return x, P, rng.dirichlet(np.ones(C), T)
+
+
+def motion(dt=0.5, slices=2):
+    config = ObstacleConfig(components=slices)
+    return BehaviourSlices(config)._motion(dt)
+
+
+def numpy_mix(x, P, mu, prior, slices, M, stay):
+    """The mixing written out: sources as they look to each behaviour, then moments."""
+    x1, P1, mu1 = x.copy(), P.copy(), mu.copy()
+    chain = np.full((M, M), (1.0 - stay) / max(M - 1, 1))
+    np.fill_diagonal(chain, stay)
+    for t in range(len(x)):
+        for k in range(slices):
+            own = slice(k * M, (k + 1) * M)
+            mu1[t, own] = mu[t, own] @ chain
+            for a in range(M):
+                share = mu[t, own] * chain[:, a] / mu1[t, k * M + a]
+                means, covariances = x[t, own].copy(), P[t, own].copy()
+                for i in range(M):
+                    if i != a:
+                        means[i, 4:] = 0.0
+                        covariances[i, 4:, :] = covariances[i, :, 4:] = 0.0
+                        covariances[i, 4:, 4:] = np.eye(2) * prior[k * M + a]
+                mean = share @ means
+                off = means - mean
+                x1[t, k * M + a] = mean
+                P1[t, k * M + a] = np.einsum('i,iab->ab', share, covariances) + np.einsum(
+                    'i,ia,ib->ab', share, off, off
+                )
+    return x1, P1, mu1
+
+
+def test_mixing_equals_numpy():
+    rng = np.random.default_rng(1)
+    before, _ = poses(rng)
+    x, P, mu = targets(rng, before)
+    prior = motion().prior
+    got = behave.mix(x, P, mu, prior, 2, 3, 0.9, 0.0)
+    for mine, plain in zip(got, numpy_mix(x, P, mu, prior, 2, 3, 0.9)):
+        assert_allclose(mine, plain, rtol=1e-12, atol=1e-15)
+    assert_allclose(got[2].sum(axis=1), 1.0)
+    assert np.all(got[1] == np.swapaxes(got[1], -1, -2))
+
+
+def test_mixing_leaves_depth_slices_alone_and_drops_the_improbable():
+    rng = np.random.default_rng(2)
+    before, _ = poses(rng)
+    x, P, mu = targets(rng, before)
+    mu[:, 3:6] *= 1e-9
+    mu /= mu.sum(axis=1, keepdims=True)
+    x1, P1, mu1 = behave.mix(x, P, mu, motion().prior, 2, 3, 0.9, 1e-6)
+    assert np.all(mu1[:, 3:6] == 0.0)
+    assert_allclose(mu1[:, :3].sum(axis=1) / mu1[:, 6], mu[:, :3].sum(axis=1) / mu[:, 6])
+    assert np.all(x1[:, 6] == x[:, 6]) and np.all(P1[:, 6] == P[:, 6])
+
+
+def numpy_advance(x, P, motion, j, before, after, noise, model):
+    n = 6 if motion.prior[j] else 4
+    centre, C = x[:n], P[:n, :n]
+    columns = (np.sqrt(n + 1.0) * np.linalg.cholesky(C)).T
+    points = np.concatenate([centre[None], centre + columns, centre - columns])
+    weights = np.array([1.0 / (n + 1.0)] + [0.5 / (n + 1.0)] * (2 * n))
+    d, delta, z, s = points[:, :4].T
+    m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
+    stretch = np.stack([1.0 + s, 1.0 + s, np.ones_like(s)], axis=-1)
+    moved = geometry.apply(before.R, m) + (before.position - after.position) * stretch
+    if n == 6:
+        moved[:, :2] += motion.step[j] * points[:, 4:]
+    seen = geometry.apply(after.R.T, moved)
+    images = np.column_stack(
+        [*geometry.project(seen, model), z, s, motion.keep[j] * points[:, 4:]]
+    )
+    mean = weights @ images
+    off = images - mean
+    covariance = np.einsum('s,si,sj->ij', weights, off, off)
+    covariance[0, 0] += noise[0]
+    covariance[1, 1] += noise[0] / mean[0] ** 2 + noise[1]
+    covariance[2, 2] += noise[2]
+    if n == 6:
+        J = np.zeros((2, 2))
+        for i in range(2):
+            step = np.zeros(3)
+            step[i] = 1e-5
+            ahead, back = (
+                np.array(
+                    geometry.project(geometry.apply(after.R.T, moved[0] + sign * step), model)
+                )
+                for sign in (1.0, -1.0)
+            )
+            J[:, i] = (ahead - back) / 2e-5
+        G = np.zeros((6, 2))
+        G[:2], G[4:] = motion.push[j] * J, np.eye(2)
+        covariance += motion.noise[j] * G @ G.T
+    return mean, covariance
+
+
+@pytest.mark.parametrize('model', MODELS)
+def test_prediction_equals_numpy(model):
+    rng = np.random.default_rng(3)
+    before, after = poses(rng)
+    x, P, mu = targets(rng, before)
+    noise, how = np.array([1e-3, 2e-7, 3e-4]), motion()
+    step = behave.Step(*before, *after, noise, MODELS[model])
+    x1, P1, repaired = behave.advance(x, P, mu, how, step)
+    assert not repaired.any()
+    for t in range(2):
+        for j in range(7):
+            mean, covariance = numpy_advance(x[t, j], P[t, j], how, j, before, after, noise, model)
+            n = len(mean)
+            assert_allclose(x1[t, j, :n], mean, rtol=1e-11, atol=1e-12)
+            assert_allclose(P1[t, j, :n, :n], covariance, rtol=1e-6, atol=1e-10)
+            assert np.all(x1[t, j, n:] == 0.0) and np.all(P1[t, j, n:] == 0.0)
+
+
+def test_fixed_components_are_predicted_as_the_fixed_filter_does():
+    """Bit for bit: what the behaviours cost a fixed obstacle is not in the arithmetic."""
+    rng = np.random.default_rng(4)
+    before, after = poses(rng)
+    x, P, mu = targets(rng, before)
+    noise = np.array([1e-3, 2e-7, 3e-4])
+    x1, P1, _ = behave.advance(x, P, mu, motion(), behave.Step(*before, *after, noise, False))
+    four = np.ascontiguousarray(x[..., :4]), np.ascontiguousarray(P[..., :4, :4])
+    plain, plain_P, _ = kernels.advance(*four, *before, *after, noise, False)
+    assert np.all(x1[:, 0, :4] == plain[:, 0]) and np.all(P1[:, 0, :4, :4] == plain_P[:, 0])
+
+
+@pytest.mark.parametrize('kind', ['swaying', 'moving'])
+def test_covariance_of_a_step_equals_sampling(kind):
+    """The cross covariance of position and e, and the sign of ``step``, show here and nowhere in
+    the error of an offset."""
+    rng = np.random.default_rng(5)
+    filter_ = BehaviourSlices(
+        ObstacleConfig(
+            components=1, behaviours=(kind,), position_noise=0.0, yaw_noise_deg=0.0,
+            depth_noise=0.0, speed_noise=0.3, scale_std=0.0,
+        )
+    )  # fmt: skip
+    sonar = Sonar(Pose(np.array([0.0, 0.0, 20.0]), np.eye(3)))
+    dt, draws = 5.0, 400_000
+    how = filter_._motion(dt)
+    # An obstacle whose place is known, level with the sonar.
+    x, P = np.zeros((1, 1, 6)), np.zeros((1, 1, 6, 6))
+    x[0, 0, :3] = 50.0, 0.2, 20.0
+    P[0, 0, 4:, 4:] = how.prior[0] * np.eye(2)
+    step = behave.Step(*sonar.pose, *sonar.pose, np.zeros(3), False)
+    x1, P1, _ = behave.advance(x, P, np.ones((1, 1)), how, step)
+    e = rng.normal(0.0, np.sqrt(how.prior[0]), (draws, 2))
+    place = 50.0 * np.array([np.cos(0.2), np.sin(0.2)])
+    if kind == 'swaying':
+        phi = np.exp(-dt / 20.0)
+        after = phi * e + rng.normal(0.0, 0.5 * np.sqrt(1.0 - phi**2), (draws, 2))
+        place = place + after - e
+    else:  # velocity is a random walk in small steps, place its integral over the whole step
+        w = rng.normal(0.0, 0.3 * np.sqrt(dt), (draws, 2))
+        place, after = place + dt * e + 0.5 * dt * w, e + w
+    sample = np.column_stack([np.hypot(*place.T), np.arctan2(place[:, 1], place[:, 0]), after])
+    pick = [0, 1, 4, 5]
+    got = P1[0, 0][np.ix_(pick, pick)]
+    scale = np.sqrt(np.outer(np.diag(got), np.diag(got)))
+    assert_allclose(got / scale, np.cov(sample.T) / scale, atol=0.04)
+
+
+def test_dropped_components_stay_finite():
+    rng = np.random.default_rng(6)
+    before, after = poses(rng)
+    x, P, mu = targets(rng, before)
+    mu[:, 0], x[:, 0] = 0.0, np.nan
+    step = behave.Step(*before, *after, np.zeros(3), False)
+    x1, P1, _ = behave.advance(x, P, mu, motion(), step)
+    assert np.isfinite(x1).all() and np.isfinite(P1).all()

@@ -1,0 +1,100 @@
+"""What obstacles do, through the whole tracker: clutter, several at once, drift, settings."""
+
+from attrs import evolve
+from helpers.obstacle_runs import track_scene
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Navigation
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+
+def velocity_errors(scene, final, ping):
+    """Error of the velocity, m/s, of the confirmed track nearest to each obstacle within 3 m."""
+    errors = []
+    estimate = final[int(scene.truth[0].stamp_ns[ping])]
+    for truth in scene.truth:
+        r, b = truth.range[ping], truth.bearing[ping]
+        ours = estimate.state[:, 0], estimate.state[:, 1]
+        off = np.hypot(
+            ours[0] * np.cos(ours[1]) - r * np.cos(b), ours[0] * np.sin(ours[1]) - r * np.sin(b)
+        )
+        off = np.where(estimate.extras['track_state'] > 0, off, np.inf)
+        if truth.in_beam[: ping + 1].sum() > 40 and len(off) and off.min() < 3.0:
+            row = int(np.argmin(off))
+            stated = np.array([estimate.extras[name][row] for name in ('vx', 'vy')])
+            errors.append(float(np.linalg.norm(stated - truth.velocity[ping])))
+    return errors
+
+
+def test_movers_are_followed_through_clutter():
+    """Born, confirmed and followed among false echoes, each by one track."""
+    errors, tracks, obstacles = [], 0, 0
+    for seed in range(3):
+        scene, final = track_scene('movers', seed)
+        errors += velocity_errors(scene, final, len(scene.truth[0].stamp_ns) - 12)
+        ids = {
+            int(number)
+            for one in final.values()
+            for number in one.extras['track_id'][one.extras['track_state'] > 0]
+        }
+        tracks, obstacles = tracks + len(ids), obstacles + len(scene.truth)
+    assert len(errors) >= 5
+    assert np.median(errors) < 0.12
+    assert tracks <= obstacles + 3
+
+
+def test_movers_that_cross_keep_their_tracks():
+    """Two obstacles pass each other before the sonar, 2 m apart in range."""
+    from helpers.obstacle_crossing import crossing
+
+    estimates, true = crossing()
+    ids = [set(one.extras['track_id'][one.extras['track_state'] > 0]) for one in estimates[12:]]
+    assert all(one == ids[0] and len(one) == 2 for one in ids)
+    for row in range(2):
+        before, after = estimates[30], estimates[-1]
+        assert np.sign(before.extras['vy'][row]) == np.sign(after.extras['vy'][row])
+        stated = [after.extras['vx'][row], after.extras['vy'][row]]
+        assert min(np.linalg.norm(np.array(stated) - one) for one in true) < 0.1
+
+
+def test_a_drifting_navigation_is_said():
+    """The ground moves under a log that measures against the water: all obstacles move alike."""
+    drift = np.array([0.3, 0.1, 0.0])
+    scene = simulate(scenario('six', {'clutter': 0.0, 'detection_probability': 1.0}), 1)
+
+    def run(v):
+        tracker, first, said = ObstacleTracker(ObstacleConfig()), None, []
+        for one in scene.measurements:
+            measurement = one.measurement
+            if isinstance(measurement, Navigation):
+                first = first or measurement.stamp_ns
+                seconds = (measurement.stamp_ns - first) * 1e-9
+                measurement = evolve(measurement, position=measurement.position + seconds * v)
+            tracker.process(measurement)
+            said.append(tracker.health()['moving_alike'])
+        return max(said), tracker.health()['pings_moving_alike']
+
+    assert run(drift)[0] == 1 and run(drift)[1] > 10
+    assert run(0.0 * drift) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    'behaviours, word',
+    [(('seabed',), 'one of fixed'), (('fixed', 'fixed'), 'twice'), (('sway',), 'must be one of')],
+)
+def test_behaviours_that_make_no_sense_are_refused(behaviours, word):
+    with pytest.raises(ConfigError, match=word):
+        ObstacleConfig.from_mapping({'behaviours': list(behaviours)})
+
+
+def test_the_order_of_the_behaviours_does_not_matter():
+    _, one = track_scene('swaying', 1, {'last_range': 70.0}, behaviours=('fixed', 'swaying'))
+    _, other = track_scene('swaying', 1, {'last_range': 70.0}, behaviours=('swaying', 'fixed'))
+    for a, b in zip(one.values(), other.values(), strict=True):
+        assert list(a.columns()) == list(b.columns())
+        for name, values in a.columns().items():
+            assert np.array_equal(values, b.columns()[name], equal_nan=True)

@@ -1,0 +1,83 @@
+"""The whole tracker on recorded encounters, beside what an independent filter made of them."""
+
+from helpers.obstacle_sea import column, encounter, KINDS, track
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+ENCOUNTERS = (
+    ('swaying_approach', 0),
+    ('moving_target', 0),
+    ('starts_moving', 0),
+    ('seabed_and_fixed', 0),
+    ('seabed_and_fixed', 1),
+)
+SETTLED = 30
+"""Pings after which the answers are compared."""
+
+
+def tracks_of(estimates):
+    return {int(number) for one in estimates for number in one.extras['track_id']}
+
+
+@pytest.mark.parametrize('name, number', ENCOUNTERS)
+def test_answers_are_those_of_an_independent_filter(name, number):
+    """Mixing e as one quantity, merging across slices, a wrong ``step`` or axes of the velocity:
+    each leaves the errors of a steady obstacle alone and shows here."""
+    data = encounter(name, number)
+    estimates = track(data)
+    assert tracks_of(estimates) == {1}
+    pings = np.arange(SETTLED, len(estimates))
+    offset = column(estimates, 'vertical_offset', pings)
+    assert_allclose(offset, data['ref_offset'][pings], atol=0.1)
+    probability = np.stack([column(estimates, f'prob_{kind}', pings) for kind in KINDS], -1)
+    assert_allclose(probability, data['ref_prob'][pings], atol=0.05)
+    assert_allclose(probability.sum(axis=-1), 1.0, atol=1e-9)
+    velocity = np.stack([column(estimates, one, pings) for one in ('vx', 'vy')], -1)
+    assert_allclose(velocity, data['ref_v'][pings], atol=0.01)
+    assert_allclose(column(estimates, 'prob_above', pings), data['ref_above'][pings], atol=0.05)
+    for end in ('lo', 'hi'):
+        stated = column(estimates, f'vertical_offset_{end}', pings)
+        assert_allclose(stated, data[f'ref_{end}'][pings], atol=0.2)
+
+
+@pytest.mark.parametrize('name, number', ENCOUNTERS)
+def test_the_true_behaviour_is_found(name, number):
+    kind = {'sway': 'swaying', 'move': 'moving', 'go': 'moving'}
+    data = encounter(name, number)
+    true = kind.get(str(data['kind']), str(data['kind']))
+    last = track(data)[-1]
+    assert last.extras[f'prob_{true}'][0] > (0.5 if true == 'seabed' else 0.9)
+
+
+def test_a_mover_is_lost_without_the_behaviour():
+    """Why it is there: under `fixed` alone the same echoes make many tracks."""
+    data = encounter('moving_target')
+    assert len(tracks_of(track(data, behaviours=('fixed',)))) >= 4
+
+
+def test_only_the_behaviours_asked_for_are_published():
+    data = encounter('starts_moving')
+    for asked in (('moving', 'fixed'), ('swaying',), ('fixed',)):
+        extras = track(data, behaviours=asked)[10].extras
+        assert {name for name in extras if name.startswith('prob_')} == {
+            f'prob_{name}' for name in asked
+        }
+        assert sum(extras[f'prob_{name}'] for name in asked) == pytest.approx(1.0)
+
+
+def test_without_altitude_there_is_no_sea_floor():
+    estimates = track(encounter('seabed_and_fixed', 0), altitude=False)
+    assert_allclose(column(estimates, 'prob_seabed', range(40)), 0.0)
+
+
+def test_velocity_is_east_and_north():
+    """A mistake of the axes shows in no error of the offset."""
+    data = encounter('moving_target')
+    last = track(data)[-1]
+    assert_allclose([last.extras['vx'][0], last.extras['vy'][0]], data['true_v'][-1], atol=0.12)
+    for i, a in enumerate('xy'):
+        spread = np.sqrt(last.extras[f'vel_cov_{a}_{a}'][0])
+        assert 0.005 < spread < 0.3
+        error = last.extras[f'v{a}'][0] - data['true_v'][-1, i]
+        assert abs(error) < 4.0 * spread
