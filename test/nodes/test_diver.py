@@ -7,8 +7,9 @@ from sensor_msgs.msg import JointState, PointCloud2
 
 from msg_adapters.estimates import read_estimate
 from msg_adapters.fixes import write_fix
+from msg_adapters.scans import write_scan
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import Fix
+from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import lockstep_qos
@@ -156,3 +157,26 @@ def test_a_storm_of_garbage_is_answered_and_leaves_no_garbage_behind(rig):
         assert np.isfinite(estimate.covariance).all()
         assert np.isfinite(estimate.probabilities).all()
     assert len(tables) > 10
+
+
+def test_scans_are_heard_and_an_empty_one_is_a_missed_detection(make_bench):
+    bench = make_bench()
+    node = bench.add(DiverNode(context=bench.context))
+    estimates = bench.listen(PointCloud2, '/diver/estimate')
+    publisher = bench.peer.create_publisher(PointCloud2, '/fixes', 20)
+    bench.spin_until(
+        lambda: publisher.get_subscription_count() and node.count_subscribers('/diver/estimate')
+    )
+    for second in range(1, 8):
+        places = [[0.5 * second, 0.0, 0.0]] if second < 7 else np.empty((0, 3))
+        scan = Fixes(
+            stamp_ns=second * 10**9,
+            position=places,
+            covariance=np.tile(np.eye(2), (len(places), 1, 1)),
+            target_id=np.full(len(places), -1),
+            frame_id='map',
+        )
+        publisher.publish(write_scan(scan, make))
+    bench.spin_until(lambda: len(estimates) == 7)
+    states = [read_estimate(message).extras['track_state'].tolist() for message in estimates]
+    assert states[2:] == [[1]] * 4 + [[2]]
