@@ -43,6 +43,7 @@ def tracked(name, tmp_path, **more):
     if name.startswith('set_iii'):
         values |= {
             'model_set': 'angle_two_rw',
+            'angle_drift': False,  # as the vectors were made
             'initial_mean': float(case['th0']),
             'sigmas_deg': [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()],
         }
