@@ -33,7 +33,7 @@ from benchmarks.obstacle_accuracy import (
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
-from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     'fixed': ('approach', {}),
@@ -44,8 +44,10 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     'moving .1-.3 m/s': ('mover', {'obstacle_speed': [0.1, 0.3]}),
     'on the sea floor': ('approach', {'placement': 'seabed', 'altitude': 6.0}),
 }
-METHODS: dict[str, dict[str, Any]] = {'fixed': {'behaviours': ('fixed',)}, 'all': {}}
-BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
+METHODS: dict[str, dict[str, Any]] = {
+    'fixed': {'behaviours': ('fixed',)},
+    'all': {'behaviours': BEHAVIOURS},
+}
 AT = 30.0
 BINS = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
 
@@ -122,7 +124,7 @@ def calibration(runs: int) -> dict[str, dict[str, float]]:
         for seed in range(runs):
             scene = simulate(setting, 1000 + seed)
             truth = scene.truth[0]
-            final = track(scene, config_of(setting))
+            final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             for at in (60.0, 40.0, 25.0):
                 stated = risk_at(truth, final, at)
                 if stated is not None:

@@ -38,16 +38,25 @@ class Safety(NamedTuple):
 
 @kernel
 def relative(
-    x: FloatArray, P: FloatArray, moves: BoolArray, p: FloatArray, R: FloatArray, cone: bool
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    moves: BoolArray,
+    p: FloatArray,
+    R: FloatArray,
+    cone: bool,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (T, K, 5) and covariance (T, K, 5, 5) of g, by the unscented transform, of components
-    whose states are (d, delta, z, s) and, where `moves` (K,), the velocity."""
+    whose states are (d, delta, z, s) and, where `moves` (K,), the velocity; zeros where the
+    weight mu (T, K) is too small."""
     T, K, size = x.shape
     mean, covariance = np.zeros((T, K, SIZE)), np.zeros((T, K, SIZE, SIZE))
     whole, images = np.zeros((size, size)), np.zeros((2 * size + 1, SIZE))
     y, m, world = np.empty(size), np.empty(3), np.empty(3)
     for t in range(T):
         for j in range(K):
+            if mu[t, j] < WEIGHT:
+                continue
             n = size if moves[j] else 4
             weight, centre = 0.5 / (n + KAPPA), KAPPA / (n + KAPPA)
             L = whole[:n, :n]

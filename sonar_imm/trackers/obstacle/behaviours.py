@@ -110,9 +110,7 @@ class BehaviourSlices(DepthSlices):
         )
 
     def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        return avoidance_kernels.relative(
-            mixture.x, mixture.P, self._is['moving'], *sonar.pose, self.cone
-        )
+        return avoidance_kernels.relative(*mixture, self._is['moving'], *sonar.pose, self.cone)
 
     def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
         x, P, mu = mixture

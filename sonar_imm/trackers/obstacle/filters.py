@@ -189,7 +189,7 @@ class DepthSlices:
         """Mean (T, K, 5) and covariance (T, K, 5, 5) of place and velocity as
         `avoidance_kernels` has them."""
         still = np.zeros(self.K, np.bool_)
-        return avoidance_kernels.relative(mixture.x, mixture.P, still, *sonar.pose, self.cone)
+        return avoidance_kernels.relative(*mixture, still, *sonar.pose, self.cone)
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
