@@ -29,8 +29,10 @@ endif
 # What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
 TESTS ?=
 # Tests that run the compiled kernels.
-KERNEL_TESTS := test/estimation test/acoustics test/trackers \
-    test/cli/test_bathymetry_vectors.py test/cli/test_fathometer_vectors.py
+KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm imm_particles \
+    set_particles smoothing covariance kalman)) \
+    $(addprefix test/acoustics/test_,$(addsuffix .py,laplace interference coherence)) \
+    test/trackers test/cli/test_bathymetry_vectors.py
 
 # The environment stands alone: a sourced ROS 2 would mix its libraries with those of the wheels.
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH

@@ -27,13 +27,16 @@ REQUIRES = [
     'scipy>=1.11',
 ]
 EXTRAS = {
+    'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
         'filterpy',
         'hypothesis',
+        'laspy[lazrs]>=2.5',
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',
+        'rasterio>=1.3',
         'segyio>=1.9',
         'stonesoup',
     ],

@@ -34,7 +34,7 @@ GRID = {'engine': 'grid'}
 COMMON = {'shadow_gate': False, 'initial_std': 1.0}
 TRACKERS = {
     'random walk only': (
-        {'model_set': 'height_bank', 'sigmas': (1.0,)},
+        {'model_set': 'height_bank', 'sigmas': (1.0,), 'engine': 'particles'},
         (0.401, 0.331, 0.391, 0.41, None),
     ),
     'constant slope only': ({**SLOPE_SET, **SLOPES_ONLY}, (0.119, 0.499, 0.231, 0.30, None)),
@@ -60,8 +60,20 @@ TRACKERS = {
         {**QUICK, **GRID, 'smoothing': 'states'},
         (0.036, 0.302, 0.128, None, 0.90),
     ),
-    'height_bank': ({'model_set': 'height_bank'}, (None,) * 5),
-    'angle_two_rw': ({'model_set': 'angle_two_rw', 'initial_std': 0.0}, (None,) * 5),
+    'height_bank': (
+        {
+            'model_set': 'height_bank',
+            'sigmas': (0.01, 0.05, 0.3, 1.5),
+            'rough_sigma': 0.3,
+            'engine': 'particles',
+            'stay_probability': 0.995,
+        },
+        (None,) * 5,
+    ),
+    'angle_two_rw': (
+        {'model_set': 'angle_two_rw', 'initial_std': 0.0, 'angle_drift': False},
+        (None,) * 5,
+    ),
     'defaults': ({'shadow_gate': True, 'initial_std': 0.0}, (None,) * 5),
 }
 CLASSICAL = {

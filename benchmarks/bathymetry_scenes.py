@@ -21,6 +21,14 @@ from sonar_imm.recordings.truth import records_of
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
+BANK = {
+    'model_set': 'height_bank',
+    'sigmas': (0.01, 0.05, 0.3, 1.5),
+    'rough_sigma': 0.3,
+    'engine': 'particles',
+    'stay_probability': 0.995,
+}
+"""The coarse bank; for the default one see `bathymetry_sea`."""
 OPEN = {'shadow_gate': False}
 SLOPE = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
 FLAT = {'patch_std': 0.0, 'slope': 0.1}
@@ -50,7 +58,7 @@ CASES = {
     'Gaussian echoes, Gaussian law': ('gaussian', {}, {'likelihood': 'gaussian'}),
     'Laplace echoes, Gaussian law': ('paper', {}, {'likelihood': 'gaussian'}),
     'undulating, two walks': ('undulating', {}, {}),
-    'undulating, bank': ('undulating', {}, {'model_set': 'height_bank'}),
+    'undulating, bank': ('undulating', {}, BANK),
     'roughness correlated, .01 and 1 m': ('correlated', {}, {'sigmas': (0.01, 1.0)}),
     'roughness correlated, defaults': ('correlated', {}, {}),
     'roughness correlated, .01 and .15 m': ('correlated', {}, {'sigmas': (0.01, 0.15)}),

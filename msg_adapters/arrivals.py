@@ -2,7 +2,9 @@
 
 Columns: ``tx_id``, ``rx_id`` u2; ``tx_x tx_y tx_z rx_x rx_y rx_z`` f8 [m]; ``toa`` f8 [s after the
 header stamp, which is the transmission]; optional ``var_toa`` f4 [s^2], ``bearing`` f8 [rad at the
-receiver, counter-clockwise from +x], ``var_bearing`` f4 [rad^2].
+receiver, counter-clockwise from +x], ``var_bearing`` f4 [rad^2], ``elevation`` f8 [rad at the
+receiver, up positive], ``var_elevation`` f4 [rad^2], ``depth`` f8 [m, down positive, what the
+diver reports of itself], ``var_depth`` f4 [m^2]; NaN where not measured.
 
 Extension for acoustic tags: with NaN in ``tx_x tx_y tx_z`` of every row the target itself emits,
 at an unknown time near the stamp, and only the differences between receivers carry information.
@@ -25,15 +27,28 @@ from .table import decode_table, encode_table, require_columns, scalar_column
 
 _TX, _RX = ('tx_x', 'tx_y', 'tx_z'), ('rx_x', 'rx_y', 'rx_z')
 REQUIRED = ('tx_id', 'rx_id', *_TX, *_RX, 'toa')
-COLUMNS = (*REQUIRED, 'var_toa', 'bearing', 'var_bearing')
+COLUMNS = (
+    *REQUIRED,
+    'var_toa',
+    'bearing',
+    'var_bearing',
+    'elevation',
+    'var_elevation',
+    'depth',
+    'var_depth',
+)
 
 MAX_PAIRS = 10_000
 FARTHEST = 1e8
 """Most metres from the origin, the limit that `Fix` has too."""
+DEEPEST = 12_000.0
+"""Most metres of depth that a diver can report."""
 LONGEST = 3600.0
 """Most seconds from the stamp to an arrival."""
 LEAST_VAR_TOA, LEAST_VAR_BEARING = 1e-18, 1e-12
 """A stated variance below (1 ns)^2 or (1 urad)^2 is a field that was not filled in."""
+LEAST_VAR_DEPTH = 1e-8
+"""Likewise below (0.1 mm)^2."""
 
 
 def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
@@ -66,6 +81,10 @@ def read_arrivals(message: Any, *, world_frame: str = 'enu') -> Arrivals:
         var_toa=_variances(columns, 'var_toa', rows, LEAST_VAR_TOA)[keep],
         bearing=_bearings(columns, rows)[keep],
         var_bearing=_variances(columns, 'var_bearing', rows, LEAST_VAR_BEARING)[keep],
+        elevation=_elevations(columns, rows)[keep],
+        var_elevation=_variances(columns, 'var_elevation', rows, LEAST_VAR_BEARING)[keep],
+        depth=_depths(columns, rows)[keep],
+        var_depth=_variances(columns, 'var_depth', rows, LEAST_VAR_DEPTH)[keep],
     )
     return to_enu(arrivals, world_frame, _turned)
 
@@ -81,7 +100,7 @@ def _turned(arrivals: Arrivals) -> Arrivals:
 
 
 def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
-    """Write an arrivals table; the bearing columns only when a bearing was measured."""
+    """Write an arrivals table; of bearing, elevation and depth the columns that were measured."""
     columns: dict[str, NDArray] = {'tx_id': arrivals.tx_id, 'rx_id': arrivals.rx_id}
     columns.update(zip(_TX, arrivals.tx.T))
     columns.update(zip(_RX, arrivals.rx.T))
@@ -90,6 +109,10 @@ def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
     if not np.isnan(arrivals.bearing).all():
         columns['bearing'] = arrivals.bearing
         columns['var_bearing'] = arrivals.var_bearing.astype(np.float32)
+    for name in ('elevation', 'depth'):
+        if not np.isnan(getattr(arrivals, name)).all():
+            columns[name] = getattr(arrivals, name)
+            columns[f'var_{name}'] = getattr(arrivals, f'var_{name}').astype(np.float32)
     return encode_table(columns, stamp_ns=arrivals.stamp_ns, frame_id=arrivals.frame_id, make=make)
 
 
@@ -119,6 +142,29 @@ def _variances(columns: dict[str, NDArray], name: str, rows: int, least: float) 
         return np.full(rows, np.nan)
     values = scalar_column(columns, name)
     return np.where(np.isfinite(values) & (values >= least), values, np.nan)
+
+
+def _elevations(columns: dict[str, NDArray], rows: int) -> NDArray:
+    """Elevations (rows,), NaN where missing. What is beyond a right angle is refused."""
+    if 'elevation' not in columns:
+        return np.full(rows, np.nan)
+    values = scalar_column(columns, 'elevation')
+    values = np.where(np.isfinite(values), values, np.nan)
+    if (np.abs(values) > 0.5 * np.pi + 1e-6).any():
+        raise Rejection(
+            'out_of_range',
+            f'arrivals: an elevation of {np.nanmax(np.abs(values)):g} is beyond pi/2; elevations '
+            'are in radians',
+        )
+    return values
+
+
+def _depths(columns: dict[str, NDArray], rows: int) -> NDArray:
+    """Depth reports (rows,), NaN where missing or deeper than any sea."""
+    if 'depth' not in columns:
+        return np.full(rows, np.nan)
+    values = scalar_column(columns, 'depth')
+    return np.where(np.abs(values) <= DEEPEST, values, np.nan)
 
 
 def _bearings(columns: dict[str, NDArray], rows: int) -> NDArray:

@@ -92,6 +92,20 @@ def write_model_probabilities(estimate: Estimate, row: int, make: Make) -> Any:
     )
 
 
+def write_model_shares(estimate: Estimate, make: Make) -> Any:
+    """Write how large a share of the valid rows each model is the most probable one of, as
+    JointState like `write_model_probabilities`; zeros without a valid row."""
+    valid = np.asarray(estimate.extras['valid'], bool)
+    labels = estimate.probabilities[valid].argmax(axis=1)
+    count = np.bincount(labels, minlength=len(estimate.model_names))
+    return make(
+        'sensor_msgs/msg/JointState',
+        header=make_header(estimate.stamp_ns, estimate.frame_id, make),
+        name=list(estimate.model_names),
+        position=count / max(len(labels), 1),
+    )
+
+
 def _planar(block: np.ndarray) -> np.ndarray:
     """Put an x-y covariance (2, 2) into the 36 numbers of ROS."""
     covariance = np.diag(np.full(6, UNKNOWN_VARIANCE))

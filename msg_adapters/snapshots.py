@@ -30,10 +30,11 @@ DEFAULT_SOUND_SPEED = 1500.0
 """m/s, for times without a sound speed, until the tracker replaces it (`Snapshot.ranges`)."""
 
 
-def read_snapshot(message: Any, *, world_frame: str = 'enu') -> Snapshot:
+def read_snapshot(message: Any, *, world_frame: str = 'enu', side: str = '') -> Snapshot:
     """Read a PointCloud2 of array snapshots.
 
-    `world_frame` has no meaning here: a snapshot is in the frame of its array. Bins with samples
+    `world_frame` has no meaning here: a snapshot is in the frame of its array. `side`: where the
+    array looks, when the topic says so. Bins with samples
     that are not finite are kept and marked. Raises `Rejection`.
     """
     columns = decode_table(message, COLUMNS, most_rows=MAX_BINS * MAX_STAVES)
@@ -50,6 +51,7 @@ def read_snapshot(message: Any, *, world_frame: str = 'enu') -> Snapshot:
         range=ranges,
         iq=iq,
         two_way_time=time,
+        side=side,
         **{name: scalar_column(columns, name) for name in VARIANCES if name in columns},
         **constants,
     )

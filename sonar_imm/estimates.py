@@ -30,6 +30,13 @@ class Estimate:
     probabilities: NDArray[np.float64] = field(factory=lambda: np.empty((0, 0)))
     extras: Mapping[str, NDArray] = field(factory=dict)
 
+    @property
+    def source(self) -> int:
+        """Which of several instruments it comes from, by the column ``side``; 0 for the only one.
+        Estimates of one stamp and several sources stand side by side."""
+        side = self.extras.get('side')
+        return int(side[0]) if side is not None and len(side) else 0
+
     def __len__(self) -> int:
         return len(self.state)
 

@@ -29,6 +29,7 @@ FLOORS = {
     'sonar_imm.parameters': 2,
     'sonar_imm.measurements': 2,
     'sonar_imm.estimates': 2,
+    'sonar_imm.soundings': 2,
     'msg_adapters': 3,
     'sonar_imm.trackers': 3,
     'sonar_imm.simulation': 4,

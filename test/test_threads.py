@@ -62,6 +62,12 @@ def loaded_alone(threads_of):
     return count
 
 
+INSTALLED = """
+import sys
+sys.argv[0] = '/opt/lib/sonar_imm/{}_node'
+from sonar_imm.nodes.commands import main
+main()
+"""
 INFO = ('-m', 'sonar_imm.cli', 'info', str(ROOT / 'bags' / 'diver_table1'))
 
 
@@ -91,8 +97,8 @@ def test_the_library_leaves_the_process_alone(threads_of, loaded_alone):
     'start',
     [
         ('-m', 'sonar_imm.nodes.diver'),
-        ('-c', 'from sonar_imm.nodes.commands import diver; diver()'),
-        ('-c', 'from sonar_imm.nodes.commands import obstacle; obstacle()'),
+        ('-c', INSTALLED.format('diver')),
+        ('-c', INSTALLED.format('obstacle')),
     ],
 )
 def test_a_node_has_one_thread_of_algebra(threads_of, loaded_alone, start):
@@ -109,8 +115,10 @@ def test_every_node_has_its_command():
     from sonar_imm.trackers import SYSTEMS
 
     text = (ROOT / 'setup.py').read_text(encoding='utf-8')
-    assert "f'{system}_node = sonar_imm.nodes.commands:{system}'" in text
-    commands = (ROOT / 'sonar_imm' / 'nodes' / 'commands.py').read_text(encoding='utf-8')
+    assert "f'{system}_node = sonar_imm.nodes.commands:main'" in text
+    assert "'fls_detector_node = sonar_imm.nodes.commands:main'" in text
     for name in (*SYSTEMS, 'fls_detector'):
-        assert f'def {name}() -> int' in commands and f"_run('{name}')" in commands
-        assert (ROOT / 'sonar_imm' / 'nodes' / f'{name}.py').is_file()
+        module = (ROOT / 'sonar_imm' / 'nodes' / f'{name}.py').read_text(encoding='utf-8')
+        assert '\ndef main(' in module
+        start = module.index("if __name__ == '__main__':")
+        assert 'one_blas_thread()' in module[start : module.index('import sys')]

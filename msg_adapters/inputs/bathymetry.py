@@ -2,18 +2,62 @@
 
 from __future__ import annotations
 
-from sonar_imm.measurements import Snapshot
+from functools import partial
 
+from sonar_imm.measurements import Altitude, Navigation, Snapshot
+
+from ..navigation import (
+    doubt_navigation,
+    read_dvl,
+    read_navigation,
+    read_range,
+    write_navigation,
+    write_range,
+)
 from ..snapshots import read_snapshot, write_snapshot
 from .topic import InputTopic
+
+TABLE = 'sensor_msgs/msg/PointCloud2'
 
 TOPICS = (
     InputTopic(
         'snapshot',
-        'complex snapshots of a side-scan array, one row per range bin',
+        'complex snapshots of a side-scan array, one row per range bin; parameter `side` says '
+        'where it looks',
         measurement=Snapshot,
-        readers={'sensor_msgs/msg/PointCloud2': read_snapshot},
+        readers={TABLE: read_snapshot},
         write=write_snapshot,
         one_topic=True,
+    ),
+    *(
+        InputTopic(
+            f'{side}/snapshot',
+            f'the same from the {side} array of a sonar with two sides',
+            measurement=Snapshot,
+            readers={TABLE: partial(read_snapshot, side=side)},
+            write=write_snapshot,
+            one_topic=True,
+        )
+        for side in ('port', 'starboard')
+    ),
+    InputTopic(
+        'nav',
+        'pose of the ship: only the pose is read',
+        measurement=Navigation,
+        readers={'nav_msgs/msg/Odometry': read_navigation},
+        write=write_navigation,
+        doubt=doubt_navigation,
+        companion=True,
+    ),
+    InputTopic(
+        'altitude',
+        'height of the navigation reference above the sea floor, for the start of each ping',
+        measurement=Altitude,
+        readers={
+            'sensor_msgs/msg/Range': read_range,
+            'marine_acoustic_msgs/msg/Dvl': read_dvl,
+        },
+        write=write_range,
+        companion=True,
     ),
 )

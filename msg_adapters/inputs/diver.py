@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.measurements import Arrivals, Fix, Fixes
 
 from ..arrivals import read_arrivals, write_arrivals
 from ..fixes import doubt_fix, read_fix, write_fix
+from ..scans import doubt_scan, read_poses, read_scan, write_scan
 from .topic import InputTopic
 
 TOPICS = (
@@ -20,6 +21,17 @@ TOPICS = (
         write=write_fix,
         doubt=doubt_fix,
         scans=True,
+    ),
+    InputTopic(
+        'fixes',
+        'all position fixes of one scan, also when there are none',
+        measurement=Fixes,
+        readers={
+            'sensor_msgs/msg/PointCloud2': read_scan,
+            'geometry_msgs/msg/PoseArray': read_poses,
+        },
+        write=write_scan,
+        doubt=doubt_scan,
     ),
     InputTopic(
         'arrivals',

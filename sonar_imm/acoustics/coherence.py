@@ -122,3 +122,22 @@ def silent_bins(
     together = coherence_threshold(staves, GATE_BINS, false_alarm, spacing)
     mean = moving_mean(values, GATE_BINS // 2, np.isfinite(values))
     return ~((values >= alone) & (mean >= together))
+
+
+def first_return(
+    gamma: ArrayLike, staves: int, *, spacing: float = 0.5, false_alarm: float = FALSE_ALARM
+) -> int:
+    """The first bin of the floor: the first one with an echo of which, itself included, at least
+    four in five have one; 0 when there is none.
+
+    gamma (n,) as in `silent_bins`, which also says why two or three staves need the mean of five.
+    """
+    values = np.asarray(gamma, np.float64)
+    if staves >= FEWEST_STAVES_ALONE:
+        passed = values >= coherence_threshold(staves, 1, false_alarm, spacing)
+    else:
+        passed = ~silent_bins(values, staves, spacing=spacing, false_alarm=false_alarm)
+    running = np.concatenate([[0], np.cumsum(passed)])
+    together = running[GATE_BINS:] - running[:-GATE_BINS]
+    begins = passed[: len(together)] & (together >= GATE_BINS - 1)
+    return int(np.argmax(begins)) if begins.any() else 0

@@ -171,6 +171,21 @@ def chirp_z(values: ComplexArray, turns: float, count: int) -> ComplexArray:
     return np.asarray(np.fft.ifft(spectrum)[:count] * chirp[:count])
 
 
+def sediment_thickness(
+    two_way_time: ArrayLike, sound_speed: float, gradient: float = 0.0
+) -> FloatArray:
+    """Metres of sediment between its top and what answers `two_way_time` s later.
+
+    sound_speed: c0 at the top, m/s; gradient: g of c0 + g z with the depth z below the top, 1/s.
+    On the way down dt = dz / (c0 + g z), so z = (c0 / g) (exp(g t / 2) - 1), c0 t / 2 without
+    gradient.
+    """
+    way = 0.5 * np.asarray(two_way_time, np.float64)
+    if not gradient:
+        return np.asarray(sound_speed * way)
+    return np.asarray(sound_speed / gradient * np.expm1(gradient * way))
+
+
 def noise_sigma(b: FloatArray) -> float:
     """Standard deviation of the noise of b, by the median absolute deviation: a few reflectors do
     not spoil it. NaN without samples."""
@@ -178,11 +193,6 @@ def noise_sigma(b: FloatArray) -> float:
     if not len(finite):
         return float('nan')
     return float(np.median(np.abs(finite - np.median(finite)))) / _MAD_OF_UNIT_NORMAL
-
-
-def expected_noise_sigma(snapshots: float, frequencies: int) -> float:
-    """1 / sqrt(2 L F): what `noise_sigma` of the conventional processor should be."""
-    return 1.0 / float(np.sqrt(2.0 * snapshots * frequencies))
 
 
 def _form(left: ComplexArray, R: ComplexArray, right: ComplexArray) -> ComplexArray:

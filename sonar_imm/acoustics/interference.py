@@ -78,10 +78,10 @@ def interfered_log_likelihood(
     step: float,
     likelihood: str = 'laplace',
 ) -> FloatArray:
-    """Log likelihood of direction sines (...) given one snapshot y (P,) and its noise covariance
-    (P, P), less what does not depend on the direction; -inf for NaN.
+    """Oracle for tests: log likelihood of direction sines (...) given one snapshot y (P,) and its
+    noise covariance (P, P), less what does not depend on the direction; -inf for NaN.
 
-    By linear algebra from the definition: slow, and what the kernels are tested against.
+    By linear algebra from the definition, which is slow.
     """
     y = np.asarray(y, np.complex128)
     u = np.asarray(sines, np.float64)

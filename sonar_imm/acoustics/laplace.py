@@ -74,19 +74,14 @@ def log_constant(staves: int, log_determinant: ArrayLike) -> FloatArray:
 
 
 def gaussian_log_density(q: ArrayLike, staves: int) -> FloatArray:
-    """The same of the complex Gaussian density of P staves: -q. `gaussian_log_constant` is the
-    rest."""
+    """Oracle for tests: the same of the complex Gaussian density of P staves, -q.
+    `gaussian_log_constant` is the rest."""
     return -np.asarray(q, np.float64)
 
 
 def gaussian_log_constant(staves: int, log_determinant: ArrayLike) -> FloatArray:
     """-P log pi - log |Gamma|."""
     return -staves * math.log(math.pi) - np.asarray(log_determinant, np.float64)
-
-
-def moments_of_q(staves: int) -> tuple[float, float]:
-    """Mean and variance of q when Gamma is right: q = z s with z ~ Exp(1), s ~ Gamma(P, 1)."""
-    return float(staves), float(2 * staves * (staves + 1) - staves**2)
 
 
 def autocorrelation(y: ArrayLike) -> ComplexArray:
@@ -127,8 +122,8 @@ def log_likelihood(
     step: float,
     likelihood: str = 'laplace',
 ) -> FloatArray:
-    """Log likelihood of direction sines (...) given one snapshot y (P,), less what does not depend
-    on the direction; -inf for NaN. `step` is from `array.phase_step`.
+    """Oracle for tests: log likelihood of direction sines (...) given one snapshot y (P,), less
+    what does not depend on the direction; -inf for NaN. `step` is from `array.phase_step`.
 
     It builds q from the definition: slow, and what the kernels are tested against.
     """

@@ -126,17 +126,23 @@ def difference_measurement(
         raise ValueError('time differences need two or more arrival times and as many variances')
     if not (np.isfinite(times).all() and np.isfinite(variances).all() and (variances > 0.0).all()):
         raise ValueError('arrival times must be finite and their variances positive')
-    weight = 1.0 / (sound_speed * np.sqrt(variances))
-    axis = weight / np.linalg.norm(weight)
-    axis[0] += 1.0
-    reflection = np.eye(len(weight)) - np.outer(axis, axis) * (2.0 / (axis @ axis))
-    projection = reflection[1:] * weight
+    projection = difference_projection(np.square(sound_speed) * variances)
     # The projection ignores a constant: taking one off keeps the digits of times since 1970.
     return DifferenceMeasurement(
         z=projection @ (sound_speed * (times - times[0])),
-        R=np.eye(len(weight) - 1),
+        R=np.eye(len(times) - 1),
         projection=projection,
     )
+
+
+def difference_projection(variances: FloatArray) -> FloatArray:
+    """(n - 1, n): turns ranges in metres with `variances` (n,) m^2 and a common offset into n - 1
+    numbers without it, uncorrelated and in standard deviations."""
+    weight = 1.0 / np.sqrt(variances)
+    axis = weight / np.linalg.norm(weight)
+    axis[0] += 1.0
+    reflection = np.eye(len(weight)) - np.outer(axis, axis) * (2.0 / (axis @ axis))
+    return np.asarray(reflection[1:] * weight)
 
 
 def emission_time(

@@ -49,8 +49,8 @@ def unbiased_polar_to_cartesian(
 def linearised_polar_to_cartesian(
     range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike, var_bearing: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """The conventional conversion, biased at long range: position (..., 2) and first-order
-    covariance (..., 2, 2)."""
+    """Oracle for tests: the conventional conversion, biased at long range, to position (..., 2)
+    and first-order covariance (..., 2, 2)."""
     r = np.asarray(range_, np.float64)
     return _along_bearing(
         r,

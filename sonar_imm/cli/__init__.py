@@ -29,6 +29,7 @@ COMMANDS = {
     'info': 'Show what is in a bag, which tracker fits it and what is wrong with it.',
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
+    'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
     'play': 'Publish a bag to live nodes.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
     'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
@@ -137,6 +138,8 @@ def missing_package(name: str) -> str | None:
         "install 'sonar_imm[sweep]', or use --workers 1",
         'rclpy': "ROS 2 is not found: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
+        'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
+        'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
         'filterpy': "FilterPy is not installed: pip install 'sonar_imm[test]'",
     }
     return remedies.get(name)

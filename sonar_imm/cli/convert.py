@@ -22,6 +22,7 @@ from .convert_options import (
     csv_options,
     FILE,
     frame_option,
+    nanoseconds,
     options,
     place_options,
     staves,
@@ -84,10 +85,10 @@ def _say_all(label: str, lines: Iterable[str]) -> None:
 @storage_option
 @json_option
 def fixes(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
-    """CSV of position fixes to /fix.
+    """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
 
     Columns: stamp, x and y [m] or latitude and longitude [deg]; optional var_x, cov_xy, var_y
-    [m^2] or std_x, std_y or std [m]. Usual names are recognised.
+    [m^2] or std_x, std_y or std [m], and id. Usual names are recognised.
     """
     _convert(
         'fixes',
@@ -173,11 +174,19 @@ def truth(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     metavar='METRES',
     help='Standard deviation to state on each axis.',
 )
+@click.option(
+    '--time-offset',
+    'time_offset_ns',
+    default='0',
+    callback=nanoseconds,
+    metavar='SECONDS',
+    help='Added to the stamps of the detections.',
+)
 @frame_option
 @storage_option
 @json_option
 def autoferry(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
-    """Detections of the Autoferry data set (JSON) to /fix: boats in clutter."""
+    """Detections of the Autoferry data set (JSON) to /fixes: boats in clutter."""
     _convert('autoferry', source, out_bag, as_json, **values)
 
 

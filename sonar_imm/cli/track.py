@@ -142,6 +142,8 @@ def _print(run: dict[str, Any], out_dir: Path) -> None:
         f'written to {out_dir}'
     )
     say('  ' + ', '.join(f'{name} {count}' for name, count in run['counts'].items()))
+    for sentence in run['warnings']:
+        say(f'  warning: {sentence}')
     for reason, entry in run['refused'].items():
         say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')
     for problem in run['problems']:

@@ -65,7 +65,7 @@ def gate(
     R: FloatArray,
     threshold: float,
 ) -> Pairs:
-    """Find the pairs whose normalised innovation squared is at most `threshold`.
+    """Oracle for tests: find the pairs whose normalised innovation squared is at most `threshold`.
 
     predicted: (T, m) predicted measurement of each target; covariance: (T, m, m), ``H P H'``;
     detections: (D, m); R: (D, m, m) or (m, m), covariance of the detections.

@@ -60,32 +60,10 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
     return float(low) / count, float(high) / count
 
 
-def normal_interval(
-    mean: FloatArray, standard_deviation: FloatArray, probability: float
-) -> tuple[FloatArray, FloatArray]:
-    """Ends of the central interval that holds a Gaussian with `probability`."""
-    from scipy.stats import norm
-
-    half = float(norm.ppf(0.5 * (1.0 + probability))) * standard_deviation
-    return mean - half, mean + half
-
-
 def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> float:
     """Share of `truth` inside [low, high], NaN when there is none."""
     inside = (low <= truth) & (truth <= high)
     return float(np.mean(inside)) if inside.size else math.nan
-
-
-def coverage_bounds(
-    count: int, probability: float, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Two-sided bounds of `interval_coverage` for `count` independent intervals that each hold the
-    truth with `probability` (binomial)."""
-    from scipy.stats import binom
-
-    tail = 0.5 * (1.0 - confidence)
-    low, high = binom.ppf(tail, count, probability), binom.ppf(1.0 - tail, count, probability)
-    return float(low) / count, float(high) / count
 
 
 class Whiteness(NamedTuple):
@@ -181,13 +159,33 @@ def _match(
 
 
 def identity_switches(track_id: IntArray) -> int:
-    """How often a target is taken over by another track.
+    """How often a target is taken over by another track: `switches_by_scan` summed."""
+    return int(switches_by_scan(track_id).sum())
+
+
+def switches_by_scan(track_id: IntArray) -> IntArray:
+    """How many targets are taken over by another track at each of K scans, (K,).
 
     track_id: (K, T) id of the track on each target over time, -1 where it is missed. A gap is no
-    switch; coming back under another identity is one.
+    switch; coming back under another identity is one, at the scan where it comes back.
     """
-    switches = 0
-    for column in np.asarray(track_id).T:
-        followed = column[column != -1]
-        switches += int(np.count_nonzero(np.diff(followed)))
+    followed = np.asarray(track_id)
+    switches = np.zeros(len(followed), np.int64)
+    for column in followed.T:
+        scans = np.flatnonzero(column != -1)
+        changed = np.flatnonzero(np.diff(column[scans])) + 1
+        np.add.at(switches, scans[changed], 1)
     return switches
+
+
+def switching_gospa(distance: FloatArray, switches: IntArray, penalty: float) -> float:
+    """One number of a whole run: ``sqrt(mean over scans of (d^2 + penalty^2 s))``, with the GOSPA
+    distance d (K,) of second order and the identity switches s (K,) of each scan.
+
+    It is the metric on trajectories of Garcia-Fernandez, Rahmathullah and Svensson (*A metric on
+    the space of finite sets of trajectories*, IEEE TSP 68, 2020), but with the pairing of each
+    scan by itself, so that it is an upper bound of theirs.
+    """
+    if not len(distance):
+        return math.nan
+    return float(np.sqrt(np.mean(np.square(distance) + penalty**2 * np.asarray(switches))))

@@ -6,11 +6,10 @@ formulas give a matrix with negative eigenvalues. Joseph's form is no cure: it s
 rounding did to the gain.
 
 So every covariance keeps to one stated limit. It is *sound* when no eigenvalue of its correlation
-matrix is below `LIMIT`: then Cholesky's method finds a factor in whatever order it rounds. (A
-component without variance is sound when it has no covariance either.)
-`propagate` and `correct` compute in covariance form, which is the fastest, and try Cholesky's
-method on what they get. Where the limit is passed they repair, and tell, so that callers can
-count:
+matrix is below `LIMIT`: then Cholesky's method finds a factor, in whatever order it rounds. (A
+component without variance is sound when it has no covariance either.) `propagate` and `correct`
+compute in covariance form, which is the fastest, and try Cholesky's method on what they get. Where
+the limit is passed they repair, and tell, so that callers can count:
 
 1. The step is computed again in square-root form, from ``P = L L'``. The result is a sum of
    squares whose rounding is small beside its *own* diagonal, however small that has become.
@@ -34,8 +33,9 @@ import numpy as np
 from .arrays import BoolArray, FloatArray
 
 LIMIT = 1e-14
-"""Least eigenvalue of a correlation matrix. Cholesky's method is sure of n (n + 1) / 2^53 of it,
-2e-15 for four states, so that up to eight states a sound covariance has a factor."""
+"""Least eigenvalue of a correlation matrix. Rounding in Cholesky's method changes it by at most
+n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a sound covariance has a
+factor."""
 
 LIFT = 1e-13
 """What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""

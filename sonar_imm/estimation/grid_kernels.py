@@ -16,6 +16,7 @@ import math
 
 from .arrays import FloatArray
 from .elementary import exponentials
+from .grid import NARROW
 from .jit import kernel
 
 TAIL = 1e-13
@@ -100,6 +101,12 @@ def _spread(
     out_high: int,
 ) -> None:
     """`walk` on the cells themselves, added to `out`."""
+    if sigma < NARROW:
+        taps[0], taps[1] = 1.0 - sigma * sigma, 0.5 * sigma * sigma
+        for lag in range(-1, 2):
+            for g in range(max(out_low, low + lag), min(out_high, high + lag)):
+                out[g] += taps[abs(lag)] * source[g - lag]
+        return
     reach = reach_of(sigma)
     total = -1.0
     for lag in range(reach + 1):

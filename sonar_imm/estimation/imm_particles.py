@@ -61,7 +61,8 @@ class WeightUpdate(NamedTuple):
 def mix(
     x: FloatArray, w: FloatArray, mu: FloatArray, transition: FloatArray, uniform: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Equally weighted x (M, n, N) for each model, and its predicted probability c (M,).
+    """Oracle for tests: equally weighted x (M, n, N) for each model, and its predicted probability
+    c (M,).
 
     A model that nothing can become (c_j below `LEAST_CHANCE`) draws from the mixture of all, so
     that it stays finite and can come back when the chain allows. uniform (M,) in [0, 1).
@@ -85,7 +86,7 @@ def mix(
 
 
 def predict(x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray) -> FloatArray:
-    """x <- F x + G e for each model; noise e (M, k, N) standard normal."""
+    """Oracle for tests: x <- F x + G e for each model; noise e (M, k, N) standard normal."""
     M, n, _ = x.shape
     moved = np.zeros_like(x)
     for j in range(M):
@@ -98,7 +99,7 @@ def predict(x: FloatArray, F: FloatArray, G: FloatArray, noise: FloatArray) -> F
 
 
 def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = None) -> WeightUpdate:
-    """w_n <- w_n q_n / L_j, mu_j <- c_j L_j / sum, L_j = sum_n w_n q_n.
+    """Oracle for tests: w_n <- w_n q_n / L_j, mu_j <- c_j L_j / sum, L_j = sum_n w_n q_n.
 
     w (M, N): weights before, equal when not given. A model whose particles are all impossible, or
     that is less likely than another by more than exp(-700), gets mu_j = 0 and keeps its weights.
@@ -123,7 +124,7 @@ def update(log_likelihood: FloatArray, c: FloatArray, w: FloatArray | None = Non
 
 
 def combine(x: FloatArray, w: FloatArray, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (n,) and covariance (n, n) of the mixture of all models."""
+    """Oracle for tests: mean (n,) and covariance (n, n) of the mixture of all models."""
     M, n, _ = x.shape
     mean, covariance = np.zeros(n), np.zeros((n, n))
     for j in range(M):

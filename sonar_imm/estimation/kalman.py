@@ -9,10 +9,10 @@ The extended filter is the same code: linearise about the mean, pass the Jacobia
 ``b = f(x) - F x``, and as innovation ``z - h(x)`` (wrapped, when it is an angle: only the caller
 knows).
 
-Covariances are kept healthy by `covariance`: the update is in Joseph form, nothing is inverted
-(``S = L L'`` is factorised and triangular systems are solved), and what rounding would make
-indefinite all the same is repaired and reported in `repaired`, so that callers can count it. Input
-from which nothing can be computed raises `CovarianceError`, which says which of the batch it was.
+`covariance` keeps covariances healthy: the update is in Joseph form, nothing is ever inverted (``S
+= L L'`` is factorised and triangular systems are solved), and what rounding would make indefinite
+all the same is repaired and reported in `repaired`, so that callers can count it. Input from which
+nothing can be computed raises `CovarianceError`, which says which of the batch it was.
 
 Reference: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*
 (2001), ch. 5 and 10.

@@ -7,9 +7,10 @@ A chain is stated at a reference step, but measurements of a sonar come at irreg
 for any step, so that ten steps of 0.1 s equal one of 1 s. `adaptation` corrects a chain by data.
 
 ``P(dt)`` is computed by uniformisation: with the largest rate q, ``U = I + G / q`` is itself a
-transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` a mixture of its powers, kept here.
-No term is negative, so there is nothing to cancel, and no eigenvector is asked for, so a defective
-generator is nothing special. A long step is halved until ``q h <= 1`` and the result squared.
+transition matrix, and ``P(h) = sum_k Poisson(k; q h) U^k`` is a mixture of its powers, which are
+kept. No term is negative, so there is nothing to cancel, and no eigenvector is asked for, so a
+defective generator is nothing special. A long step is halved until ``q h <= 1`` and the result
+squared.
 
 Reference: Stewart, *Introduction to the Numerical Solution of Markov Chains* (1994), ch. 8.
 """
@@ -47,7 +48,8 @@ def check_transition_matrix(
 
 
 def stationary_law(P: FloatArray) -> FloatArray:
-    """The stationary distribution (M,): pi P = pi. ValueError when there is more than one."""
+    """Oracle for tests: the stationary distribution (M,), pi P = pi. ValueError when there is more
+    than one."""
     M = len(P)
     system = np.vstack([P.T - np.eye(M), np.ones(M)])
     if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:

@@ -24,7 +24,9 @@ from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
-from .set_particles import gain, Proposals, propose_births, SetModel, Sets
+from .set_model import SetModel, Sets
+from .set_particles import gains, Proposals, propose_births
+from .set_shifts import shift_tables
 
 _STEP, _START, _RESAMPLE = range(3)
 
@@ -63,8 +65,10 @@ class SetFilter:
         self.model = model
         self.particles = particles
         self.threads = threads
-        n, width = model.cells, len(model.move)
-        self._move, self._move_ratio = np.empty((n, width)), np.empty((n, width))
+        shape = model.record_cells * len(model.signs), len(model.move)
+        self._move, self._move_ratio = np.empty(shape), np.empty(shape)
+        log_sum = np.zeros((len(model.signs), model.record_cells if model.shift else 0))
+        self._shifts = shift_tables(model.shift, log_sum, model.move_share)
         self._motion = kernels.SetMotion(
             order_min=model.order_min,
             separation=model.separation,
@@ -81,15 +85,15 @@ class SetFilter:
         )
         self._charge = np.array(
             [
-                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(n)
+                math.lgamma(m + 1) + math.log(max(model.room(m), 1)) - m * math.log(model.cells)
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> SetStep:
-        """Take in the record b (n,), in units of its noise. before: None before the first record.
-        key: seed and name of the record, each in 0 .. 2^64 - 1."""
+        """Take in the record b (n,), or (n + 2 pad,) with a shift, in units of its noise. before:
+        None before the first record. key: seed and name of the record, each in 0 .. 2^64 - 1."""
         if before is None:
             before = self._start(b, key)
         sets, log_ratio = self._propagate(before.sets, b, _uniform(key, _STEP))
@@ -111,22 +115,33 @@ class SetFilter:
 
     def warm(self) -> None:
         """Compile or load the kernels."""
-        b = np.maximum(0.0, 10.0 * self.model.gram[np.abs(np.arange(self.model.cells) - 1)])
+        lag = np.minimum(np.arange(self.model.record_cells), self.model.cells - 1)
+        b = np.maximum(0.0, 10.0 * self.model.gram[np.abs(lag - 1)])
         step = SetFilter(self.model, 8).step(None, b, (0, 0))
         self.summary(step, step.w, step.sets)
 
     def summary(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-        """PMF (orders,) of the order and sums (4, n), see `set_particles_kernels.moments`, of
+        """PMF (orders,) of the order and sums (5, n), see `set_particles_kernels.moments`, of
         `sets` with weights w (N,)."""
-        pmf, sums = np.zeros(len(self.model.transition)), np.zeros((4, self.model.cells))
+        pmf = np.zeros(len(self.model.transition))
+        rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
+        sums = np.zeros((rows, self.model.record_cells))
         kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
         return pmf, sums
 
+    def shift(self, w: FloatArray, sets: Sets) -> tuple[float, float]:
+        """Mean and standard deviation of the shift, cells."""
+        mean = float(w @ sets.shift)
+        spread = float(np.sqrt(w @ np.square(sets.shift - mean)))
+        return mean - self.model.pad, spread
+
     def _start(self, b: FloatArray, key: tuple[int, int]) -> Weighted:
         model, sets = self.model, Sets.empty(self.model, self.particles)
-        uniform = _uniform(key, _START).random((self.particles, 1 + model.order_max))
+        uniform = _uniform(key, _START).random(
+            (self.particles, 1 + model.order_max + (model.shift is not None))
+        )
         log_ratio = np.zeros(self.particles)
-        proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
+        proposals = self._proposals(b)
         self._split(
             lambda first, last: kernels.start(
                 first, last, self._motion, self._charge, proposals, uniform, sets, log_ratio
@@ -137,15 +152,24 @@ class SetFilter:
         # The sets are draws from the prior in disguise: as many particles as if they were.
         return Weighted(sets, log_ratio)
 
+    def _proposals(self, b: FloatArray) -> Proposals:
+        """The tables of one record, moves not filled in."""
+        births = propose_births(self.model, b)
+        return Proposals(self._move, self._move_ratio, *births, self._shifts)
+
     def _propagate(
         self, old: Sets, b: FloatArray, rng: np.random.Generator
     ) -> tuple[Sets, FloatArray]:
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
-        filled = np.zeros(model.cells, np.bool_)
-        proposals = Proposals(self._move, self._move_ratio, *propose_births(model, b))
-        kernels.fill_moves(old, gain(b), model.move, model.move_share, filled, proposals)
+        proposals = self._proposals(b)
+        if model.shift:
+            kernels.fill_all_moves(gains(model, b), model.move, model.move_share, proposals)
+        else:
+            filled = np.zeros(len(self._move), np.bool_)
+            g = gains(model, b)
+            kernels.fill_moves(old, g, model.move, model.move_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
                 first,

@@ -18,21 +18,22 @@ from .arrays import FloatArray
 class Members(NamedTuple):
     """K members by place: place (K,) in cells, mean over the hill; amplitude (K,) mean in units of
     the noise; covariance (K, 2, 2) of both, the spread of the particles; prior_variance (K,) of
-    the amplitude before the record, given the place; existence (K,), the probability that it is
-    there, at most 1."""
+    the amplitude before the record, given the place; foremost (K,), the probability that it is the
+    first of its set; existence (K,), the probability that it is there, at most 1."""
 
     place: FloatArray
     amplitude: FloatArray
     covariance: FloatArray
     prior_variance: FloatArray
+    foremost: FloatArray
     existence: FloatArray
 
 
 def find_members(sums: FloatArray, separation: int, most: int, least_existence: float) -> Members:
     """At most `most` members whose existence is at least `least_existence`.
 
-    sums (4, n): intensity, first and second moment of the amplitude and its prior variance on each
-    cell (see `SetFilter.summary`).
+    sums (5, n): intensity, first and second moment of the amplitude, its prior variance, and the
+    share of first members on each cell, and with a shift three more (see `SetFilter.summary`).
     """
     n, half = sums.shape[1], max(0, (separation - 1) // 2)
     left = sums.copy()
@@ -49,14 +50,23 @@ def find_members(sums: FloatArray, separation: int, most: int, least_existence: 
         left[:, low:high] = 0.0
     found.sort(key=lambda member: member[0])
     if not found:
-        return Members(np.empty(0), np.empty(0), np.empty((0, 2, 2)), np.empty(0), np.empty(0))
+        nothing = np.empty(0)
+        return Members(nothing, nothing, np.empty((0, 2, 2)), nothing, nothing, nothing)
     return Members(*(np.array(column) for column in zip(*found)))
 
 
-def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, float]:
+def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, float, float]:
     cells = first + np.arange(sums.shape[1])
     total = sums[0].sum()
     place, amplitude = float(sums[0] @ cells) / total, float(sums[1].sum()) / total
+    foremost, prior = min(1.0, float(sums[4].sum())), float(sums[3].sum()) / total
+    if len(sums) > 5:
+        place, second = float(sums[5].sum()) / total, float(sums[6].sum()) / total
+        cross = float(sums[7].sum()) / total - place * amplitude
+        spread_of = max(0.0, second - place**2), cross
+        left = float(sums[2].sum()) / total - amplitude**2
+        left = max(left, cross**2 / spread_of[0] if spread_of[0] else 0.0)
+        return place, amplitude, np.array([spread_of, (cross, left)]), prior, foremost
     spread = cells - place
     cross = float(sums[1] @ spread) / total
     covariance = np.array(
@@ -65,7 +75,7 @@ def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, fl
             [cross, max(0.0, float(sums[2].sum()) / total - amplitude**2)],
         ]
     )
-    return place, amplitude, covariance, float(sums[3].sum()) / total
+    return place, amplitude, covariance, prior, foremost
 
 
 def _windowed(intensity: FloatArray, half: int) -> FloatArray:

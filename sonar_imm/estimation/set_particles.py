@@ -36,13 +36,15 @@ The record
     ``paper``      the best a, and a penalty of log(N) for each. The prior of births already
                    charges for the place, so this charges twice: too much.
 
-    A set that needs an amplitude that is not positive is impossible.
+    Each member has a sign for life, drawn at its birth: negative with ``negative_probability``. A
+    set that needs an amplitude of another sign is impossible.
 
 Data-driven proposals
     A move is drawn from ``share * K(z' - z) exp(g(z')) / Z(z) + (1 - share) * K(z' - z)``, with
-    ``g = max(b, 0)^2 / 2`` (what one thing alone would be worth); of the births a share is drawn
-    in proportion to ``exp(min(g, cap))`` and the rest uniformly, at the places that those already
-    there leave free. The cap lets a weak peak have births beside a strong one; the uniform rest
+    ``g = max(s b, 0)^2 / 2`` (what one thing of sign s alone would be worth); of the births a
+    share is drawn in proportion to the sign's probability times ``exp(min(g, cap))`` and the rest
+    uniformly, at the places that those already there leave free. The cap lets a weak peak have
+    births beside a strong one; the uniform rest
     bounds the weight of a birth where the record shows nothing. Each draw is weighted by the exact
     ratio of model to proposal, so proposals change how many particles are needed and nothing else.
     Shares of zero make the bootstrap filter: with eight sharp peaks in a record, all but a handful
@@ -65,140 +67,28 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from attrs import field, frozen
 import numpy as np
 
-from .arrays import FloatArray, IntArray
-from .markov import check_transition_matrix
+from .arrays import FloatArray
+from .set_model import SetModel, Sets
+from .set_shifts import propose_shift, shift_tables, ShiftTables
 
-PRIORS = ('marginal', 'bic_half', 'paper')
 IMPOSSIBLE = -math.inf
 
 
-def banded_transition(orders: int, switch: float) -> FloatArray:
-    """Transition matrix (orders, orders): one more or one less with probability `switch` each; at
-    the ends the probability of what cannot happen goes to staying."""
-    P = np.diag(np.full(orders - 1, switch), 1) + np.diag(np.full(orders - 1, switch), -1)
-    return np.asarray(P + np.diag(1.0 - P.sum(axis=1)))
-
-
-def gaussian_move(std: float, *, reach: float = 4.0) -> FloatArray:
-    """Probabilities (2 r + 1,) of moving by -r .. r cells: Gaussian of `std` cells, cut at `reach`
-    standard deviations."""
-    radius = max(1, int(reach * std))
-    K = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / std))
-    return np.asarray(K / K.sum())
-
-
-@frozen(eq=False, kw_only=True)
-class SetModel:
-    """What is assumed of the set and of the record; see the module's text.
-
-    cells: n, of the lattice; separation: smallest distance of two members, cells; order_min: the
-    smallest set; transition (orders, orders); move (2 r + 1,); gram (n,) by lag in cells, one at
-    0; amplitude_prior: one of PRIORS, with amplitude_std: s, and independent_samples: N;
-    move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
-    noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record.
-    """
-
-    cells: int
-    separation: int
-    order_min: int
-    transition: FloatArray = field(converter=check_transition_matrix)
-    move: FloatArray
-    gram: FloatArray
-    amplitude_prior: str = 'marginal'
-    amplitude_std: float = 7.5
-    independent_samples: float = 500.0
-    move_share: float = 0.95
-    birth_share: float = 0.75
-    birth_cap: float = 8.0
-    amplitude_memory: float = 0.0
-
-    def __attrs_post_init__(self) -> None:
-        if self.amplitude_prior not in PRIORS:
-            raise ValueError(f'amplitude_prior is one of {PRIORS}, not {self.amplitude_prior!r}')
-        if self.amplitude_memory and self.amplitude_prior != 'marginal':
-            raise ValueError('only marginal amplitudes can have a memory')
-        if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:
-            raise ValueError('a set model needs order_min >= 0, separation >= 1, gram (n,)')
-        if self.room(self.order_max) == 0:
-            raise ValueError(
-                f'{self.order_max} members {self.separation} cells apart do not fit into '
-                f'{self.cells} cells'
-            )
-
-    @property
-    def order_max(self) -> int:
-        return self.order_min + len(self.transition) - 1
-
-    @property
-    def most_changes(self) -> int:
-        """How many members can come or go at once."""
-        rows, columns = np.nonzero(self.transition > 0.0)
-        return int(np.abs(rows - columns).max())
-
-    @property
-    def uniforms(self) -> int:
-        """Random numbers a particle needs for one record."""
-        return 1 + self.most_changes + self.order_max
-
-    @property
-    def ridge(self) -> float:
-        """What is added to the diagonal of G: 1 / s^2, or nothing."""
-        return self.amplitude_std**-2 if self.amplitude_prior == 'marginal' else 0.0
-
-    @property
-    def penalty(self) -> float:
-        """What each member costs in log likelihood besides the determinant."""
-        if self.amplitude_prior == 'marginal':
-            return math.log(self.amplitude_std)
-        half = 0.5 * math.log(self.independent_samples)
-        return half if self.amplitude_prior == 'bic_half' else 2.0 * half
-
-    def room(self, order: int) -> int:
-        """The number of possible sets of that size."""
-        free = self.cells - max(order - 1, 0) * (self.separation - 1)
-        return math.comb(free, order) if free >= 0 else 0
-
-
-class Sets(NamedTuple):
-    """N sets: order (N,), cell (N, J) of which the first `order` count, ascending; prior_mean and
-    prior_variance (N, J) of the amplitudes in units of the noise, used with a memory only."""
-
-    order: IntArray
-    cell: IntArray
-    prior_mean: FloatArray
-    prior_variance: FloatArray
-
-    @classmethod
-    def empty(cls, model: SetModel, count: int) -> Sets:
-        shape = count, model.order_max
-        return cls(
-            np.zeros(count, np.int64),
-            np.zeros(shape, np.int64),
-            np.zeros(shape),
-            np.full(shape, model.amplitude_std**2),
-        )
-
-    def take(self, index: IntArray) -> Sets:
-        return Sets(
-            self.order[index],
-            self.cell[index],
-            self.prior_mean[index],
-            self.prior_variance[index],
-        )
-
-
 class Proposals(NamedTuple):
-    """Tables of one record: move (n, 2 r + 1) cumulative, move_ratio (n, 2 r + 1) log of model to
-    proposal, for cells from which something moves (others are not filled in); birth (n + 1,)
-    running sum of the birth weights, birth_ratio (n,) log of uniform to weight."""
+    """Tables of one record, for S signs: move (S n, 2 r + 1) cumulative, move_ratio (S n, 2 r + 1)
+    log of model to proposal, for cells from which something moves (others are not filled in),
+    negative members in the second n rows; birth (n + 1,) running sum of the birth weights of both
+    signs, birth_ratio (S, n) log of model to weight, birth_positive (n,) the weight of positive
+    births; shifts."""
 
     move: FloatArray
     move_ratio: FloatArray
     birth: FloatArray
     birth_ratio: FloatArray
+    birth_positive: FloatArray
+    shifts: ShiftTables
 
 
 def gain(b: FloatArray) -> FloatArray:
@@ -206,35 +96,48 @@ def gain(b: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.square(np.maximum(b, 0.0)))
 
 
+def gains(model: SetModel, b: FloatArray) -> FloatArray:
+    """g (S, n) for each sign."""
+    return np.stack([gain(sign * b) for sign in model.signs])
+
+
 def propose(model: SetModel, b: FloatArray) -> Proposals:
-    """The tables for the record b (n,)."""
-    n, radius = model.cells, len(model.move) // 2
+    """Oracle for tests: the tables for the record b (n,)."""
+    n, radius = model.record_cells, len(model.move) // 2
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
     K = np.where(there, model.move, 0.0)
-    g = np.where(there, gain(b)[np.clip(to, 0, n - 1)], -np.inf)
-    data_driven = K * np.exp(g - g.max(axis=1, keepdims=True))
+    signs = len(model.signs)
+    g = np.where(there, gains(model, b)[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
+    K = np.tile(K, (signs, 1))
+    best = g.max(axis=1, keepdims=True)
+    data_driven = K * np.exp(g - best)
     q = model.move_share * data_driven / data_driven.sum(axis=1, keepdims=True)
     q += (1.0 - model.move_share) * K / K.sum(axis=1, keepdims=True)
     with np.errstate(divide='ignore', invalid='ignore'):
         ratio = np.where(q > 0.0, np.log(K / q), IMPOSSIBLE)
-    return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, b))
+    log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
+    shifts = shift_tables(model.shift, log_sum, model.move_share)
+    return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, b), shifts)
 
 
-def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """birth (n + 1,) and birth_ratio (n,) of `Proposals`."""
-    data_driven = np.exp(np.minimum(gain(b), model.birth_cap))
+def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """birth (n + 1,), birth_ratio (S, n) and birth_positive (n,) of `Proposals`."""
+    prior = np.array(list(model.signs.values()))[:, None]
+    data_driven = prior * np.exp(np.minimum(gains(model, b), model.birth_cap))
     weight = (
         model.birth_share * data_driven / data_driven.sum()
-        + (1.0 - model.birth_share) / model.cells
+        + (1.0 - model.birth_share) * prior / model.cells
     )
-    return np.append(0.0, np.cumsum(weight)), -np.log(model.cells * weight)
+    running = np.append(0.0, np.cumsum(weight.sum(axis=0)))
+    return running, -np.log(model.cells * weight / prior), weight[0]
 
 
 def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
-    """Sets before the first record, drawn where it will want them, and the log ratio (N,).
+    """Oracle for tests: sets before the first record, drawn where it will want them, and the log
+    ratio (N,).
 
-    uniform (N, 1 + J): the order, and one for each member.
+    uniform (N, 1 + J), or one more with a shift: the order, one for each member, and the shift.
     """
     N = len(uniform)
     orders = len(model.transition)
@@ -243,10 +146,16 @@ def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[S
     log_ratio = np.zeros(N)
     for i in range(N):
         m = int(sets.order[i])
+        if model.shift:
+            place = np.searchsorted(proposals.shifts.start, uniform[i, -1], 'right')
+            sets.shift[i] = min(int(place), model.shift.count - 1) * model.shift.step
         members: list[int] = []
+        sign: dict[int, int] = {}
         for k in range(m):
-            log_ratio[i] += _birth(model, proposals, members, uniform[i, 1 + k])
-        sets.cell[i, :m] = members
+            born = _birth(model, proposals, members, sign, uniform[i, 1 + k], int(sets.shift[i]))
+            log_ratio[i] += born
+        sets.cell[i, : len(members)] = members
+        sets.sign[i, : len(members)] = [sign[z] for z in members]
         # Births charge 1/n each; possible sets of one size are equally likely in any order.
         charge = math.log(math.factorial(m) * model.room(m)) - m * math.log(model.cells)
         log_ratio[i] -= charge
@@ -256,8 +165,8 @@ def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[S
 def propagate(
     model: SetModel, proposals: Proposals, sets: Sets, uniform: FloatArray
 ) -> tuple[Sets, FloatArray]:
-    """Steps 1 to 5 of the model: the new sets and the log ratio (N,) of model to proposal, -inf
-    for impossible sets (whose members mean nothing)."""
+    """Oracle for tests: steps 1 to 5 of the model, the new sets and the log ratio (N,) of model to
+    proposal, -inf for impossible sets (whose members mean nothing)."""
     N, changes = len(uniform), model.most_changes
     cumulative = np.cumsum(model.transition, axis=1)
     new = Sets.empty(model, N)
@@ -269,22 +178,35 @@ def propagate(
         members = [(int(z), j) for j, z in enumerate(sets.cell[i, : sets.order[i]])]
         for k in range(len(members) - m):
             del members[min(int(uniform[i, 1 + k] * len(members)), len(members) - 1)]
+        offset = model.pad
+        if model.shift:
+            at = np.array([z for z, _ in members], np.int64)
+            below = np.array([int(sets.sign[i, j] < 0) for _, j in members], np.int64)
+            chances, paid = propose_shift(proposals.shifts, int(sets.shift[i]), at, below)
+            running = np.cumsum(chances)
+            place = int(np.searchsorted(running, uniform[i, -1] * running[-1], 'right'))
+            offset, log_ratio[i] = place * model.shift.step, paid[place]
+        new.shift[i] = offset
         survivors = []
         for k, (z, j) in enumerate(members):
-            table = proposals.move[z]
+            row = z + offset + (sets.sign[i, j] < 0) * model.record_cells
+            table = proposals.move[row]
             point = uniform[i, 1 + changes + k] * table[-1]
             step = min(int(np.searchsorted(table, point, 'right')), 2 * radius)
-            log_ratio[i] += proposals.move_ratio[z, step]
+            log_ratio[i] += proposals.move_ratio[row, step]
             survivors.append((z + step - radius, j))
         places = sorted(z for z, _ in survivors)
-        if any(b - a < model.separation for a, b in zip(places, places[1:])):
+        sign = {z: int(sets.sign[i, j]) for z, j in survivors}
+        apart = all(b - a >= model.separation for a, b in zip(places, places[1:]))
+        if not apart or (places and not 0 <= places[0] <= places[-1] < model.cells):
             log_ratio[i] = IMPOSSIBLE
         for k in range(m - len(survivors)):
             if log_ratio[i] > IMPOSSIBLE:
-                log_ratio[i] += _birth(model, proposals, places, uniform[i, 1 + k])
+                log_ratio[i] += _birth(model, proposals, places, sign, uniform[i, 1 + k], offset)
         new.order[i] = m
         if log_ratio[i] > IMPOSSIBLE:
             new.cell[i, :m] = places
+            new.sign[i, :m] = [sign[z] for z in places]
             parents = dict(survivors)
             for k, z in enumerate(places):
                 if model.amplitude_memory and z in parents:
@@ -293,35 +215,47 @@ def propagate(
     return new, log_ratio
 
 
-def _birth(model: SetModel, proposals: Proposals, places: list[int], uniform: float) -> float:
-    """Insert one more place into ascending `places`, as far from them as it must be; the log ratio
-    of a uniform birth to this one, -inf when there is no room."""
+def _birth(
+    model: SetModel,
+    proposals: Proposals,
+    places: list[int],
+    sign: dict[int, int],
+    uniform: float,
+    offset: int,
+) -> float:
+    """Insert one more place into ascending `places`, as far from them as it must be, and its sign
+    into `sign`; the log ratio of the model's birth to this one, -inf when there is no room.
+    offset: from cells of the lattice to those of the record."""
+    birth = proposals.birth[offset:]
     edges = [-model.separation, *places, model.cells - 1 + model.separation]
     gaps = [
         (low + model.separation, high - model.separation + 1)
         for low, high in zip(edges, edges[1:])
     ]
-    weights = [
-        proposals.birth[high] - proposals.birth[low] if high > low else 0.0 for low, high in gaps
-    ]
+    weights = [birth[high] - birth[low] if high > low else 0.0 for low, high in gaps]
     total = math.fsum(weights)
     if not total > 0.0:
         return IMPOSSIBLE
     left = uniform * total
     for k, ((low, high), weight) in enumerate(zip(gaps, weights)):
         if weight > 0.0 and (left < weight or not any(weights[k + 1 :])):
-            point = proposals.birth[low] + left
-            found = int(np.searchsorted(proposals.birth, point, 'right')) - 1
+            point = birth[low] + left
+            found = int(np.searchsorted(birth, point, 'right')) - 1
             place = min(max(found, low), high - 1)
             places.insert(k, place)
-            return float(proposals.birth_ratio[place] + math.log(total))
+            # What is left of the random number within the cell chooses the sign.
+            negative = point - birth[place] >= proposals.birth_positive[place + offset]
+            sign[place] = -1 if negative and len(model.signs) > 1 else 1
+            row = int(sign[place] < 0)
+            return float(proposals.birth_ratio[row, place + offset] + math.log(total))
         left -= weight
     raise AssertionError('a gap that has weight is always found')
 
 
 def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-    """log likelihood (N,) of the record against that of an empty one, -inf where an amplitude is
-    not positive, and the amplitudes (N, J), their mean given the set, in units of the noise."""
+    """Oracle for tests: log likelihood (N,) of the record against that of an empty one, -inf where
+    an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
+    in units of the noise."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
     for m in np.unique(sets.order[sets.order > 0]):
@@ -332,7 +266,7 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
             precision = 1.0 / sets.prior_variance[at, :m]
         else:
             precision = np.full(z.shape, model.ridge)
-        h = b[z] + precision * sets.prior_mean[at, :m]
+        h = b[z + sets.shift[at, None]] + precision * sets.prior_mean[at, :m]
         A = A + precision[:, :, None] * np.eye(m)
         a = np.linalg.solve(A, h[..., None])[..., 0]
         value = 0.5 * np.einsum('im,im->i', h, a) - m * model.penalty
@@ -342,5 +276,5 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
             value -= 0.5 * np.sum(precision * np.square(sets.prior_mean[at, :m]), axis=1)
             value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
         amplitude[at, :m] = a
-        log_likelihood[at] = np.where((a > 0.0).all(axis=1), value, IMPOSSIBLE)
+        log_likelihood[at] = np.where((a * sets.sign[at, :m] > 0.0).all(axis=1), value, IMPOSSIBLE)
     return log_likelihood, amplitude

@@ -13,7 +13,12 @@ import numpy as np
 
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
-from .set_particles import Proposals, Sets
+from .set_model import Sets
+from .set_particles import Proposals
+from .set_shifts import draw_shift
+
+SUMS, SHIFTED_SUMS = 5, 8
+"""Rows of what `moments` adds up, without a shift and with one."""
 
 
 class SetMotion(NamedTuple):
@@ -41,42 +46,61 @@ class AmplitudeModel(NamedTuple):
 
 
 @kernel
+def _fill_row(
+    row: int, z: int, g: FloatArray, move: FloatArray, share: float, proposals: Proposals
+) -> float:
+    """Row `row` of move and move_ratio of `proposals`, from the cell z; log Z of it."""
+    n, width = len(g), len(move)
+    radius = width // 2
+    low, high = max(0, radius - z), min(width, n + radius - z)
+    best, inside = -math.inf, 0.0
+    for step in range(low, high):
+        best = max(best, g[z + step - radius])
+        inside += move[step]
+    data_driven = 0.0
+    for step in range(low, high):
+        data_driven += move[step] * math.exp(g[z + step - radius] - best)
+    total = 0.0
+    for step in range(width):
+        q = 0.0
+        if low <= step < high:
+            q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
+            q += (1.0 - share) * move[step] / inside
+        total += q
+        proposals.move[row, step] = total
+        proposals.move_ratio[row, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
+    return best + math.log(data_driven)
+
+
+@kernel
 def fill_moves(
     sets: Sets,
-    g: FloatArray,
+    gain: FloatArray,
     move: FloatArray,
     share: float,
     filled: BoolArray,
     proposals: Proposals,
 ) -> None:
     """The rows of `set_particles.propose` from which some particle moves, into move and
-    move_ratio of `proposals`; filled (n,) is False throughout before, and says which rows after.
-    """
-    n, width = proposals.move.shape
-    radius = width // 2
+    move_ratio of `proposals`; gain (S, n) for each sign; filled (S n,) is False throughout before,
+    and says which rows after."""
     for i in range(sets.order.shape[0]):
         for k in range(sets.order[i]):
-            z = sets.cell[i, k]
-            if filled[z]:
-                continue
-            filled[z] = True
-            low, high = max(0, radius - z), min(width, n + radius - z)
-            best, inside = -math.inf, 0.0
-            for step in range(low, high):
-                best = max(best, g[z + step - radius])
-                inside += move[step]
-            data_driven = 0.0
-            for step in range(low, high):
-                data_driven += move[step] * math.exp(g[z + step - radius] - best)
-            total = 0.0
-            for step in range(width):
-                q = 0.0
-                if low <= step < high:
-                    q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
-                    q += (1.0 - share) * move[step] / inside
-                total += q
-                proposals.move[z, step] = total
-                proposals.move_ratio[z, step] = math.log(move[step] / q) if q > 0.0 else -math.inf
+            z, negative = sets.cell[i, k], int(sets.sign[i, k] < 0)
+            row = z + gain.shape[1] * negative
+            if not filled[row]:
+                filled[row] = True
+                _fill_row(row, z, gain[negative], move, share, proposals)
+
+
+@kernel
+def fill_all_moves(gain: FloatArray, move: FloatArray, share: float, proposals: Proposals) -> None:
+    """All rows of `set_particles.propose`, and log_sum of its shifts."""
+    for negative in range(gain.shape[0]):
+        for z in range(gain.shape[1]):
+            row = z + gain.shape[1] * negative
+            found = _fill_row(row, z, gain[negative], move, share, proposals)
+            proposals.shifts.log_sum[negative, z] = found
 
 
 @kernel
@@ -98,11 +122,12 @@ def _birth(
     separation: int,
     proposals: Proposals,
     uniform: float,
-) -> tuple[int, int, float]:
-    """(position in cells, cell, log ratio) of one more member of cells[:m]; position -1 when
-    there is no room."""
-    birth = proposals.birth
-    n = birth.shape[0] - 1
+    offset: int,
+) -> tuple[int, int, int, float]:
+    """(position in cells, cell, sign, log ratio) of one more member of cells[:m]; position -1 when
+    there is no room. offset: from cells of the lattice to those of the record."""
+    birth = proposals.birth[offset:]
+    n = proposals.birth.shape[0] - 1 - proposals.shifts.step * (len(proposals.shifts.start) - 1)
     total, last = 0.0, -1
     for k in range(m + 1):
         low = 0 if k == 0 else cells[k - 1] + separation
@@ -111,7 +136,7 @@ def _birth(
             total += birth[high] - birth[low]
             last = k
     if last < 0:
-        return -1, 0, -math.inf
+        return -1, 0, 1, -math.inf
     left = uniform * total
     for k in range(last + 1):
         low = 0 if k == 0 else cells[k - 1] + separation
@@ -121,9 +146,15 @@ def _birth(
             if left < weight or k == last:
                 place = _search(birth, low, high, birth[low] + left) - 1
                 place = max(low, min(place, high - 1))
-                return k, place, proposals.birth_ratio[place] + math.log(total)
+                negative = 0
+                if proposals.birth_ratio.shape[0] > 1:
+                    # What is left of the random number within the cell chooses the sign.
+                    inside = birth[low] + left - birth[place]
+                    negative = int(inside >= proposals.birth_positive[place + offset])
+                paid = proposals.birth_ratio[negative, place + offset] + math.log(total)
+                return k, place, 1 - 2 * negative, paid
             left -= weight
-    return -1, 0, -math.inf
+    return -1, 0, 1, -math.inf
 
 
 @kernel
@@ -143,15 +174,22 @@ def start(
     for i in range(first, last):
         chosen = min(int(uniform[i, 0] * orders), orders - 1)
         m = motion.order_min + chosen
-        ratio, here = 0.0, sets.cell[i]
+        ratio, here, sign, offset = 0.0, sets.cell[i], sets.sign[i], 0
+        if len(proposals.shifts.start) > 1:
+            G, drawn_at = len(proposals.shifts.start), uniform[i, 1 + sets.cell.shape[1]]
+            offset = min(_search(proposals.shifts.start, 0, G, drawn_at), G - 1)
+            offset *= proposals.shifts.step
+        sets.shift[i] = offset
         for k in range(m):
-            at, place, paid = _birth(here, k, separation, proposals, uniform[i, 1 + k])
+            at, place, drawn, paid = _birth(
+                here, k, separation, proposals, uniform[i, 1 + k], offset
+            )
             ratio += paid
             if at < 0:
                 break
             for j in range(k, at, -1):
-                here[j] = here[j - 1]
-            here[at] = place
+                here[j], sign[j] = here[j - 1], sign[j - 1]
+            here[at], sign[at] = place, drawn
         sets.order[i] = m
         log_ratio[i] = ratio - charge[chosen]
 
@@ -170,10 +208,16 @@ def propagate(
 ) -> None:
     """See `set_particles.propagate`: from the sets `old` to `new` and log_ratio (N,)."""
     order_min, separation, changes, cumulative = motion
-    orders, (cells, width) = cumulative.shape[0], proposals.move.shape
-    parent = np.empty(new.cell.shape[1], np.int64)
+    orders, width, cells = (
+        cumulative.shape[0],
+        proposals.move.shape[1],
+        proposals.birth_ratio.shape[1],
+    )
+    J, G = new.cell.shape[1], len(proposals.shifts.start)
+    last_cell = cells - 1 - proposals.shifts.step * (G - 1)
+    parent, rows, q = np.empty(J, np.int64), np.empty(J, np.int64), np.empty(G)
     for i in range(first, last):
-        before, u, here = old.order[i], uniform[i], new.cell[i]
+        before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
         m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
         left, ratio = before, 0.0
         for k in range(before):
@@ -183,31 +227,48 @@ def propagate(
             left -= 1
             for j in range(gone, left):
                 parent[j] = parent[j + 1]
+        offset = 0
+        for k in range(left):
+            negative = int(old.sign[i, parent[k]] < 0)
+            rows[k] = old.cell[i, parent[k]] + negative * cells
+        if G > 1:
+            offset, ratio = draw_shift(
+                proposals.shifts, old.shift[i], rows, left, cells, u[1 + changes + J], q
+            )
+        new.shift[i] = offset
         for k in range(left):
             source = parent[k]
             z = old.cell[i, source]
-            table = proposals.move[z]
+            row = rows[k] + offset
+            table = proposals.move[row]
             step = min(_search(table, 0, width, u[1 + changes + k] * table[width - 1]), width - 1)
-            ratio += proposals.move_ratio[z, step]
+            ratio += proposals.move_ratio[row, step]
             # What leaves the lattice is impossible already; its number must stay an index.
-            z = min(max(z + step - width // 2, 0), cells - 1)
+            z += step - width // 2
+            if not 0 <= z <= last_cell:
+                ratio = -math.inf
+            z = min(max(z, 0), last_cell)
             j = k
             while j > 0 and here[j - 1] > z:
                 here[j], parent[j] = here[j - 1], parent[j - 1]
                 j -= 1
             here[j], parent[j] = z, source
+        for k in range(left):
+            sign[k] = old.sign[i, parent[k]]
         for k in range(1, left):
             if here[k] - here[k - 1] < separation:
                 ratio = -math.inf
         for k in range(m - left):
             if ratio > -math.inf:
                 count = left + k
-                at, place, paid = _birth(here, count, separation, proposals, u[1 + k])
+                at, place, drawn, paid = _birth(
+                    here, count, separation, proposals, u[1 + k], offset
+                )
                 ratio += paid
                 if at >= 0:
                     for j in range(count, at, -1):
-                        here[j], parent[j] = here[j - 1], parent[j - 1]
-                    here[at], parent[at] = place, -1
+                        here[j], parent[j], sign[j] = here[j - 1], parent[j - 1], sign[j - 1]
+                    here[at], parent[at], sign[at] = place, -1, drawn
         new.order[i], log_ratio[i] = m, ratio
         if amplitudes.memory > 0.0 and ratio > -math.inf:
             for k in range(m):
@@ -229,7 +290,7 @@ def weigh(
 ) -> None:
     """See `set_particles.weigh`: adds the log likelihood to log_weight (N,), whose -inf are left
     alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
-    order, cell, mean, variance = sets
+    order, cell, mean, variance, sign, shift = sets
     gram, memory = amplitudes.gram, amplitudes.memory > 0.0
     J = cell.shape[1]
     L, y = np.empty((J, J)), np.empty(J)
@@ -239,7 +300,7 @@ def weigh(
             continue
         value = 0.0
         for r in range(m):
-            z, h, precision = cell[i, r], b[cell[i, r]], amplitudes.ridge
+            z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
             if memory:
                 precision = 1.0 / variance[i, r]
                 h += precision * mean[i, r]
@@ -274,7 +335,7 @@ def weigh(
                 for k in range(r + 1, m):
                     rest -= L[k, r] * a[k]
                 a[r] = rest * L[r, r]
-                if not a[r] > 0.0:
+                if not a[r] * sign[i, r] > 0.0:
                     value = -math.inf
                     break
         log_weight[i] += value
@@ -310,15 +371,26 @@ def moments(
     pmf: FloatArray,
     sums: FloatArray,
 ) -> None:
-    """Add to pmf (orders,) and to sums (4, n), the intensity, the first two moments of the
-    amplitude and the variance it had before the record, that lie on each cell. Both are zero
-    before."""
+    """Add to pmf (orders,) and to sums (5, n), the intensity, the first two moments of the
+    amplitude, the variance it had before the record, and the share of members that are the first
+    of their set, that lie on each cell. Both are zero before. With a shift, cells are those of
+    the record, where members that share an error are not blurred by it, and sums (8, n + 2 pad)
+    has the first two moments of the cell on the lattice and its product with the amplitude
+    besides."""
+    shifted = sums.shape[0] > SUMS
     for i in range(w.shape[0]):
         if w[i] > 0.0:
             pmf[sets.order[i] - order_min] += w[i]
             for k in range(sets.order[i]):
-                z, a = sets.cell[i, k], amplitude[i, k]
+                place, a = sets.cell[i, k], amplitude[i, k]
+                z = place + sets.shift[i]
                 sums[0, z] += w[i]
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
                 sums[3, z] += w[i] * sets.prior_variance[i, k]
+                if shifted:
+                    sums[5, z] += w[i] * place
+                    sums[6, z] += w[i] * place * place
+                    sums[7, z] += w[i] * place * a
+            if sets.order[i] > 0:
+                sums[4, sets.cell[i, 0] + sets.shift[i]] += w[i]

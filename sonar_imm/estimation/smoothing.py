@@ -68,8 +68,9 @@ class IMMSmoothed(NamedTuple):
 def rts_smooth(
     x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Smooth a forward pass: x (K, ..., n) and P (K, ..., n, n) filtered; F, Q (K, ..., n, n) and
-    B (K, ..., n) of the move into each step. Returns the smoothed x and P."""
+    """Oracle for tests: smooth a forward pass of one model: x (K, ..., n) and P (K, ..., n, n)
+    filtered; F, Q (K, ..., n, n) and B (K, ..., n) of the move into each step. Returns the
+    smoothed x and P."""
     smoothed_x, smoothed_P = x.copy(), P.copy()
     for k in range(len(x) - 2, -1, -1):
         predicted = apply(F[k + 1], x[k]) + (0.0 if B is None else B[k + 1])

@@ -1,6 +1,8 @@
 """The folder of a tracked recording: what ``track`` writes and ``evaluate`` reads.
 
 estimate/      the estimates as a bag, topic ``/<system>/estimate``
+soundings.csv  what of them goes into a chart, when a sonar with navigation was tracked; in the bag
+               as the topic ``/<system>/soundings``
 estimate.csv   the same rows as text: stamp_ns, then the columns of the contract
 run.json       input, parameters, versions; written last, so a folder without it is unfinished
 metrics.json   and report.html, once evaluated
@@ -12,6 +14,7 @@ same bytes. Times and versions are in run.json.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+import contextlib
 import csv
 import hashlib
 from importlib.metadata import version
@@ -27,6 +30,7 @@ import numpy
 import scipy
 
 from msg_adapters.estimates import read_estimate, write_estimate
+from msg_adapters.soundings import write_soundings
 
 from .. import __version__
 from ..estimates import Estimate
@@ -35,11 +39,13 @@ from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
 from ..recordings.writer import BagWriter, naming, ros_message
+from ..soundings import soundings_of
 from ..trackers import SYSTEMS
 
-BAG, CSV, RUN, METRICS, REPORT = (
+BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
     'estimate',
     'estimate.csv',
+    'soundings.csv',
     'run.json',
     'metrics.json',
     'report.html',
@@ -59,7 +65,7 @@ class RunFolder:
         """
         if self.path.exists() and not self.path.is_dir():
             raise BagError(f'{self.path} is a file; a folder is needed')
-        old = [self.path / name for name in (BAG, CSV, RUN, METRICS, REPORT)]
+        old = [self.path / name for name in (BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT)]
         old = [path for path in old if path.exists()]
         if old and not overwrite:
             raise BagError(
@@ -71,16 +77,28 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
 
     def write_estimates(self, estimates: Iterable[Estimate], system: str) -> dict[str, int]:
-        """Write bag and CSV while the estimates come; gives the number of estimates and rows."""
+        """Write bag and CSV while the estimates come; gives the number of estimates and rows, and
+        of soundings where there are any."""
         written = {'estimates': 0, 'rows': 0}
-        with BagWriter(self.path / BAG) as bag, CsvTable(self.path / CSV) as table:
+        with contextlib.ExitStack() as stack:
+            bag = stack.enter_context(BagWriter(self.path / BAG))
+            table = stack.enter_context(CsvTable(self.path / CSV))
+            chart: CsvTable | None = None
             for estimate in estimates:
                 bag.write(
                     f'/{system}/estimate', write_estimate(estimate, ros_message), estimate.stamp_ns
                 )
-                table.write(estimate)
+                table.write(estimate.stamp_ns, estimate.columns())
                 written['estimates'] += 1
                 written['rows'] += len(estimate)
+                if (soundings := soundings_of(estimate)) is None:
+                    continue
+                if chart is None:
+                    chart = stack.enter_context(CsvTable(self.path / SOUNDINGS))
+                message = write_soundings(soundings, ros_message)
+                bag.write(f'/{system}/soundings', message, estimate.stamp_ns)
+                chart.write(soundings.stamp_ns, soundings.columns)
+                written['soundings'] = written.get('soundings', 0) + len(soundings)
         return written
 
     def write_json(self, name: str, content: Any) -> Path:
@@ -109,11 +127,12 @@ class RunFolder:
 
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
-        return _read_estimates(self.path / BAG)
+        topic = f'/{self.read_run()["system"]}/estimate'
+        return _read_estimates(self.path / BAG, [topic])
 
 
 class CsvTable:
-    """estimate.csv, one line per row; floats as the shortest text that reads back exactly."""
+    """A table as CSV, one line per row; floats as the shortest text that reads back exactly."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -128,9 +147,8 @@ class CsvTable:
         with naming(self._path):
             self._file.close()
 
-    def write(self, estimate: Estimate) -> None:
-        """Append the rows of one estimate. Raises ValueError when the columns change."""
-        columns = estimate.columns()
+    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
+        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
         if self._names is None:
             self._names = list(columns)
             self._writer.writerow(['stamp_ns', *columns])
@@ -138,7 +156,7 @@ class CsvTable:
             raise ValueError('the columns change from one estimate to another')
         with naming(self._path):
             for row in zip(*(column.tolist() for column in columns.values())):
-                self._writer.writerow([estimate.stamp_ns, *row])
+                self._writer.writerow([stamp_ns, *row])
 
 
 def read_truth(

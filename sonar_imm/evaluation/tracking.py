@@ -51,7 +51,8 @@ class Refused:
 
 
 class Revisions:
-    """Holds estimates while they can still be revised; the last one of a stamp counts.
+    """Holds estimates while they can still be revised; the last one of a stamp, and of each
+    instrument, counts.
 
     window_ns: how far back a late measurement can reach. When the clock was restarted, what is
     held from before is final.
@@ -59,27 +60,27 @@ class Revisions:
 
     def __init__(self, window_ns: int):
         self.window_ns = window_ns
-        self._held: dict[int, Estimate] = {}
+        self._held: dict[tuple[int, int], Estimate] = {}
 
     def add(self, estimates: Iterable[Estimate]) -> list[Estimate]:
         """Add the estimates of one measurement; gives those that became final, oldest first."""
         final: list[Estimate] = []
         for estimate in estimates:
-            newest = max(self._held, default=estimate.stamp_ns)
+            newest = max(self._held, default=(estimate.stamp_ns, 0))[0]
             if estimate.stamp_ns < newest - self.window_ns:
                 final += self.finish()
-            self._held[estimate.stamp_ns] = estimate
+            self._held[estimate.stamp_ns, estimate.source] = estimate
         if self._held:
-            oldest = max(self._held) - self.window_ns
-            final += self._release(sorted(stamp for stamp in self._held if stamp < oldest))
+            oldest = max(self._held)[0] - self.window_ns
+            final += self._release(sorted(key for key in self._held if key[0] < oldest))
         return final
 
     def finish(self) -> list[Estimate]:
         """Everything still held, oldest first."""
         return self._release(sorted(self._held))
 
-    def _release(self, stamps: list[int]) -> list[Estimate]:
-        return [self._held.pop(stamp) for stamp in stamps]
+    def _release(self, keys: list[tuple[int, int]]) -> list[Estimate]:
+        return [self._held.pop(key) for key in keys]
 
 
 def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
@@ -114,7 +115,7 @@ class OfflineRun:
         chosen = fitting_topics(bag, system.name, self.options.topics)
         self.topics = {name: entry.name for name, entry in chosen.items()}
         build = system.build_smoother if self.options.smooth else system.build
-        self.tracker = build(config)
+        self.tracker = build(config.for_inputs(frozenset(self.topics.values())))
         self.refused: dict[str, Refused] = {}
         self.messages = 0
         self.durations = array('d')
@@ -180,6 +181,10 @@ class OfflineRun:
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
+    def warnings(self) -> list[str]:
+        """What of the input cannot be true, as the tracker says it at the end."""
+        return list(getattr(self.tracker, 'warnings', list)())
+
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""
         return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
@@ -215,6 +220,7 @@ def write_run(
         **written,
         counts=offline.outcomes(),
         refused=offline.refusals(),
+        warnings=offline.warnings(),
         problems=list(offline.bag.problems),
         parameters=offline.tracker.config.as_dict(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
 from .checks import check_covariance, check_stamp, nanoseconds, Rejection
-from .diver import Arrivals, Fix
+from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .frames import frame_role, FrameGuard
 from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
@@ -24,6 +24,7 @@ __all__ = [
     'CrossSpectra',
     'Detections',
     'Fix',
+    'Fixes',
     'frame_role',
     'FrameGuard',
     'IMAGE_ORDERS',
@@ -31,15 +32,19 @@ __all__ = [
     'Measurement',
     'nanoseconds',
     'Navigation',
+    'NOBODY',
     'Pressure',
     'Rejection',
+    'scan_of',
     'Snapshot',
     'SonarImage',
     'Trace',
+    'usable_fixes',
 ]
 
 Measurement = (
     Fix
+    | Fixes
     | Arrivals
     | Snapshot
     | Trace

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from attrs import field, frozen
 import numpy as np
@@ -36,8 +36,11 @@ class Snapshot:
     per stave in squared units of iq, NaN where unknown, None when nowhere known.
     two_way_time: (n,) s, when the sonar gave times: `range` is then for `sound_speed`, or for
     1500 m/s when that is None (see `ranges`). sound_speed m/s, frequency Hz, element_spacing m and
-    sample_rate Hz are None where the sonar does not say.
+    sample_rate Hz are None where the sonar does not say. side: ``'port'`` or ``'starboard'``
+    where its topic says so, else empty.
     """
+
+    FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
     range: FloatArray = field(converter=floats(None))
@@ -50,6 +53,7 @@ class Snapshot:
     frequency: float | None = None
     element_spacing: float | None = None
     sample_rate: float | None = None
+    side: str = ''
     usable: NDArray[np.bool_] = field(init=False)
 
     def __attrs_post_init__(self) -> None:

@@ -1,10 +1,10 @@
-"""What the diver tracker takes in: position fixes and arrival times."""
+"""What the diver tracker takes in: position fixes, one by one or as scans, and arrival times."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,6 +52,105 @@ class Fix:
         return content_key('fix', self.position, self.covariance)
 
 
+NOBODY = -1
+"""The `Fixes.target_id` of a fix that does not say whose it is."""
+
+
+def _names(value: Any) -> NDArray[np.int32] | None:
+    if value is None:
+        return None
+    array = np.array(value, dtype=np.int32)
+    array.flags.writeable = False
+    return array
+
+
+@frozen(eq=False, kw_only=True)
+class Fixes:
+    """A scan: all positions that were found at one stamp, also when there are none.
+
+    position: (n, 3) x, y, z in `frame_id`, metres; covariance: (n, 2, 2) of x and y in m^2, a row
+    of NaN where the sender does not know it, None when no row has one; target_id: (n,) whose
+    position it is, `NOBODY` where that is not known, None when no row says so.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=floats(None, 3))
+    covariance: FloatArray | None = None
+    target_id: NDArray[np.int32] | None = field(default=None, converter=_names)
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        n = len(self.position)
+        if self.target_id is not None and self.target_id.shape != (n,):
+            raise Rejection(
+                'bad_shape', f'fixes: {len(self.target_id)} identities for {n} positions'
+            )
+        if self.covariance is not None:
+            covariance = floats(n, 2, 2)(self.covariance)
+            object.__setattr__(self, 'covariance', covariance)
+        if not usable_fixes(self.position, self.covariance).all():
+            raise Rejection(
+                'bad_row', 'a fix of the scan has a position or a covariance that cannot be used'
+            )
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('fixes', self.position, self.covariance, self.target_id)
+
+
+def scan_of(measurement: Fix | Fixes) -> Fixes:
+    """A fix as a scan with one row; a scan as it is."""
+    if isinstance(measurement, Fixes):
+        return measurement
+    return Fixes(
+        stamp_ns=measurement.stamp_ns,
+        position=measurement.position[None],
+        covariance=None if measurement.covariance is None else measurement.covariance[None],
+        frame_id=measurement.frame_id,
+    )
+
+
+FARTHEST_FIX = 1e8
+"""Most metres of a fix from the origin on each axis."""
+
+
+def usable_fixes(position: FloatArray, covariance: FloatArray | None) -> NDArray[np.bool_]:
+    """Which of the positions (n, 3), with covariances (n, 2, 2) or None, can be used: finite x and
+    y, and a covariance that is unknown (NaN throughout) or symmetric and positive definite."""
+    with np.errstate(invalid='ignore', over='ignore'):
+        usable = (np.abs(position[:, :2]) <= FARTHEST_FIX).all(axis=1)
+        if covariance is None:
+            return np.asarray(usable)
+        a, b, c, d = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+        scale = np.abs(covariance).max(axis=(1, 2), initial=0.0)
+        # Relative to the largest entry, so that nothing overflows; as `check_covariance`.
+        a, b, c, d = (one / np.where(scale > 0.0, scale, 1.0) for one in (a, b, c, d))
+        least = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
+        known = np.isfinite(scale) & (scale > 0.0) & (np.abs(b - c) <= 1e-6) & (least > 1e-12)
+        return np.asarray(usable & (known | np.isnan(covariance).all(axis=(1, 2))))
+
+
+OPTIONAL_ARRIVALS = ('elevation', 'var_elevation', 'depth', 'var_depth')
+"""Columns of `Arrivals` that may be left out."""
+
+ARRIVAL_COLUMNS = (
+    'tx_id',
+    'rx_id',
+    'toa',
+    'var_toa',
+    'tx',
+    'rx',
+    'bearing',
+    'var_bearing',
+    *OPTIONAL_ARRIVALS,
+)
+"""Columns of `Arrivals`, in the order in which they sort its rows."""
+
+
 @frozen(eq=False, kw_only=True)
 class Arrivals:
     """Arrival times of one ping, one row a transmitter-receiver pair.
@@ -61,7 +160,9 @@ class Arrivals:
     emits at an unknown time near the stamp (an acoustic tag) and only differences between
     receivers carry information. tx, rx: (n, 3) metres in `frame_id`; var_toa: (n,) s^2, NaN where
     unknown; bearing: (n,) rad at the receiver, counter-clockwise from +x, NaN where not measured;
-    var_bearing: (n,) rad^2.
+    var_bearing: (n,) rad^2. elevation: (n,) rad at the receiver, up positive, with var_elevation,
+    and depth: (n,) m, down positive, the target's own report, with var_depth m^2; each NaN or left
+    out where not measured.
     """
 
     stamp_ns: int
@@ -73,12 +174,20 @@ class Arrivals:
     var_toa: FloatArray = field(converter=floats(None))
     bearing: FloatArray = field(converter=floats(None))
     var_bearing: FloatArray = field(converter=floats(None))
+    elevation: FloatArray = field(default=(), converter=floats(None))
+    var_elevation: FloatArray = field(default=(), converter=floats(None))
+    depth: FloatArray = field(default=(), converter=floats(None))
+    var_depth: FloatArray = field(default=(), converter=floats(None))
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
         n = len(self.toa)
-        for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing'):
+        for name in OPTIONAL_ARRIVALS:
+            if n and not len(getattr(self, name)):
+                object.__setattr__(self, name, floats(None)(np.full(n, np.nan)))
+        columns = ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing')
+        for name in (*columns, *OPTIONAL_ARRIVALS):
             if len(getattr(self, name)) != n:
                 raise Rejection(
                     'bad_shape',
@@ -92,9 +201,17 @@ class Arrivals:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        where = (self.tx_id, self.rx_id, self.tx, self.rx)
-        heard = (self.toa, self.var_toa, self.bearing, self.var_bearing)
-        return content_key('arrivals', *where, *heard)
+        one = self.in_order()
+        return content_key('arrivals', *(getattr(one, name) for name in ARRIVAL_COLUMNS))
+
+    def in_order(self) -> Arrivals:
+        """The same ping with its rows in the order of their content."""
+        keys = [getattr(self, name) for name in reversed(ARRIVAL_COLUMNS)]
+        columns = [column for key in keys for column in np.atleast_2d(key.T)[::-1]]
+        order = np.lexsort(columns) if len(self) else np.arange(0)
+        if (np.diff(order) == 1).all():
+            return self
+        return evolve(self, **{name: getattr(self, name)[order] for name in ARRIVAL_COLUMNS})
 
     @property
     def passive(self) -> bool:

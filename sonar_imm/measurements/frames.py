@@ -21,7 +21,7 @@ def frame_role(measurement: Any) -> str:
 
 class FrameGuard:
     """Lets one frame of the tracks pass: the one it is told, or else the first that a measurement
-    names; and one frame for each kind of measurement that is in a frame of its own."""
+    names; and one frame for each sensor (kind of measurement, and side) that has its own."""
 
     def __init__(self, frame_id: str = ''):
         """Expect `frame_id`; empty means that the measurements decide."""
@@ -43,13 +43,14 @@ class FrameGuard:
             _compare(frame_id, self._world, 'the tracks')
             self._world = frame_id
         elif role == 'own':
-            _compare(frame_id, self._own.get(type(measurement), ''), 'earlier ones')
-            self._own[type(measurement)] = frame_id
+            sensor = type(measurement), getattr(measurement, 'side', '')
+            _compare(frame_id, self._own.get(sensor, ''), 'earlier ones')
+            self._own[sensor] = frame_id
 
     def reset(self) -> None:
         """Let the measurements decide again, unless a frame was told."""
         self._world = self._told
-        self._own: dict[type, str] = {}
+        self._own: dict[tuple[type, str], str] = {}
 
 
 def _compare(frame_id: str, expected: str, whose: str) -> None:

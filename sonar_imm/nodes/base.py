@@ -108,6 +108,10 @@ class TrackerNode(Node):
     def show(self, newest: Estimate) -> None:
         """Publish the newest state for displays."""
 
+    def show_all(self, estimates: list[Estimate]) -> None:
+        """Publish what each of the estimates of one message is to be shown as."""
+        self.show(estimates[-1])
+
     def forget(self) -> None:
         """Tell displays that all tracks are forgotten."""
 
@@ -210,7 +214,7 @@ class TrackerNode(Node):
         for estimate in self._wanted(estimates):
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1
-        self.show(estimates[-1])
+        self.show_all(estimates)
 
     def _wanted(self, estimates: list[Estimate]) -> list[Estimate]:
         """The newest estimate, and before it the newest revised ones, as many as are wanted."""
@@ -300,6 +304,7 @@ class TrackerNode(Node):
                 stale_after=self._node_config.stale_after,
                 counts=counts,
                 health=self.tracker.health(),
+                warnings=getattr(self.tracker, 'warnings', list)(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
             )

@@ -6,11 +6,15 @@ bin. The points are the floor in the frame of the sonar; the column ``label`` is
 most probable terrain model, by which RViz2 and Foxglove colour them (config/bathymetry.rviz,
 config/foxglove_bathymetry.json), ``label_probability`` how probable it is.
 
-One node is one side. A sonar with two sides has two nodes, in namespaces, each with a core of its
-own if there is one::
+Also published, for each ping: ``~/model_probabilities``, the share of the bins that each terrain
+model holds, and with navigation on ``nav`` ``~/soundings``, what goes into a chart: a row for each
+bin with an echo, in the frame of the navigation, with its uncertainties (`sonar_imm.soundings`).
 
-    ros2 run sonar_imm bathymetry_node --ros-args -r __ns:=/port -p side:=port
-    ros2 run sonar_imm bathymetry_node --ros-args -r __ns:=/starboard
+A sonar with two sides has one node, which hears ``port/snapshot`` and ``starboard/snapshot``, or
+two, in namespaces, each with a core of its own if there is one::
+
+    ros2 run sonar_imm bathymetry_node --ros-args -r __ns:=/port -p side:=port -r nav:=/nav
+    ros2 run sonar_imm bathymetry_node --ros-args -r __ns:=/starboard -r nav:=/nav
 
 No ping needs the one before. So a node that cannot keep up drops whole pings, those that waited
 longer than ``max_wait``, and says so in /diagnostics, rather than show the floor of a while ago.
@@ -26,7 +30,13 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
+from msg_adapters.estimates import write_model_shares
+from msg_adapters.soundings import write_soundings
+
+from ..estimates import Estimate
+from ..soundings import soundings_of
 from .base import run, TrackerNode
+from .messages import make
 
 
 class BathymetryNode(TrackerNode):
@@ -34,6 +44,18 @@ class BathymetryNode(TrackerNode):
 
     def __init__(self, **options: Any):
         super().__init__('bathymetry', **options)
+
+    def advertise_displays(self) -> None:
+        self._soundings = self.advertise('sensor_msgs/msg/PointCloud2', '~/soundings')
+        self._shares = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
+
+    def show_all(self, estimates: list[Estimate]) -> None:
+        for estimate in estimates:
+            if self._shares.get_subscription_count():
+                self._shares.publish(write_model_shares(estimate, make))
+            soundings = soundings_of(estimate)
+            if soundings is not None and self._soundings.get_subscription_count():
+                self._soundings.publish(write_soundings(soundings, make))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -11,7 +11,7 @@ The class knows nothing of subscriptions and clocks; the node tells it what happ
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -67,6 +67,7 @@ class Reporter:
         stale_after: float,
         counts: Mapping[str, int],
         health: Mapping[str, float],
+        warnings: Sequence[str] = (),
         lost: Mapping[str, int],
         incompatible: Mapping[str, str],
     ) -> DiagnosticArray:
@@ -86,7 +87,12 @@ class Reporter:
                 now, elapsed, fresh, refused, enabled, stale_after, lost, incompatible
             ),
             self._tracker_status(
-                fresh.total() / elapsed, dropped - dropped_before, enabled, counts, health
+                fresh.total() / elapsed,
+                dropped - dropped_before,
+                enabled,
+                counts,
+                health,
+                warnings,
             ),
         ]
         return message
@@ -143,12 +149,15 @@ class Reporter:
         enabled: bool,
         counts: Mapping[str, int],
         health: Mapping[str, float],
+        warnings: Sequence[str],
     ) -> DiagnosticStatus:
         p50, p99 = self._meter.compute_ms()
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
         level, text = DiagnosticStatus.OK, 'tracking' if enabled else 'disabled'
+        if warnings:
+            level, text = DiagnosticStatus.WARN, '; '.join(warnings)
         if dropped:
             level, text = (
                 DiagnosticStatus.WARN,

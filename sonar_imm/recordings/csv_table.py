@@ -39,8 +39,20 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'y': ('y', 'north', 'northing', 'py', 'pos_y', 'position_y', 'utm_n', 'utm_y', 'n'),
     'z': ('z', 'up', 'pz', 'pos_z', 'position_z'),
     'depth': ('depth', 'down'),
-    'latitude': ('latitude', 'lat'),
-    'longitude': ('longitude', 'lon', 'lng', 'long'),
+    'latitude': ('latitude', 'lat', 'gps_latitude', 'gps_lat', 'decimal_latitude', 'lat_dd'),
+    'longitude': (
+        'longitude',
+        'lon',
+        'lng',
+        'long',
+        'gps_longitude',
+        'gps_lon',
+        'gps_lng',
+        'gps_long',
+        'decimal_longitude',
+        'lon_dd',
+        'long_dd',
+    ),
     'height': ('height', 'altitude', 'alt', 'ellipsoidal_height'),
     'var_x': ('var_x', 'var_east', 'xx', 'cov_xx', 'cov_x_x'),
     'cov_xy': ('cov_xy', 'cov_east_north', 'xy', 'cov_x_y'),
@@ -72,8 +84,13 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'amplitude': ('amplitude', 'amp', 'response', 'value'),
     'var_bearing': ('var_bearing',),
     'std_bearing': ('std_bearing', 'sigma_bearing'),
+    'elevation': ('elevation', 'elevation_angle'),
+    'var_elevation': ('var_elevation',),
+    'std_elevation': ('std_elevation', 'sigma_elevation'),
+    'var_depth': ('var_depth',),
+    'std_depth': ('std_depth', 'sigma_depth'),
 }
-_UNIT = re.compile(r'_(m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
+_UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
 _TIME = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
 
 
@@ -186,9 +203,11 @@ class CsvTable:
             raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
         if not first or '\0' in first:
             raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
+        if _binary(self.path):
+            raise BagError(f'{self.path} is no text, not a CSV file')
         likely = max(',;\t|', key=first.count)
         self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
-        self._headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        self.headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
         self.index = self._find_columns()
 
     def __iter__(self) -> Iterator[Row]:
@@ -200,8 +219,12 @@ class CsvTable:
                     cells = next(reader)
                 except StopIteration:
                     return
-                except csv.Error as error:
-                    raise BagError(f'{self.path}, line {reader.line_num}: {error}') from None
+                except csv.Error:
+                    raise BagError(
+                        f'{self.path}, line {reader.line_num} is no line of a CSV file: it holds '
+                        f'more than {csv.field_size_limit()} characters in a cell, or bytes that '
+                        'are no text'
+                    ) from None
                 if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
                     continue
                 if header_seen:
@@ -217,13 +240,13 @@ class CsvTable:
         if missing := [name for name in names if name not in self.index]:
             raise BagError(
                 f'{self.path} has no column for {" and ".join(missing)}; it has '
-                f'{", ".join(self._headers)}; say which column holds '
+                f'{", ".join(self.headers)}; say which column holds '
                 f'{"it" if len(missing) == 1 else "them"}'
             )
 
     def header(self, name: str) -> str:
         """What the file calls a quantity."""
-        return self._headers[self.index[name]] if name in self.index else name
+        return self.headers[self.index[name]] if name in self.index else name
 
     def time_scale(self, name: str) -> int:
         """Nanoseconds in one unit of a time column."""
@@ -243,19 +266,29 @@ class CsvTable:
         """Match headers with quantities: mapped by hand first, then by their usual names."""
         by_hand = {}
         for name, header in self.options.columns.items():
-            if header not in self._headers:
+            if header not in self.headers:
                 raise BagError(
-                    f"{self.path} has no column '{header}'{did_you_mean(header, self._headers)}"
+                    f"{self.path} has no column '{header}'{did_you_mean(header, self.headers)}"
                 )
-            by_hand[name] = self._headers.index(header)
+            by_hand[name] = self.headers.index(header)
         found = dict(by_hand)
-        plain = [_plain(header) for header in self._headers]
+        plain = [_plain(header) for header in self.headers]
         for name, aliases in ALIASES.items():
             matches = [plain.index(alias) for alias in aliases if alias in plain]
             matches = [index for index in matches if index not in by_hand.values()]
             if name not in found and matches:
                 found[name] = matches[0]
         return found
+
+
+def _binary(path: Path) -> bool:
+    """Whether a file holds something else than text: control characters among its first bytes, or
+    many that are no UTF-8. A byte of another alphabet here and there is text all the same."""
+    with path.open('rb') as file:
+        start = file.read(4096)
+    controls = sum(byte < 32 and byte not in b'\t\n\r\f\x1a' for byte in start)
+    strange = start.decode('utf-8', errors='replace').count('\ufffd')
+    return controls > 0 or 10 * strange > len(start)
 
 
 def _plain(header: str) -> str:
@@ -269,8 +302,8 @@ def _iso_ns(date: str, clock: str, fraction: str | None, zone: str | None) -> in
     zone = '+00:00' if zone in (None, 'Z') else zone if ':' in zone else f'{zone[:3]}:{zone[3:]}'
     try:
         moment = datetime.fromisoformat(f'{date}T{clock}{zone}')
-    except ValueError as error:
-        raise BadRow(str(error)) from None
+    except ValueError:
+        raise BadRow(f"'{date} {clock}{zone}' is no date and time of the calendar") from None
     elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
     nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
     return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)

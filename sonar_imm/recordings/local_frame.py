@@ -21,6 +21,14 @@ class LocalFrame:
     def __init__(self, table: CsvTable, origin: tuple[float, ...] | None = None):
         self.geodetic = not table.has('x', 'y') and table.has('latitude', 'longitude')
         if not self.geodetic:
+            if not any(table.has(name) for name in ('x', 'y')):
+                for one, other in (('latitude', 'longitude'), ('longitude', 'latitude')):
+                    if table.has(one):
+                        table.require(other)
+                raise BagError(
+                    f'{table.path} has no column for x and y, nor for latitude and longitude; it '
+                    f'has {", ".join(table.headers)}; say which columns hold the position'
+                )
             table.require('x', 'y')
         self.origin = None if origin is None or not self.geodetic else _checked(origin)
 

@@ -16,6 +16,7 @@ from .sources import BagError, TopicInfo
 DOUBTS = {
     'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
     'no_frame': 'have no frame_id',
+    'unusable_rows': 'have rows that cannot be used, which are left out',
 }
 
 
@@ -32,10 +33,11 @@ def fitting_topics(
 ) -> dict[str, InputTopic]:
     """Say which topics of `bag` feed the tracker `system`: input by topic name.
 
-    A topic fits when its type can be read and its last name component is the input's name; topics
-    below ``/truth`` never do, and companions alone are not enough. `topics` maps topic names to
-    input names instead, e.g. ``{'/usbl/pose': 'fix'}``. Raises `BagError` when nothing fits, with
-    a list of what is there, and when several topics fit an input that is one instrument.
+    A topic fits when its type can be read and its name ends in the input's name; where several
+    inputs fit, the later one counts. Topics below ``/truth`` never fit, and companions alone are
+    not enough. `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``.
+    Raises `BagError` when nothing fits, with a list of what is there, and when several topics fit
+    an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
@@ -44,7 +46,7 @@ def fitting_topics(
         for topic in bag.topics
         for entry in inputs_of(system)
         if _can_read(topic, entry)
-        and topic.name.split('/')[-1] == entry.name
+        and f'/{topic.name}'.endswith(f'/{entry.name}')
         and 'truth' not in topic.name.split('/')[:-1]
     }
     if all(entry.companion for entry in fitting.values()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msg_adapters.inputs import inputs_of
+from msg_adapters.inputs import inputs_of, InputTopic
 
 from ..simulation.scene import Scene
 from ..trackers import SYSTEMS
@@ -17,7 +17,10 @@ from .writer import BagWriter
 def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) -> ConversionReport:
     """Write measurements and truth, in the order of reception. Raises `BagError`."""
     report = ConversionReport(Path(out))
-    inputs = {entry.measurement: entry for system in SYSTEMS for entry in inputs_of(system)}
+    inputs: dict[type, InputTopic] = {}
+    for system in SYSTEMS:
+        for entry in inputs_of(system):
+            inputs.setdefault(entry.measurement, entry)
     records: list[Record] = []
     for one in scene.measurements:
         entry = inputs[type(one.measurement)]

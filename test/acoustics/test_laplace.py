@@ -79,14 +79,6 @@ def test_the_slope_is_the_derivative():
         assert np.allclose((ends[0] - ends[1]) / 2e-5, slope, rtol=1e-5)
 
 
-def test_moments_of_q_are_those_of_samples():
-    rng = np.random.default_rng(1)
-    q = rng.exponential(size=400_000) * rng.gamma(8, size=400_000)
-    mean, variance = laplace.moments_of_q(8)
-    assert q.mean() == pytest.approx(mean, rel=0.01)
-    assert q.var() == pytest.approx(variance, rel=0.02)
-
-
 @pytest.mark.parametrize('staves', [2, 3, 8, 17])
 def test_the_form_is_that_of_the_covariance(staves):
     rng = np.random.default_rng(staves)

@@ -12,16 +12,16 @@ from scipy.stats import chi2
 from sonar_imm.estimation import kalman
 from sonar_imm.estimation.consistency import (
     average_bounds,
-    coverage_bounds,
     gospa,
     identity_switches,
     innovation_autocorrelation,
     interval_coverage,
     nees,
     nis,
-    normal_interval,
     ospa,
     rmse,
+    switches_by_scan,
+    switching_gospa,
 )
 
 
@@ -49,15 +49,11 @@ def test_average_bounds_hold_as_often_as_they_say():
 def test_coverage_of_honest_and_of_boastful_intervals():
     rng = np.random.default_rng(2)
     truth = rng.normal(size=2000)
-    low, high = coverage_bounds(2000, 0.9)
-    assert (
-        low
-        <= interval_coverage(truth, *normal_interval(np.zeros(2000), np.ones(2000), 0.9))
-        <= high
-    )
-    assert (
-        interval_coverage(truth, *normal_interval(np.zeros(2000), 0.5 * np.ones(2000), 0.9)) < low
-    )
+    half = np.full(2000, 1.6449)  # 90 % of a standard normal
+    spread = np.sqrt(0.9 * 0.1 / 2000)
+    assert interval_coverage(truth, -half, half) == pytest.approx(0.9, abs=4.0 * spread)
+    boastful = interval_coverage(truth, -0.5 * half, 0.5 * half)
+    assert boastful == pytest.approx(0.5892, abs=4.0 * np.sqrt(0.59 * 0.41 / 2000))
     assert np.isnan(interval_coverage(np.empty(0), np.empty(0), np.empty(0)))
 
 
@@ -204,3 +200,16 @@ def test_nonsense_is_refused(arguments):
 )
 def test_identity_switches(ids, switches):
     assert identity_switches(np.array(ids)) == switches
+
+
+def test_a_switch_counts_at_the_scan_where_the_other_track_appears():
+    ids = np.array([[1, 5], [-1, 5], [2, 5], [2, 6], [1, -1]])
+    assert switches_by_scan(ids).tolist() == [0, 0, 1, 1, 1]
+    assert switches_by_scan(np.empty((0, 2), int)).tolist() == []
+
+
+def test_switching_gospa_is_the_root_mean_square_with_a_penalty_for_each_switch():
+    distance, switches = np.array([3.0, 4.0]), np.array([0, 2])
+    assert switching_gospa(distance, switches * 0, 5.0) == pytest.approx(np.sqrt(12.5))
+    assert switching_gospa(distance, switches, 5.0) == pytest.approx(np.sqrt(37.5))
+    assert np.isnan(switching_gospa(np.empty(0), np.empty(0, int), 5.0))

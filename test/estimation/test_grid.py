@@ -146,3 +146,13 @@ def test_the_smoother_is_the_sum_over_all_paths():
     assert grid.smooth_densities(density, ASYMMETRIC, sigma, log_likelihood) == pytest.approx(
         total
     )
+
+
+@pytest.mark.parametrize('sigma', [0.05, 0.3, 0.49])
+def test_a_walk_narrower_than_a_cell_keeps_its_variance(sigma):
+    W = grid.walk_matrix(9, sigma)
+    place = np.arange(9) - 4
+    assert W[4] @ np.square(place) == pytest.approx(sigma**2) and W[4].sum() == pytest.approx(1.0)
+    out, scratch = np.empty(9), np.empty((7, 144))
+    grid_kernels.walk(np.eye(9)[4], 0, 9, sigma, scratch, out, 0, 9)
+    assert out == pytest.approx(W[4], abs=1e-15)

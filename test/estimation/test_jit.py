@@ -52,9 +52,10 @@ def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path)
     code = """
 import numpy as np
 from sonar_imm.estimation import imm_particles_kernels as imm
-from sonar_imm.trackers.bathymetry.kernels import Geometry, sines_of
+from sonar_imm.trackers.bathymetry.kernels import sines_of
+from sonar_imm.trackers.bathymetry.swath import level_geometry
 out = np.empty(1)
-sines_of(np.zeros(1), 2.0, Geometry(1.0, 1.0, 0.0, 0.5), np.empty((2, 1)), out)
+sines_of(np.zeros(1), 0, level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5), np.empty((2, 1)), out)
 mixed, c = np.empty((2, 1, 1)), np.empty(2)
 scratch = imm.MixScratch(np.empty((2, 1)), np.empty(1), np.empty(2, np.int64))
 imm.mix(np.array([[[3.0]], [[4.0]]]), np.ones((2, 1)), np.array([1.0, 1e-9]), np.eye(2),
@@ -81,9 +82,11 @@ def edit(path, old, new):
 def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypatch):
     code = """
 import numpy as np
-from sonar_imm.trackers.bathymetry.kernels import Geometry, sines_of
+from sonar_imm.trackers.bathymetry.kernels import sines_of
+from sonar_imm.trackers.bathymetry.swath import level_geometry
+geometry = level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5)
 try:
-    sines_of(np.zeros(1), 2.0, Geometry(1.0, 1.0, 0.0, 0.5), np.empty((1, 2)), np.empty(1)[:0])
+    sines_of(np.zeros(1), 0, geometry, np.empty((1, 2)), np.empty(1)[:0])
     print('unchecked')
 except IndexError:
     print('checked')

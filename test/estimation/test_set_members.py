@@ -7,11 +7,11 @@ from sonar_imm.estimation.set_members import find_members
 
 
 def hills(*places):
-    sums = np.zeros((4, 100))
+    sums = np.zeros((5, 100))
     for place, mass, amplitude in places:
         shape = mass * np.exp(-0.5 * (np.arange(100) - place) ** 2)
         shape *= mass / shape.sum()
-        sums += shape * np.array([[1.0], [amplitude], [amplitude**2 + 0.25], [place]])
+        sums += shape * np.array([[1.0], [amplitude], [amplitude**2 + 0.25], [place], [0.5]])
     return sums
 
 
@@ -21,6 +21,7 @@ def test_each_hill_is_a_member():
     assert found.amplitude[:2] == pytest.approx([5.0, 2.0])
     assert found.existence[:2] == pytest.approx([0.9, 0.6], abs=1e-3)
     assert found.prior_variance[:2] == pytest.approx([20.0, 70.0])
+    assert found.foremost[:2] == pytest.approx([0.45, 0.3], abs=1e-3)
     assert found.covariance[0] == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.25]]), abs=0.01)
 
 
@@ -28,12 +29,12 @@ def test_no_more_than_asked_and_none_that_is_not_believed():
     sums = hills((20, 0.9, 5.0), (50, 0.3, 1.0), (70, 0.6, 2.0))
     assert len(find_members(sums, 10, 2, 0.0).place) == 2
     assert find_members(sums, 10, 9, 0.5).place == pytest.approx([20.0, 70.0], abs=0.01)
-    assert len(find_members(np.zeros((4, 100)), 10, 9, 0.0).place) == 0
+    assert len(find_members(np.zeros((5, 100)), 10, 9, 0.0).place) == 0
 
 
 def test_a_member_at_the_edge_and_a_separation_of_one():
-    sums = np.zeros((4, 4))
-    sums[:, 0] = 0.8, 0.8, 0.9, 1.6
+    sums = np.zeros((5, 4))
+    sums[:, 0] = 0.8, 0.8, 0.9, 1.6, 0.4
     found = find_members(sums, 1, 3, 0.1)
     assert found.place == pytest.approx([0.0])
     assert found.existence == pytest.approx([0.8])

@@ -9,16 +9,9 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
-from sonar_imm.estimation.set_particles import (
-    banded_transition,
-    gaussian_move,
-    propagate,
-    propose,
-    SetModel,
-    Sets,
-    start,
-    weigh,
-)
+from sonar_imm.estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
+from sonar_imm.estimation.set_particles import propagate, propose, start, weigh
+from sonar_imm.estimation.set_shifts import Shift
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
 EXACT_LOG_EVIDENCE = 298.6663117
@@ -101,7 +94,9 @@ def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch)
     else:
         births = set_filter.propose_births
         monkeypatch.setattr(
-            set_filter, 'propose_births', lambda *a: (births(*a)[0], np.zeros(model.cells))
+            set_filter,
+            'propose_births',
+            lambda *a: (births(*a)[0], np.zeros((1, model.cells)), births(*a)[2]),
         )
     assert variation(run(model, exact['B'], 5000, seed=1)[0], exact) > 0.03
 
@@ -143,6 +138,9 @@ def test_a_record_has_random_numbers_of_its_own(model, exact):
         {'amplitude_prior': 'bic_half'},
         {'amplitude_prior': 'paper'},
         {'amplitude_memory': 0.9},
+        {'negative_probability': 0.3},
+        {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3},
+        {'shift': Shift(std=1.5, memory=0.9)},
         {'transition': banded_transition(3, 0.3), 'order_min': 0},
     ],
 )
@@ -150,22 +148,25 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     changed = evolve(model, **change)
     tracker, N = SetFilter(changed, 400), 400
     rng = np.random.default_rng(1)
-    b = exact['B'][3]
+    b = np.pad(exact['B'][3], changed.pad)
     before = tracker._start(b, (1, 2))
     uniform = np.random.Generator(
         np.random.Philox(
             key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64)
         )
-    ).random((N, 1 + changed.order_max))
+    ).random((N, 1 + changed.order_max + (changed.shift is not None)))
     sets, ratio = start(changed, propose(changed, b), uniform)
     assert np.allclose(before.log_weight, ratio)
     possible = np.isfinite(ratio)
     assert np.array_equal(before.sets.cell[possible], sets.cell[possible])
+    assert np.array_equal(before.sets.sign[possible], sets.sign[possible])
+    assert np.array_equal(before.sets.shift, sets.shift)
+    assert (len(np.unique(sets.shift)) > 3) == (changed.shift is not None)
+    assert (len(np.unique(sets.sign)) == 2) == (changed.negative_probability > 0.0)
 
-    sets = Sets(
-        *before.sets[:2],
-        rng.uniform(-1.0, 3.0, before.sets.cell.shape),
-        rng.uniform(0.5, 4.0, before.sets.cell.shape),
+    sets = before.sets._replace(
+        prior_mean=rng.uniform(-1.0, 3.0, before.sets.cell.shape),
+        prior_variance=rng.uniform(0.5, 4.0, before.sets.cell.shape),
     )
     moved, ratio = tracker._propagate(sets, b, np.random.default_rng(8))
     expected, wanted = propagate(
@@ -181,6 +182,8 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     for i in np.flatnonzero(possible):
         m = moved.order[i]
         assert np.array_equal(moved.cell[i, :m], expected.cell[i, :m])
+        assert np.array_equal(moved.sign[i, :m], expected.sign[i, :m])
+        assert moved.shift[i] == expected.shift[i]
         if changed.amplitude_memory:
             assert np.array_equal(moved.prior_mean[i, :m], expected.prior_mean[i, :m])
 
@@ -307,6 +310,7 @@ def test_models_that_cannot_be_are_refused(model):
     for change in (
         {'amplitude_prior': 'flat'},
         {'separation': 40},
+        {'negative_probability': 1.0},
         {'amplitude_prior': 'paper', 'amplitude_memory': 0.5},
         {'transition': np.ones((3, 3))},
     ):

@@ -81,6 +81,15 @@ def test_refused_messages_are_counted_with_their_reason(tmp_path):
     assert sum(advanced) == run.total == run.messages == 120
 
 
+def test_repaired_covariances_are_told_with_the_counts(tmp_path, monkeypatch):
+    with BagReader(write_dive(tmp_path / 'dive')) as bag:
+        run = OfflineRun(bag, DIVER, CONFIG)
+        list(run.estimates())
+        assert 'covariance_repairs' not in run.outcomes()
+        monkeypatch.setattr(run.tracker, 'health', lambda: {'covariance_repairs': 3})
+        assert run.outcomes() == {'covariance_repairs': 3, 'used': 120}
+
+
 def test_the_expected_frame_refuses_the_others(tmp_path):
     with BagReader(write_dive(tmp_path / 'dive')) as bag:
         run = OfflineRun(bag, DIVER, CONFIG, InputOptions(frame_id='odom'))

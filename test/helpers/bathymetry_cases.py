@@ -31,7 +31,7 @@ def vector(name):
     elif name.startswith('set_iii'):
         sigmas = [float(case['sigma1_deg']), *case['sigma2_deg'].tolist()]
         values |= {'model_set': 'angle_two_rw', 'sigmas_deg': sigmas}
-        values['initial_mean'] = float(case['th0'])
+        values |= {'initial_mean': float(case['th0']), 'angle_drift': False}
     else:
         values |= {
             'model_set': 'height_rw_ncs',

@@ -3,7 +3,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from msg_adapters.arrivals import read_arrivals, REQUIRED, write_arrivals
+from msg_adapters.arrivals import COLUMNS, read_arrivals, REQUIRED, write_arrivals
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import Arrivals, Rejection
 from sonar_imm.recordings.messages import ros_message
@@ -68,6 +68,24 @@ def test_variances_that_are_none_become_unknown():
     variances = np.float32([1e-6, 0.0, -1.0, np.nan, np.inf])
     arrivals = read_arrivals(message(rows=5, var_toa=variances))
     assert arrivals.var_toa[0] == np.float32(1e-6) and np.isnan(arrivals.var_toa[1:]).all()
+
+
+def test_elevation_and_depth_come_and_go_and_degrees_are_refused():
+    told = {
+        'elevation': np.array([-0.2, np.nan, 0.1]),
+        'var_elevation': np.float32([1e-4, np.nan, 2e-4]),
+        'depth': np.array([11.0, 11.0, np.inf]),
+        'var_depth': np.float32([0.04, 0.04, 0.0]),
+    }
+    arrivals = read_arrivals(message(**told))
+    again = read_arrivals(write_arrivals(arrivals, ros_message))
+    for one in (arrivals, again):
+        np.testing.assert_array_equal(one.elevation, told['elevation'])
+        np.testing.assert_array_equal(one.depth, [11.0, 11.0, np.nan])
+        np.testing.assert_array_equal(one.var_depth, np.float32([0.04, 0.04, np.nan]))
+        np.testing.assert_array_equal(one.var_elevation, told['var_elevation'])
+    assert np.isnan(read_arrivals(message()).depth).all()
+    assert reason(elevation=np.array([0.1, 45.0, 0.1])) == 'out_of_range'
 
 
 def test_bearings_are_wrapped_and_degrees_are_refused():
@@ -137,7 +155,7 @@ NASTY = np.array(
         -np.inf,
     ]
 )
-ALL = (*REQUIRED, 'var_toa', 'bearing', 'var_bearing')
+ALL = COLUMNS
 
 
 @given(

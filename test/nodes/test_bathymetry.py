@@ -2,17 +2,22 @@
 
 import time
 
+from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import JointState, PointCloud2
 
 from msg_adapters.estimates import read_estimate
+from msg_adapters.navigation import write_navigation
 from msg_adapters.snapshots import write_snapshot
+from msg_adapters.soundings import read_soundings
 from msg_adapters.table import encode_table
+from sonar_imm.measurements import Navigation
 from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.soundings import soundings_of
 
 SHORT = {'pings': 3, 'last_range': 24.0}
 
@@ -162,3 +167,48 @@ def test_two_sides_are_two_nodes(make_bench):
     publisher.publish(write_snapshot(pings(pings=1)[0][0], make))
     bench.spin_until(lambda: tables)
     assert (read_estimate(tables[0]).xyz[20:, 1] > 0.0).all()
+
+
+def test_with_navigation_soundings_and_shares_are_published(make_bench):
+    """One node for both sides; what `~/soundings` says is what the offline table holds."""
+    bench = make_bench('-p', 'max_wait:=0.0', '-p', 'navigation:=required')
+    node = bench.add(BathymetryNode(context=bench.context))
+    tables = bench.listen(PointCloud2, '/bathymetry/estimate', lockstep_qos())
+    clouds = bench.listen(PointCloud2, '/bathymetry/soundings', lockstep_qos())
+    shares = bench.listen(JointState, '/bathymetry/model_probabilities', lockstep_qos())
+    types = {'port/snapshot': PointCloud2, 'starboard/snapshot': PointCloud2, 'nav': Odometry}
+    publishers = {
+        name: bench.peer.create_publisher(kind, f'/{name}', lockstep_qos())
+        for name, kind in types.items()
+    }
+    outputs = ('estimate', 'soundings', 'model_probabilities')
+    bench.spin_until(
+        lambda: (
+            all(one.get_subscription_count() for one in publishers.values())
+            and all(node.count_subscribers(f'/bathymetry/{name}') for name in outputs)
+        )
+    )
+    values = {'pings': 2, 'ping_rate': 10.0, 'last_range': 24.0}
+    scene = simulate(scenario('moving_two_sides', values), 3)
+    received = node._meter.received
+    for item in scene.measurements:
+        before = received.total()
+        if isinstance(item.measurement, Navigation):
+            publishers['nav'].publish(write_navigation(item.measurement, make))
+        else:
+            message = write_snapshot(item.measurement, make)
+            publishers[f'{item.namespace}/snapshot'].publish(message)
+        bench.spin_until(lambda want=before: received.total() > want)
+    bench.spin_until(lambda: len(tables) == len(clouds) == len(shares) == 4)
+    for table, cloud, share in zip(tables, clouds, shares):
+        estimate = read_estimate(table)
+        expected = soundings_of(estimate)
+        found = read_soundings(cloud)
+        assert found.frame_id == 'map' and len(found) == len(expected) > 100
+        for name, column in expected.columns.items():
+            np.testing.assert_array_equal(found.columns[name], column)
+        assert list(share.name) == ['rw_smooth', 'rw_rough']
+        assert sum(share.position) == pytest.approx(1.0)
+        labels = estimate.extras['label'][estimate.extras['valid'] > 0]
+        assert share.position[1] == pytest.approx(labels.mean())
+    assert {int(read_soundings(cloud).columns['side'][0]) for cloud in clouds} == {0, 1}

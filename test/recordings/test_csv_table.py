@@ -93,7 +93,7 @@ def test_a_stated_unit_and_an_offset_are_used(table):
         ('1e400', 'time unit'),
         ('nan', 'not a time'),
         ('inf', 'time unit'),
-        ('2019-13-45T00:00:00', 'month'),
+        ('2019-13-45T00:00:00', 'calendar'),
         ('1e9999999999', ''),
     ],
 )
@@ -151,3 +151,32 @@ def test_any_bytes_give_rows_bad_rows_or_a_bag_error(tmp_path_factory, content):
                 assert str(error)
     except BagError as error:
         assert error.sentence
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'stamp,x\n\x00\x01\x02',
+        b'\x89PNG\r\n\x1a\n' + bytes(range(256)),
+        b'\xff\xfe\xfd' * 99,
+        b'PK\3\4',
+    ],
+)
+def test_a_file_that_is_no_text_is_no_table(table, content):
+    with pytest.raises(BagError, match='no text'):
+        table(content)
+
+
+def test_a_byte_of_another_alphabet_is_text(table):
+    assert table(b'time,east,note\n5,1,M\xfcnchen\n').has('stamp', 'x')
+
+
+@pytest.mark.parametrize('header', ['Latitude_deg,lon [deg]', 'GPS Lat,GPS Long', 'lat_dd,lon_dd'])
+def test_degrees_are_recognised(table, header):
+    assert table(header + '\n').has('latitude', 'longitude')
+
+
+def test_an_impossible_date_is_told_in_our_words(table):
+    (row,) = table('time\n2024-13-40T10:00:00\n')
+    with pytest.raises(BadRow, match='no date and time of the calendar'):
+        row.stamp_ns()

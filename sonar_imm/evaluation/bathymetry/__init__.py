@@ -9,8 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import functools
 import math
+from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from attrs import evolve
+import numpy as np
+
+from ...estimates import Estimate
+from ...soundings import SIDES
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_truth, RunFolder
 from .profiles import profiles_of, Swath
@@ -28,31 +34,44 @@ default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     """Score the floors of `folder`. Raises `BagError` when they or the truth cannot be read."""
     run = folder.read_run()
-    truth = read_truth(run, options.truth_bag, truth_topic(run))
+    truth: list[Estimate] = []
+    for topic, side in truth_topics(run).items():
+        for one in read_truth(run, options.truth_bag, topic) or []:
+            sided = {} if side is None else {'side': np.full(len(one), side, np.uint8)}
+            truth.append(evolve(one, extras={**one.extras, **sided}))
     swath = profiles_of(folder.read_estimates(), truth)
     metrics = score(swath)
     return Judgement(
         metrics=metrics,
         summary=summary_sentence(metrics),
         lines=tuple(lines(metrics)),
-        part=functools.partial(_part, run, metrics, swath),
+        part=functools.partial(_part, folder.path, run, metrics, swath),
         accuracy=functools.partial(_accuracy, metrics),
     )
 
 
-def truth_topic(run: Mapping[str, Any]) -> str:
-    """Where the truth of a run lies: ``/port/snapshot`` belongs to ``/truth/port/estimate``."""
-    tracked = next(iter(run['topics']))
-    return f'/truth{tracked.rpartition("/")[0]}/estimate'
+def truth_topics(run: Mapping[str, Any]) -> dict[str, int | None]:
+    """Where the truth of a run lies, and of which side: ``/port/snapshot`` belongs to
+    ``/truth/port/estimate``. None: the input has one side only."""
+    sides = {f'{side}/snapshot': number for number, side in enumerate(SIDES)}
+    return {
+        f'/truth{topic.rpartition("/")[0]}/estimate': sides.get(name)
+        for topic, name in run['topics'].items()
+        if name.endswith('snapshot')
+    }
 
 
 def _part(
-    run: Mapping[str, Any], metrics: Mapping[str, Any], swath: Swath, checks: Sequence[Check]
+    folder: Path,
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    swath: Swath,
+    checks: Sequence[Check],
 ) -> Part:
     # plotly, which only a report needs, takes a second to load.
     from .sections import bathymetry_part
 
-    return bathymetry_part(run, metrics, swath, checks)
+    return bathymetry_part(folder, run, metrics, swath, checks)
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:

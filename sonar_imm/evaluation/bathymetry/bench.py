@@ -97,7 +97,8 @@ def bench_scaling(rounds: int = 7) -> dict[str, Any]:
     variants: dict[str, tuple[dict[str, Any], Snapshot]] = {}
     for M in (1, 2, 4, 8):
         sigmas = tuple(np.geomspace(0.01, 1.0, M).tolist())
-        variants[f'M = {M}'] = {'model_set': 'height_bank', 'sigmas': sigmas}, ping
+        bank = {'model_set': 'height_bank', 'sigmas': sigmas, 'engine': 'particles'}
+        variants[f'M = {M}'] = bank, ping
     for N in (50, 100, 300, 1000):
         variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
     for P in (2, 4, 8, 16, 32):

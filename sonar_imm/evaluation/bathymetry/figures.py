@@ -136,8 +136,8 @@ def models_figure(profile: Profile, names: Iterable[str]) -> go.Figure:
 
 def segmentation_figure(swath: Swath) -> go.Figure:
     """Probability of rough floor over pings and range, with the ends of the true patches."""
-    pings = thin(len(swath.profiles), 400)
-    profiles = swath.profiles[pings]
+    one_side = [one for one in swath.profiles if one.side == swath.profiles[0].side]
+    profiles = one_side[thin(len(one_side), 400)]
     longest = max(profiles, key=lambda profile: len(profile.range))
     bins = thin(len(longest.range), 600)
     ranges = longest.range[bins]

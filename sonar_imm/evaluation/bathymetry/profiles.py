@@ -9,6 +9,7 @@ import numpy as np
 
 from ...estimates import Estimate
 from ...estimation.arrays import BoolArray, FloatArray
+from ...soundings import SIDES
 
 FAR = 0.55
 """Share of a bin by which the range of the true floor may differ from that of the estimate: half a
@@ -29,7 +30,9 @@ class TrueFloor:
 @frozen(eq=False)
 class Profile:
     """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
-    probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown."""
+    probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown;
+    side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
+    the estimate itself says it, as those of a bank do."""
 
     stamp_ns: int
     range: FloatArray
@@ -40,6 +43,8 @@ class Profile:
     heard: BoolArray
     probabilities: FloatArray
     truth: TrueFloor | None
+    side: str = ''
+    rough: FloatArray | None = None
 
 
 @frozen(eq=False)
@@ -52,18 +57,24 @@ class Swath:
 
     def roughness(self, profile: Profile) -> FloatArray:
         """Probability (n,) that the floor is rough; NaN when no model means rough floor."""
+        if profile.rough is not None:
+            return profile.rough
         if not self.rough.any():
             return np.full(len(profile.range), np.nan)
         return profile.probabilities[:, self.rough].sum(axis=1)
 
 
 def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None) -> Swath:
-    """The estimates of a run, each with the truth of the same stamp."""
-    known = {one.stamp_ns: one for one in truth or ()}
+    """The estimates of a run, each with the truth of the same stamp and side."""
+    known = {(one.stamp_ns, one.source): one for one in truth or ()}
     profiles, names = [], ()
     for estimate in estimates:
         names = estimate.model_names
-        profiles.append(profile_of(estimate, known.get(estimate.stamp_ns)))
+        # A single side that is no namespace: its truth names no side.
+        single = known.get((estimate.stamp_ns, 0))
+        profiles.append(
+            profile_of(estimate, known.get((estimate.stamp_ns, estimate.source), single))
+        )
     return Swath(tuple(profiles), names, rough_models(names))
 
 
@@ -77,23 +88,30 @@ def rough_models(names: tuple[str, ...]) -> BoolArray:
 
 
 def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
-    """One ping; the state is a height or an angle, and the other one follows from it."""
+    """One ping; the state is a height or an angle, and the other one follows from it. With
+    navigation the stated error is that of the soundings: pose and sound speed are in it."""
     ranges, height, angle = (_column(estimate, name) for name in ('range', 'height', 'angle'))
     std = np.sqrt(estimate.covariance[:, 0, 0])
     # A small angle moves the point along the circle around the sonar: dh = |y| d(angle).
     arm = np.abs(estimate.xyz[:, 1].astype(np.float64))
     arm = np.where(arm > 0.0, arm, np.nan)
     in_angle = estimate.state_names[0] == 'angle'
+    height_std = std * arm if in_angle else std
+    if 'vertical_uncertainty' in estimate.extras:
+        arm = np.abs(ranges * np.sin(_column(estimate, 'beam_angle')))
+        height_std = np.sqrt(_column(estimate, 'vertical_uncertainty'))
     return Profile(
         stamp_ns=estimate.stamp_ns,
         range=ranges,
         height=height,
-        height_std=std * arm if in_angle else std,
+        height_std=height_std,
         angle=angle,
         angle_std=std if in_angle else std / arm,
         heard=estimate.extras['valid'].astype(bool),
         probabilities=estimate.probabilities,
         truth=None if truth is None else true_floor(truth, ranges),
+        rough=_column(estimate, 'rough') if 'rough' in estimate.extras else None,
+        side=SIDES[estimate.source] if 'side' in estimate.extras else '',
     )
 
 

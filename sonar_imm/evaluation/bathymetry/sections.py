@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ...measurements import Snapshot
@@ -12,13 +13,17 @@ from ..judging import Check
 from ..page import Card, Part, Section
 from ..report import run_part
 from ..run_folder import read_measurements
-from . import figures
+from . import chart, figures
 from .profiles import Profile, Swath
 from .summary import percent, summary_sentence
 
 
 def bathymetry_part(
-    run: Mapping[str, Any], metrics: Mapping[str, Any], swath: Swath, checks: Sequence[Check]
+    folder: Path,
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    swath: Swath,
+    checks: Sequence[Check],
 ) -> Part:
     """The whole part of one run, `checks` first."""
     return run_part(
@@ -27,7 +32,7 @@ def bathymetry_part(
         checks,
         summary=summary_sentence(metrics),
         cards=_cards(metrics),
-        sections=_sections(run, swath),
+        sections=[*_sections(run, swath), *_chart(folder, run)],
     )
 
 
@@ -116,9 +121,27 @@ def _sections(run: Mapping[str, Any], swath: Swath) -> list[Section]:
     return sections
 
 
+def _chart(folder: Path, run: Mapping[str, Any]) -> list[Section]:
+    """The chart of the soundings; nothing without navigation."""
+    points = chart.points_of(folder)
+    if points is None:
+        return []
+    grid = chart.chart_of(points)
+    return [
+        Section(
+            'Chart',
+            f'{len(points)} soundings in cells of {grid.cell:g} m, as `sonar-imm export` writes '
+            'them; north is up. Dark line: the ship.',
+            chart.chart_figure(grid, chart.track_of(run)),
+        )
+    ]
+
+
 def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
     """The samples of one ping, None when the recording is gone."""
     for one in read_measurements(run):
-        if one.stamp_ns == profile.stamp_ns and len(one) == len(profile.range):
+        if not isinstance(one, Snapshot) or one.stamp_ns != profile.stamp_ns:
+            continue
+        if len(one) == len(profile.range) and profile.side in ('', one.side):
             return one
     return None

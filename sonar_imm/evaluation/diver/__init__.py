@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from ...estimates import Estimate
-from ...measurements import Fix
+from ...measurements import Fix, Fixes
 from ...recordings.sources import BagError
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_measurements, read_truth, RunFolder
@@ -38,7 +38,7 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     run = folder.read_run()
     series = _series(folder.read_estimates(), folder.path)
     truth = _truth(run, options)
-    fixes = [one for one in read_measurements(run) if isinstance(one, Fix)]
+    fixes = [one for one in read_measurements(run) if isinstance(one, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics = score(series, truth, fixes=raw, cutoff=cutoff)

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from ...estimation.consistency import gospa
-from ...measurements import Fix
+from ...estimation.consistency import gospa, switches_by_scan, switching_gospa
+from ...measurements import Fix, Fixes, scan_of
 from .. import SECOND
 from ..numbers import chi2_summary, error_summary, nis_summary, usable_nees
 from .matching import match, Matching, track_summary
@@ -71,19 +71,21 @@ def score(
     return metrics
 
 
-def fix_series(fixes: Iterable[Fix]) -> Series:
+def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
     """Fixes as a series without tracks: every row has track id 0, no velocity, no models."""
-    ordered = sorted(fixes, key=lambda fix: fix.stamp_ns)
-    n = len(ordered)
-    stamp_ns = np.array([fix.stamp_ns for fix in ordered], np.int64)
+    ordered = [scan_of(one) for one in sorted(fixes, key=lambda fix: fix.stamp_ns)]
+    counts = [len(scan) for scan in ordered]
+    stamps = np.array([scan.stamp_ns for scan in ordered], np.int64)
+    n = sum(counts)
     state, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
-    for row, fix in enumerate(ordered):
-        state[row, :2] = fix.position[:2]
-        if fix.covariance is not None:
-            covariance[row, :2, :2] = fix.covariance
+    for scan, start in zip(ordered, np.cumsum([0, *counts])):
+        rows = slice(start, start + len(scan))
+        state[rows, :2] = scan.position[:, :2]
+        if scan.covariance is not None:
+            covariance[rows, :2, :2] = scan.covariance
     return Series(
-        scan_ns=np.unique(stamp_ns),
-        stamp_ns=stamp_ns,
+        scan_ns=np.unique(stamps),
+        stamp_ns=np.repeat(stamps, counts),
         track_id=np.zeros(n, np.int64),
         track_state=np.ones(n, np.int64),
         state=state,
@@ -139,7 +141,8 @@ def model_summary(series: Series) -> dict[str, Any]:
 
 
 def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, float]:
-    """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and its parts."""
+    """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and its parts; and the same of the
+    run as a whole with half of the cutoff for each identity switch."""
     series, states = matching.series, truth.at(matching.scan_ns)
     starts = np.searchsorted(series.stamp_ns, matching.scan_ns, side='left')
     ends = np.searchsorted(series.stamp_ns, matching.scan_ns, side='right')
@@ -152,6 +155,12 @@ def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, 
     half = 0.5 * cutoff**2
     return {
         'mean_m': float(np.mean([part.distance for part in parts])),
+        'rms_m': float(np.sqrt(np.mean([part.distance**2 for part in parts]))),
+        'with_switches_m': switching_gospa(
+            np.array([part.distance for part in parts]),
+            switches_by_scan(matching.followed_by.T),
+            0.5 * cutoff,
+        ),
         'missed_per_scan': float(np.mean([part.missed for part in parts])) / half,
         'false_per_scan': float(np.mean([part.false for part in parts])) / half,
     }

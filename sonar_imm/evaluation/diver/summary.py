@@ -22,17 +22,20 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
     sentences = [f'On average the track lies {position["rmse_m"]:.2f} m from the truth (RMS).']
     raw = metrics.get('raw_fix', {})
     if raw.get('n'):
-        change = 1.0 - position['rmse_m'] / raw['rmse_m']
-        sentences.append(
-            f'The raw fixes lie {raw["rmse_m"]:.2f} m away: tracking '
-            + (
-                f'removes {100 * change:.0f} % of the error.'
-                if change >= 0.0
-                else f'adds {-100 * change:.0f} % to it.'
-            )
-        )
+        sentences.append(_against_fixes(position['rmse_m'], raw['rmse_m']))
     sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
     return ' '.join(sentences)
+
+
+def _against_fixes(tracked: float, raw: float) -> str:
+    if not raw > 0.0:
+        return 'The raw fixes are the truth itself: no tracker can be better than they are.'
+    change = 1.0 - tracked / raw
+    return f'The raw fixes lie {raw:.2f} m away: tracking ' + (
+        f'removes {100 * change:.0f} % of the error.'
+        if change >= 0.0
+        else f'adds {-100 * change:.0f} % to it.'
+    )
 
 
 def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -11,7 +11,8 @@ Two kinds of file are understood:
   such column, are one ping.
 
 Optional in both: ``var_toa`` or ``std_toa``, ``bearing`` [rad] with ``var_bearing`` or
-``std_bearing``.
+``std_bearing``, ``elevation`` [rad, up positive] and ``depth`` [m, down positive, the diver's own
+report] likewise.
 """
 
 from __future__ import annotations
@@ -48,6 +49,10 @@ class _Arrival(NamedTuple):
     var_toa: float
     bearing: float
     var_bearing: float
+    elevation: float
+    var_elevation: float
+    depth: float
+    var_depth: float
 
 
 def convert_arrivals(
@@ -141,6 +146,10 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
         default if math.isnan(var_toa) else var_toa,
         row.optional('bearing'),
         _variance(row, 'bearing'),
+        row.optional('elevation'),
+        _variance(row, 'elevation'),
+        row.optional('depth'),
+        _variance(row, 'depth'),
     )
 
 
@@ -178,6 +187,10 @@ def _one_ping(
         var_toa=[arrival.var_toa for arrival in ping],
         bearing=[arrival.bearing for arrival in ping],
         var_bearing=[arrival.var_bearing for arrival in ping],
+        elevation=[arrival.elevation for arrival in ping],
+        var_elevation=[arrival.var_elevation for arrival in ping],
+        depth=[arrival.depth for arrival in ping],
+        var_depth=[arrival.var_depth for arrival in ping],
     )
 
 

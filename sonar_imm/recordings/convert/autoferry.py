@@ -2,8 +2,8 @@
 
 A record holds one scan of one sensor. ``measurement`` is 2 x M, north then east relative to the
 own ship (a flat pair for M = 1, empty for none). ``ownshipPosition`` is north and east of the own
-ship. Records are not sorted by time. Every detection becomes a fix; those of one scan share its
-stamp. A scan without detections gives no message. Infrared and camera (bearings only) are not
+ship. Records are not sorted by time. Every record becomes a scan of fixes, also one without
+detections: that nothing was seen is evidence too. Infrared and camera (bearings only) are not
 converted. The targets are boats, not divers.
 """
 
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_adapters.fixes import write_fix
+from msg_adapters.scans import write_scan
 
-from ...measurements import Fix, Rejection
+from ...measurements import Fixes, Rejection
 from ...simulation.scene import TrueTrack
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import BadRow
@@ -39,14 +39,16 @@ def convert_autoferry(
     truth: str | Path | None = None,
     sensors: Collection[str] = ('radar',),
     std: float | None = None,
+    time_offset_ns: int = 0,
     frame_id: str = 'map',
     storage: str = 'mcap',
 ) -> ConversionReport:
-    """Convert the detections of a scenario (JSON) to the topic ``/fix``, east-north-up.
+    """Convert the detections of a scenario (JSON) to the topic ``/fixes``, east-north-up.
 
     truth: the scenario's ground truth (JSON) for ``/truth/estimate``, velocity by central
     differences; sensors: of radar, lidar; std: standard deviation [m] on each axis to state in the
-    fixes, None to leave the covariance open, because the data set states none.
+    fixes, None to leave the covariance open, because the data set states none; time_offset_ns:
+    added to the stamps of the detections, not of the truth.
     Raises `BagError` for a file of another kind.
     """
     if unknown := [name for name in sensors if name not in SENSORS]:
@@ -62,15 +64,14 @@ def convert_autoferry(
         try:
             if record['sensorID'] not in numbers:
                 continue
-            stamp = _stamp_ns(record['time'])
-            for east, north in _east_north(record):
-                fix = Fix(
-                    stamp_ns=stamp,
-                    position=(east, north, 0.0),
-                    covariance=covariance,
-                    frame_id=frame_id,
-                )
-                records.append((stamp, '/fix', write_fix(fix, ros_message)))
+            found = _east_north(record)
+            scan = Fixes(
+                stamp_ns=_stamp_ns(record['time'], time_offset_ns),
+                position=np.column_stack([found, np.zeros(len(found))]),
+                covariance=None if covariance is None else np.tile(covariance, (len(found), 1, 1)),
+                frame_id=frame_id,
+            )
+            records.append((scan.stamp_ns, '/fixes', write_scan(scan, ros_message)))
         except (KeyError, TypeError, ValueError) as error:  # covers BadRow and Rejection
             report.bad_row(Path(path), f'record {index}', _why(error))
     if truth is not None:
@@ -121,17 +122,18 @@ def _json_list(path: str | Path) -> list[Any]:
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror}') from None
     except (ValueError, RecursionError) as error:
-        raise BagError(f'{path} is not a JSON file: {error}') from None
+        where = f' from line {error.lineno} on' if isinstance(error, json.JSONDecodeError) else ''
+        raise BagError(f'{path} is not a JSON file{where}') from None
     if not isinstance(content, list):
         raise BagError(f'{path} holds no list of records; is it an Autoferry scenario?')
     return content
 
 
-def _stamp_ns(seconds: Any) -> int:
+def _stamp_ns(seconds: Any, offset_ns: int = 0) -> int:
     """Integer nanoseconds of a JSON time; a double resolves about 0.2 us today."""
     if not isinstance(seconds, (int, float)) or not math.isfinite(seconds):
         raise BadRow(f'the time is {seconds!r}')
-    stamp = round(seconds * 1e9)
+    stamp = round(seconds * 1e9) + offset_ns
     if not 0 < stamp < 2**31 * 10**9:
         raise BadRow(f'the time {seconds!r} does not fit a ROS stamp')
     return stamp
@@ -140,4 +142,6 @@ def _stamp_ns(seconds: Any) -> int:
 def _why(error: Exception) -> str:
     if isinstance(error, (BadRow, Rejection)):
         return str(error)
-    return f'not a record of this data set ({type(error).__name__}: {error})'
+    if isinstance(error, KeyError) and error.args:
+        return f'it has no {error.args[0]}'
+    return 'it is not a record of this data set'

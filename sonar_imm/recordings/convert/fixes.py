@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import math
 from pathlib import Path
 
 import numpy as np
 
 from msg_adapters.fixes import check_size, write_fix
+from msg_adapters.scans import write_scan
 
-from ...measurements import Fix
+from ...measurements import Fix, Fixes, NOBODY
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame
 from ..messages import ros_message
-from .truth import truth_records
+from .truth import number_names, truth_records
 
 
 def convert_fixes(
@@ -28,11 +30,12 @@ def convert_fixes(
     origin: tuple[float, ...] | None = None,
     storage: str = 'mcap',
 ) -> ConversionReport:
-    """Convert a CSV of position fixes to the topic ``/fix``.
+    """Convert a CSV of position fixes to the topic ``/fix``, or ``/fixes`` with identities.
 
     Columns: ``stamp``, ``x`` and ``y`` [m] or ``latitude`` and ``longitude`` [deg]; optional ``z``
-    (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]. A row with
-    empty uncertainties becomes a fix without covariance. Latitudes become metres around `origin`
+    (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; ``id``: whose
+    position it is, a number or a name. A row with empty uncertainties becomes a fix without
+    covariance. Latitudes become metres around `origin`
     (latitude, longitude[, height]), the first good row when None. `truth` is a CSV as in
     `convert_truth`, for the same bag and the same origin.
     """
@@ -41,7 +44,7 @@ def convert_fixes(
     frame = LocalFrame(table, origin)
     report = ConversionReport(Path(out))
 
-    def parse(row: Row) -> Fix:
+    def parse(row: Row) -> tuple[Fix, str]:
         fix = Fix(
             stamp_ns=row.stamp_ns(),
             position=frame.position(row),
@@ -49,16 +52,68 @@ def convert_fixes(
             frame_id=frame_id,
         )
         check_size(fix)
-        return fix
+        return fix, row.text('id')
 
-    records: list[Record] = [
-        (fix.stamp_ns, '/fix', write_fix(fix, ros_message))
-        for _, fix in report.read_rows(table, parse)
-    ]
+    rows = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
+    if _names_divers(table, rows, report):
+        records = _named_scans(rows, report, frame_id)
+    else:
+        records = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for _, fix, _ in rows]
     if truth is not None and records:
         records += truth_records(truth, report, truth_options, frame_id, frame.origin)
     report.notes.update(frame.notes())
     return write_bag(out, records, report, source=Path(path).name, storage=storage)
+
+
+def _names_divers(
+    table: CsvTable, rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport
+) -> bool:
+    """Whether the column ``id`` says whose the rows are. One that is another in most rows numbers
+    the rows."""
+    names = [name for _, _, name in rows if name]
+    if not names:
+        return False
+    if len(names) > 1 and 2 * len(set(names)) > len(names):
+        report.notes['id'] = f'{table.header("id")} changes from row to row and names no diver'
+        return False
+    return True
+
+
+def _named_scans(
+    rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport, frame_id: str
+) -> list[Record]:
+    """Scans of the rows with the same stamp, each with the number of its diver."""
+    numbers = number_names([name for _, _, name in rows if name])
+    if any(str(number) != name for name, number in numbers.items()):
+        report.notes['id'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
+    by_stamp: dict[int, list[tuple[Fix, int]]] = {}
+    for row, fix, name in rows:
+        scan = by_stamp.setdefault(fix.stamp_ns, [])
+        number = numbers.get(name, NOBODY)
+        if number != NOBODY and any(number == other for _, other in scan):
+            report.bad_row(row.table.path, f'line {row.line}', f'{name} is there at this time')
+            continue
+        scan.append((fix, number))
+    unknown = np.full((2, 2), np.nan)
+    return [
+        (
+            stamp_ns,
+            '/fixes',
+            write_scan(
+                Fixes(
+                    stamp_ns=stamp_ns,
+                    position=[fix.position for fix, _ in scan],
+                    covariance=[
+                        unknown if fix.covariance is None else fix.covariance for fix, _ in scan
+                    ],
+                    target_id=[number for _, number in scan],
+                    frame_id=frame_id,
+                ),
+                ros_message,
+            ),
+        )
+        for stamp_ns, scan in by_stamp.items()
+    ]
 
 
 def _covariance(row: Row) -> np.ndarray | None:

@@ -4,7 +4,7 @@
 The signal-to-noise ratio falls from 30 to 10 dB along the swath, linearly in decibels over the
 logarithm of range, as spreading loss does. The other scenarios add one difficulty each: slope,
 undulation, roughness that is correlated as real roughness is, shadows, spikes, echoes by way of
-the surface, Gaussian echoes, a second side.
+the surface, Gaussian echoes, a second side; and a ship that moves (`ship`).
 
 One bin is y = sqrt(z) (s a(u) + n), the observation model of `acoustics.laplace`. Surface echoes
 fade with a z of their own. A spike is a strong burst of noise, incoherent across the array.
@@ -20,11 +20,12 @@ from attrs import frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from ...acoustics import array
-from ...estimation.arrays import ComplexArray, FloatArray
+from ...acoustics import array, geometry, rays, sounding
+from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from ...parameters import parameter
-from ..scene import Received, Scenario, Scene, TrueProfile
+from ..scene import Received, Scene, TrueProfile
+from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
 
 SIDES = ('starboard', 'port', 'both')
 LAWS = ('laplace', 'gaussian')
@@ -32,7 +33,7 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
 @frozen(kw_only=True)
-class BathymetryScenario(Scenario):
+class BathymetryScenario(ShipScenario):
     """Parameters of a bathymetry scene; the defaults are the scene of the paper."""
 
     INSTRUMENT = ('tilt_deg', 'conjugate', 'sonar_height', 'sonar_depth')
@@ -98,7 +99,9 @@ class BathymetryScenario(Scenario):
     )
 
     def check(self) -> list[str]:
-        problems = []
+        problems = super().check()
+        if self.multipath and self.moving:
+            problems.append('multipath is for a sonar that rests, not for moving: true')
         if self.last_range < self.first_range + 2.0 * self.bin_width:
             problems.append('last_range must lie at least two bins beyond first_range')
         elif (self.last_range - self.first_range) / self.bin_width > 100_000:
@@ -109,6 +112,26 @@ class BathymetryScenario(Scenario):
             problems.append('shadows needs increasing ranges in pairs, begin and end of each')
         return problems
 
+    def told(self) -> dict[str, Any]:
+        ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
+        mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
+        return {**super().told(), **mounted}
+
+
+SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
+"""Depth and sound speed of a shallow sea in summer."""
+_UNDER_WAY: dict[str, Any] = {
+    'moving': True,
+    'pings': 24,
+    'ping_rate': 2.0,
+    'sonar_depth': 5.0,
+    'patch_along': (8.0, 20.0),
+    'patch_outline': 1.0,
+    'nav_attitude_error_deg': 0.05,
+    'nav_heading_error_deg': 0.1,
+    'nav_heave_error': 0.05,
+    'nav_position_error': 0.1,
+}
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'paper': ('flat floor with a rough patch, 30 to 10 dB: the scene of the paper', {}),
@@ -130,6 +153,19 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     'gaussian': ('paper with Gaussian echoes', {'law': 'gaussian'}),
     'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
+    'moving': (
+        'a ship under way in a swell, with navigation and its errors; a rough patch with a wavy '
+        'outline',
+        {**_UNDER_WAY},
+    ),
+    'moving_profile': (
+        'moving in summer, when sound bends by metres at the end of the swath',
+        {**_UNDER_WAY, 'sonar_depth': 5.0, 'sound_speed_profile': SUMMER},
+    ),
+    'moving_two_sides': (
+        'moving, on both sides of the ship',
+        {**_UNDER_WAY, 'side': 'both'},
+    ),
     'drifting_patch': (
         'paper with a patch that lies further out each ping',
         {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0},
@@ -147,7 +183,8 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
     """Run a scene. The same config and seed give the same scene.
 
     A measurement is received together with its last echo. With both sides, each has a namespace of
-    its own. The frame is that of the sonar: x forward, y to port, z up.
+    its own. The frame is that of the sonar: x forward, y to port, z up. With a moving ship it is
+    the world, and the navigation is part of the scene.
     """
     rng = np.random.default_rng(seed)
     sides = ('port', 'starboard') if config.side == 'both' else (config.side,)
@@ -155,15 +192,25 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
         round((config.last_range - config.first_range) / config.bin_width)
     )
     listening_ns = round(2e9 * ranges[-1] / config.sound_speed)
+    ship = ship_of(config, config.sonar_depth, rng) if config.moving else None
     received, truth = [], []
     for ping in range(config.pings):
-        stamp = FIRST_STAMP_NS + round(ping * 1e9 / config.ping_rate)
+        since_start = ping / config.ping_rate
+        stamp = FIRST_STAMP_NS + round(since_start * 1e9)
         for side in sides:
             namespace = side if len(sides) > 1 else ''
-            profile = _floor(config, ping, ranges, rng, stamp, side, namespace)
+            if ship is None:
+                profile = _floor(config, ping, ranges, rng, stamp, side, namespace)
+            else:
+                profile = _floor_below(config, ship, since_start, ranges, rng, side, namespace)
             truth.append(profile)
             snapshot = _hear(config, profile, rng)
             received.append(Received(stamp + listening_ns, snapshot, namespace))
+    if ship is not None:
+        seconds = (config.pings - 1) / config.ping_rate
+        stated = navigation_of(config, ship, FIRST_STAMP_NS, seconds, rng, 'map')
+        received = [*(Received(one.stamp_ns, one) for one in stated), *received]
+        received.sort(key=lambda one: one.received_ns)
     return Scene(tuple(received), tuple(truth), frame_id=truth[0].frame_id)
 
 
@@ -192,8 +239,7 @@ def _floor(
     )
     depth = config.sonar_height - height
     valid = np.abs(depth) <= ranges  # before that, the sound is still in the water column
-    for begin, end in zip(config.shadows[::2], config.shadows[1::2]):
-        valid &= (ranges < begin) | (ranges >= end)
+    valid &= _lit(config, ranges)
     outward = array.across_track(depth, ranges)
     return TrueProfile(
         stamp_ns=stamp_ns,
@@ -208,6 +254,58 @@ def _floor(
         ),
         namespace=namespace,
     )
+
+
+def _floor_below(
+    config: BathymetryScenario,
+    ship: Ship,
+    since_start: float,
+    ranges: FloatArray,
+    rng: np.random.Generator,
+    side: str,
+    namespace: str,
+) -> TrueProfile:
+    """The floor that one ping of a moving ship sees."""
+
+    def rise(along: FloatArray, off: FloatArray) -> FloatArray:
+        wave = np.sin(2.0 * np.pi * off / config.undulation_length)
+        return config.slope * off + config.undulation_height * wave
+
+    def rough(along: FloatArray, off: FloatArray) -> BoolArray:
+        return in_outline(config, along, off, config.patch_start, config.patch_end)
+
+    level = config.water_level - config.sonar_depth - config.sonar_height
+    mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
+    seen = see(
+        config,
+        ship,
+        Terrain(level, ship.course, rise, rough),
+        _roughness(config, len(ranges), rng),
+        since_start,
+        ranges,
+        config.sound_speed,
+        sounding.array_axes(side, math.radians(config.tilt_deg), mount),
+    )
+    valid = seen.reached & _lit(config, ranges)
+    return TrueProfile(
+        stamp_ns=FIRST_STAMP_NS + round(since_start * 1e9),
+        frame_id='map',
+        range=ranges,
+        height=seen.place[:, 2],
+        angle=np.where(seen.reached, np.arcsin(np.clip(seen.sine, -1.0, 1.0)), np.nan),
+        patch=seen.patch,
+        valid=valid,
+        xyz=np.where(seen.reached[:, None], seen.place, np.nan),
+        namespace=namespace,
+    )
+
+
+def _lit(config: BathymetryScenario, ranges: FloatArray) -> BoolArray:
+    """Bins (n,) outside the shadows."""
+    lit = np.ones(len(ranges), bool)
+    for begin, end in zip(config.shadows[::2], config.shadows[1::2]):
+        lit &= (ranges < begin) | (ranges >= end)
+    return lit
 
 
 def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
@@ -242,16 +340,23 @@ def _hear(config: BathymetryScenario, floor: TrueProfile, rng: np.random.Generat
         y += np.sqrt(power)[:, None] * _circular(rng, bins, config.staves)
     return Snapshot(
         stamp_ns=floor.stamp_ns,
-        frame_id=floor.frame_id,
+        frame_id='sonar',
         range=floor.range,
         iq=y.astype(np.complex64),
         noise_variance=np.full(bins, config.noise_variance) if config.state_noise else None,
         signal_variance=signal if config.state_signal else None,
         sound_speed=config.sound_speed,
         frequency=config.frequency,
-        element_spacing=config.spacing_wavelengths * config.sound_speed / config.frequency,
+        element_spacing=config.spacing_wavelengths * _speed_at_array(config) / config.frequency,
         sample_rate=0.5 * config.sound_speed / config.bin_width,
     )
+
+
+def _speed_at_array(config: BathymetryScenario) -> float:
+    """Sound speed that makes the wavelength at the array, m/s."""
+    if not config.sound_speed_profile:
+        return config.sound_speed
+    return float(rays.profile_of(config.sound_speed_profile).at(config.sonar_depth))
 
 
 def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator) -> ComplexArray:

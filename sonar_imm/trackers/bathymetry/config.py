@@ -6,24 +6,21 @@ next ping is the first to see it.
 
 from __future__ import annotations
 
-from functools import partial
 import math
 
 from attrs import frozen
 
 from ...acoustics.laplace import LIKELIHOODS
-from ...parameters import Config
-from ...parameters import parameter as fixed_parameter
 from ..model_checks import chain_problems
-
-parameter = partial(fixed_parameter, read_only=False)
+from .sea_parameters import parameter, SeaParameters
 
 DEFAULT_SIGMAS = {
     'height_rw_ncs': (0.5, 1.0),
     'height_two_rw': (0.01, 0.5),
-    'height_bank': (0.01, 0.05, 0.3, 1.5),
+    'height_bank': (0.003, 0.03, 0.07, 0.5),
 }
 """Noise of each model a range bin: metres, but 1/m for the slope model `ncs`."""
+DEFAULT_STAY, BANK_STAY = 0.995, 0.998
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
 MODEL_SETS = ('height_rw_ncs', 'height_two_rw', 'angle_two_rw', 'height_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
@@ -31,7 +28,7 @@ SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
 
 
 @frozen(kw_only=True)
-class BathymetryConfig(Config):
+class BathymetryConfig(SeaParameters):
     """Everything the bathymetry tracker can be told."""
 
     # -- which models ----------------------------------------------------------------------------
@@ -68,6 +65,14 @@ class BathymetryConfig(Config):
         low=0.0,
         high=100.0,
     )
+    rough_sigma: float = parameter(
+        0.07,
+        'height_bank: walks of at least this noise over a range bin are rough floor; undulations '
+        'and slopes of a smooth floor need up to 0.05',
+        unit='m',
+        low=0.0,
+        high=1000.0,
+    )
     transition_matrix: tuple[float, ...] = parameter(
         (),
         'transition matrix over a range bin, row-major, row = from; empty: stay_probability',
@@ -76,9 +81,9 @@ class BathymetryConfig(Config):
         high=1.0,
     )
     stay_probability: float = parameter(
-        0.995,
-        'probability of keeping the model over a range bin, without transition_matrix; the paper '
-        'has 0.98',
+        0.0,
+        'probability of keeping the model over a range bin, without transition_matrix; 0: 0.995, '
+        'or 0.998 in height_bank; the paper has 0.98',
         low=0.0,
         high=1.0,
     )
@@ -113,9 +118,20 @@ class BathymetryConfig(Config):
         high=100.0,
     )
 
+    angle_drift: bool = parameter(
+        True,
+        'angle_two_rw: the floor is predicted at constant height, not at constant angle; near '
+        'nadir it turns by degrees from bin to bin',
+    )
+
     # -- sonar -----------------------------------------------------------------------------------
     sonar_height: float = parameter(
-        15.0, 'height of the sonar above the reference floor', unit='m', low=0.01, high=12000.0
+        15.0,
+        'height of the sonar above the reference floor; with nav only where the filter starts, '
+        'see also sonar_height_std',
+        unit='m',
+        low=0.01,
+        high=12000.0,
     )
     side: str = parameter('starboard', 'side the array looks to', choices=('port', 'starboard'))
     tilt_deg: float = parameter(
@@ -167,44 +183,48 @@ class BathymetryConfig(Config):
 
     # -- computation -----------------------------------------------------------------------------
     engine: str = parameter(
-        'particles',
-        'particles, or a grid: exact, without Monte Carlo noise, for sets of one state',
-        choices=('particles', 'grid'),
+        'auto',
+        'particles, or a grid: exact, without Monte Carlo noise, for sets of one state; auto: '
+        'grid for height_bank, else particles',
+        choices=('auto', 'particles', 'grid'),
     )
     particles_per_model: int = parameter(100, 'particles of each model', low=2, high=100_000)
     grid_step: float = parameter(
         0.0,
-        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most',
+        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most; '
+        '0.01 m for height_bank',
         low=0.0,
         high=100.0,
     )
     grid_extent: float = parameter(
         20.0,
-        'the grid reaches so far to both sides of initial_mean (angles: all that can be)',
+        'the grid reaches so far to both sides of the start, and at least 2 sonar_height_std '
+        '(angles: all that can be)',
         unit='m',
         low=0.1,
         high=1000.0,
     )
     smoothing: str = parameter(
-        'none',
+        'auto',
         'use the whole ping for each bin: modes (Kim: the model probabilities only), or states '
-        '(forward-backward on the grid: everything)',
-        choices=('none', 'modes', 'states'),
+        '(forward-backward on the grid: everything); auto: states for height_bank on the grid, '
+        'which finds nothing rough without, else none',
+        choices=('auto', 'none', 'modes', 'states'),
     )
     seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
 
     def check(self) -> list[str]:
-        problems = self._check_sigmas()
+        problems = super().check() + self._check_sigmas()
         models = self.model_count()
         problems += chain_problems(
             self.transition_matrix, self.initial_probabilities, models, self.model_set
         )
-        if self.engine == 'grid' and self.model_set not in SCALAR_SETS:
+        if self.runs_on_grid and self.model_set not in SCALAR_SETS:
             problems.append(
                 f'engine grid needs a set of one state ({", ".join(SCALAR_SETS)}), '
                 f'{self.model_set} has two'
             )
-        if self.smoothing == 'states' and self.engine != 'grid':
+        if self.smoothing == 'states' and not self.runs_on_grid:
             problems.append('smoothing of the states needs engine grid; particles smooth modes')
         if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
             problems.append(
@@ -233,6 +253,27 @@ class BathymetryConfig(Config):
                 f'{len(self.sigmas)}'
             )
         return problems
+
+    @property
+    def runs_on_grid(self) -> bool:
+        """Whether the engine is the grid."""
+        return self.engine == 'grid' or (self.engine == 'auto' and self.in_bank)
+
+    @property
+    def smoothing_used(self) -> str:
+        """``none``, ``modes`` or ``states``."""
+        if self.smoothing != 'auto':
+            return self.smoothing
+        return 'states' if self.in_bank and self.runs_on_grid else 'none'
+
+    @property
+    def stay_used(self) -> float:
+        """Probability of keeping the model over a range bin."""
+        return self.stay_probability or (BANK_STAY if self.in_bank else DEFAULT_STAY)
+
+    @property
+    def in_bank(self) -> bool:
+        return self.model_set == 'height_bank'
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""

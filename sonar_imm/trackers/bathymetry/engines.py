@@ -62,7 +62,7 @@ def run_grid(
     T, M = models.scale.shape
     track = _empty(T, M, 1)
     track.sample_size[:] = np.nan
-    shape = np.exp(-0.5 * np.square((cells - models.mean[0]) / models.std[0]))
+    shape = models.density(cells)
     p = models.initial[:, None] * (shape / shape.sum())
     sigma = models.scale / (cells[1] - cells[0])
     motion = GridMotion(cells, models.transition, sigma, models.coast)

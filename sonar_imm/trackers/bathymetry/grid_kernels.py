@@ -13,7 +13,7 @@ from ...acoustics import likelihood_kernels
 from ...estimation import grid_kernels as grid
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.jit import kernel
-from .kernels import PingLikelihood, sines_of, Track
+from .kernels import drift, Geometry, PingLikelihood, sines_of, Track
 
 
 class GridMotion(NamedTuple):
@@ -25,6 +25,75 @@ class GridMotion(NamedTuple):
     transition: FloatArray
     sigma: FloatArray
     coast: int
+
+
+class Drift(NamedTuple):
+    """Where each cell goes if the floor keeps its height: `first` (G,), the cell before the one
+    that lies just before that place, and the weights (4, G) of that and the next three cells.
+
+    The weights are those of cubic interpolation, which keep the first four moments: splitting
+    between two cells would add noise at every bin."""
+
+    first: IntArray
+    weight: FloatArray
+
+
+@kernel
+def find_drift(
+    cells: FloatArray,
+    low: int,
+    high: int,
+    t: int,
+    geometry: Geometry,
+    out: Drift,
+    work: FloatArray,
+) -> tuple[int, int]:
+    """The drift of the cells [low, high) from bin t - 1 to bin t; the window they reach. work (1
+    or more, G) is scratch."""
+    G, step = cells.shape[0], cells[1] - cells[0]
+    to = work[0, : high - low]
+    drift(cells[low:high], t, geometry, to)
+    new_low, new_high = G, 0
+    for g in range(low, high):
+        place = min(max((to[g - low] - cells[0]) / step, 1.0), G - 3.0)
+        k = min(int(place), G - 3)
+        f = place - k
+        out.first[g] = k - 1
+        out.weight[0, g] = -f * (f - 1.0) * (f - 2.0) / 6.0
+        out.weight[1, g] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
+        out.weight[2, g] = -(f + 1.0) * f * (f - 2.0) / 2.0
+        out.weight[3, g] = (f + 1.0) * f * (f - 1.0) / 6.0
+        new_low, new_high = min(new_low, k - 1), max(new_high, k + 3)
+    return new_low, new_high
+
+
+@kernel
+def push(
+    p: FloatArray, low: int, high: int, cells: Drift, out: FloatArray, to_low: int, to_high: int
+) -> None:
+    """Probability p (G,) on [low, high) carried along, into out (G,) on [to_low, to_high)."""
+    for g in range(to_low, to_high):
+        out[g] = 0.0
+    for g in range(low, high):
+        for i in range(4):
+            out[cells.first[g] + i] += cells.weight[i, g] * p[g]
+    for g in range(to_low, to_high):
+        out[g] = max(out[g], 0.0)
+
+
+@kernel
+def pull(
+    beta: FloatArray, low: int, high: int, cells: Drift, out: FloatArray, to_low: int, to_high: int
+) -> None:
+    """The adjoint of `push`: what the future says of where each cell of [low, high) goes, from
+    beta (G,) on [to_low, to_high), zero outside, into out (G,)."""
+    for g in range(low, high):
+        total = 0.0
+        for i in range(4):
+            k = cells.first[g] + i
+            if to_low <= k < to_high:
+                total += cells.weight[i, g] * beta[k]
+        out[g] = max(total, 0.0)
 
 
 @kernel
@@ -47,6 +116,7 @@ def filter_ping(
     mixed, scratch = np.empty((M, G)), np.empty((7, max(G, 128) + 16))
     work, value, sines = np.empty((4, G)), np.empty(G), np.empty(G)
     kept, used = np.empty(4096 if keep else 0), 0
+    carried = Drift(np.empty(G, np.int64), np.empty((4, G)))
     low, high = grid.trim(p, 0, G)
     for t in range(T):
         heard, reach = ping.heard[t], 0
@@ -56,6 +126,13 @@ def filter_ping(
             for j in range(M):
                 for g in range(low, high):
                     mixed[j, g] = p[j, g]
+        if t >= ping.geometry.drift_from:
+            to_low, to_high = find_drift(cells, low, high, t, ping.geometry, carried, work)
+            for j in range(M):
+                push(mixed[j], low, high, carried, p[j], to_low, to_high)
+                for g in range(to_low, to_high):
+                    mixed[j, g] = p[j, g]
+            low, high = to_low, to_high
         for j in range(M):
             reach = max(reach, grid.reach_of(sigma[t, j if heard else coast]))
         new_low, new_high = max(low - reach, 0), min(high + reach, G)
@@ -105,6 +182,7 @@ def smooth_ping(
     beta, back, p = np.empty((M, G)), np.empty((M, G)), np.empty((M, G))
     scratch, work = np.empty((7, max(G, 128) + 16)), np.empty((4, G))
     value, sines = np.empty(G), np.empty(G)
+    carried = Drift(np.empty(G, np.int64), np.empty((4, G)))
     end = 0
     for t in range(T):
         end += M * (window[t, 1] - window[t, 0])
@@ -120,9 +198,19 @@ def smooth_ping(
             _log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
             grid.update(beta, low, high, value[:n], work)
         new_low, new_high = window[t, 0], window[t, 1]
+        drifts = t + 1 >= ping.geometry.drift_from
+        to_low, to_high = new_low, new_high
+        if drifts:
+            to_low, to_high = find_drift(
+                cells, new_low, new_high, t + 1, ping.geometry, carried, work
+            )
         for j in range(M):
             width = motion.sigma[t + 1, j if heard else coast]
-            grid.walk(beta[j], low, high, width, scratch, back[j], new_low, new_high)
+            grid.walk(beta[j], low, high, width, scratch, back[j], to_low, to_high)
+            if drifts:
+                pull(back[j], new_low, new_high, carried, beta[j], to_low, to_high)
+                for g in range(new_low, new_high):
+                    back[j, g] = beta[j, g]
         low, high = new_low, new_high
         if heard:
             grid.mix(back, low, high, motion.transition.T, beta)
@@ -156,7 +244,7 @@ def _log_likelihoods(
 ) -> None:
     """Log likelihood of states (n,) given bin t into out (n,); sines (n,) and work (4, n or more)
     are scratch."""
-    sines_of(state, ping.ranges[t], ping.geometry, work, sines)
+    sines_of(state, t, ping.geometry, work, sines)
     likelihood_kernels.log_likelihoods(
         sines,
         ping.geometry.spacing,

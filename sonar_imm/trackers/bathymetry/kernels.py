@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import likelihood_kernels
+from ...acoustics import likelihood_kernels, rays
 from ...estimation import imm_particles_kernels as imm
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...estimation.elementary import phasors
@@ -25,14 +25,28 @@ _TURNS = 0.5 / math.pi
 
 
 class Geometry(NamedTuple):
-    """How a state becomes a direction: `sonar_height` in metres above the reference floor, NaN
-    when the states are angles; cosine and sine of the tilt; `spacing` of the staves in
-    wavelengths, negative for a conjugated array."""
+    """How a state becomes a direction in each of T bins; see `acoustics.sounding`.
 
-    sonar_height: float
-    cos_tilt: float
-    sin_tilt: float
+    of_heights: states are heights of the floor, else angles. height (T,): of the array, in the
+    same terms, m; reach (T,): r C, by which a depth is divided, m; tilt (T,): psi, rad, with its
+    cosine and sine; `spacing` of the staves in wavelengths, negative for a conjugated array.
+    launch: where rays bend, the table of `rays.launch_table`, (0, 0) where they do not; row (T,):
+    place of each range in it; first_depth and depth_step, m, of its columns.
+    drift_from: the first bin that angles reach at constant height, T or more for never.
+    """
+
+    of_heights: bool
+    height: FloatArray
+    reach: FloatArray
+    tilt: FloatArray
+    cos_tilt: FloatArray
+    sin_tilt: FloatArray
     spacing: float
+    launch: FloatArray
+    row: FloatArray
+    first_depth: float
+    depth_step: float
+    drift_from: int
 
 
 class PingLikelihood(NamedTuple):
@@ -96,28 +110,54 @@ class Track(NamedTuple):
 
 @kernel
 def sines_of(
-    state: FloatArray,
-    slant_range: float,
-    geometry: Geometry,
-    work: FloatArray,
-    out: FloatArray,
+    state: FloatArray, t: int, geometry: Geometry, work: FloatArray, out: FloatArray
 ) -> None:
-    """Direction sines of states (n,) into out (n,), NaN where no echo can come from. States are
-    heights of the floor, or angles, as `geometry` says; work (1 or more, n or more) is scratch."""
+    """Direction sines of states (n,) at bin t into out (n,), NaN where no echo can come from.
+    States are heights of the floor, or angles, as `geometry` says; work (1 or more, n or more) is
+    scratch."""
     n = state.shape[0]
     first = work[0, :n]
-    height = geometry.sonar_height
-    if height == height:
+    if geometry.of_heights:
+        height = geometry.height[t]
         for s in range(n):
             first[s] = height - state[s]
+        if geometry.launch.shape[0] > 0:
+            rays.look_up(
+                geometry.launch,
+                geometry.row[t],
+                geometry.first_depth,
+                geometry.depth_step,
+                first,
+            )
         likelihood_kernels.direction_sines(
-            first, slant_range, geometry.cos_tilt, geometry.sin_tilt, out
+            first, geometry.reach[t], geometry.cos_tilt[t], geometry.sin_tilt[t], out
         )
     else:
         phasors(state, _TURNS, first, out)
         for s in range(n):
             if not abs(state[s]) <= _HALF_CIRCLE:
                 out[s] = math.nan
+
+
+@kernel
+def drift(state: FloatArray, t: int, geometry: Geometry, out: FloatArray) -> None:
+    """Where angles (n,) of bin t - 1 are at bin t if the floor keeps its height, into out (n,).
+
+    ``phi' = asin(sin(phi) r / r')`` for a level sonar; near nadir that is degrees a bin, more than
+    a walk could follow. What is beyond straight down stays beyond it. Bent rays are taken as
+    straight: it is a prediction over one bin.
+    """
+    rise = geometry.height[t] - geometry.height[t - 1]
+    for s in range(state.shape[0]):
+        down = state[s] + geometry.tilt[t - 1]
+        depth = math.sin(down) * geometry.reach[t - 1] + rise
+        ratio = min(max(depth / geometry.reach[t], -1.0), 1.0)
+        after = math.asin(ratio)
+        if down > _HALF_CIRCLE:
+            after = math.pi - after
+        elif down < -_HALF_CIRCLE:
+            after = -math.pi - after
+        out[s] = after - geometry.tilt[t]
 
 
 @kernel
@@ -139,7 +179,7 @@ def filter_block(
     x, w, mu = particles
     M, n, N = x.shape
     F, G, scale, noise = motion.F, motion.G, motion.scale, draws.noise
-    ranges, heard, geometry, table = ping.ranges, ping.heard, ping.geometry, ping.table
+    heard, geometry, table = ping.heard, ping.geometry, ping.table
     form, base, spread, signal = ping.form, ping.base, ping.spread, ping.signal
     scratch = imm.MixScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
     sines, value = np.empty(N), np.empty((M, N))
@@ -154,10 +194,13 @@ def filter_block(
             for a in range(n):
                 for k in range(G.shape[2]):
                     step[a, k] = G[model, a, k] * scale[t, model]
+            if t >= geometry.drift_from:
+                before = mixed[j, 0] if heard[t] else x[j, 0]
+                drift(before, t, geometry, before)
             if heard[t]:
                 imm.predict(mixed[j], F[model], step, noise[b, j], x[j])
                 # Written out: a call that takes the whole of `ping` would cost 5 % of the ping.
-                sines_of(x[j, 0], ranges[t], geometry, work, sines)
+                sines_of(x[j, 0], t, geometry, work, sines)
                 likelihood_kernels.log_likelihoods(
                     sines,
                     geometry.spacing,

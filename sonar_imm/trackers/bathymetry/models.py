@@ -27,17 +27,55 @@ import math
 
 from attrs import frozen
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from ...acoustics.array import angle_of_depth
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
 from .config import BathymetryConfig, DEFAULT_SIGMAS, DEFAULT_SIGMAS_DEG
+from .kernels import Geometry
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
 HEIGHT_STEP, ANGLE_STEP = 0.01, math.radians(0.05)
+FIRST_RETURN_ERROR = 0.25
+"""Metres by which the first return may be found too early."""
 MOST_CELLS = 20_000
 """The grid has at most so many cells to either side of its middle."""
+
+
+@frozen(eq=False)
+class UnknownHeight:
+    """Where the floor starts below a sonar whose height is not known well.
+
+    The height of the floor is normal, mean and std, but not lower than `lowest`: there the first
+    return would have come later. Angles are those at which such a floor is seen at the first bin,
+    from `height` of the array with `reach` and `tilt`, see `kernels.Geometry`; None for heights.
+    """
+
+    mean: float
+    std: float
+    lowest: float
+    view: tuple[float, float, float] | None
+
+    def quantile(self, level: FloatArray) -> FloatArray:
+        """States (N,) at probabilities `level` (N,)."""
+        below = ndtr((self.lowest - self.mean) / self.std)
+        whole = np.clip(below + (1.0 - below) * level, 1e-12, 1.0 - 1e-12)
+        z = np.maximum(self.mean + self.std * ndtri(whole), self.lowest)
+        if self.view is None:
+            return z
+        height, reach, tilt = self.view
+        return np.arcsin(np.clip((height - z) / reach, -1.0, 1.0)) - tilt
+
+    def density(self, cells: FloatArray) -> FloatArray:
+        """Density (G,) at states `cells`, in any unit."""
+        z, slope = cells, np.ones(len(cells))
+        if self.view is not None:
+            height, reach, tilt = self.view
+            z, slope = height - reach * np.sin(cells + tilt), np.abs(np.cos(cells + tilt))
+            slope = np.where(np.abs(cells + tilt) <= 0.5 * math.pi, slope, 0.0)
+        shape = slope * np.exp(-0.5 * np.square((z - self.mean) / self.std))
+        return np.where(z >= self.lowest, shape, 0.0)
 
 
 @frozen(eq=False)
@@ -46,7 +84,9 @@ class TerrainModels:
 
     F (M, n, n), G (M, n, k); scale (T, M): noise of each model at each bin; transition (M, M);
     initial (M,) probabilities before the first bin; mean (n,) and std (n,) of the state then;
-    coast: the model that crosses bins where nothing is heard.
+    coast: the model that crosses bins where nothing is heard. rough (M,): models that mean rough
+    floor, none but in a bank. start: the law of the first state
+    where it is no normal one.
     """
 
     names: tuple[str, ...]
@@ -59,6 +99,8 @@ class TerrainModels:
     mean: FloatArray
     std: FloatArray
     coast: int
+    rough: BoolArray
+    start: UnknownHeight | None = None
 
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
         """Particles (M, n, N) of the state before the first bin.
@@ -73,13 +115,29 @@ class TerrainModels:
             for a in range(n):
                 level = (np.arange(particles) + rng.random(particles)) / particles
                 level = level if a == 0 else rng.permutation(level)
+                if a == 0 and self.start is not None:
+                    x[j, a] = self.start.quantile(level)
+                    continue
                 x[j, a] = self.mean[a] + self.std[a] * ndtri(np.clip(level, 1e-12, 1.0 - 1e-12))
         return x
 
+    def density(self, cells: FloatArray) -> FloatArray:
+        """Density (G,) of the first state before the first bin at `cells`, in any unit."""
+        if self.start is not None:
+            return self.start.density(cells)
+        return np.exp(-0.5 * np.square((cells - self.mean[0]) / self.std[0]))
 
-def build_models(config: BathymetryConfig, ranges: FloatArray, first: int) -> TerrainModels:
+
+def build_models(
+    config: BathymetryConfig,
+    ranges: FloatArray,
+    geometry: Geometry,
+    first: int,
+    floor_below: float,
+) -> TerrainModels:
     """The models that `config` names for bins at `ranges` (T,) m, T > 1, of which the bin number
-    `first` is the first with an echo."""
+    `first` is the first with an echo; floor_below: how far below the array the floor is said to
+    be, m."""
     M, T = config.model_count(), len(ranges)
     slope_set = config.model_set == 'height_rw_ncs'
     if slope_set:
@@ -88,7 +146,7 @@ def build_models(config: BathymetryConfig, ranges: FloatArray, first: int) -> Te
     else:
         F, G = np.ones((M, 1, 1)), np.ones((M, 1, 1))
         scale = _noises(config, ranges)
-    mean, std = _start(config, float(ranges[first]))
+    mean, std = _start(config, geometry, first, floor_below)
     return TerrainModels(
         names=_names(config, M),
         state_names=_states(config),
@@ -100,6 +158,8 @@ def build_models(config: BathymetryConfig, ranges: FloatArray, first: int) -> Te
         mean=np.array([mean, 0.0][: F.shape[1]]),
         std=np.array([std, config.initial_slope_std][: F.shape[1]]),
         coast=1 if slope_set else int(np.argmin(scale.sum(axis=0))),
+        rough=_rough(config, M),
+        start=_unknown_height(config, ranges, geometry, first, floor_below),
     )
 
 
@@ -115,6 +175,12 @@ def _states(config: BathymetryConfig) -> tuple[str, ...]:
     if config.model_set == 'height_rw_ncs':
         return 'height', 'slope'
     return ('angle',) if config.model_set == 'angle_two_rw' else ('height',)
+
+
+def _rough(config: BathymetryConfig, models: int) -> BoolArray:
+    if not config.in_bank:
+        return np.zeros(models, bool)
+    return np.array(config.sigmas or DEFAULT_SIGMAS['height_bank']) >= config.rough_sigma
 
 
 def _bin_width(ranges: FloatArray) -> float:
@@ -155,17 +221,41 @@ def _noises(config: BathymetryConfig, ranges: FloatArray) -> FloatArray:
 def _transition(config: BathymetryConfig, models: int) -> FloatArray:
     if config.transition_matrix:
         return check_transition_matrix(np.reshape(config.transition_matrix, (models, models)))
-    return persistent(models, config.stay_probability)
+    return persistent(models, config.stay_used)
 
 
-def _start(config: BathymetryConfig, first_range: float) -> tuple[float, float]:
+def _start(
+    config: BathymetryConfig, geometry: Geometry, first: int, floor_below: float
+) -> tuple[float, float]:
     """Mean and standard deviation of the first state before the first bin."""
+    if geometry.of_heights:
+        mean = float(geometry.height[first]) - floor_below + config.initial_mean
+        return mean, config.sonar_height_std or config.initial_std or HEIGHT_STD
     if config.initial_std > 0.0:
         return config.initial_mean, config.initial_std
-    if config.model_set != 'angle_two_rw':
-        return config.initial_mean, HEIGHT_STD
-    depth = min(config.sonar_height, first_range)
-    return float(angle_of_depth(depth, first_range, math.radians(config.tilt_deg))), ANGLE_STD
+    reach, tilt = float(geometry.reach[first]), float(geometry.tilt[first])
+    return float(angle_of_depth(min(floor_below, reach), reach, tilt)), ANGLE_STD
+
+
+def _unknown_height(
+    config: BathymetryConfig,
+    ranges: FloatArray,
+    geometry: Geometry,
+    first: int,
+    floor_below: float,
+) -> UnknownHeight | None:
+    """The start when `sonar_height_std` says that the floor may be elsewhere."""
+    if not config.sonar_height_std > 0.0:
+        return None
+    height = float(geometry.height[first])
+    view = height, float(geometry.reach[first]), float(geometry.tilt[first])
+    offset = config.initial_mean if geometry.of_heights else 0.0
+    return UnknownHeight(
+        mean=height - floor_below + offset,
+        std=config.sonar_height_std,
+        lowest=height - float(ranges[first]) - FIRST_RETURN_ERROR,
+        view=None if geometry.of_heights else view,
+    )
 
 
 def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
@@ -174,8 +264,10 @@ def grid_cells(config: BathymetryConfig, models: TerrainModels) -> FloatArray:
     step = config.grid_step
     if not step > 0.0:
         noises = models.scale[models.scale > 0.0]
-        step = min(noises.min(initial=np.inf), ANGLE_STEP if angle else HEIGHT_STEP)
-    extent = math.pi if angle else config.grid_extent
+        finest = ANGLE_STEP if angle else HEIGHT_STEP
+        # The smallest walk of a bank is far below what an echo tells: no need to resolve it.
+        step = finest if config.in_bank else min(noises.min(initial=np.inf), finest)
+    extent = math.pi if angle else max(config.grid_extent, 2.0 * config.sonar_height_std)
     count = math.ceil(min(extent / step, MOST_CELLS))
     cells = models.mean[0] + extent * np.arange(-count, count + 1) / count
     return cells[np.abs(cells) <= 0.5 * math.pi] if angle else cells

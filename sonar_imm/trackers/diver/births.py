@@ -4,17 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import islice, product
+import math
+from typing import NamedTuple
 
 import numpy as np
 
 from ...acoustics import multistatic
-from ...estimation.arrays import FloatArray
-from ...measurements import Arrivals
+from ...estimation.arrays import FloatArray, IndexArray
+from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
-from .sensing import locate, Positions, toa_variance
+from .model_set import heights_of
+from .sensing import locate, Positions, systematic_variance, toa_variance
 
-Birth = tuple[FloatArray, FloatArray]
-"""Position (2,) and covariance (2, 2)."""
+
+class Birth(NamedTuple):
+    """Where a track may begin: position (2,), covariance (2, 2), and the ping and its rows from
+    which it is, None for a fix; the probability that there is a diver, NaN where its hits will
+    tell; whose track it is."""
+
+    position: FloatArray
+    covariance: FloatArray
+    ping: Arrivals | None = None
+    rows: IndexArray | None = None
+    existence: float = math.nan
+    target_id: int = NOBODY
+
 
 SEED_PAIRS = 3
 """Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
@@ -24,9 +38,16 @@ MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
 
 
-def births_from_fixes(group: Positions, free: np.ndarray) -> list[Birth]:
-    """Every fix that is `free` (D,) is a place to begin a track."""
-    return [(group.z[d], group.R[d]) for d in np.flatnonzero(free)]
+def births_from_fixes(
+    group: Positions, free: np.ndarray, existence: FloatArray | None = None
+) -> list[Birth]:
+    """Every fix that is `free` (D,) is a place to begin a track; existence: (D,) of those."""
+    names = np.full(len(free), NOBODY) if group.target_id is None else group.target_id
+    known = np.full(len(free), math.nan) if existence is None else existence
+    return [
+        Birth(group.z[d], group.R[d], existence=float(known[d]), target_id=int(names[d]))
+        for d in np.flatnonzero(free)
+    ]
 
 
 def births_from_ping(
@@ -64,8 +85,10 @@ def _fix(
     fix = locate(ping, rows, config, config.covariance_scale * factor)
     if fix is None:
         return [], rows[:0]
-    ghosts = [(other.position, other.covariance) for other in fix.alternatives]
-    return [(fix.position, fix.covariance), *ghosts], rows[fix.used]
+    used = rows[fix.used | fix.used_bearing]
+    return [
+        Birth(one.position, one.covariance, ping, used) for one in (fix, *fix.alternatives)
+    ], rows[fix.used]
 
 
 def _best_combination(
@@ -89,11 +112,13 @@ def _agreeing(
     ping: Arrivals, pairs: Sequence[np.ndarray], birth: Birth, config: DiverConfig, factor: float
 ) -> np.ndarray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
-    position, covariance = birth
-    expected = multistatic.range_sum(position, ping.tx, ping.rx, config.target_z)
-    slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, config.target_z)
-    variance = config.sound_speed**2 * toa_variance(
-        ping, config, config.covariance_scale * factor
+    position, covariance = birth.position, birth.covariance
+    height = float(np.mean(heights_of(config)))
+    expected = multistatic.range_sum(position, ping.tx, ping.rx, height)
+    slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, height)
+    variance = config.sound_speed**2 * (
+        toa_variance(ping, config, config.covariance_scale * factor)
+        + systematic_variance(ping, config)
     ) + np.einsum('na,ab,nb->n', slope, covariance, slope)
     nis = np.square(config.sound_speed * ping.toa - expected) / variance
     nearest = np.array([rows[np.argmin(nis[rows])] for rows in pairs])

@@ -7,6 +7,8 @@ from attrs import frozen
 from ...parameters import inherited, parameter
 from ..model_checks import chain_problems
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+from .scan_parameters import ScanParameters
+from .sea_parameters import SeaParameters
 
 MODEL_SETS = (
     'heading_speed',
@@ -24,7 +26,9 @@ ADAPTATIONS = ('counts', 'paper', 'fixed')
 
 
 @frozen(kw_only=True)
-class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
+class DiverConfig(
+    SeaParameters, ScanParameters, DetectionParameters, TrackLifeParameters, StreamParameters
+):
     """Everything the diver tracker can be told. The defaults are the `heading_speed` set of the
     docs."""
 

@@ -24,80 +24,24 @@ these are reconstructions.
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable
-from typing import NamedTuple
-
-from attrs import field, frozen
 import numpy as np
 
 from ...estimation import markov
 from ...estimation.adaptation import Chain
 from ...estimation.arrays import FloatArray
+from .augment import with_depth, with_fix_bias
 from .config import DiverConfig
+from .model_set import ModelSet, Motion, OUTPUTS
 
-OUTPUTS = ('px', 'py', 'vx', 'vy')
-_CACHED_STEPS = 64
+__all__ = ['build_models', 'ModelSet', 'Motion', 'OUTPUTS']
 
 BASELINE_NOISE = {'cv': (0.25,), 'cv_cv': (0.05, 0.6), 'cv_ct': (0.1, 0.3, 0.3)}
 """Acceleration noise, m/s^2, that suits divers: tuned on the scene of the paper's Table 1."""
 
 
-class Motion(NamedTuple):
-    """One step of all models: x <- F x + B + N(0, Q). F, Q (M, n, n), B (M, n)."""
-
-    F: FloatArray
-    Q: FloatArray
-    B: FloatArray
-
-
-@frozen(eq=False)
-class ModelSet:
-    """M models over a common state of n components.
-
-    names: of the models; E: (M, 4, n) outputs; chain: the law of switching; start: state
-    components after the position for a new track, mean and variance, (n - 2,) each; initial: (M,)
-    model probabilities of a new track.
-    """
-
-    names: tuple[str, ...]
-    E: FloatArray
-    chain: Chain
-    start_mean: FloatArray
-    start_variance: FloatArray
-    initial: FloatArray
-    _motion: Callable[[float], Motion]
-    _cache: OrderedDict[float, Motion] = field(factory=OrderedDict, init=False)
-
-    @property
-    def n(self) -> int:
-        return int(self.E.shape[2])
-
-    def motion(self, dt: float) -> Motion:
-        """The models over a step of dt seconds, dt >= 0."""
-        found = self._cache.get(dt)
-        if found is None:
-            found = self._cache[dt] = Motion(*map(np.ascontiguousarray, self._motion(dt)))
-            if len(self._cache) > _CACHED_STEPS:
-                self._cache.popitem(last=False)
-        return found
-
-    def new_track(
-        self, position: FloatArray, covariance: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x (M, n), P (M, n, n), mu (M,) of a track first seen at `position` (2,) with
-        `covariance` (2, 2)."""
-        M, n = len(self.names), self.n
-        x = np.tile(np.concatenate([position, self.start_mean]), (M, 1))
-        P = np.zeros((M, n, n))
-        P[:, :2, :2] = covariance
-        P[:, range(2, n), range(2, n)] = self.start_variance
-        return x, P, self.initial.copy()
-
-
 def build_models(config: DiverConfig) -> ModelSet:
-    """The model set that `config` names."""
-    return {
+    """The model set that `config` names, with the depth and the bias of fixes that it asks for."""
+    models = {
         'heading_speed': _heading_speed,
         'heading_speed_lateral': _heading_speed_lateral,
         'world_headings': _world_headings,
@@ -106,6 +50,9 @@ def build_models(config: DiverConfig) -> ModelSet:
         'cv_cv': _single_direction,
         'cv_ct': _single_direction,
     }[config.model_set](config)
+    if config.dimensions == 3:
+        models = with_depth(models, config)
+    return with_fix_bias(models, config) if config.fix_bias_std > 0.0 else models
 
 
 def _headings(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:

@@ -2,32 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 import math
-from typing import NamedTuple
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
+from ...acoustics.multistatic import difference_projection
 from ...estimation import imm, imm_kernels
 from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import (
+    assign,
     assign_by_rank,
     association_cost,
     gate_threshold,
-    Tracks,
     TrackStatus,
 )
+from ...estimation.consider import consider_models
+from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
-from .models import ModelSet
-from .sensing import as_fix, Bearings, Group, Positions, RangeSums, TagPing
+from .expectation_kernels import fit_numbers
+from .model_set import ModelSet
+from .pings import Ping, ping_numbers, PingUpdate, residuals, update_by_ping
+from .sensing import Positions
+from .state import cross, DiverState
 
-SCALE_PRIOR = 20.0
-"""Numbers measured that the stated covariances are worth when their scale is being learnt."""
+FIXES, ARRIVALS = 0, 1
+"""Rows of the learnt scale."""
 
-MOST_STEPS = 300
-"""A gap is crossed in no more steps than this, however long it is."""
+NEAR = 28.0
+"""NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
+`estimation.subset_update`."""
+
+TAKEN = 0.5
+"""Probability of being good from which a number counts as a track's."""
 
 EXCLUDED = -1
 """Rank of a track that takes no part in a message."""
@@ -39,81 +48,9 @@ SCALE_MEMORY = 400.0
 """Numbers measured over which the learnt scale forgets."""
 
 
-@frozen(eq=False, kw_only=True)
-class DiverState:
-    """All that is known after a scan: T tracks with M models of n states.
-
-    x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
-    (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
-    track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
-    for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    broken: tracks ended so far because their numbers were not finite; repairs: covariances
-    repaired so far (`estimation.covariance`).
-    """
-
-    stamp_ns: int
-    life: Tracks
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    learnt: FloatArray
-    nis: FloatArray
-    nis_dof: np.ndarray
-    score: FloatArray
-    scale: FloatArray
-    broken: int = 0
-    repairs: int = 0
-
-    def factor(self) -> FloatArray:
-        """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
-        return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
-
-    def rows(self, kept: np.ndarray) -> DiverState:
-        """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
-        if kept.all():
-            return self
-        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score')
-        return evolve(self, **{name: getattr(self, name)[kept] for name in names})
-
-
-class Step(NamedTuple):
-    """Tracks after a step of dt seconds without a measurement, the transitions (T or 1, M, M) of
-    that step, and how many covariances it had to repair."""
-
-    x: FloatArray
-    P: FloatArray
-    mu: FloatArray
-    transition: FloatArray
-    dt: float
-    repairs: int
-
-    def row(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
-        """The step as one track took it."""
-        shared = len(self.transition) == 1
-        transition = self.transition[0 if shared else track]
-        return self.x[track], self.P[track], self.mu[track], transition, self.dt
-
-
-def cross(
-    models: ModelSet, chain: AdaptiveChain, before: DiverState, dt: float, longest: float
-) -> Iterator[Step]:
-    """Mix and predict over dt seconds, in equal steps of at most `longest`.
-
-    A model holds for a whole step, so one step over a long gap says that the diver swam straight
-    all the while: the prediction is a ring, and the diver, who turned, is inside it.
-    """
-    count = min(max(math.ceil(dt / longest), 1), MOST_STEPS)
-    transition, motion = chain.transition(before.learnt, dt / count), models.motion(dt / count)
-    x, P, mu = before.x, before.P, before.mu
-    for _ in range(count):
-        x, P, mu = imm_kernels.mix(x, P, mu, transition)
-        x, P, repaired = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-        yield Step(x, P, mu, transition, dt / count, int(repaired.sum()))
-
-
 class Scan:
     """The tracks in the middle of a scan: predicted when made, then `associate_and_update` for
-    each message, and `learn` at the end."""
+    the fixes, `update_by_ping` for each ping, and `learn` at the end."""
 
     def __init__(
         self,
@@ -134,60 +71,25 @@ class Scan:
         self.nis_dof = np.zeros(len(self.x), np.uint16)
         self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
-        self.rank = np.zeros(len(self.x), np.int64)
-
-    def associate_and_update(self, groups: Sequence[Group]) -> list[np.ndarray]:
-        """Update the tracks with what one message holds for them, group after group. Gives for
-        each group True (D,) where a detection was taken.
-
-        Tracks that can explain more of the groups choose first, and among those the confirmed
-        ones: a ghost fits the arrivals it was made of, but only those. One that ends up with
-        fewer than half of the groups is not what the message shows; for it nothing happened.
-        """
-        before = self._copies()
-        tentative = self.before.life.status == TrackStatus.TENTATIVE
-        explained = np.sum([self._fit(group).max(axis=1) > -np.inf for group in groups], axis=0)
-        self.rank = 2 * (len(groups) - explained) + tentative
-        chosen = [self._take_group(group) for group in groups]
-        agreeing = np.sum([choice >= 0 for choice in chosen], axis=0)
-        doubtful = (agreeing > 0) & (2 * agreeing < len(groups))
-        if doubtful.any():
-            self.x, self.P, self.mu, self.nis, self.nis_dof, self.score, self.scale = before
-            self.rank = np.where(doubtful, EXCLUDED, self.rank)
-            chosen = [self._take_group(group) for group in groups]
-        return [np.isin(np.arange(len(group.z)), choice) for group, choice in zip(groups, chosen)]
-
-    def _copies(self) -> tuple[np.ndarray, ...]:
-        return tuple(
-            part.copy()
-            for part in (self.x, self.P, self.mu, self.nis, self.nis_dof, self.score, self.scale)
-        )
-
-    def _take_group(self, group: Group) -> np.ndarray:
-        """Associate and update; the detection (T,) each track took, -1 for none."""
-        chosen = self._associate(group)
-        if isinstance(group, TagPing) and not (chosen >= 0).any():
-            # A late reflection among the arrivals, or a prediction too uncertain to linearise at.
-            fixed = as_fix(group, self.config)
-            if fixed is not None:
-                group, chosen = fixed, self._associate(fixed)
-        tracks = np.flatnonzero(chosen >= 0)
-        if len(tracks):
-            self._update(group, tracks, chosen[tracks])
-            if isinstance(group, RangeSums):
-                self._take_bearings(group.bearings(), tracks, chosen[tracks])
-        return chosen
+        self.white = before.white.copy()
+        self.fixes = before.fixes
+        self.tentative = before.life.status == TrackStatus.TENTATIVE
+        self.instruments = before.instruments
+        self.layout = self.instruments.layout(config, models.n)
+        self.named = before.target_id != NOBODY
+        self.existence = before.existence * math.exp(-self.dt / config.survival_time)
+        self.evidence = before.evidence
 
     def learn(self) -> DiverState:
-        """The state after the updates; transitions have learnt from the tracks that were hit."""
+        """What is known now; the transitions have learnt from the tracks that were hit."""
         hit = np.flatnonzero(self.nis_dof > 0)
         learnt = self.before.learnt.copy()
         shared = len(self.transition) == 1
         learnt[hit] = self.chain.learn(
             learnt[hit],
             self.transition if shared else self.transition[hit],
-            self.before.mu[hit],
-            self.mu[hit],
+            self.models.by_model(self.before.mu)[hit],
+            self.models.by_model(self.mu)[hit],
             self.dt,
         )
         return evolve(
@@ -201,90 +103,298 @@ class Scan:
             nis_dof=self.nis_dof,
             score=self.score,
             scale=self.scale,
+            existence=self.existence,
+            evidence=self.evidence,
+            white=self.white,
+            fixes=self.fixes,
+            instruments=self.instruments,
             repairs=self.before.repairs + self.repairs,
         )
 
-    def _fit(self, group: Group) -> FloatArray:
-        """Log-likelihood (T, D) of each detection for each track, -inf outside the gate."""
-        h, H = group.linearise(self.x, self.models.E)
-        threshold = gate_threshold(self.config.gate_probability, group.z.shape[1])
-        return imm_kernels.gate(
-            h, np.ascontiguousarray(H), self.P, self.mu, group.z, group.R, threshold
-        )
+    # -- fixes ---------------------------------------------------------------------------------
 
-    def _associate(self, group: Group) -> np.ndarray:
+    def associate_and_update(self, group: Positions) -> BoolArray:
+        """Associate and update; True (D,) where a fix was taken. Confirmed tracks choose first."""
+        H, h = self.expected_fixes()
+        threshold = gate_threshold(self.config.gate_probability, 2)
+        fit = imm_kernels.gate(h, H, self.P, self.mu, group.z, group.R, threshold)
+        fit[self.named] = -np.inf  # they know their own
+        rank = 2 * ~(fit.max(axis=1, initial=-np.inf) > -np.inf) + self.tentative
+        chosen = self._associate(fit, rank, group.clutter)
+        self._keep_score(fit, chosen, group.clutter)
+        tracks = np.flatnonzero(chosen >= 0)
+        if len(tracks):
+            self._update(group, tracks, chosen[tracks], H, h[tracks])
+        return np.isin(np.arange(len(group.z)), chosen)
+
+    def update_by_fixes(self, group: Positions, tracks: IndexArray, detection: IntArray) -> None:
+        """Update `tracks` (t,), each with its `detection` (t,), without association."""
+        H, h = self.expected_fixes()
+        self._update(group, tracks, detection, H, h[tracks])
+
+    def expected_fixes(self) -> tuple[FloatArray, FloatArray]:
+        """H (1, M, 2, n + q), what a fix measures of the whole state, and the fix h (T, M, 2) that
+        each model expects."""
+        fix, extra = self.models.fix, self.layout.size - self.models.n
+        if extra:
+            fix = np.concatenate([fix, np.zeros((*fix.shape[:2], extra))], axis=2)
+        return np.ascontiguousarray(fix[None]), np.einsum('jma,tja->tjm', fix, self.x)
+
+    def _associate(self, fit: FloatArray, rank: IntArray, clutter: float) -> IntArray:
         """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
-        fit = self._fit(group)
         target, detection = imm.pairs_inside(fit)
-        likelihood = fit[target, detection]
-        if group.clutter == 0.0:
-            cost = -1e6 - likelihood  # nothing to compare with but the other tracks
-        else:
-            p_detection = self.config.detection_probability
-            cost = association_cost(likelihood, p_detection, group.clutter)
-        chosen = assign_by_rank(target, detection, cost, self.rank, len(group.z))
-        self._keep_score(fit, chosen, group)
-        return chosen
+        cost = association_cost(fit[target, detection], self.config.detection_probability, clutter)
+        return assign_by_rank(target, detection, cost, rank, fit.shape[1])
 
-    def _keep_score(self, fit: FloatArray, chosen: np.ndarray, group: Group) -> None:
+    def _keep_score(self, fit: FloatArray, chosen: IntArray, clutter: float) -> None:
         """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""
         p_detection = self.config.detection_probability
         hit = np.flatnonzero(chosen >= 0)
-        self.score += np.log1p(-p_detection)
+        self.score += np.where(self.named, 0.0, np.log1p(-p_detection))
         self.score[hit] += fit[hit, chosen[hit]] + np.log(p_detection / (1.0 - p_detection))
-        self.score[hit] -= np.log(group.clutter or self.config.clutter_density)
+        self.score[hit] -= np.log(clutter)
 
-    def _expected(self, group: Group, tracks: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Mean (t, m) and covariance (t, m, m), without R, of what the group would measure of
-        `tracks`."""
+    def _update(
+        self,
+        group: Positions,
+        tracks: IndexArray,
+        detection: IntArray,
+        H: FloatArray,
+        h: FloatArray,
+    ) -> None:
+        """Update `tracks` (t,), each with its `detection` (t,); h (t, M, 2) what they expect."""
         x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
-        if isinstance(group, Positions):
-            return imm_kernels.combine(x, P, mu, np.ascontiguousarray(self.models.E[:, :2]))
-        h, H = group.linearise(x, self.models.E)
-        mean = np.einsum('tj,tjm->tm', mu, h)
-        spread = h - mean[:, None]
-        covariance = H @ P @ np.swapaxes(H, -1, -2) + spread[..., :, None] * spread[..., None, :]
-        return mean, np.einsum('tj,tjmk->tmk', mu, covariance)
-
-    def _update(self, group: Group, tracks: np.ndarray, detection: np.ndarray) -> None:
-        """Update `tracks` (t,), each with its `detection` (t,)."""
-        x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
-        h, H = group.linearise(x, self.models.E)
         R = np.ascontiguousarray(group.R[detection])
-        x, P, mu, _, nis, ok, repaired = imm_kernels.update(
-            x, P, mu, group.innovation(h, detection), np.ascontiguousarray(H), R
-        )
-        self.repairs += int(repaired.sum())
+        innovation = group.z[detection][:, None, :] - h
+        self.watch(x, P, mu, group.z[detection], H, R, tracks)
+        mask = self.layout.mask
+        if mask.all():
+            x, P, mu, _, nis, ok, repaired = imm_kernels.update(x, P, mu, innovation, H, R)
+            self.repairs += int(repaired.sum())
+        else:
+            x, P, mu, nis, ok = consider_models(x, P, mu, innovation, H[0], R, mask)
         self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
         self.nis[tracks] += np.where(ok, nis, 0.0)
-        self.nis_dof[tracks] += np.where(ok, group.z.shape[1], 0).astype(np.uint16)
+        self.nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
         if self.config.estimate_covariance_scale:
-            self._learn_scale(group, tracks, detection)
+            mean, covariance = imm_kernels.combine(x, P, mu, np.ascontiguousarray(H[0]))
+            residual = group.z[detection] - mean
+            stated = group.R[detection] / group.factor
+            self._learn_scale(FIXES, residual, covariance, stated)
 
-    def _take_bearings(
-        self, bearings: Bearings, tracks: np.ndarray, detection: np.ndarray
+    def watch(
+        self,
+        x: FloatArray,
+        P: FloatArray,
+        mu: FloatArray,
+        z: FloatArray,
+        H: FloatArray,
+        R: FloatArray,
+        tracks: IndexArray,
     ) -> None:
-        """Bearings belong to the echo they came with; the gate only keeps outliers out."""
-        measured = np.isfinite(bearings.z[detection, 0])
-        tracks, detection = tracks[measured], detection[measured]
-        if not len(tracks):
-            return
-        h, H = bearings.linearise(self.x[tracks], self.models.E)
-        innovation = np.einsum(
-            'tj,tj->t', self.mu[tracks], bearings.innovation(h, detection)[..., 0]
-        )
-        _, covariance = self._expected(bearings, tracks)
-        nis = innovation**2 / (covariance[:, 0, 0] + bearings.R[detection, 0, 0])
-        near = nis <= gate_threshold(self.config.gate_probability, 1)
-        self._update(bearings, tracks[near], detection[near])
+        """Keep account of whitened innovations, of the mixture as it was predicted."""
+        mean, covariance = imm_kernels.combine(x, P, mu, np.ascontiguousarray(H[0]))
+        nu, S = z - mean, covariance + R
+        # The inverse of the Cholesky factor of 2 x 2, written out: this runs at every fix.
+        with np.errstate(invalid='ignore', divide='ignore'):
+            a = np.sqrt(S[:, 0, 0])
+            b = S[:, 1, 0] / a
+            first = nu[:, 0] / a
+            second = (nu[:, 1] - b * first) / np.sqrt(S[:, 1, 1] - b * b)
+        white = np.column_stack([first, second])
+        counted = ~self.tentative[tracks] & np.isfinite(white).all(axis=1)
+        if counted.any():
+            self.fixes = self.fixes.after(self.white[tracks][counted], white[counted])
+        self.white[tracks] = white
 
-    def _learn_scale(self, group: Group, tracks: np.ndarray, detection: np.ndarray) -> None:
-        """Compare residuals with the stated covariance: E[r r' + H P H'] = R after the update,
-        where R is right."""
-        mean, covariance = self._expected(group, tracks)
-        residual = group.innovation(mean[:, None], detection)[:, 0]
+    def _learn_scale(
+        self, kind: int, residual: FloatArray, covariance: FloatArray, stated: FloatArray
+    ) -> None:
+        """Compare residuals (t, m) with the `stated` covariance (t, m, m): E[r r' + H P H'] = R
+        after the update, where R is right."""
         spread = residual[:, :, None] * residual[:, None, :] + covariance
-        stated = group.R[detection] / group.factor
         total = float(np.trace(np.linalg.solve(stated, spread), axis1=-2, axis2=-1).sum())
-        row = self.scale[group.kind] + (total, residual.size)
-        self.scale[group.kind] = row * min(1.0, SCALE_MEMORY / row[1])
+        row = self.scale[kind] + (total, residual.size)
+        self.scale[kind] = row * min(1.0, SCALE_MEMORY / row[1])
+
+    # -- pings -----------------------------------------------------------------------------------
+
+    def take_ping(self, ping: Arrivals, factor: float) -> BoolArray:
+        """Update the tracks by a ping, `factor` on the variances of its arrival times; True (n,)
+        for the rows that a track took."""
+        self.instruments = self.instruments.heard(ping, self.config)
+        self.layout = self.instruments.layout(self.config, self.models.n)
+        self.x, self.P = self.layout.widened(self.x, self.P)
+        rows = np.arange(len(ping))
+        numbers = ping_numbers(ping, rows, self.config, factor, self.models, self.layout)
+        taken = np.zeros(len(ping), bool)
+        if len(self.x) and numbers.pairs > int(ping.passive):
+            good = (self._take_tag if ping.passive else self._take_echoes)(numbers, factor)
+            taken[numbers.row[good & numbers.echo]] = True
+        return taken
+
+    def _take_echoes(self, ping: Ping, factor: float) -> BoolArray:
+        """Which numbers (C,) the tracks took of the echoes of one transmission.
+
+        Tracks that can explain more of the pairs choose first, and among those the confirmed
+        ones: a ghost fits the echoes it was made of, but only those. One that ends up with fewer
+        than half of the pairs is not what the ping shows; for it nothing happened.
+        """
+        fits = [fit_numbers(*one, self.config.target_z, ping.numbers) for one in self._each()]
+        fit, nis = (np.array(column) for column in zip(*fits))
+        near = (nis < NEAR) & ping.echo
+        pairs = [np.flatnonzero((ping.numbers.node == one) & ping.echo) for one in ping.nodes]
+        explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
+        rank = 2 * (len(pairs) - explained) + self.tentative
+        before = self._copies()
+        taken, hits = self._by_rank(ping, factor, rank, fit, near, pairs)
+        doubtful = (hits > 0) & (2 * hits < len(pairs))
+        if doubtful.any():
+            self._restore(before)
+            rank = np.where(doubtful, EXCLUDED, rank)
+            taken, _ = self._by_rank(ping, factor, rank, fit, near, pairs)
+        return taken
+
+    def _by_rank(
+        self,
+        ping: Ping,
+        factor: float,
+        rank: IntArray,
+        fit: FloatArray,
+        near: BoolArray,
+        pairs: list[IndexArray],
+    ) -> tuple[BoolArray, IntArray]:
+        """Which numbers (C,) were taken, and how many pairs each track (T,) took one of."""
+        taken, hits = np.zeros(len(ping.row), bool), np.zeros(len(rank), np.int64)
+        self.score += len(pairs) * np.log1p(-self.config.detection_probability)
+        gain = np.log(
+            self.config.detection_probability / (1.0 - self.config.detection_probability)
+        )
+        gain -= 0.5 * np.log(self.config.clutter_density)
+        for now in np.unique(rank[rank != EXCLUDED]):
+            tracks = np.flatnonzero(rank == now)
+            owner = self._owners(tracks, fit, near & ~taken, pairs)
+            found = np.zeros(len(taken), bool)
+            for track in tracks:
+                mine = ~taken & ~found & ((owner < 0) | (owner == track))
+                index = np.flatnonzero(mine)
+                good = self._accept(track, ping.only(mine), factor)
+                found[index[good]] = True
+                echoes = index[good & ping.echo[index]]
+                hits[track] = len(echoes)
+                self.score[track] += fit[track, echoes].sum() + gain * len(echoes)
+            taken |= found
+        return taken, hits
+
+    def _owners(
+        self, tracks: IndexArray, fit: FloatArray, near: BoolArray, pairs: list[IndexArray]
+    ) -> IntArray:
+        """The track each number (C,) is kept for, -1 for none: where several tracks choose at
+        once, each pair's echoes are assigned from the prediction."""
+        owner = np.full(fit.shape[1], -1)
+        if len(tracks) > 1:
+            for members in pairs:
+                inside = near[np.ix_(tracks, members)]
+                target, detection = np.nonzero(inside)
+                likelihood = fit[np.ix_(tracks, members)][target, detection]
+                cost = association_cost(
+                    likelihood,
+                    self.config.detection_probability,
+                    math.sqrt(self.config.clutter_density),
+                )
+                chosen = assign(target, detection, cost, len(tracks), len(members))
+                hit = np.flatnonzero(chosen >= 0)
+                owner[members[chosen[hit]]] = tracks[hit]
+        return owner
+
+    def _take_tag(self, ping: Ping, factor: float) -> BoolArray:
+        """Which numbers (C,) were taken of a tag's ping, all of it by one track.
+
+        A single diver known to be there is given every ping. Otherwise it is the track that
+        explains the ping best of those that need not jump for it. Confirmed tracks come first;
+        others are asked where less than half of the arrivals fit the one chosen.
+        """
+        self.score += np.log1p(-self.config.detection_probability)
+        for turn in (~self.tentative, self.tentative):
+            chosen = self._best_for_tag(ping, np.flatnonzero(turn))
+            if chosen is not None:
+                track, after = chosen
+                good = self._accept(track, ping, factor, after)
+                self.score[track] += float(good.sum())
+                if 2 * good.sum() >= len(good):
+                    return np.ones(len(good), bool)
+        return np.zeros(len(ping.row), bool)
+
+    def _best_for_tag(self, ping: Ping, tracks: IndexArray) -> tuple[int, PingUpdate] | None:
+        """Which of `tracks` explains a tag's ping best, and what becomes of it."""
+        best: tuple[int, PingUpdate] | None = None
+        for track in tracks.tolist():
+            after = update_by_ping(*self._one(track), ping, self.config, self.layout)
+            if after is None or not (self.config.max_tracks == 1 or self._near(track, after)):
+                continue
+            if best is None or after.log_evidence > best[1].log_evidence:
+                best = track, after
+        return best
+
+    def _near(self, track: int, after: PingUpdate) -> bool:
+        """Whether the diver after a ping is where the prediction allows it to be."""
+        E = self._position_matrix()
+        mean, covariance = imm_kernels.combine(*(one[None] for one in self._one(track)), E)
+        there, _ = imm_kernels.combine(after.x[None], after.P[None], after.mu[None], E)
+        gap = there[0] - mean[0]
+        distance = float(gap @ np.linalg.solve(covariance[0], gap))
+        return distance <= gate_threshold(self.config.gate_probability, 2)
+
+    def _position_matrix(self) -> FloatArray:
+        E = np.zeros((self.x.shape[1], 2, self.layout.size))
+        E[:, 0, 0] = E[:, 1, 1] = 1.0
+        return E
+
+    def _one(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self.x[track], self.P[track], self.mu[track]
+
+    def _each(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+        return (self._one(track) for track in range(len(self.x)))
+
+    def _accept(
+        self, track: int, ping: Ping, factor: float, after: PingUpdate | None = None
+    ) -> BoolArray:
+        """Update one track by numbers it may have; True (C,) for those that are its own."""
+        before = self._one(track)
+        if after is None and ping.echo.any():
+            after = update_by_ping(*before, ping, self.config, self.layout)
+        if after is None:
+            return np.zeros(len(ping.row), bool)
+        good = np.asarray(after.good > TAKEN)
+        height = self.config.target_z
+        if (good & ping.echo).sum() > int(ping.passive):
+            own = ping.only(good)
+            residual, covariance, dof = residuals(*before, own, height)
+            S = covariance + np.diag(own.numbers.variance)
+            self.nis[track] += float(residual @ np.linalg.solve(S, residual))
+            self.nis_dof[track] += np.uint16(dof)
+        self.x[track], self.P[track], self.mu[track] = after.x, after.P, after.mu
+        if self.config.estimate_covariance_scale and (good & ping.echo).any():
+            self._learn_from_ping(track, ping.only(good & ping.echo), factor)
+        return good
+
+    def _learn_from_ping(self, track: int, ping: Ping, factor: float) -> None:
+        """The scale of arrival times, from the arrivals a track took."""
+        residual, covariance, dof = residuals(*self._one(track), ping, self.config.target_z)
+        stated = np.diag(ping.numbers.variance / factor)
+        if ping.passive and dof:
+            # The emission is unknown: differences, whitened by what is stated.
+            projection = difference_projection(ping.numbers.variance / factor)
+            residual, stated = projection @ residual, np.eye(dof)
+            covariance = projection @ covariance @ projection.T
+        if dof:
+            self._learn_scale(ARRIVALS, residual[None], covariance[None], stated[None])
+
+    def _copies(self) -> tuple[FloatArray | IntArray, ...]:
+        return tuple(
+            part.copy()
+            for part in (self.x, self.P, self.mu, self.nis, self.nis_dof, self.score, self.scale)
+        )
+
+    def _restore(self, copies: tuple[FloatArray | IntArray, ...]) -> None:
+        self.x, self.P, self.mu, self.nis, self.nis_dof, self.score, self.scale = copies

@@ -12,7 +12,7 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.smoothing import imm_smooth
 from ...measurements import Measurement
-from .scan import cross, DiverState
+from .state import cross, DiverState
 from .tracker import DiverTracker
 
 LONGEST_GAP = 5
@@ -67,18 +67,48 @@ class SmoothingDiverTracker(DiverTracker):
 
         Tracks, ids and states are those of the filter; ``nis`` stays the filter's too.
         """
-        scans = [self._passed[stamp] for stamp in sorted(self._passed)]
+        if not self._passed:
+            return []
+        newest = self._passed[max(self._passed)]
+        layout = newest.instruments.layout(self.config, self.models.n)
+        scans = []
+        for stamp in sorted(self._passed):
+            scan = self._passed[stamp]
+            x, P = layout.widened(scan.x, scan.P)
+            scans.append(evolve(scan, x=x, P=P, instruments=newest.instruments))
         smooth = [
             evolve(scan, x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
         ]
         for track_id, one in self._passes(scans):
-            result = imm_smooth(*self._arrays(one))
-            self._smoothed_repairs += int(result.repaired.sum())
-            for scan, x, P, mu in zip(one.scans, result.x, result.P, result.mu):
+            x, P, mu = self._smooth(one)
+            for k, scan in enumerate(one.scans):
                 if scan is not None:
                     row = np.flatnonzero(scans[scan].life.track_id == track_id)[0]
-                    smooth[scan].x[row], smooth[scan].P[row], smooth[scan].mu[row] = x, P, mu
+                    smooth[scan].x[row], smooth[scan].P[row] = x[k], P[k]
+                    smooth[scan].mu[row] = mu[k]
         return [self._estimate(scan) for scan in smooth]
+
+    def _smooth(self, one: _Pass) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x (K, M, n), P (K, M, n, n), mu (K, M) of a pass, smoothed copy by copy: copies do not
+        switch, so that what each weighs at the end it weighs all along."""
+        x, P, mu = np.stack(one.x), np.stack(one.P), np.stack(one.mu)
+        M = len(self.models.names)
+        moves = self._moves(one, x.shape[-1])
+        for copy in range(self.models.copies):
+            own = slice(copy * M, (copy + 1) * M)
+            total = mu[:, own].sum(axis=1, keepdims=True)
+            if not (total > 0.0).all():
+                mu[:, own] = 0.0
+                continue
+            weight = mu[:, own] / total if self.models.copies > 1 else mu
+            transition = np.stack(one.transition)
+            result = imm_smooth(x[:, own], P[:, own], weight, transition, *moves)
+            self._smoothed_repairs += int(result.repaired.sum())
+            x[:, own], P[:, own] = result.x, result.P
+            mu[:, own] = result.mu * total[-1] if self.models.copies > 1 else result.mu
+        if self.models.copies > 1:
+            mu /= mu.sum(axis=1, keepdims=True)
+        return x, P, mu
 
     def _passes(self, scans: Sequence[DiverState]) -> list[tuple[int, _Pass]]:
         """Each track, cut where a gap is too long to look across."""
@@ -103,14 +133,15 @@ class SmoothingDiverTracker(DiverTracker):
                 )
         return passes
 
-    def _arrays(self, one: _Pass) -> tuple[FloatArray, ...]:
+    def _moves(self, one: _Pass, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """F, Q (K, M, size, size) and B (K, M, size): the motion, and constants that stay."""
         moves = [self.models.motion(dt) for dt in one.dt]
-        return (
-            np.stack(one.x),
-            np.stack(one.P),
-            np.stack(one.mu),
-            np.stack(one.transition),
-            np.stack([move.F for move in moves]),
-            np.stack([move.Q for move in moves]),
-            np.stack([move.B for move in moves]),
-        )
+        F, Q, B = (np.stack(parts) for parts in zip(*moves))
+        n = B.shape[-1]
+        if size == n:
+            return F, Q, B
+        wide = (*B.shape[:-1], size)
+        F_all, Q_all, B_all = np.zeros((*wide, size)), np.zeros((*wide, size)), np.zeros(wide)
+        F_all[..., :n, :n], Q_all[..., :n, :n], B_all[..., :n] = F, Q, B
+        F_all[..., range(n, size), range(n, size)] = 1.0
+        return F_all, Q_all, B_all

@@ -4,7 +4,7 @@ A diver swims slowly and turns often. The tracker runs one motion model for each
 headings (`models`) in an interacting multiple model filter, and lets the data correct the
 probabilities of turning. A scan of the world goes through
 
-    predict -> for each group of detections: gate, associate, update -> learn -> prune -> spawn
+    predict -> fixes: gate, associate, update; pings: explain -> learn -> prune -> spawn
 
 and the whole of what is known after it is one value, `DiverState`, so that a late measurement is
 put in its place by computing the scans after it again (`trackers.stream`).
@@ -20,23 +20,30 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...estimation import imm_kernels
+from ...estimation import imm_kernels, jipda_kernels
 from ...estimation.adaptation import AdaptiveChain
+from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
-from ...measurements import Arrivals, Fix, Measurement
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
-from .births import Birth, births_from_fixes, births_from_ping
+from . import soft
+from .births import Birth, births_from_ping
 from .config import DiverConfig
-from .models import build_models, OUTPUTS
-from .scan import DiverState, Scan
-from .sensing import Group, groups_of, Positions
+from .fix_consistency import FixConsistency
+from .fix_scans import each_name_once, shows_all, take_fixes
+from .instruments import Instruments
+from .models import build_models
+from .pings import begin_from_ping, FAR, ping_numbers
+from .scan import Scan
+from .sensing import position_groups
+from .state import DiverState
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
 
 class DiverTracker:
-    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix` and `Arrivals`."""
+    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`."""
 
     def __init__(self, config: DiverConfig):
         self.config = config
@@ -51,7 +58,7 @@ class DiverTracker:
 
     def reset(self) -> None:
         self._stream = ReplayStream(
-            (Fix, Arrivals),
+            (Fix, Fixes, Arrivals),
             StreamRules.of(self.config),
             step=self._scan,
             initial=self._nobody(Tracks.none(track_rules(self.config))),
@@ -65,13 +72,29 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
-        # A contested scan and a ping, in which nothing is left to be loaded at the first real one.
+        jipda_kernels.warm()
+        # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
+        rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+        leg = np.linalg.norm(rx - [20.0, 30.0, -5.0], axis=1)
         for second in (1, 2):
             for x in (0.0, 0.1):
                 position = np.array([x, 0.0, 0.0])
                 fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
                 tracker.process(fix)
+            for tx in (rx[0], np.full(3, np.nan)):
+                ping = Arrivals(
+                    stamp_ns=second * 10**9,
+                    tx_id=np.zeros(4),
+                    rx_id=np.arange(4),
+                    tx=np.tile(tx, (4, 1)),
+                    rx=rx,
+                    toa=(leg + leg[0]) / self.config.sound_speed,
+                    var_toa=np.full(4, 1e-8),
+                    bearing=np.full(4, np.nan),
+                    var_bearing=np.full(4, np.nan),
+                )
+                tracker.process(ping)
 
     def health(self) -> dict[str, float]:
         now = self._stream.state
@@ -84,9 +107,15 @@ class DiverTracker:
             else float('nan'),
             'broken_tracks': now.broken,
             'covariance_repairs': now.repairs,
+            'fixes_mean_nis': now.fixes.mean_nis,
+            'fixes_lag_1': now.fixes.lag_1,
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
+
+    def warnings(self) -> list[str]:
+        """What of the input cannot be true, in sentences for the user."""
+        return self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -97,7 +126,7 @@ class DiverTracker:
 
     def _nobody(self, life: Tracks) -> DiverState:
         """The state without a track; `life` has none, but the next identity."""
-        M, n = len(self.models.names), self.models.n
+        M, n = self.models.copies * len(self.models.names), self.models.n
         return DiverState(
             stamp_ns=0,
             life=life,
@@ -108,7 +137,14 @@ class DiverTracker:
             nis=np.empty(0),
             nis_dof=np.empty(0, np.uint16),
             score=np.empty(0),
+            white=np.empty((0, 2)),
+            fixes=FixConsistency(),
             scale=np.zeros((2, 2)),
+            existence=np.empty(0),
+            evidence=np.empty(0),
+            target_id=np.empty(0, np.int64),
+            near_to=np.empty(0, np.int64),
+            near_for=np.empty(0, np.int64),
         )
 
     # -- one scan ------------------------------------------------------------------------------
@@ -117,62 +153,55 @@ class DiverTracker:
         """The state after all measurements of one stamp. Pure."""
         factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
         scan = self._predict(before, stamp_ns)
-        unassigned = [
-            (group, ~taken)
-            for groups in groups_of(items, self.config, factor)
-            for group, taken in zip(groups, scan.associate_and_update(groups))
-        ]
-        now = self._prune(scan.learn())
-        return self._spawn(now, self._births(items, unassigned, float(factor[1])))
+        births: list[Birth] = []
+        fix_factor = float(self.config.covariance_scale * factor[0])
+        for group in position_groups(items, self.config, fix_factor):
+            births += take_fixes(scan, group)
+        for ping in (item.in_order() for item in items if isinstance(item, Arrivals)):
+            taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
+            births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
+        now = self._prune(scan.learn(), items)
+        return self._spawn(now, births)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
         return Scan(self.config, self.models, self._chain, before, stamp_ns)
 
-    def _births(
-        self, items: Sequence[Measurement], left: Sequence[tuple[Group, np.ndarray]], factor: float
-    ) -> list[Birth]:
-        """Where the detections no track took put new divers."""
-        births: list[Birth] = []
-        for group, free in left:
-            if isinstance(group, Positions):
-                births += births_from_fixes(group, free)
-        for ping in (item for item in items if isinstance(item, Arrivals)):
-            rows = np.zeros(len(ping), bool)
-            for group, free in left:
-                if group.ping is ping:
-                    rows[group.rows] = free
-            births += births_from_ping(ping, rows, self.config, factor)
-        return births
-
-    def _prune(self, now: DiverState) -> DiverState:
+    def _prune(self, now: DiverState, items: Sequence[Measurement]) -> DiverState:
         """End the tracks that are over, broken, or too many."""
         config = self.config
         sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
+        broken = now.broken + int((~sound).sum())
+        hit = now.nis_dof > 0
+        looked = any(shows_all(item, config) for item in items) & (now.target_id == NOBODY)
+        by_existence = np.isfinite(now.existence)
         life, kept = now.life.scan(
-            now.nis_dof > 0,
-            now.stamp_ns,
-            track_rules(config),
-            looked=np.full(len(sound), config.fixes_are_scans),
+            hit, now.stamp_ns, track_rules(config), looked=looked & ~by_existence
         )
+        if by_existence.any():
+            judged = soft.judge(now, hit, looked, self.models.E[:, :2])
+            status = np.where(by_existence[kept], judged.status[kept], life.status)
+            life = evolve(life, status=status)
+            now = evolve(now, near_to=judged.near_to, near_for=judged.near_for)
+            sound = sound & (judged.alive | ~by_existence)
         life, kept = life.only(sound[kept]), kept & sound
         confirmed = np.flatnonzero(life.status != TrackStatus.TENTATIVE)
         if len(confirmed) > config.max_tracks:
-            best = np.argsort(-now.score[kept][confirmed], kind='stable')[: config.max_tracks]
+            known = np.where(now.target_id == NOBODY, now.score, np.inf)[kept][confirmed]
+            best = np.argsort(-known, kind='stable')[: config.max_tracks]
             room = life.status == TrackStatus.TENTATIVE
             room[confirmed[best]] = True
             kept[kept] = room
             life = life.only(room)
-        broken = now.broken + int((~sound).sum())
         return evolve(now.rows(kept), life=life, broken=broken)
 
     def _spawn(self, now: DiverState, births: list[Birth]) -> DiverState:
         """Begin a tentative track at each birth, as long as there is room."""
         config = self.config
-        births = births[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
+        births = each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
         if not births:
             return now
-        new = [self.models.new_track(*birth) for birth in births]
-        M, n, count = len(self.models.names), self.models.n, len(new)
+        new = [self._new_track(birth, now.instruments) for birth in births]
+        M, n, count = now.x.shape[1], now.x.shape[2], len(new)
         return evolve(
             now,
             life=now.life.born(count, now.stamp_ns, track_rules(config)),
@@ -183,24 +212,59 @@ class DiverTracker:
             nis=np.append(now.nis, np.full(count, np.nan)),
             nis_dof=np.append(now.nis_dof, np.zeros(count, np.uint16)),
             score=np.append(now.score, np.zeros(count)),
+            white=np.concatenate([now.white, np.full((count, 2), np.nan)]),
+            existence=np.append(now.existence, [birth.existence for birth in births]),
+            evidence=np.append(now.evidence, np.ones(count)),
+            target_id=np.append(now.target_id, [birth.target_id for birth in births]),
+            near_to=np.append(now.near_to, np.zeros(count, np.int64)),
+            near_for=np.append(now.near_for, np.zeros(count, np.int64)),
         )
 
+    def _new_track(
+        self, birth: Birth, instruments: Instruments
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x, P and mu of a track that begins."""
+        layout = instruments.layout(self.config, self.models.n)
+        plain = self.models.height < 0 and layout.size == self.models.n
+        if birth.ping is None or birth.rows is None or plain:
+            x, P, mu = self.models.new_track(birth.position, birth.covariance, birth.ping is None)
+            return *layout.widened(x, P), mu
+        x, P, mu = self.models.new_track(birth.position, np.eye(2) * FAR**2, False)
+        x, P = layout.widened(x, P)
+        factor = self.config.covariance_scale
+        ping = ping_numbers(birth.ping, birth.rows, self.config, factor, self.models, layout)
+        # All models of a copy begin alike: one of each is enough to ask.
+        M = len(self.models.names)
+        first = begin_from_ping(x[::M], P[::M], ping, birth.position, self.config, layout)
+        share = np.exp(first[2] - first[2].max())
+        mu = mu * np.repeat(share / share.sum() * len(share), M)
+        return np.repeat(first[0], M, axis=0), np.repeat(first[1], M, axis=0), mu
+
     def _estimate(self, state: DiverState) -> Estimate:
-        mean, covariance = imm_kernels.combine(state.x, state.P, state.mu, self.models.E)
+        n, shown = self.models.n, soft.published(state.existence)
+        state = evolve(state.rows(shown), life=state.life.only(shown))
+        x, P = state.x, state.P
+        if x.shape[-1] > n:
+            x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
+        mean, covariance = imm_kernels.combine(x, P, state.mu, self.models.E)
         depth = np.full(len(mean), self.config.target_z)
+        if self.models.height >= 0:
+            depth = mean[:, 2]
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._stream.frame_id,
             xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
-            state_names=OUTPUTS,
+            state_names=self.models.outputs,
             state=mean,
             covariance=covariance,
             model_names=self.models.names,
-            probabilities=state.mu,
+            probabilities=self.models.by_model(state.mu),
             extras={
                 'track_id': state.life.track_id,
                 'track_state': state.life.status,
                 'nis': state.nis,
                 'nis_dof': state.nis_dof,
+                'existence': state.existence,
+                'target_id': state.target_id.astype(np.int32),
             },
         )

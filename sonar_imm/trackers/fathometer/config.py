@@ -8,7 +8,7 @@ from attrs import frozen
 
 from ...acoustics.fathometer import PROCESSORS
 from ...acoustics.spectra import WINDOWS
-from ...estimation.set_particles import PRIORS
+from ...estimation.set_model import PRIORS
 from ...parameters import inherited, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
@@ -17,6 +17,10 @@ live = partial(parameter, read_only=False)
 
 PULSES = ('band', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
+POLARITIES = ('positive', 'both')
+MULTIPLES = ('mark', 'off')
+HEAVES = ('none', 'independent', 'memory')
+MAX_MEMBERS = 50_000_000
 
 
 @frozen(kw_only=True)
@@ -49,6 +53,17 @@ class FathometerConfig(StampParameters):
         unit='m',
         low=0.0,
         high=1000.0,
+    )
+
+    heave: str = parameter(
+        'none',
+        'whether the error of the told depth, of standard deviation array_depth_std, is a state '
+        'that all reflectors share: none; independent, wrong anew in each record; memory, by '
+        'heave_memory',
+        choices=HEAVES,
+    )
+    heave_memory: float = parameter(
+        0.9, 'memory: how much of the error stays from record to record', low=0.01, high=0.99
     )
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
@@ -109,7 +124,9 @@ class FathometerConfig(StampParameters):
     noise_depth_min: float = live(
         180.0,
         'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
-        'the whole trace when it does not reach there',
+        'the whole trace when it does not reach there. 0 together with noise_depth_max: where '
+        'the depths tracked have their mirror image at the array, or in what reflectors leave of '
+        'a trace',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -118,7 +135,10 @@ class FathometerConfig(StampParameters):
         300.0, 'end of the depths where noise is measured', unit='m', low=0.0, high=12000.0
     )
     noise_sigma: float = live(
-        0.0, 'standard deviation of the noise; 0: as the trace says, else measured', low=0.0
+        0.0,
+        'standard deviation of the noise; 0: as the trace says, else measured',
+        low=0.0,
+        high=1e30,
     )
     remove_background: bool = live(
         False, 'take the median of the noise off the trace first: for envelopes'
@@ -136,6 +156,25 @@ class FathometerConfig(StampParameters):
     )
     pulse_file: str = parameter(
         '', 'file: a CSV of two columns, distance in m from 0 on, and value'
+    )
+
+    # -- sediment ---------------------------------------------------------------------------------
+    sediment_sound_speed: float = live(
+        0.0,
+        'speed of sound just below the bottom, for sediment_depth; 0: as in the water',
+        unit='m/s',
+        low=0.0,
+        high=8000.0,
+    )
+    sediment_sound_speed_std: float = live(
+        0.0, 'error of sediment_sound_speed', unit='m/s', low=0.0, high=2000.0
+    )
+    sediment_sound_speed_gradient: float = live(
+        0.0,
+        'growth of the speed of sound with the depth below the bottom',
+        unit='1/s',
+        low=0.0,
+        high=10.0,
     )
 
     # -- the set of reflectors --------------------------------------------------------------------
@@ -157,6 +196,15 @@ class FathometerConfig(StampParameters):
     )
     min_separation: float = parameter(
         0.4, 'least distance of two reflectors', unit='m', low=1e-4, high=1000.0
+    )
+    polarity: str = parameter(
+        'positive',
+        'sign of the reflectors looked for: where the impedance grows with depth they are '
+        'positive; envelopes (remove_background) have no negative ones',
+        choices=POLARITIES,
+    )
+    negative_probability: float = parameter(
+        0.05, 'polarity both: that a new reflector is negative', low=1e-6, high=0.999
     )
     amplitude_prior: str = parameter(
         'marginal',
@@ -193,6 +241,12 @@ class FathometerConfig(StampParameters):
     existence_min: float = live(
         0.5, 'least probability with which a reflector is reported', low=0.0, high=1.0
     )
+    multiples: str = live(
+        'mark',
+        'whether reflectors get a probability of being multiples of others, by depths from the '
+        'surface; they are never left out',
+        choices=MULTIPLES,
+    )
     track_memory: int = live(
         5, 'a reflector not seen for so many records gets a new id', low=0, high=10_000
     )
@@ -203,12 +257,10 @@ class FathometerConfig(StampParameters):
 
     def check(self) -> list[str]:
         problems = super().check()
-        for low, high in (
-            ('frequency_min', 'frequency_max'),
-            ('noise_depth_min', 'noise_depth_max'),
-        ):
-            if getattr(self, low) >= getattr(self, high):
-                problems.append(f'{high} must exceed {low}')
+        if self.frequency_min >= self.frequency_max:
+            problems.append('frequency_max must exceed frequency_min')
+        if self.noise_depth_min >= self.noise_depth_max and not self.noise_from_mirror:
+            problems.append('noise_depth_max must exceed noise_depth_min')
         if self.depth_max <= self.depth_min and (self.depth_min or self.depth_max):
             problems.append('depth_max must exceed depth_min')
         if self.order_max < self.order_min:
@@ -220,6 +272,12 @@ class FathometerConfig(StampParameters):
                 f'order_min {self.order_min} to order_max {self.order_max}',
                 name='order_transition_matrix',
             )
+        if self.heave != 'none' and not self.array_depth_std:
+            problems.append(f'heave {self.heave} needs array_depth_std')
+        if self.particles * self.order_max > MAX_MEMBERS:
+            problems.append(
+                f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'
+            )
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
@@ -229,6 +287,18 @@ class FathometerConfig(StampParameters):
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems
+
+    @property
+    def noise_from_mirror(self) -> bool:
+        """True when no depths of noise are given."""
+        return not (self.noise_depth_min or self.noise_depth_max)
+
+    @property
+    def negative_share(self) -> float:
+        """How many of the new reflectors are negative."""
+        if self.polarity == 'positive' or self.remove_background:
+            return 0.0
+        return self.negative_probability
 
     @property
     def orders(self) -> int:

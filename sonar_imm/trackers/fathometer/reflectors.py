@@ -14,12 +14,14 @@ from attrs import evolve, frozen
 import numpy as np
 from numpy.typing import NDArray
 
+from ...acoustics.fathometer import sediment_thickness
 from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_members import Members
 from .config import FathometerConfig
+from .multiples import Seen
 from .response import Lattice, Response
 
 IdArray = NDArray[np.uint32]
@@ -80,12 +82,17 @@ def nearest_ids(
 @frozen(eq=False)
 class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
-    covariance (K, 2, 2) of both, existence (K,)."""
+    covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
+    above it; heave and heave_std: told minus true depth of the array, m, 0 where it is no state.
+    """
 
     depth: FloatArray
     amplitude: FloatArray
     covariance: FloatArray
     existence: FloatArray
+    is_bottom: FloatArray
+    heave: float = 0.0
+    heave_std: float = 0.0
 
 
 def reflectors_of(
@@ -94,10 +101,12 @@ def reflectors_of(
     lattice: Lattice,
     pulse: Pulse,
     config: FathometerConfig,
+    heave: tuple[float, float] | None = None,
 ) -> Reflectors:
-    """Members of the set in cells and units of the noise, as reflectors in m and amplitudes."""
+    """Members of the set in cells and units of the noise, as reflectors in m and amplitudes.
+    heave: its mean and standard deviation, m, where it is a state."""
     depth = lattice.first + lattice.step * members.place
-    sigma = np.interp(depth, response.depth, response.sigma)
+    sigma = np.interp(depth + (heave[0] if heave else 0.0), response.depth, response.sigma)
     covariance = members.covariance.copy()
     # A cell is as uncertain as it is wide; given the places, the amplitudes are uncertain too.
     covariance[:, 0, 0] += 1.0 / 12.0
@@ -106,8 +115,17 @@ def reflectors_of(
     covariance *= scale[:, :, None] * scale[:, None, :]
     # The particles know depths as they follow from the depth told with this record: it alone fixes
     # them to some centimetres, so that the errors of earlier records have no say.
-    covariance[:, 0, 0] += config.array_depth_std**2
-    return Reflectors(depth, sigma * members.amplitude, covariance, members.existence)
+    # Where it is a state, the places of the particles are spread by what is not known of it.
+    if heave is None:
+        covariance[:, 0, 0] += config.array_depth_std**2
+    return Reflectors(
+        depth,
+        sigma * members.amplitude,
+        covariance,
+        members.existence,
+        members.foremost,
+        *(heave or (0.0, 0.0)),
+    )
 
 
 def _conditional_variance(
@@ -126,29 +144,65 @@ def relative_amplitude(
     """Amplitudes (K,) freed of spreading and of the window, in m: A (2 H + L) / taper(tau / T), H
     below the array of length L, tau = 2 H / c, T the length of a snapshot. NaN when the depth of
     the array is not known."""
-    height = reflectors.depth - response.reference_depth
+    height = reflectors.depth - response.reference_depth + reflectors.heave
     share = 2.0 * height / (config.sound_speed * config.snapshot_seconds)
     with np.errstate(divide='ignore', invalid='ignore'):
         taper = window_overlap(config.window, share) if response.aperture else 1.0
         return np.asarray(reflectors.amplitude * (2.0 * height + response.aperture) / taper)
 
 
+def sediment_depths(
+    reflectors: Reflectors, config: FathometerConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Depths (K,) with the sediment's own speed of sound below the bottom, m, and their standard
+    deviations (K,), m. The bottom is the reflector that is it most probably; what lies above it
+    keeps its depth."""
+    if not len(reflectors.depth):
+        return np.empty(0), np.empty(0)
+    bottom = reflectors.depth[np.argmax(reflectors.is_bottom)]
+    time = 2.0 * np.maximum(reflectors.depth - bottom, 0.0) / config.sound_speed
+    speed = config.sediment_sound_speed or config.sound_speed
+    thickness = sediment_thickness(time, speed, config.sediment_sound_speed_gradient)
+    variance = reflectors.covariance[:, 0, 0]
+    variance = variance + np.square(thickness * config.sediment_sound_speed_std / speed)
+    depth = np.where(time > 0.0, bottom + thickness, reflectors.depth)
+    return depth, np.sqrt(variance)
+
+
+def seen_as(reflectors: Reflectors, ids: IdArray, config: FathometerConfig) -> Seen:
+    """What `multiples` needs to know of a record."""
+    shared = config.array_depth_std if config.heave == 'none' else reflectors.heave_std
+    variance = np.maximum(reflectors.covariance[:, 0, 0] - shared**2, 1e-6)
+    sign = np.sign(reflectors.amplitude)
+    return Seen(ids, reflectors.depth, variance, sign, shared**2)
+
+
 def write_estimate(
     reflectors: Reflectors,
     ids: IdArray,
     pmf: FloatArray,
+    multiple: FloatArray,
     response: Response,
     config: FathometerConfig,
     *,
     preview: bool = False,
 ) -> Estimate:
-    """One row per reflector; without any, one row whose depth is NaN, for the PMF's sake."""
+    """One row per reflector, multiple (K,) the probability that it is a multiple; without any, one
+    row whose depth is NaN, for the PMF's sake."""
     rows = max(1, len(ids))
     state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
     extras = {
         'track_id': np.zeros(rows, np.uint32),
         'existence': np.zeros(rows),
         'relative_amplitude': np.full(rows, np.nan),
+        'polarity': np.zeros(rows, np.int8),
+        'heave': np.full(rows, reflectors.heave),
+        'heave_std': np.full(rows, reflectors.heave_std),
+        'two_way_time': np.full(rows, np.nan),
+        'is_bottom': np.zeros(rows),
+        'multiple_probability': np.full(rows, np.nan),
+        'sediment_depth': np.full(rows, np.nan),
+        'sediment_depth_std': np.full(rows, np.nan),
         'sigma': np.full(rows, float(np.median(response.sigma))),
         'preview': np.full(rows, int(preview), np.uint8),
     }
@@ -158,6 +212,13 @@ def write_estimate(
         extras['track_id'][:] = ids
         extras['existence'][:] = reflectors.existence
         extras['relative_amplitude'][:] = relative_amplitude(reflectors, response, config)
+        height = reflectors.depth - response.reference_depth
+        extras['two_way_time'][:] = 2.0 * height / config.sound_speed
+        extras['polarity'][:] = np.sign(reflectors.amplitude)
+        extras['multiple_probability'][:] = multiple
+        extras['is_bottom'][:] = reflectors.is_bottom
+        found = sediment_depths(reflectors, config)
+        extras['sediment_depth'][:], extras['sediment_depth_std'][:] = found
     zero = np.zeros(rows)
     return Estimate(
         stamp_ns=response.stamp_ns,

@@ -6,9 +6,10 @@ was, is put onto it: its `Response` is what the particles see.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
-from attrs import field, frozen
+from attrs import evolve, field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,11 +17,17 @@ from ...acoustics import fathometer
 from ...acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
+from ...estimation.set_model import move_reach
+from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError
 from .config import FathometerConfig
 
 MAX_CELLS = 100_000
+MAX_MOVES = 8_000_000
+"""Of a lattice: cells times the cells that a reflector can move to. Each takes 16 bytes in the
+tables of moves, 32 where reflectors of either sign are looked for."""
+MAX_SIGMAS = 1e6
 _LEAST_NOISE_SAMPLES = 50
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
 
@@ -37,6 +44,10 @@ class Lattice:
     def depth(self) -> FloatArray:
         return self.first + self.step * np.arange(self.cells)
 
+    def padded(self, cells: int) -> Lattice:
+        """With so many more cells at either end."""
+        return Lattice(self.first - cells * self.step, self.step, self.cells + 2 * cells)
+
 
 @frozen(eq=False)
 class Response:
@@ -44,7 +55,7 @@ class Response:
 
     depth, amplitude, sigma (n,): on the lattice, with the standard deviation of the noise.
     reference_depth: of the array, m, NaN when not known. aperture: length of the array, m, 0 for
-    traces.
+    traces. noise_unknown: sigma is that of the whole trace, reflectors included.
     """
 
     stamp_ns: int
@@ -54,6 +65,7 @@ class Response:
     sigma: FloatArray = field(repr=False)
     reference_depth: float = np.nan
     aperture: float = 0.0
+    noise_unknown: bool = False
 
 
 def pulse_of(config: FathometerConfig) -> Pulse:
@@ -82,14 +94,14 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
     if not step:
         step = trace.step / np.ceil(0.5 * trace.step / config.depth_std)
     first = trace.depth[0] + step * np.ceil((low - trace.depth[0]) / step - 1e-6)
-    return _checked(float(first), float(step), min(high, float(trace.depth[-1])))
+    return _checked(float(first), float(step), min(high, float(trace.depth[-1])), config)
 
 
 def lattice_of_array(reference_depth: float, config: FathometerConfig) -> Lattice:
     """The depths in the window. Raises `Rejection` when there are none."""
     low, high = _window(config, (reference_depth + 10.0, reference_depth + 110.0))
     step = config.depth_step or config.sound_speed / (12.0 * config.frequency_max)
-    return _checked(low, step, high)
+    return _checked(low, step, high, config)
 
 
 def trace_response(
@@ -98,6 +110,7 @@ def trace_response(
     """Put a trace onto the lattice; where it does not reach, the response is zero. Raises
     `Rejection` when it has no noise to compare with, or lies elsewhere."""
     amplitude = np.where(np.isfinite(trace.amplitude), trace.amplitude, 0.0)
+    noise_unknown = False
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)
     quiet &= np.isfinite(trace.amplitude)
     if np.count_nonzero(quiet) < _LEAST_NOISE_SAMPLES:
@@ -114,6 +127,7 @@ def trace_response(
             sigma = np.interp(depth, trace.depth[finite], trace.sigma[finite])
         else:
             sigma[:] = _measured_sigma(amplitude[quiet])
+            noise_unknown = config.noise_from_mirror
     return Response(
         trace.stamp_ns,
         trace.frame_id,
@@ -121,6 +135,7 @@ def trace_response(
         np.interp(depth, trace.depth, amplitude, left=0.0, right=0.0),
         sigma,
         reference_depth,
+        noise_unknown=noise_unknown,
     )
 
 
@@ -144,10 +159,13 @@ def array_response(
     # Nearer than its own length the array hears itself.
     b[lattice.depth - reference_depth < aperture] = 0.0
     sigma = np.full(lattice.cells, config.noise_sigma)
-    if not config.noise_sigma:
-        count = int((config.noise_depth_max - config.noise_depth_min) / lattice.step)
+    if not config.noise_sigma and config.noise_from_mirror:
+        sigma[:] = mirror_sigma(at, lattice, reference_depth, aperture)
+    elif not config.noise_sigma:
+        span = config.noise_depth_max - config.noise_depth_min
+        step = max(lattice.step, span / MAX_CELLS)
         low = max(config.noise_depth_min, reference_depth + 2.0 * aperture)
-        quiet = Lattice(low, lattice.step, max(count, _LEAST_NOISE_SAMPLES))
+        quiet = Lattice(low, step, max(int(span / step), _LEAST_NOISE_SAMPLES))
         # The deeper, the less is left of the noise, too: it is measured deeper than it is needed.
         flat = at(quiet.first, quiet.step, quiet.cells) / taper(quiet.depth)
         sigma = _measured_sigma(flat) * taper(lattice.depth)
@@ -160,6 +178,38 @@ def array_response(
         reference_depth,
         aperture,
     )
+
+
+def mirror_sigma(
+    at: Callable[[float, float, int], FloatArray],
+    lattice: Lattice,
+    reference_depth: float,
+    aperture: float,
+) -> float:
+    """Noise of a response where it holds no echo: at the lags of the lattice, negative, that is at
+    the depths 2 reference_depth - z. It fades there as it does on the lattice. Left out: what is
+    nearer than the aperture. at(first, step, count): the response."""
+    # A short lattice is made longer.
+    count = max(lattice.cells, 4 * _LEAST_NOISE_SAMPLES)
+    first = 2.0 * reference_depth - lattice.first - lattice.step * (count - 1)
+    depth = first + lattice.step * np.arange(count)
+    quiet = reference_depth - depth >= aperture
+    if np.count_nonzero(quiet) < _LEAST_NOISE_SAMPLES:
+        raise Rejection('no_noise', 'nothing of the mirrored depths is free of the array itself')
+    noise = at(first, lattice.step, count)[quiet]
+    # The noise of a coherence has mean zero: no median of it is taken off.
+    return _measured_sigma(np.append(noise, -noise))
+
+
+def residual_sigma(response: Response, fitted: FloatArray) -> Response:
+    """`response` with the noise that is left where the reflectors' own response `fitted` (n,) is
+    taken off; as it was when that has no noise."""
+    heard = response.amplitude != 0.0
+    try:
+        sigma = _measured_sigma((response.amplitude - fitted)[heard])
+    except Rejection:
+        return response
+    return evolve(response, sigma=np.full(len(response.depth), sigma))
 
 
 def array_coherence(
@@ -243,13 +293,35 @@ def _window(config: FathometerConfig, otherwise: tuple[float, float]) -> tuple[f
     return (config.depth_min, config.depth_max) if config.depth_max else otherwise
 
 
-def _checked(first: float, step: float, high: float) -> Lattice:
-    cells = int(np.floor((high - first) / step + 1e-6)) + 1
-    if cells < 2:
+def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
+    """The heave as a shift in cells of `step` m: on a grid that is finer than reflectors move and
+    than the heave changes."""
+    if config.heave == 'none':
+        return None
+    memory = config.heave_memory if config.heave == 'memory' else 0.0
+    std = config.array_depth_std / step
+    fine = min(config.depth_std / step / 3.0, 0.5 * std * np.sqrt(1.0 - memory**2))
+    return Shift(std=std, memory=memory, step=int(max(1.0, fine, np.ceil(4.0 * std / 200.0))))
+
+
+def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:
+    wanted = (high - first) / step + 1.0 + 1e-6
+    if not wanted >= 2.0:
         raise Rejection('other_depths', 'the record does not reach the depths to be tracked')
-    if cells > MAX_CELLS:
+    # With heave the record is looked at further up and down.
+    heard = wanted + (9.0 * config.array_depth_std / step if config.heave != 'none' else 0.0)
+    if heard > MAX_CELLS:
         raise Rejection(
             'too_large',
-            f'the depths to be tracked make {cells} steps of {step:g} m; {MAX_CELLS} at most',
+            f'the depths to be tracked make {heard:.0f} steps of {step:g} m; {MAX_CELLS} at most',
         )
-    return Lattice(first, step, cells)
+    reach = move_reach(config.depth_std / step)
+    if heard * (2.0 * reach + 1.0) > MAX_MOVES:
+        raise Rejection(
+            'too_large',
+            f'{heard:.0f} steps of {step:g} m, from each of which a reflector can move by '
+            f'{reach:.0f} (depth_std {config.depth_std:g} m), are '
+            f'{heard * (2.0 * reach + 1.0):.3g} moves; {MAX_MOVES} at most: use a greater '
+            'depth_step or fewer depths',
+        )
+    return Lattice(first, step, int(wanted))

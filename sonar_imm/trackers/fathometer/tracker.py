@@ -31,26 +31,32 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_members import find_members
-from ...estimation.set_particles import banded_transition, gaussian_move, SetModel, Sets
+from ...estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
+from .multiples import Multiples
 from .pressure import PressureStream
 from .reflectors import (
+    IdArray,
     Identified,
     Identities,
     nearest_ids,
     Reflectors,
     reflectors_of,
+    seen_as,
     write_estimate,
 )
 from .response import (
     array_response,
+    heave_shift,
     Lattice,
     lattice_of_array,
     lattice_of_trace,
+    MAX_SIGMAS,
     pulse_of,
     rank_deficient,
+    residual_sigma,
     Response,
     trace_response,
 )
@@ -94,7 +100,9 @@ class FathometerTracker:
         self._hydrophones = self.config.phones
         self._pressure = PressureStream(self.config, self.counts)
         self._ids = self._ids.forget()
+        self._multiples = Multiples()
         self._lattice: Lattice | None = None
+        self._heard: Lattice | None = None
         self._filter: SetFilter | None = None
         self._before: Weighted | None = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
@@ -103,12 +111,21 @@ class FathometerTracker:
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
+        heave_differs = config.array_depth_std != self.config.array_depth_std
         self.config = config
+        if config.heave != 'none' and heave_differs:
+            # It is built into the filter as the spread of a state.
+            self._forget()
 
     def warm(self) -> None:
         depth = 0.05 * np.arange(200)
         config = evolve(
-            self.config, depth_min=0.0, depth_max=0.0, depth_step=0.05, min_separation=0.05
+            self.config,
+            depth_min=0.0,
+            depth_max=0.0,
+            depth_step=0.05,
+            min_separation=0.05,
+            array_depth_std=0.1,
         )
         tracker = FathometerTracker(evolve(config, particles=8, threads=1))
         amplitude = np.exp(-np.square((depth - 5.0) / 0.1)) + 0.01 * np.sin(31.0 * depth)
@@ -143,9 +160,9 @@ class FathometerTracker:
             depth = self._array_depth(item, 0)
             if self._lattice is None:
                 self._begin(lattice_of_trace(item, self.config))
-            assert self._lattice is not None
+            assert self._heard is not None
             reference = math.nan if depth is None else depth
-            return self._record(trace_response(item, self._lattice, self.config, reference))
+            return self._record(trace_response(item, self._heard, self.config, reference))
         self._count_hydrophones(item)
         if isinstance(item, CrossSpectra):
             return self._record(self._hear(item, 0))
@@ -199,8 +216,8 @@ class FathometerTracker:
         depth = self._array_depth(record, span_ns) or 0.0
         if self._lattice is None:
             self._begin(lattice_of_array(depth, self.config))
-        assert self._lattice is not None
-        return array_response(record, self._lattice, self.config, depth)
+        assert self._heard is not None
+        return array_response(record, self._heard, self.config, depth)
 
     def _begin(self, lattice: Lattice) -> None:
         try:
@@ -210,16 +227,30 @@ class FathometerTracker:
         except ValueError as error:
             raise Rejection('too_crowded', str(error)) from None
         self._lattice = lattice
+        self._heard = lattice.padded(self._filter.model.pad)
 
-    def _try(self, response: Response) -> SetStep:
-        """What this record would change."""
-        assert self._filter is not None
-        b = np.ascontiguousarray(response.amplitude / response.sigma)
+    def _try(self, response: Response) -> tuple[Response, SetStep]:
+        """What this record would change. Where its noise is not known, it is measured in what the
+        reflectors of a first round leave."""
+        step = self._step(response)
+        if response.noise_unknown:
+            found, _ = self._reflectors(step, step.w, step.sets, response)
+            away = response.depth[:, None] - (found.depth + found.heave)
+            response = residual_sigma(response, self.pulse(away) @ found.amplitude)
+            step = self._step(response)
         self.response = response
+        return response, step
+
+    def _step(self, response: Response) -> SetStep:
+        assert self._filter is not None
+        # Beyond a million sigmas the numbers say nothing more, and their squares would overflow.
+        with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
+            b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
+        b = np.ascontiguousarray(np.nan_to_num(b))
         return self._filter.step(self._before, b, (self.config.seed, response.stamp_ns))
 
     def _record(self, response: Response) -> list[Estimate]:
-        step = self._try(response)
+        response, step = self._try(response)
         self._before = step.after if step.ok else None
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
@@ -232,15 +263,16 @@ class FathometerTracker:
             sigma=float(np.median(response.sigma)),
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
-        newest = write_estimate(reflectors, ids, pmf, response, self.config)
+        newest = self._write(reflectors, ids, pmf, response)
+        self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config))
         return [*self._smoothed(step), newest]
 
     def _preview(self, response: Response) -> Estimate:
-        step = self._try(response)
+        response, step = self._try(response)
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
         _, ids = self._ids.name(reflectors.depth, self.config)
         self.counts['previews'] += 1
-        return write_estimate(reflectors, ids, pmf, response, self.config, preview=True)
+        return self._write(reflectors, ids, pmf, response, preview=True)
 
     def _smoothed(self, newest: SetStep) -> list[Estimate]:
         """The record `smoothing_lag` ago, seen with all since."""
@@ -256,7 +288,26 @@ class FathometerTracker:
             free = [one for one in taken.named if one.track_id not in ids]
             missing = np.flatnonzero(ids == 0)
             ids[missing] = nearest_ids(reflectors.depth[missing], free, self.config)
-        return [write_estimate(reflectors, ids, pmf, response, self.config)]
+        return [self._write(reflectors, ids, pmf, response)]
+
+    def _write(
+        self,
+        reflectors: Reflectors,
+        ids: IdArray,
+        pmf: FloatArray,
+        response: Response,
+        *,
+        preview: bool = False,
+    ) -> Estimate:
+        multiple = np.full(len(ids), np.nan)
+        if self.config.multiples == 'mark':
+            assert self._lattice is not None
+            span = self._lattice.step * self._lattice.cells
+            seen = seen_as(reflectors, ids, self.config)
+            multiple = self._multiples.probabilities(seen, self.config, span)
+        return write_estimate(
+            reflectors, ids, pmf, multiple, response, self.config, preview=preview
+        )
 
     def _reflectors(
         self, step: SetStep, w: FloatArray, sets: Sets, response: Response
@@ -267,7 +318,12 @@ class FathometerTracker:
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
         members = find_members(sums, separation, most, self.config.existence_min)
-        return reflectors_of(members, response, self._lattice, self.pulse, self.config), pmf
+        heave = None
+        if self._filter.model.shift:
+            mean, std = self._filter.shift(w, sets)
+            heave = self._lattice.step * mean, self._lattice.step * std
+        found = reflectors_of(members, response, self._lattice, self.pulse, self.config, heave)
+        return found, pmf
 
 
 def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
@@ -288,5 +344,7 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         amplitude_std=config.amplitude_std_sigmas,
         independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
         amplitude_memory=config.amplitude_memory,
+        negative_probability=config.negative_share,
+        shift=heave_shift(config, step),
         **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )

@@ -22,8 +22,9 @@ from ...acoustics.geometry import Pose
 from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray
 from ...measurements import Navigation
+from ..navigation import NavigationBuffer
 from .config import ObstacleConfig
-from .navigation import Mount, NavigationBuffer
+from .navigation import Mount
 
 _STEPS = (1e-3, 1e-6, 1e-6)
 """Differences for the slopes: range m, azimuth rad, scale."""

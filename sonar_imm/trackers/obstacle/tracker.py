@@ -34,12 +34,13 @@ from ...estimation.association import (
 )
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
+from ..navigation import NavigationBuffer
 from ..stream import ReplayStream, StreamRules
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
-from .navigation import Mount, NavigationBuffer
+from .navigation import Mount
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 

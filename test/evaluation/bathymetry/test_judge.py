@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sonar_imm.cli import main
-from sonar_imm.evaluation.bathymetry import truth_topic
+from sonar_imm.evaluation.bathymetry import truth_topics
 from sonar_imm.evaluation.bathymetry.figures import spectrum_figure
 from sonar_imm.evaluation.bathymetry.profiles import profile_of
-from sonar_imm.evaluation.judging import judge
+from sonar_imm.evaluation.judging import judge, JudgeOptions
 from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
@@ -102,7 +102,7 @@ def test_every_model_set_is_judged(bag, tmp_path, values):
     assert len(judgement.part([]).sections) >= 5
 
 
-def test_two_sides_need_a_choice(tmp_path, capsys):
+def test_two_sides_are_tracked_in_one_run_or_one_by_choice(tmp_path, capsys):
     assert (
         run(
             'simulate',
@@ -117,9 +117,12 @@ def test_two_sides_need_a_choice(tmp_path, capsys):
         )
         == 0
     )
-    assert run('track', tmp_path / 'both', tmp_path / 'out') == 2
-    error = capsys.readouterr().err
-    assert 'several topics fit snapshot: /port/snapshot, /starboard/snapshot' in error
+    assert run('track', tmp_path / 'both', tmp_path / 'two') == 0
+    estimates = RunFolder(tmp_path / 'two').read_estimates()
+    assert [one.source for one in estimates] == [0, 1]
+    assert (estimates[0].xyz[:, 1] >= 0.0).all() and (estimates[1].xyz[:, 1] <= 0.0).all()
+    scored = judge(RunFolder(tmp_path / 'two'), JudgeOptions()).metrics
+    assert scored['scored_pings'] == 2 and scored['height']['all']['rmse_m'] < 0.25
     assert (
         run(
             'track',
@@ -138,8 +141,13 @@ def test_two_sides_need_a_choice(tmp_path, capsys):
 
 
 def test_truth_lies_beside_the_topic_that_was_tracked():
-    assert truth_topic({'topics': {'/snapshot': 'snapshot'}}) == '/truth/estimate'
-    assert truth_topic({'topics': {'/port/snapshot': 'snapshot'}}) == '/truth/port/estimate'
+    def of(**topics):
+        return truth_topics({'topics': {f'/{k.replace("__", "/")}': v for k, v in topics.items()}})
+
+    assert of(snapshot='snapshot', nav='nav') == {'/truth/estimate': None}
+    assert of(port__snapshot='snapshot') == {'/truth/port/estimate': None}
+    both = of(port__snapshot='port/snapshot', starboard__snapshot='starboard/snapshot')
+    assert both == {'/truth/port/estimate': 0, '/truth/starboard/estimate': 1}
 
 
 @pytest.mark.parametrize('conjugate', [False, True])

@@ -62,6 +62,17 @@ def test_transmitters_may_be_among_the_receivers(convert):
     assert ping.tx.tolist() == [[0, 20, -3]] and ping.tx_id.tolist() == [2]
 
 
+def test_elevation_and_the_depth_a_diver_reports_are_kept(convert):
+    report = convert(
+        'stamp,transmitter,receiver,toa,elevation,std_elevation,depth,std_depth\n'
+        '5,2,1,0.1,-0.2,0.01,11.5,0.2\n'
+    )
+    (ping,) = pings_of(report.path)
+    assert ping.elevation.tolist() == [-0.2] and ping.depth.tolist() == [11.5]
+    assert ping.var_elevation[0] == pytest.approx(1e-4)
+    assert ping.var_depth[0] == pytest.approx(0.04)
+
+
 def test_bad_rows_are_named(convert):
     report = convert(
         'ping,receiver,arrival\n1,0,5\n1,9,5\n,0,5\n1,1,x\n',

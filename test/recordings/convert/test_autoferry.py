@@ -47,15 +47,15 @@ def test_detections_become_fixes_in_the_world_east_first(convert):
         ],
         std=2.0,
     )
-    fixes = fixes_of(report.path)
-    assert [fix.stamp_ns for fix in fixes] == [3 * 10**9] * 3 + [9 * 10**9]
-    assert [fix.position.tolist() for fix in fixes] == [
+    scans = fixes_of(report.path)
+    assert [(scan.stamp_ns // 10**9, len(scan)) for scan in scans] == [(3, 3), (4, 0), (9, 1)]
+    assert np.concatenate([scan.position for scan in scans]).tolist() == [
         [210.0, 101.0, 0.0],
         [220.0, 102.0, 0.0],
         [230.0, 103.0, 0.0],
         [194.0, 105.0, 0.0],
     ]
-    assert fixes[0].covariance.tolist() == [[4.0, 0.0], [0.0, 4.0]]
+    assert scans[0].covariance[0].tolist() == [[4.0, 0.0], [0.0, 4.0]]
     assert 'boats' in report.notes['targets'] and not report.bad_rows
 
 
@@ -66,6 +66,15 @@ def test_sensors_are_chosen(convert):
     ]
     with pytest.raises(BagError, match="no sensor 'sonar'"):
         convert(records, sensors=('sonar',))
+
+
+def test_late_stamps_are_moved_and_truth_is_not(convert):
+    truth = [[{'targetID': 1, 'position': [0.0, 0.0, 0.0], 'time': 3.0}]]
+    report = convert([record(3.0, [1.0, 2.0])], truth, time_offset_ns=-1_500_000_000)
+    assert [scan.stamp_ns for scan in fixes_of(report.path)] == [1_500_000_000]
+    with BagReader(report.path) as bag:
+        (table,) = (read_estimate(item.message) for item in bag.messages(['/truth/estimate']))
+    assert table.stamp_ns == 3 * 10**9
 
 
 @pytest.mark.parametrize(
@@ -89,7 +98,7 @@ def test_sensors_are_chosen(convert):
 )
 def test_bad_records_are_named(convert, bad):
     report = convert([record(3.0, [1.0, 2.0]), bad])
-    assert report.messages == {'/fix': 1} and report.bad_rows == 1
+    assert report.messages == {'/fixes': 1} and report.bad_rows == 1
     assert report.problems[0].startswith('in.json, record 1: ')
 
 
@@ -134,7 +143,7 @@ def test_the_real_scenario_lies_around_its_truth(real_data, tmp_path):
         truth=folder / 'scenario13_groundTruth.json',
     )
     assert report.bad_rows == 0 and report.messages['/truth/estimate'] == 1152 + 575
-    fixes = fixes_of(report.path)
+    scans = fixes_of(report.path)
     with BagReader(report.path) as bag:
         tables = [read_estimate(item.message) for item in bag.messages(['/truth/estimate'])]
     near = {}
@@ -145,13 +154,15 @@ def test_the_real_scenario_lies_around_its_truth(real_data, tmp_path):
         distance = [
             np.hypot(
                 *(
-                    fix.position[:2]
-                    - [np.interp(fix.stamp_ns, stamp, place[:, axis]) for axis in (0, 1)]
+                    position[:2]
+                    - [np.interp(scan.stamp_ns, stamp, place[:, axis]) for axis in (0, 1)]
                 )
             )
-            for fix in fixes
+            for scan in scans
+            for position in scan.position
         ]
         near[track_id] = np.sum(np.array(distance) < 15.0)
-    scans = len({fix.stamp_ns for fix in fixes})
-    assert scans == 68 and len(fixes) > 2 * scans  # clutter besides the boats
-    assert min(near.values()) > 0.6 * scans
+    filled = sum(len(scan) > 0 for scan in scans)
+    assert filled == 68 and len(distance) > 2 * filled  # clutter besides the boats
+    assert len(scans) > filled  # some scans saw nothing
+    assert min(near.values()) > 0.6 * filled

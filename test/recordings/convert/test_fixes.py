@@ -51,6 +51,42 @@ def test_bad_rows_are_named_by_line_and_the_rest_is_converted(convert):
     assert fixes[0].position.tolist() == [3.0, 4.0, 0.0] and fixes[0].frame_id == 'map'
 
 
+def test_rows_that_say_whose_they_are_become_scans_with_identities(convert):
+    rows = '5,1,2,cod\n5,3,4,ling\n6,1,3,cod\n6,9,9,cod\n7,3,5,ling\n7,8,8,\n8,1,4,cod\n'
+    report = convert('stamp,x,y,name\n' + rows)
+    assert report.messages == {'/fixes': 4} and report.notes['id'] == 'cod is 1, ling is 2'
+    assert report.problems == ['in.csv, line 5: cod is there at this time']
+    scans = fixes_of(report.path)
+    assert [scan.target_id.tolist() for scan in scans] == [[1, 2], [1], [2, -1], [1]]
+    assert scans[2].position[:, :2].tolist() == [[3.0, 5.0], [8.0, 8.0]]
+    assert scans[0].covariance is None
+
+
+@pytest.mark.parametrize(
+    'header, words',
+    [
+        ('stamp,lat', 'no column for longitude'),
+        ('stamp,Longitude', 'no column for latitude'),
+        ('stamp,foo', 'nor for latitude and longitude; it has stamp, foo'),
+        ('stamp,x', 'no column for y'),
+    ],
+)
+def test_a_table_without_a_position_is_told_what_is_missing(convert, header, words):
+    with pytest.raises(BagError, match=words):
+        convert(header + '\n5,1\n')
+
+
+def test_numbers_of_divers_stay_and_numbers_of_rows_name_nobody(convert, tmp_path):
+    report = convert('stamp,x,y,id,std\n5,1,2,17,.5\n6,1,2,17,.5\n7,3,4,4,\n8,3,4,4,.5\n')
+    scans = fixes_of(report.path)
+    assert [scan.target_id.tolist() for scan in scans] == [[17], [17], [4], [4]]
+    assert scans[0].covariance.tolist() == [[[0.25, 0.0], [0.0, 0.25]]]
+    assert scans[2].covariance is None and 'id' not in report.notes
+    (tmp_path / 'rows.csv').write_text('stamp,x,y,id\n5,1,2,1\n6,1,2,2\n7,3,4,3\n')
+    rows = convert_fixes(tmp_path / 'rows.csv', tmp_path / 'other')
+    assert rows.messages == {'/fix': 3} and 'names no diver' in rows.notes['id']
+
+
 def test_many_bad_rows_are_counted_but_not_all_listed(convert):
     report = convert('stamp,x,y\n5,1,2\n' + 'bad,1,2\n' * 500)
     assert report.bad_rows == 500 and len(report.problems) == MOST_NAMED + 1

@@ -6,7 +6,8 @@ from helpers.bathymetry_cases import floor
 import numpy as np
 import pytest
 
-from sonar_imm.trackers.bathymetry.kernels import Geometry, sines_of
+from sonar_imm.trackers.bathymetry.kernels import sines_of
+from sonar_imm.trackers.bathymetry.swath import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 
@@ -42,8 +43,10 @@ def test_a_chain_that_never_switches_is_no_harm():
 
 def test_direction_sines_write_only_those_asked_for():
     state = np.linspace(-1.0, 1.0, 5)
-    for height in (15.0, math.nan):
-        geometry = Geometry(height, 0.8, 0.6, 0.5)
+    for of_heights in (True, False):
+        geometry = level_geometry(
+            np.full(3, 20.0), 15.0, math.asin(0.6), 0.5, of_heights=of_heights
+        )
         work, out = np.zeros((2, 9)), np.full(9, -7.0)
-        sines_of(state, 20.0, geometry, work, out[:5])
+        sines_of(state, 1, geometry, work, out[:5])
         assert (out[5:] == -7.0).all() and np.isfinite(out[:5]).all()

@@ -52,7 +52,9 @@ def test_the_estimate_is_the_contract():
     columns = estimate.columns()
     assert list(columns)[:8] == ['x', 'y', 'z', 'px', 'py', 'vx', 'vy', 'cov_px_px']
     assert [name for name in columns if name.startswith('prob_')][0] == 'prob_heading_000'
-    assert list(columns)[-4:] == ['track_id', 'track_state', 'nis', 'nis_dof']
+    assert list(columns)[-6:-2] == ['track_id', 'track_state', 'nis', 'nis_dof']
+    assert list(columns)[-2:] == ['existence', 'target_id']
+    assert np.isnan(columns['existence']).all() and columns['target_id'].tolist() == [-1]
     assert columns['x'].dtype == np.float32 and columns['px'].dtype == np.float64
     assert columns['track_id'].dtype == np.uint32 and columns['track_state'].dtype == np.uint8
     assert estimate.stamp_ns == SECOND and estimate.frame_id == 'map'

@@ -3,14 +3,17 @@
 from pathlib import Path
 
 from helpers.fathometer_runs import run
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from sonar_imm.estimation.consistency import nees, ospa
-from sonar_imm.measurements import Fix, Trace
+from sonar_imm.measurements import Fix, Rejection, Trace
 from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.fathometer.response import lattice_of_trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer'
@@ -287,6 +290,7 @@ def test_a_warm_tracker_is_as_new():
         ({'depth_min': 50.0}, 'depth_max'),
         ({'amplitude_prior': 'paper', 'amplitude_memory': 0.5}, 'marginal'),
         ({'particles': 0}, 'particles'),
+        ({'particles': 10_000_000, 'order_max': 12}, 'memory'),
     ],
 )
 def test_configurations_that_cannot_be(parameters, word):
@@ -305,3 +309,64 @@ def test_a_pulse_from_a_file(tmp_path):
             FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(path)))
     with pytest.raises(ConfigError, match='No such file'):
         FathometerTracker(FathometerConfig(pulse='file', pulse_file=str(tmp_path / 'no')))
+
+
+def fine_trace():
+    """50,000 steps of a tenth of a millimetre: 400 kB."""
+    depth = 50.0 + 1e-4 * np.arange(50_000)
+    return Trace(stamp_ns=1, depth=depth, amplitude=np.sin(depth))
+
+
+@pytest.mark.parametrize(
+    'parameters',
+    [
+        {},
+        {'depth_std': 100.0, 'depth_step': 1e-3},
+        {'depth_step': 1e-9, 'depth_min': 50.0, 'depth_max': 50.0 + 1e-6},
+        {'depth_step': 1e-300},
+    ],
+)
+def test_lattices_that_would_fill_the_memory_are_refused(parameters):
+    """Tables of moves hold every cell times every distance a reflector can move by."""
+    config = FathometerConfig(particles=100, **parameters)
+    with pytest.raises(Rejection, match='at most') as refused:
+        lattice_of_trace(fine_trace(), config)
+    assert refused.value.reason == 'too_large' and '\n' not in str(refused.value)
+    tracker = FathometerTracker(config)
+    assert tracker.process(fine_trace()) == [] and tracker.counts['too_large'] == 1
+
+
+def test_a_fine_trace_is_tracked_where_reflectors_move_little():
+    tracker = FathometerTracker(FathometerConfig(particles=100, depth_std=1e-3))
+    assert len(tracker.process(fine_trace())) == 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    scale=st.floats(-30.0, 30.0),
+    sigma=st.floats(-40.0, 30.0),
+    seed=st.integers(0, 1000),
+    prior=st.sampled_from(['marginal', 'bic_half', 'paper']),
+    separation=st.floats(1e-3, 3.0),
+)
+def test_states_are_finite_however_strange_the_numbers(scale, sigma, seed, prior, separation):
+    rng = np.random.default_rng(seed)
+    depth = np.linspace(20.0, 40.0, 200)
+    amplitude = 10.0**scale * rng.standard_normal(200)
+    amplitude[::17] *= 1e6
+    amplitude[::23] = np.nan
+    tracker = FathometerTracker(
+        FathometerConfig(particles=50, amplitude_prior=prior, min_separation=separation)
+    )
+    for stamp in (1, 2, 3):
+        trace = Trace(
+            stamp_ns=stamp,
+            depth=depth,
+            amplitude=amplitude,
+            sigma=10.0**sigma * (1.0 + rng.random(200)),
+        )
+        for estimate in tracker.process(trace):
+            there = estimate.extras['track_id'] > 0
+            assert np.isfinite(estimate.state[there]).all()
+            assert np.isfinite(estimate.covariance[there]).all()
+            assert np.isfinite(estimate.probabilities).all()

@@ -1,0 +1,153 @@
+"""A side-scan array at sea: motion, refraction, unknown height, nadir, labels; with and without.
+
+    python -m benchmarks.bathymetry_sea --out docs/results/bathymetry_sea.json
+
+Prints RMSE of the height (m), the share of heights within two standard deviations (with navigation
+those of the soundings), the overlap of rough patch and rough labels, and lost pings (RMSE above
+1 m). Pings of moving scenes are 3.3 s apart: the errors of the navigation last seconds and are
+common to a ping, so that closer pings would judge one error many times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msg_adapters.estimates import read_estimate
+from sonar_imm.evaluation.bathymetry.profiles import Profile, profiles_of
+from sonar_imm.evaluation.bathymetry.scoring import score
+from sonar_imm.recordings.truth import records_of
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+
+APART = {'ping_rate': 0.3, 'patch_along': []}
+GRID = {'engine': 'grid'}
+ANGLES = {'model_set': 'angle_two_rw'}
+BANK = {'model_set': 'height_bank'}
+NADIR = {'first_range': 15.1}
+LOST = 1.0
+"""Metres of RMSE from which a ping is lost."""
+
+
+def unknown(height: float) -> dict[str, Any]:
+    """A sonar at another height than it is told, the water column included."""
+    return {**APART, 'sonar_height': height, 'first_range': 5.0}
+
+
+TOLD = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
+
+# Name: scenario, what it changes, parameters beside those of the instruments.
+CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    'motion, grid': ('moving', APART, GRID),
+    'motion, particles': ('moving', APART, {}),
+    'motion, forward-backward': ('moving', APART, {**GRID, 'smoothing': 'states'}),
+    'motion, navigation ignored': ('moving', APART, {**GRID, 'navigation': 'ignored'}),
+    'motion, lever and mount ignored': (
+        'moving',
+        APART,
+        {**GRID, 'sonar_lever': [0, 0, 0], 'sonar_mount_rpy_deg': [0, 0, 0]},
+    ),
+    'summer profile, grid': ('moving_profile', APART, GRID),
+    'summer profile, particles': ('moving_profile', APART, {}),
+    'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
+    'height 10 m, told 15, grid': ('moving', unknown(10.0), {**TOLD, **GRID}),
+    'height 10 m, told 15, particles': ('moving', unknown(10.0), TOLD),
+    'height 20 m, told 15, grid': ('moving', unknown(20.0), {**TOLD, **GRID}),
+    'height 20 m, told 15, particles': ('moving', unknown(20.0), TOLD),
+    'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),
+    'nadir, angles, drift, particles': ('paper', NADIR, ANGLES),
+    'nadir, angles, paper, grid': ('paper', NADIR, {**ANGLES, **GRID, 'angle_drift': False}),
+    'nadir, angles, paper, particles': ('paper', NADIR, {**ANGLES, 'angle_drift': False}),
+    'nadir, angles, .03 deg, drift, grid': (
+        'paper',
+        NADIR,
+        {**ANGLES, **GRID, 'sigmas_deg': [0.03, 0.1, 2.0]},
+    ),
+    'nadir, heights': ('paper', NADIR, GRID),
+    'labels, white, two walks': ('paper', {}, GRID),
+    'labels, white, bank': ('paper', {}, BANK),
+    'labels, Gaussian .3 m, two walks': ('correlated', {'correlation_length': 0.3}, GRID),
+    'labels, Gaussian .3 m, bank': ('correlated', {'correlation_length': 0.3}, BANK),
+    'labels, Gaussian 1 m, two walks': ('correlated', {}, GRID),
+    'labels, Gaussian 1 m, bank': ('correlated', {}, BANK),
+    'labels, Gaussian 1 m, .003 .05 .5': (
+        'correlated',
+        {},
+        {**BANK, 'sigmas': [0.003, 0.05, 0.5], 'rough_sigma': 0.05},
+    ),
+    'labels, undulation .5 m in 15 m, bank': ('undulating', {}, BANK),
+    'labels, undulation .2 m in 20 m, bank': (
+        'undulating',
+        {'undulation_height': 0.2, 'undulation_length': 20.0},
+        BANK,
+    ),
+    'labels, slope .1, bank': ('slope', {}, BANK),
+    'labels, slope .05, bank': ('slope', {'slope': 0.05}, BANK),
+}
+
+
+def run(name: str, pings: int, seed: int) -> dict[str, float]:
+    """Scores of one case."""
+    scene_name, changes, values = CASES[name]
+    config = scenario(scene_name, {'pings': pings, **changes})
+    scene = simulate(config, seed)
+    heard = frozenset({'snapshot', 'nav'} if config.moving else {'snapshot'})
+    told = BathymetryConfig.from_mapping({**config.told(), **values}).for_inputs(heard)
+    if told.navigation == 'ignored' and told.sound_speed_profile:
+        raise ValueError('a profile needs navigation')
+    tracker = BathymetryTracker(told)
+    estimates = [
+        estimate for item in scene.measurements for estimate in tracker.process(item.measurement)
+    ]
+    records = [record for true in scene.truth for record in records_of(true, '')]
+    truth = [read_estimate(message) for _, _, message in records]
+    swath = profiles_of(estimates, truth)
+    if config.moving and told.navigation == 'ignored':
+        level = config.water_level - config.sonar_depth - config.sonar_height
+        for profile in swath.profiles:
+            profile.truth.height[:] -= level  # a sonar at rest counts from its reference floor
+    metrics = score(swath)
+    return {
+        'rmse_m': metrics['height']['all']['rmse_m'],
+        'inside_two_sd': metrics['inside_band']['all'],
+        'iou': metrics.get('segmentation', {}).get('iou', float('nan')),
+        'patch_rmse_m': metrics['height']['patch']['rmse_m'],
+        'lost_pings': sum(_rmse(profile) > LOST for profile in swath.profiles),
+        'pings': len(swath.profiles),
+    }
+
+
+def _rmse(profile: Profile) -> float:
+    assert profile.truth is not None
+    error = (profile.height - profile.truth.height)[profile.truth.echo]
+    return float(np.sqrt(np.nanmean(np.square(error))))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--pings', type=int, default=24)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--only', default='', help='cases whose name begins so')
+    parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
+    options = parser.parse_args()
+    print(f'{options.pings} pings, seed {options.seed}')
+    print(f'{"":42}{"all":>8}{"patch":>8}{"within":>8}{"iou":>8}{"lost":>6}')
+    results = {}
+    for name in CASES:
+        if not name.startswith(options.only):
+            continue
+        results[name] = row = run(name, options.pings, options.seed)
+        names = ('rmse_m', 'patch_rmse_m', 'inside_two_sd', 'iou')
+        cells = ''.join(f'{row[column]:8.3f}' for column in names)
+        print(f'{name:42}{cells}{row["lost_pings"]:6d}', flush=True)
+    if options.out:
+        run_of = {'pings': options.pings, 'seed': options.seed, 'cases': results}
+        options.out.write_text(json.dumps(run_of, indent=2) + '\n')
+
+
+if __name__ == '__main__':
+    main()

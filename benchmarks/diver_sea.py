@@ -1,0 +1,191 @@
+"""The diver tracker at sea: depth, misplaced instruments, errors that last.
+
+    python -m benchmarks.diver_sea --runs 30 --table depth --out docs/results/diver_sea.json
+
+Every number is that of the whole tracker on simulated scenes, from the first fix through track
+logic, one diver known to be there (`max_tracks: 1`). RMSE is horizontal, from 10 s on; NEES is of
+the horizontal position (2 is due), for depth also of all three coordinates (3 is due).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+import time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.tables import write_json
+from sonar_imm.simulation.diver.simulator import scenario, simulate
+from sonar_imm.simulation.scene import Scene
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SETTLED = 10.0
+"""Seconds from the start that are not scored."""
+
+Values = Mapping[str, Any]
+
+
+def score(scene: Scene, config: DiverConfig) -> np.ndarray:
+    """Rows (k, 4) of squared horizontal error, horizontal NEES, squared depth error, whole NEES;
+    the last two NaN where depth is no state. A stamp without a track gives NaN."""
+    tracker, final = DiverTracker(config), {}
+    for one in scene.measurements:
+        final.update((e.stamp_ns, e) for e in tracker.process(one.measurement))
+    track = scene.truth[0]
+    rows = []
+    for k, stamp in enumerate(track.stamp_ns.tolist()):
+        if (stamp - track.stamp_ns[0]) * 1e-9 < SETTLED or stamp not in final:
+            continue
+        estimate = final[stamp]
+        confirmed = np.flatnonzero(estimate.extras['track_state'] > 0)
+        if not len(confirmed):
+            rows.append([np.nan] * 4)
+            continue
+        row = confirmed[0]
+        m = 3 if 'pz' in estimate.state_names else 2
+        error = estimate.state[row, :m] - track.position[k, :m]
+        P = estimate.covariance[row, :m, :m]
+        flat = error[:2] @ np.linalg.solve(P[:2, :2], error[:2])
+        whole = error @ np.linalg.solve(P, error) if m == 3 else np.nan
+        deep = error[2] ** 2 if m == 3 else np.nan
+        rows.append([error[:2] @ error[:2], flat, deep, whole])
+    return np.array(rows)
+
+
+def study(scene: Values, config: Values, runs: int, name: str = 'multistatic') -> dict[str, float]:
+    """RMSE and NEES over `runs` scenes. `scene` and `config` may hold functions of the run."""
+    rows = []
+    for seed in range(1000, 1000 + runs):
+        made = simulate(scenario(name, scene), seed)
+        values = {key: v(made) if callable(v) else v for key, v in config.items()}
+        rows.append(score(made, DiverConfig(max_tracks=1, **values)))
+    every = np.concatenate(rows)
+    seen = np.isfinite(every[:, 0])
+    mean = every[seen].mean(axis=0)
+    return {
+        'rmse': float(np.sqrt(mean[0])),
+        'nees': float(mean[1]),
+        'rmse_depth': float(np.sqrt(mean[2])),
+        'nees_3d': float(mean[3]),
+        'without_track': float(1.0 - seen.mean()),
+    }
+
+
+def cell(found: Mapping[str, float]) -> str:
+    text = f'{found["rmse"]:.2f}'
+    if np.isfinite(found['rmse_depth']):
+        text += f' / {found["rmse_depth"]:.2f}'
+    text += f', {found["nees"]:.2g}'
+    if np.isfinite(found['nees_3d']):
+        text += f' / {found["nees_3d"]:.2g}'
+    if found['without_track'] > 0.005:
+        text += f' ({found["without_track"]:.0%} no track)'
+    return text
+
+
+def middle_depth(scene: Scene) -> float:
+    return float(scene.truth[0].position[:, 2].mean())
+
+
+def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
+    """(row, column, scenario, scene, config)."""
+    rows = {
+        '2, 5, 8, 12 m': (2.0, 5.0, 8.0, 12.0),
+        '5 m': (5.0,) * 4,
+        '0 m': (0.0,) * 4,
+    }
+    divers: dict[str, Values] = {
+        'U(1, 19) m, swell': {'depth': (1.0, 19.0), 'swell_height': 1.0},
+        '10 m': {'depth': (10.0, 10.0)},
+    }
+    configs: dict[str, tuple[Values, Values]] = {
+        'told 0 m': ({}, {}),
+        'told its depth without swell': ({}, {'target_z': middle_depth}),
+        'pressure, .2 m': ({'depth_std': 0.2}, {'dimensions': 3}),
+        'depth bank': ({}, {'dimensions': 3}),
+    }
+    return [
+        (f'{row}, diver {diver}', column, 'multistatic', {'receiver_depths': at, **swims, **more},
+         config)
+        for row, at in rows.items()
+        for diver, swims in divers.items()
+        for column, (more, config) in configs.items()
+    ]  # fmt: skip
+
+
+def systematic_cells() -> list[tuple[str, str, str, Values, Values]]:
+    off: dict[str, Values] = {
+        'receivers': {'receiver_position_std': 1.0},
+        'clocks': {'receiver_clock_std': 5e-4},
+        'sound': {'sound_speed_std': 5.0},
+    }
+    every: Values = {key: value for one in off.values() for key, value in one.items()}
+    cells = []
+    for row, scene in {'nothing, told all three': {}, **off, 'all': every}.items():
+        told = scene or every
+        for column, config in {
+            'ignore': {},
+            'consider': {**told, 'systematic_errors': 'consider'},
+            'mixed': {**told, 'systematic_errors': 'mixed'},
+            'estimate': {**told, 'systematic_errors': 'estimate'},
+        }.items():
+            cells.append((row, column, 'multistatic', scene, config))
+    return cells
+
+
+def lasting_cells() -> list[tuple[str, str, str, Values, Values]]:
+    cells = []
+    for std, tau, white in ((1.0, 60.0, 0.5), (2.0, 60.0, 0.05), (2.0, 600.0, 0.05),
+                            (1.0, 10.0, 0.5)):  # fmt: skip
+        scene = {'fix_bias_std': std, 'fix_bias_time': tau, 'fix_std': white}
+        total = (std**2 + white**2) / white**2
+        bias = {'fix_bias_std': std}
+        for column, config in {
+            'white part alone stated': {},
+            'stated total, as white': {'covariance_scale': total},
+            'its variance x 6': {'covariance_scale': 6.0 * total},
+            'Gauss-Markov, right': {**bias, 'fix_bias_time': tau},
+            'tau x 3': {**bias, 'fix_bias_time': 3.0 * tau},
+            'tau / 3': {**bias, 'fix_bias_time': tau / 3.0},
+        }.items():
+            cells.append((f'{std:g} m, {tau:g} s, {white:g} m', column, 'lasting_errors', scene,
+                          config))  # fmt: skip
+    return cells
+
+
+TABLES = {'depth': depth_cells, 'systematic': systematic_cells, 'lasting': lasting_cells}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
+    parser.add_argument('--runs', type=int, default=30)
+    parser.add_argument('--table', choices=[*TABLES], action='append')
+    parser.add_argument('--only', help='columns or rows whose name holds this')
+    parser.add_argument('--out', type=Path)
+    options = parser.parse_args()
+    results: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for name in options.table or TABLES:
+        table = results.setdefault(name, {})
+        for row, column, scene_name, scene, config in TABLES[name]():
+            if options.only and options.only not in row + column:
+                continue
+            began = time.process_time()
+            found = study(scene, config, options.runs, scene_name)
+            table.setdefault(row, {})[column] = found
+            spent = time.process_time() - began
+            print(f'{name}: {row} | {column} | {cell(found)} | {spent:.0f} s', flush=True)
+        columns = list(dict.fromkeys(column for one in table.values() for column in one))
+        print(f'\n| | {" | ".join(columns)} |\n{"|---" * (len(columns) + 1)}|')
+        for row, found_row in table.items():
+            texts = [cell(found_row[c]) if c in found_row else '' for c in columns]
+            print(f'| {row} | {" | ".join(texts)} |')
+        print()
+    if options.out:
+        write_json(options.out, {'runs': options.runs, **results})
+
+
+if __name__ == '__main__':
+    main()

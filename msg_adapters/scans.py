@@ -1,0 +1,158 @@
+"""Scans of fixes: one message with all positions that were found at a stamp, also without any.
+
+Our own message is a table with one row per fix. Columns: ``x``, ``y`` f8 [m]; ``cov_x_x``,
+``cov_x_y``, ``cov_y_y`` f4 [m^2]; optional ``z`` f8 [m], ``cov_z_z`` f4 and ``id`` i4, whose
+position it is. The columns are there in an empty scan too: a table of something else that
+happens to be empty is no scan. As in `fixes`, a negative variance or NaN means unknown, and all
+zeros that the covariance was not filled in. A negative ``id`` is nobody's.
+
+Rows that cannot be used are left out, so that ``message.height * message.width - len(scan)``
+counts them (see `doubt_scan`).
+
+A geometry_msgs/PoseArray is a scan without covariances.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from attrs import evolve
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.measurements import Fixes, NOBODY, Rejection, usable_fixes
+
+from .fixes import LEAST_VARIANCE, MOST_VARIANCE
+from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
+from .table import decode_table, encode_table, require_columns, scalar_column
+
+REQUIRED = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')
+COLUMNS = (*REQUIRED, 'z', 'id')
+MAX_FIXES = 10_000
+
+
+def read_scan(message: Any, *, world_frame: str = 'enu') -> Fixes:
+    """Read a table of fixes; `world_frame` is ``'enu'`` or ``'ned'``. Raises `Rejection`, also
+    when there are rows but none can be used."""
+    columns = decode_table(message, COLUMNS, most_rows=MAX_FIXES)
+    require_columns(columns, REQUIRED, 'fixes')
+    values = {name: scalar_column(columns, name) for name in columns}
+    rows = len(values['x'])
+    z = values.get('z', np.zeros(rows))
+    position = np.column_stack([values['x'], values['y'], np.where(np.isfinite(z), z, 0.0)])
+    covariance = np.stack(
+        [values[name] for name in ('cov_x_x', 'cov_x_y', 'cov_x_y', 'cov_y_y')], axis=-1
+    ).reshape(rows, 2, 2)
+    return _scan(message, position, covariance, _names(values.get('id')), world_frame)
+
+
+def read_poses(message: Any, *, world_frame: str = 'enu') -> Fixes:
+    """Read a PoseArray as a scan of positions without covariance. Raises `Rejection`."""
+    if len(message.poses) > MAX_FIXES:
+        raise Rejection(
+            'too_large', f'a scan of {len(message.poses)} poses; at most {MAX_FIXES} are read'
+        )
+    position = np.array(
+        [[pose.position.x, pose.position.y, pose.position.z] for pose in message.poses], np.float64
+    ).reshape(-1, 3)
+    position[:, 2] = np.where(np.isfinite(position[:, 2]), position[:, 2], 0.0)
+    return _scan(message, position, None, None, world_frame)
+
+
+def doubt_scan(message: Any) -> str | None:
+    """Give ``'unusable_rows'`` for a scan of which some rows are left out."""
+    try:
+        scan = read_poses(message) if hasattr(message, 'poses') else read_scan(message)
+    except Rejection:
+        return None
+    rows = len(message.poses) if hasattr(message, 'poses') else message.height * message.width
+    return 'unusable_rows' if len(scan) < rows else None
+
+
+def write_scan(scan: Fixes, make: Make) -> Any:
+    """Write our table; the column ``id`` only when a row says whose it is."""
+    n = len(scan)
+    covariance = np.full((n, 2, 2), np.nan) if scan.covariance is None else scan.covariance
+    columns: dict[str, NDArray] = dict(zip('xyz', scan.position.T))
+    for name, (i, j) in {'cov_x_x': (0, 0), 'cov_x_y': (0, 1), 'cov_y_y': (1, 1)}.items():
+        columns[name] = covariance[:, i, j].astype(np.float32)
+    if scan.target_id is not None:
+        columns['id'] = scan.target_id
+    return encode_table(columns, stamp_ns=scan.stamp_ns, frame_id=scan.frame_id, make=make)
+
+
+def write_poses(scan: Fixes, make: Make) -> Any:
+    """Write a PoseArray, which has no room for covariances and identities."""
+    poses = [
+        make(
+            'geometry_msgs/msg/Pose',
+            position=make('geometry_msgs/msg/Point', x=float(x), y=float(y), z=float(z)),
+            orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+        )
+        for x, y, z in scan.position
+    ]
+    header = make_header(scan.stamp_ns, scan.frame_id, make)
+    return make('geometry_msgs/msg/PoseArray', header=header, poses=poses)
+
+
+def _scan(
+    message: Any,
+    position: NDArray,
+    covariance: NDArray | None,
+    target_id: NDArray | None,
+    world_frame: str,
+) -> Fixes:
+    """The scan of the rows (n,) that can be used."""
+    if covariance is not None:
+        covariance = _known(covariance)
+    keep = usable_fixes(position, covariance) & _sized(covariance, len(position))
+    if len(keep) and not keep.any():
+        raise Rejection('nan', f'none of the {len(keep)} fixes of the scan can be used')
+    if covariance is not None and (len(keep) == 0 or np.isnan(covariance[keep]).all()):
+        covariance = None
+    scan = Fixes(
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        position=position[keep],
+        covariance=None if covariance is None else covariance[keep],
+        target_id=None if target_id is None else target_id[keep],
+    )
+    return to_enu(scan, world_frame, _turned)
+
+
+def _turned(scan: Fixes) -> Fixes:
+    """The same scan in ENU, of one in NED."""
+    covariance = None if scan.covariance is None else scan.covariance[:, ::-1, ::-1]
+    return evolve(scan, position=swap_axes(scan.position), covariance=covariance)
+
+
+def _known(covariance: NDArray) -> NDArray:
+    """Covariances (n, 2, 2) with NaN throughout where they are said to be unknown."""
+    variance = covariance[:, (0, 1), (0, 1)]
+    unknown = (variance < 0.0).any(axis=1) | np.isnan(variance).any(axis=1)
+    unknown |= ~covariance.any(axis=(1, 2))
+    return np.where(unknown[:, None, None], np.nan, covariance)
+
+
+def _sized(covariance: NDArray | None, rows: int) -> NDArray[np.bool_]:
+    """Which covariances (n,) are neither so small nor so large that arithmetic breaks down."""
+    if covariance is None:
+        return np.ones(rows, bool)
+    with np.errstate(invalid='ignore', over='ignore'):
+        variance = covariance[:, (0, 1), (0, 1)]
+        sized = (variance.min(axis=1) >= LEAST_VARIANCE) & (variance.max(axis=1) <= MOST_VARIANCE)
+    return sized | np.isnan(variance).all(axis=1)
+
+
+def _names(values: NDArray | None) -> NDArray[np.int32] | None:
+    """Identities (n,), `NOBODY` where negative or NaN; None when no row has one."""
+    if values is None:
+        return None
+    named = np.where(np.isnan(values) | (values < 0), NOBODY, values)
+    good = (named < 2**31) & (named == np.floor(named))
+    if not good.all():
+        raise Rejection(
+            'out_of_range',
+            f'fixes: id {named[~good][0]:g} is not a whole number from 0 to 2147483647',
+        )
+    return None if (named == NOBODY).all() else named.astype(np.int32)

@@ -1,0 +1,34 @@
+"""Soundings as messages: the PointCloud2 of ``~/soundings``, which gridders like CUBE take."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sonar_imm.measurements import Rejection
+from sonar_imm.soundings import COLUMNS, Soundings
+
+from .headers import Make, stamp_ns
+from .table import decode_table, encode_table, require_columns
+
+
+def write_soundings(soundings: Soundings, make: Make) -> Any:
+    """Write the table of ``~/soundings``, one row per bin with an echo, nothing NaN."""
+    return encode_table(
+        soundings.columns, stamp_ns=soundings.stamp_ns, frame_id=soundings.frame_id, make=make
+    )
+
+
+def read_soundings(message: Any) -> Soundings:
+    """Read what `write_soundings` wrote. Raises `Rejection`."""
+    columns = decode_table(message)
+    require_columns(columns, tuple(COLUMNS), 'soundings')
+    for name, kind in COLUMNS.items():
+        if columns[name].dtype != np.dtype(kind) or columns[name].ndim != 1:
+            raise Rejection(
+                'bad_field', f'column {name} of a table of soundings is not {np.dtype(kind).name}'
+            )
+    return Soundings(
+        stamp_ns(message), str(message.header.frame_id), {name: columns[name] for name in COLUMNS}
+    )

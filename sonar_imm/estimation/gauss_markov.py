@@ -1,0 +1,21 @@
+"""Errors that are correlated in time: the first-order Gauss-Markov process.
+
+A position source that filters its output makes errors that last. As white noise they would
+average out within seconds and the track would be sure of what is wrong. The process
+``b' = a b + q`` with ``a = exp(-dt / time)`` and ``var q = std^2 (1 - a^2)`` keeps the variance
+``std^2`` at any step, and its correlation fades to 1/e within `time`.
+
+Source: A. Gelb (ed.), *Applied Optimal Estimation*, 1974, sec. 3.8; Y. Bar-Shalom, X. R. Li,
+T. Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, sec. 8.2 (state
+augmentation for autocorrelated noise).
+"""
+
+from __future__ import annotations
+
+import math
+
+
+def gauss_markov(std: float, time: float, dt: float) -> tuple[float, float]:
+    """(a, q): the factor of a step of dt seconds and the variance it adds, `std` being the
+    standard deviation for ever and `time` in seconds that of the correlation."""
+    return math.exp(-dt / time), -(std**2) * math.expm1(-2.0 * dt / time)

@@ -1,0 +1,297 @@
+"""The functions of `jipda` compiled: the same mathematics over plain loops.
+
+All arrays are float64 and C-contiguous. `warm` compiles or loads every kernel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .arrays import BoolArray, FloatArray, IntArray
+from .jipda import LEAST_GATE, MOST_EVENTS, OPENS_GATE, SMALLER
+from .jit import kernel
+from .small_matrices import (
+    cholesky_lifted,
+    gain,
+    innovation_covariance,
+    joseph,
+    lift,
+    whitened_square,
+)
+
+LOG_2PI = math.log(2.0 * math.pi)
+
+
+@kernel
+def likelihoods(
+    h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """See `jipda.likelihoods`: mixture and nis (T, D)."""
+    T, M, m = h.shape
+    D, n = len(z), P.shape[2]
+    mixture, least = np.zeros((T, D)), np.full((T, D), np.inf)
+    PHt, nothing, S0 = np.empty((n, m)), np.zeros((m, m)), np.empty((m, m))
+    S, L, v, w = np.empty((m, m)), np.zeros((m, m)), np.empty(m), np.empty(m)
+    for t in range(T):
+        for j in range(M):
+            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0)
+            for d in range(D):
+                for r in range(m):
+                    v[r] = z[d, r] - h[t, j, r]
+                    for s in range(m):
+                        S[r, s] = S0[r, s] + R[d, r, s]
+                if not cholesky_lifted(S, L):
+                    continue
+                nis = whitened_square(L, v, w)
+                value = -0.5 * (nis + m * LOG_2PI)
+                for r in range(m):
+                    value -= math.log(L[r, r])
+                mixture[t, d] += c[t, j] * math.exp(value)
+                if c[t, j] > OPENS_GATE and nis < least[t, d]:
+                    least[t, d] = nis
+    return mixture, least
+
+
+@kernel
+def associate(
+    ratio: FloatArray,
+    nis: FloatArray,
+    existence: FloatArray,
+    detection_probability: FloatArray,
+    threshold: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """See `jipda.associate`: beta (T, D), missed (T,), existence (T,)."""
+    T, D = ratio.shape
+    beta, missed, after = np.zeros((T, D)), np.empty(T), np.empty(T)
+    inside = np.empty((T, D), dtype=np.bool_)
+    for t in range(T):
+        detected = existence[t] * detection_probability[t]
+        missed[t] = existence[t] * (1.0 - detection_probability[t]) / (1.0 - detected)
+        for d in range(D):
+            inside[t, d] = nis[t, d] <= threshold
+    label = _labels(inside)
+    members, shares, alone = np.empty(T, dtype=np.int64), np.empty((T, D)), np.empty(T)
+    for first in range(T):
+        if label[first] != first:
+            continue
+        size = 0
+        for t in range(first, T):
+            if label[t] == first:
+                members[size] = t
+                size += 1
+        own = members[:size]
+        gate = threshold
+        while _enumerate(own, inside, ratio, existence, detection_probability, shares, alone) < 0:
+            gate = gate * SMALLER if gate > LEAST_GATE else -1.0
+            for t in own:
+                for d in range(D):
+                    inside[t, d] = nis[t, d] <= gate
+        for t in own:
+            missed[t] *= alone[t]
+            for d in range(D):
+                beta[t, d] = shares[t, d]
+    for t in range(T):
+        after[t] = missed[t]
+        for d in range(D):
+            after[t] += beta[t, d]
+    return beta, missed, after
+
+
+@kernel
+def _labels(inside: BoolArray) -> IntArray:
+    """For each track the first track of its cluster; -1 for one without a detection."""
+    T, D = inside.shape
+    label = np.full(T, -1, dtype=np.int64)
+    for t in range(T):
+        for d in range(D):
+            if inside[t, d]:
+                label[t] = t
+                break
+    changed = True
+    while changed:
+        changed = False
+        for d in range(D):
+            least = T
+            for t in range(T):
+                if inside[t, d]:
+                    least = min(least, label[t])
+            for t in range(T):
+                if inside[t, d] and label[t] > least:
+                    label[t] = least
+                    changed = True
+    return label
+
+
+@kernel
+def _enumerate(
+    tracks: IntArray,
+    inside: BoolArray,
+    ratio: FloatArray,
+    existence: FloatArray,
+    detection_probability: FloatArray,
+    shares: FloatArray,
+    alone: FloatArray,
+) -> int:
+    """Visit the joint events of a cluster: the probability of each pair into `shares` (T, D), of
+    no detection into `alone` (T,). Gives their number, -1 where there are too many."""
+    size, D = len(tracks), inside.shape[1]
+    for t in tracks:
+        alone[t] = 0.0
+        for d in range(D):
+            shares[t, d] = 0.0
+    used = np.zeros(D, dtype=np.bool_)
+    chosen = np.full(size, -2, dtype=np.int64)
+    weight = np.ones(size + 1)
+    count, total, place = 0, 0.0, 0
+    while place >= 0:
+        if place == size:
+            count += 1
+            if count > MOST_EVENTS:
+                return -1
+            total += weight[size]
+            for k in range(size):
+                if chosen[k] < 0:
+                    alone[tracks[k]] += weight[size]
+                else:
+                    shares[tracks[k], chosen[k]] += weight[size]
+            place -= 1
+            continue
+        t = tracks[place]
+        if chosen[place] >= 0:
+            used[chosen[place]] = False
+        chosen[place] += 1
+        while chosen[place] >= 0 and chosen[place] < D:
+            if inside[t, chosen[place]] and not used[chosen[place]]:
+                break
+            chosen[place] += 1
+        if chosen[place] >= D:
+            chosen[place] = -2
+            place -= 1
+            continue
+        detected = existence[t] * detection_probability[t]
+        if chosen[place] < 0:
+            weight[place + 1] = weight[place] * (1.0 - detected)
+        else:
+            used[chosen[place]] = True
+            weight[place + 1] = weight[place] * detected * ratio[t, chosen[place]]
+        place += 1
+    for t in tracks:
+        alone[t] /= total
+        for d in range(D):
+            shares[t, d] /= total
+    return count
+
+
+@kernel
+def update(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    h: FloatArray,
+    H: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    beta: FloatArray,
+    missed: FloatArray,
+    considered: BoolArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """`jipda.update` of each track: x (T, M, n), P (T, M, n, n), mu (T, M), covariances repaired.
+
+    h (T, M, m) expected; z (D, m); R (D, m, m); beta (T, D) and missed (T,) as of `associate`:
+    they need not sum to one. considered (n,).
+    """
+    T, M, n = x.shape
+    D, m = z.shape
+    x1, P1, mu = x.copy(), P.copy(), c.copy()
+    repairs = 0
+    log, shift = np.empty((D, M)), np.empty((D, M, n))
+    after, nothing = np.empty((D, M, n, n)), np.zeros((m, m))
+    PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
+    A, AP, root = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    S, S0, L = np.empty((m, m)), np.empty((m, m)), np.zeros((m, m))
+    v, w, mean = np.empty(m), np.empty(m), np.empty(n)
+    share, weight = np.empty((D, M)), np.empty(M)
+    for t in range(T):
+        exists = missed[t]
+        for d in range(D):
+            exists += beta[t, d]
+        if not exists > missed[t]:
+            continue
+        for j in range(M):
+            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0)
+            for d in range(D):
+                if not beta[t, d] > 0.0:
+                    continue
+                log[d, j] = -np.inf
+                for r in range(m):
+                    v[r] = z[d, r] - h[t, j, r]
+                    for s in range(m):
+                        S[r, s] = S0[r, s] + R[d, r, s]
+                for a in range(n):
+                    shift[d, j, a] = 0.0
+                if not cholesky_lifted(S, L):
+                    continue
+                log[d, j] = -0.5 * whitened_square(L, v, w)
+                for r in range(m):
+                    log[d, j] -= math.log(L[r, r])
+                gain(PHt, L, K)
+                for a in range(n):
+                    for r in range(m):
+                        if considered[a]:
+                            K[a, r] = 0.0
+                        shift[d, j, a] += K[a, r] * v[r]
+                joseph(P[t, j], K, H[t % H.shape[0], j], R[d], A, AP, KR, after[d, j])
+        for j in range(M):
+            weight[j] = missed[t] / exists
+        for d in range(D):
+            if not beta[t, d] > 0.0:
+                continue
+            top, total = -np.inf, 0.0
+            for j in range(M):
+                if c[t, j] > 0.0:
+                    top = max(top, log[d, j])
+            for j in range(M):
+                total += c[t, j] * math.exp(log[d, j] - top) if c[t, j] > 0.0 else 0.0
+            for j in range(M):
+                share[d, j] = beta[t, d] / exists * math.exp(log[d, j] - top - math.log(total))
+                weight[j] += share[d, j]
+        total = 0.0
+        for j in range(M):
+            mu[t, j] = c[t, j] * weight[j]
+            total += mu[t, j]
+            if not (weight[j] > 0.0 and weight[j] < np.inf):
+                continue
+            for a in range(n):
+                mean[a] = 0.0
+                for d in range(D):
+                    if beta[t, d] > 0.0 and share[d, j] > 0.0:
+                        mean[a] += share[d, j] / weight[j] * shift[d, j, a]
+                x1[t, j, a] = x[t, j, a] + mean[a]
+            for a in range(n):
+                for b in range(a + 1):
+                    value = missed[t] / exists / weight[j] * P[t, j, a, b] - mean[a] * mean[b]
+                    for d in range(D):
+                        if beta[t, d] > 0.0 and share[d, j] > 0.0:
+                            value += (
+                                share[d, j]
+                                / weight[j]
+                                * (after[d, j, a, b] + shift[d, j, a] * shift[d, j, b])
+                            )
+                    P1[t, j, a, b] = value
+                    P1[t, j, b, a] = value
+            if lift(P1[t, j], root):
+                repairs += 1
+        for j in range(M):
+            mu[t, j] /= total
+    return x1, P1, mu, repairs
+
+
+def warm() -> None:
+    """Run the kernels once on tiny input: compiled or loaded from the cache."""
+    x, P, c = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
+    H, R, z = np.tile(np.eye(2), (1, 2, 1, 1)), np.eye(2)[None], np.zeros((1, 2))
+    mixture, nis = likelihoods(x, H, P, c, z, R)
+    beta, missed, _ = associate(mixture, nis, np.full(1, 0.5), np.full(1, 0.9), 9.0)
+    update(x, P, c, x, H, z, R, beta, missed, np.zeros(2, np.bool_))

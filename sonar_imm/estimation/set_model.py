@@ -1,0 +1,159 @@
+"""What `set_particles` assumes of a set of unknown size and of its records, and sets as arrays."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from attrs import field, frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import FloatArray, IntArray
+from .markov import check_transition_matrix
+from .set_shifts import Shift
+
+PRIORS = ('marginal', 'bic_half', 'paper')
+
+
+def banded_transition(orders: int, switch: float) -> FloatArray:
+    """Transition matrix (orders, orders): one more or one less with probability `switch` each; at
+    the ends the probability of what cannot happen goes to staying."""
+    P = np.diag(np.full(orders - 1, switch), 1) + np.diag(np.full(orders - 1, switch), -1)
+    return np.asarray(P + np.diag(1.0 - P.sum(axis=1)))
+
+
+def move_reach(std: float, *, reach: float = 4.0) -> float:
+    """How many cells `gaussian_move` reaches to either side."""
+    return max(1.0, math.floor(reach * std)) if math.isfinite(reach * std) else math.inf
+
+
+def gaussian_move(std: float, *, reach: float = 4.0) -> FloatArray:
+    """Probabilities (2 r + 1,) of moving by -r .. r cells: Gaussian of `std` cells, cut at `reach`
+    standard deviations."""
+    radius = int(move_reach(std, reach=reach))
+    K = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / std))
+    return np.asarray(K / K.sum())
+
+
+@frozen(eq=False, kw_only=True)
+class SetModel:
+    """What is assumed of the set and of the record; see the module's text.
+
+    cells: n, of the lattice; separation: smallest distance of two members, cells; order_min: the
+    smallest set; transition (orders, orders); move (2 r + 1,); gram (n,) by lag in cells, one at
+    0; amplitude_prior: one of PRIORS, with amplitude_std: s, and independent_samples: N;
+    move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
+    noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
+    negative_probability: that a member is negative; shift: that all members share, None for none.
+    With a shift, records b have ``record_cells`` cells, the lattice with the largest shift before
+    and after it.
+    """
+
+    cells: int
+    separation: int
+    order_min: int
+    transition: FloatArray = field(converter=check_transition_matrix)
+    move: FloatArray
+    gram: FloatArray
+    amplitude_prior: str = 'marginal'
+    amplitude_std: float = 7.5
+    independent_samples: float = 500.0
+    move_share: float = 0.95
+    birth_share: float = 0.75
+    birth_cap: float = 8.0
+    amplitude_memory: float = 0.0
+    negative_probability: float = 0.0
+    shift: Shift | None = None
+
+    def __attrs_post_init__(self) -> None:
+        if self.amplitude_prior not in PRIORS:
+            raise ValueError(f'amplitude_prior is one of {PRIORS}, not {self.amplitude_prior!r}')
+        if self.amplitude_memory and self.amplitude_prior != 'marginal':
+            raise ValueError('only marginal amplitudes can have a memory')
+        if not 0.0 <= self.negative_probability < 1.0:
+            raise ValueError('negative_probability lies in [0, 1)')
+        if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:
+            raise ValueError('a set model needs order_min >= 0, separation >= 1, gram (n,)')
+        if self.room(self.order_max) == 0:
+            raise ValueError(
+                f'{self.order_max} members {self.separation} cells apart do not fit into '
+                f'{self.cells} cells'
+            )
+
+    @property
+    def order_max(self) -> int:
+        return self.order_min + len(self.transition) - 1
+
+    @property
+    def most_changes(self) -> int:
+        """How many members can come or go at once."""
+        rows, columns = np.nonzero(self.transition > 0.0)
+        return int(np.abs(rows - columns).max())
+
+    @property
+    def uniforms(self) -> int:
+        """Random numbers a particle needs for one record."""
+        return 1 + self.most_changes + self.order_max + (self.shift is not None)
+
+    @property
+    def pad(self) -> int:
+        """Largest shift, cells."""
+        return self.shift.pad if self.shift else 0
+
+    @property
+    def record_cells(self) -> int:
+        return self.cells + 2 * self.pad
+
+    @property
+    def signs(self) -> dict[int, float]:
+        """The signs that members can have, and how probable each is at a birth."""
+        negative = self.negative_probability
+        return {1: 1.0 - negative, -1: negative} if negative else {1: 1.0}
+
+    @property
+    def ridge(self) -> float:
+        """What is added to the diagonal of G: 1 / s^2, or nothing."""
+        return self.amplitude_std**-2 if self.amplitude_prior == 'marginal' else 0.0
+
+    @property
+    def penalty(self) -> float:
+        """What each member costs in log likelihood besides the determinant."""
+        if self.amplitude_prior == 'marginal':
+            return math.log(self.amplitude_std)
+        half = 0.5 * math.log(self.independent_samples)
+        return half if self.amplitude_prior == 'bic_half' else 2.0 * half
+
+    def room(self, order: int) -> int:
+        """The number of possible sets of that size."""
+        free = self.cells - max(order - 1, 0) * (self.separation - 1)
+        return math.comb(free, order) if free >= 0 else 0
+
+
+class Sets(NamedTuple):
+    """N sets: order (N,), cell (N, J) of which the first `order` count, ascending; prior_mean and
+    prior_variance (N, J) of the amplitudes in units of the noise, used with a memory only; sign
+    (N, J) of the amplitudes, 1 or -1; shift (N,) plus pad: what is in cell z shows in the record's
+    cell z + shift."""
+
+    order: IntArray
+    cell: IntArray
+    prior_mean: FloatArray
+    prior_variance: FloatArray
+    sign: NDArray[np.int8]
+    shift: IntArray
+
+    @classmethod
+    def empty(cls, model: SetModel, count: int) -> Sets:
+        shape = count, model.order_max
+        return cls(
+            np.zeros(count, np.int64),
+            np.zeros(shape, np.int64),
+            np.zeros(shape),
+            np.full(shape, model.amplitude_std**2),
+            np.ones(shape, np.int8),
+            np.full(count, model.pad, np.int64),
+        )
+
+    def take(self, index: IntArray) -> Sets:
+        return Sets._make(column[index] for column in self)

@@ -1,0 +1,110 @@
+"""Measurements some of which may be wild: the update over all inlier/outlier subsets.
+
+A late echo is not a large error of a good measurement, it is another measurement. With a few
+numbers y_1 .. y_R at once, each good with probability 1 - eps and else spread with a flat density
+u, there are 2^R explanations, and all of them can be computed: a Gaussian each, weighted by its
+evidence, one Gaussian of the same mean and covariance at the end. A sequential gate picks one of
+these explanations, and which one depends on the order of the numbers.
+
+Explanations are grown number by number (`Explanation`), and those that fall `PRUNE` below the best
+are dropped. A number that is rejected costs ``eps u`` in every explanation: without that charge
+the explanation that rejects everything wins.
+
+This is the mathematics as it reads; `trackers.diver.ping_kernels` is the same, compiled, for the
+arrivals of a ping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import math
+
+from attrs import frozen
+import numpy as np
+
+from .arrays import BoolArray, FloatArray
+from .consider import consider_update
+
+PRUNE = 14.0
+"""An explanation whose log-probability is this much below the best one's is dropped."""
+
+Observation = tuple[Callable[[FloatArray], tuple[float, FloatArray]], float, float]
+"""A number: what gives h(x) and its gradient (n,) at a state, the value, its variance."""
+
+
+@frozen(eq=False)
+class Explanation:
+    """Which numbers (R,) are good, the state given that, and the log of its joint probability."""
+
+    good: tuple[bool, ...]
+    x: FloatArray
+    P: FloatArray
+    log_weight: float
+
+
+@frozen(eq=False)
+class SubsetUpdate:
+    """The explanations left, best known by `probability` (B,); x (n,) and P (n, n) of all of them
+    together; log_evidence of all the numbers; good (R,): probability that each is no outlier."""
+
+    explanations: Sequence[Explanation]
+    probability: FloatArray
+    x: FloatArray
+    P: FloatArray
+    log_evidence: float
+    good: FloatArray
+
+
+def subset_update(
+    x: FloatArray,
+    P: FloatArray,
+    observations: Sequence[Observation],
+    *,
+    outlier_probability: float,
+    outlier_density: float,
+    estimated: BoolArray | None = None,
+    prune: float = PRUNE,
+) -> SubsetUpdate:
+    """Oracle for tests: update x (n,), P (n, n) with numbers each of which may be wild.
+
+    A number is linearised where the explanation so far stands. outlier_density is per unit of the
+    numbers; estimated (n,): see `consider.consider_update`, None for all.
+    """
+    mask = np.ones(len(x), bool) if estimated is None else estimated
+    log_bad = _log(outlier_probability) + math.log(outlier_density)
+    log_good = math.log1p(-outlier_probability)
+    left = [Explanation((), np.array(x, np.float64), np.array(P, np.float64), 0.0)]
+    for measure, value, variance in observations:
+        grown = []
+        for one in left:
+            expected, gradient = measure(one.x)
+            S = float(gradient @ one.P @ gradient) + variance
+            innovation = value - expected
+            fit = -0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
+            row, noise = gradient[None], np.array([[variance]])
+            x_b, P_b = consider_update(one.x, one.P, row, noise, np.array([innovation]), mask)
+            grown.append(Explanation((*one.good, False), one.x, one.P, one.log_weight + log_bad))
+            grown.append(Explanation((*one.good, True), x_b, P_b, one.log_weight + log_good + fit))
+        best = max(one.log_weight for one in grown)
+        left = [one for one in grown if one.log_weight >= best - prune]
+    return _together(left, len(observations))
+
+
+def _together(left: Sequence[Explanation], count: int) -> SubsetUpdate:
+    weight = np.array([one.log_weight for one in left])
+    best = float(weight.max())
+    share = np.exp(weight - best)
+    probability = share / share.sum()
+    states = np.stack([one.x for one in left])
+    x = probability @ states
+    spread = states - x
+    P = np.einsum('b,bij->ij', probability, np.stack([one.P for one in left]))
+    P = P + np.einsum('b,bi,bj->ij', probability, spread, spread)
+    good = np.array([one.good for one in left], np.float64).reshape(len(left), count)
+    return SubsetUpdate(
+        left, probability, x, P, best + math.log(float(share.sum())), probability @ good
+    )
+
+
+def _log(value: float) -> float:
+    return math.log(value) if value > 0.0 else -math.inf

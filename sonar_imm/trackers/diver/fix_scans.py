@@ -1,0 +1,52 @@
+"""What the fixes of a scan do to the tracks, and where they begin new ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...estimation.arrays import BoolArray
+from ...measurements import Fixes, Measurement, NOBODY
+from . import soft
+from .births import Birth, births_from_fixes
+from .config import DiverConfig
+from .scan import Scan
+from .sensing import Positions
+
+
+def take_fixes(scan: Scan, group: Positions) -> list[Birth]:
+    """Update the tracks by fixes; gives where they put new divers."""
+    if group.target_id is not None:
+        return births_from_fixes(group, ~_take_named(scan, group))
+    if scan.config.association == 'gnn':
+        return births_from_fixes(group, ~scan.associate_and_update(group))
+    claimed = soft.take_softly(scan, group)
+    return births_from_fixes(group, claimed < 0.5, soft.birth_existence(scan.config, claimed))
+
+
+def _take_named(scan: Scan, group: Positions) -> BoolArray:
+    """Update each track by the fix that says it is its own, without association; True (D,) where
+    there is a track of that name."""
+    names = np.asarray(group.target_id)
+    tracks, row = np.nonzero(scan.before.target_id[:, None] == names[None])
+    if len(tracks):
+        scan.update_by_fixes(group, tracks, row)
+    return np.isin(np.arange(len(names)), row)
+
+
+def shows_all(item: Measurement, config: DiverConfig) -> bool:
+    """Whether a diver of whom `item` says nothing was missed by it."""
+    if isinstance(item, Fixes):
+        return item.target_id is None or not len(item) or bool((item.target_id == NOBODY).any())
+    return config.fixes_are_scans
+
+
+def each_name_once(births: Sequence[Birth]) -> list[Birth]:
+    """Without a second birth of the same name."""
+    names = [birth.target_id for birth in births]
+    return [
+        birth
+        for place, birth in enumerate(births)
+        if birth.target_id == NOBODY or names.index(birth.target_id) == place
+    ]

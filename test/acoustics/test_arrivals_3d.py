@@ -1,0 +1,78 @@
+"""Paths and angles in three dimensions: vectors, the compiled form, numerical derivatives."""
+
+from helpers.sea_vectors import vectors
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.arrivals_3d import (
+    arrival_angles,
+    arrival_paths,
+    BEARING,
+    ELEVATION,
+    HEIGHT,
+    observe,
+    ONE_WAY,
+    PATH,
+)
+
+
+def test_the_paths_of_the_vectors():
+    v = vectors('arrivals_3d')
+    got, jacobian = arrival_paths(v['position'], v['tx'], v['rx']), v['out_jacobian']
+    np.testing.assert_allclose(got.length, v['out_path'], atol=1e-9)
+    np.testing.assert_allclose(got.by_position, jacobian[:, :3], atol=1e-9)
+    for r in range(4):
+        np.testing.assert_allclose(got.by_offset[r], jacobian[r, 3 + 2 * r : 5 + 2 * r], atol=1e-9)
+        assert jacobian[r, 13 + r] == got.by_clock[r]
+    np.testing.assert_allclose(got.by_sound, jacobian[:, 17], atol=1e-9)
+
+
+def test_the_angles_of_the_vectors():
+    v = vectors('usbl')
+    bearing, by_bearing, elevation, by_elevation = arrival_angles(
+        v['position'], v['receiver'][None]
+    )
+    assert bearing[0] == pytest.approx(float(v['out_bearing']), abs=1e-9)
+    assert elevation[0] == pytest.approx(float(v['out_elevation']), abs=1e-9)
+    np.testing.assert_allclose(by_bearing[0], v['out_jacobian_bearing'], atol=1e-9)
+    np.testing.assert_allclose(by_elevation[0], v['out_jacobian_elevation'], atol=1e-9)
+    leg = arrival_paths(v['position'], None, v['receiver'][None])
+    assert leg.length[0] == pytest.approx(float(v['out_range']), abs=1e-9)
+    np.testing.assert_allclose(leg.by_position[0], v['out_jacobian_range'], atol=1e-9)
+
+
+COLUMNS = np.array([0, 1, 3, 5, 7, 8, 9])
+STATE = np.array([31.0, -12.0, 0.7, -9.0, 0.1, 0.6, -0.4, 0.8, 0.003, 4.0])
+
+
+@pytest.mark.parametrize('kind', [PATH, ONE_WAY, BEARING, ELEVATION, HEIGHT])
+def test_the_compiled_form_equals_the_plain_one_and_its_gradient_the_differences(kind):
+    tx, rx, gradient = np.array([0.0, 0.0, -3.0]), np.array([70.0, 10.0, -5.0]), np.empty(10)
+    value = observe(kind, STATE, COLUMNS, 0.0, tx, rx, gradient)
+    place = STATE[[0, 1, 3]]
+    angles = arrival_angles(place, rx[None])
+    errors = {'offset': STATE[5:7], 'clock': STATE[7], 'sound': STATE[8]}
+    expected = {
+        PATH: arrival_paths(place, tx, rx[None], **errors).length[0],
+        ONE_WAY: arrival_paths(place, None, rx[None], **errors).length[0] + STATE[9],
+        BEARING: angles[0][0],
+        ELEVATION: angles[2][0],
+        HEIGHT: STATE[3],
+    }[kind]
+    assert value == pytest.approx(expected, abs=1e-12)
+    scratch, step = np.empty(10), 1e-6
+    for a, unit in enumerate(np.eye(10)):
+        ahead = observe(kind, STATE + step * unit, COLUMNS, 0.0, tx, rx, scratch)
+        behind = observe(kind, STATE - step * unit, COLUMNS, 0.0, tx, rx, scratch)
+        # angles have no gradient by the offset of the receiver: it is metres among tens
+        assert gradient[a] == pytest.approx((ahead - behind) / (2 * step), abs=1e-7)
+
+
+def test_without_states_the_height_is_the_given_one_and_no_point_is_singular():
+    columns, gradient = np.array([0, 1, -1, -1, -1, -1, -1]), np.empty(2)
+    here = np.array([5.0, 5.0, -3.0])
+    for kind in (PATH, ONE_WAY, BEARING, ELEVATION):
+        value = observe(kind, here[:2].copy(), columns, -3.0, here, here, gradient)
+        assert np.isfinite(value) and (gradient == 0.0).all()
+    assert all(np.isfinite(part).all() for part in arrival_paths(here, here, here[None]))
+    assert all(np.isfinite(part).all() for part in arrival_angles(here, here[None]))

@@ -1,0 +1,98 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import array, geometry, sounding
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.acoustics.sounding import ErrorBudget
+
+VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'pose_table.npz'
+
+
+def rows():
+    with np.load(VECTORS) as archive:
+        table = dict(archive)
+    s_att, s_head, *rest = table.pop('tpu')
+    budget = ErrorBudget(
+        attitude=np.radians(s_att),
+        heading=np.radians(s_head),
+        heave=rest[0],
+        position=rest[1],
+        sound_speed=rest[2],
+    )
+    speed = float(table.pop('sound_speed'))
+    for k in range(len(table['p'])):
+        yield {name: values[k] for name, values in table.items()}, budget, speed
+
+
+def look_of(row):
+    side = 'port' if row['side'] == 0 else 'starboard'
+    axes = sounding.array_axes(side, row['tilt'], geometry.rotation(*row['mount']))
+    pose = Pose(row['p'], geometry.rotation_of_quaternion(row['quaternion_xyzw']))
+    return sounding.looks(axes, row['lever'], pose, pose), side
+
+
+def test_the_pose_table():
+    for row, budget, speed in rows():
+        look, side = look_of(row)
+        n = sounding.direction(look, row['u'])
+        point = look.position + row['range'] * n
+        assert look.position == pytest.approx(row['sonar'], abs=1e-9)
+        assert point == pytest.approx(row['point'], abs=1e-6)
+        assert (look.psi, look.C) == (
+            pytest.approx(row['psi'], abs=1e-6),
+            pytest.approx(row['C'], abs=1e-6),
+        )
+        assert sounding.beam_angle(n, side) == pytest.approx(row['beam_angle'], abs=1e-6)
+        depth, distance = -(point - look.position)[2], np.hypot(*(point - look.position)[:2])
+        vertical, horizontal = sounding.uncertainties(
+            row['var_filter'], depth, distance, budget, speed
+        )
+        assert vertical == pytest.approx(row['vertical_uncertainty'], abs=1e-6)
+        assert horizontal == pytest.approx(row['horizontal_uncertainty'], abs=1e-6)
+
+
+def test_height_gives_back_the_direction_sine_also_with_pitch():
+    """C belongs into the formula: without it a pitched array is wrong."""
+    without = []
+    for row, _, _ in rows():
+        look, _ = look_of(row)
+        s = (look.position[2] - row['point'][2]) / (row['range'] * look.C)
+        u = array.direction_sine(s * row['range'], row['range'], look.psi)
+        # Two directions of the fan have one height: the formula gives the one nearer to broadside.
+        if abs(np.arcsin(row['u']) + look.psi) <= 0.5 * np.pi:
+            assert u == pytest.approx(row['u'], abs=1e-9)
+            wrong = array.direction_sine(s * look.C * row['range'], row['range'], look.psi)
+            without.append(abs(wrong - row['u']))
+    assert len(without) > 40 and max(without) > 1e-3
+
+
+def test_rolling_to_starboard_lets_the_starboard_array_look_deeper():
+    axes = sounding.array_axes('starboard', np.radians(30.0), np.eye(3))
+    rolled = Pose(np.zeros(3), geometry.rotation(np.radians(5.0), 0.0, 0.0))
+    assert sounding.looks(axes, np.zeros(3), rolled, rolled).psi == pytest.approx(np.radians(35.0))
+    port = sounding.array_axes('port', np.radians(30.0), np.eye(3))
+    assert sounding.looks(port, np.zeros(3), rolled, rolled).psi == pytest.approx(np.radians(25.0))
+
+
+def test_attitude_is_that_of_reception_and_position_the_mean():
+    axes = sounding.array_axes('port', 0.5, np.eye(3))
+    sent = Pose(np.array([0.0, 0.0, 1.0]), np.eye(3))
+    received = Pose(
+        np.array([[2.0, 0.0, 1.0], [4.0, 0.0, 3.0]]),
+        geometry.rotation(np.array([0.0, 0.1]), np.zeros(2), np.zeros(2)),
+    )
+    look = sounding.looks(axes, np.array([0.0, 0.0, -1.0]), sent, received)
+    assert look.position[0] == pytest.approx([1.0, 0.0, 0.0])
+    assert look.position[1] == pytest.approx([2.0, 0.5 * np.sin(0.1), 1.5 - 0.5 * np.cos(0.1)])
+    assert look.psi == pytest.approx([0.5, 0.4])
+
+
+def test_the_budget_is_finite_straight_below_and_infinite_where_the_depth_says_nothing():
+    budget = ErrorBudget(attitude=1e-3, heading=1e-3, heave=0.05, position=0.1, sound_speed=0.5)
+    vertical, horizontal = sounding.uncertainties(
+        np.array([0.01, 0.01]), np.array([15.0, 0.0]), np.array([0.0, 50.0]), budget, 1500.0
+    )
+    assert np.isfinite(horizontal).all() and np.isfinite(vertical[0])
+    assert vertical[1] == np.inf

@@ -1,0 +1,83 @@
+"""``sonar-imm export``: from a scene of a moving ship to files that other programs read."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.recordings.export.points import read_points
+
+SMALL = ('--set', 'pings=3', '--set', 'last_range=30', '--set', 'bin_width=0.1')
+
+
+def run(*arguments):
+    return main([str(one) for one in arguments])
+
+
+@pytest.fixture(scope='module')
+def tracked(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('export')
+    scene = ('simulate', 'bathymetry', folder / 'bag', '--scenario', 'moving_two_sides')
+    assert run(*scene, *SMALL) == 0
+    assert run('track', folder / 'bag', folder / 'run', '--set', 'particles_per_model=30') == 0
+    return folder / 'run'
+
+
+def test_a_run_holds_the_soundings_of_both_sides(tracked):
+    points = read_points(tracked / 'soundings.csv')
+    told = json.loads((tracked / 'run.json').read_text())
+    assert len(points) == told['soundings'] > 400
+    assert told['parameters']['navigation'] == 'required' and told['estimates'] == 6
+    assert set(points['side']) == {0.0, 1.0} and points['z'].mean() == pytest.approx(-20, abs=0.2)
+    assert all(np.isfinite(column).all() for column in points.columns.values())
+
+
+def test_xyz_las_and_tif_hold_the_same_floor(tracked, tmp_path):
+    laspy, rasterio = pytest.importorskip('laspy'), pytest.importorskip('rasterio')
+    place = ('--epsg', '32632', '--origin', '500000,6000000,1.5')
+    for name in ('a.xyz', 'a.laz', 'a.tif'):
+        assert run('export', tracked, tmp_path / name, *place) == 0
+    points = read_points(tracked / 'soundings.csv')
+    text = np.loadtxt(tmp_path / 'a.xyz')
+    las = laspy.read(tmp_path / 'a.laz')
+    assert text[:, 0] == pytest.approx(points['x'] + 500_000.0, abs=1e-3)
+    assert np.asarray(las.y) == pytest.approx(points['y'] + 6_000_000.0, abs=1e-3)
+    assert np.asarray(las.z) == pytest.approx(text[:, 2], abs=1.1e-3)
+    with rasterio.open(tmp_path / 'a.tif') as file:
+        depth, _, _, count = file.read()
+        assert file.crs.to_epsg() == 32632 and count.sum() == len(points)
+    assert np.nanmean(depth) == pytest.approx(18.5, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    'arguments, word',
+    [
+        (('a.pdf',), '.xyz, .las, .laz, .tif'),
+        (('a.tif', '--epsg', '1'), 'EPSG number 1'),
+        (('a.tif', '--cell', '0.00001'), 'too large'),
+        (('a.xyz', '--origin', '5'), 'X,Y'),
+        (('a.tif', '--cell', '0'), 'cell'),
+    ],
+)
+def test_mistakes_are_one_sentence(tracked, tmp_path, capsys, arguments, word):
+    pytest.importorskip('rasterio')
+    name, *options = arguments
+    assert run('export', tracked, tmp_path / name, *options) == 2
+    error = capsys.readouterr().err
+    assert word in error and error.count('\n') == 1
+    assert not (tmp_path / name).exists()
+
+
+def test_runs_without_soundings_and_files_in_the_way_are_named(tracked, tmp_path, capsys):
+    scene = ('simulate', 'bathymetry', tmp_path / 'bag', '--set', 'pings=1')
+    assert run(*scene, '--set', 'last_range=25') == 0
+    assert run('track', tmp_path / 'bag', tmp_path / 'run') == 0
+    assert run('export', tmp_path / 'run', tmp_path / 'a.xyz') == 2
+    assert 'holds no soundings' in capsys.readouterr().err
+    (tmp_path / 'a.xyz').write_text('mine')
+    assert run('export', tracked, tmp_path / 'a.xyz') == 2
+    assert 'there already' in capsys.readouterr().err
+    assert run('export', tracked, tmp_path / 'a.xyz', '--overwrite') == 0
+    assert run('evaluate', tracked) == 0
+    assert 'track of the ship' in (tracked / 'report.html').read_text()

@@ -1,0 +1,87 @@
+"""Schmidt's update: vectors, the scalar kernel, and a bias that must never be averaged away."""
+
+from helpers.sea_vectors import vectors
+import numpy as np
+import pytest
+
+from sonar_imm.estimation import imm
+from sonar_imm.estimation.consider import consider_models, consider_scalar, consider_update
+
+
+def test_the_update_of_the_vectors():
+    v = vectors('consider_update')
+    x, P = consider_update(
+        v['x'], v['P'], v['H'], v['R'], v['innovation'], v['estimated'].astype(bool)
+    )
+    np.testing.assert_allclose(x, v['out_x'], atol=1e-9)
+    np.testing.assert_allclose(P, v['out_P'], atol=1e-9)
+    assert (P == P.T).all()
+
+
+@pytest.mark.parametrize('mask', [[True] * 5, [True, True, True, False, False], [False] * 5])
+def test_numbers_one_by_one_equal_the_joint_update(mask):
+    """Independent noises: scalar updates in turn are the joint one, for any gain but Schmidt's,
+    whose considered part is not conditioned; so they are compared with the numpy form in turn."""
+    v, mask = vectors('consider_update'), np.array(mask)
+    x, P = v['x'].copy(), v['P'].copy()
+    y = v['innovation'] + v['H'] @ x
+    plain_x, plain_P = x.copy(), P.copy()
+    for h, R, value in zip(v['H'], np.diag(v['R']), y):
+        nu = value - h @ x
+        expected = -0.5 * (nu**2 / (h @ P @ h + R) + np.log(2 * np.pi * (h @ P @ h + R)))
+        assert consider_scalar(x, P, h, R, nu, mask, np.empty(5)) == pytest.approx(expected)
+        plain_x, plain_P = consider_update(
+            plain_x, plain_P, h[None], np.array([[R]]), np.array([value - h @ plain_x]), mask
+        )
+        np.testing.assert_allclose(x, plain_x, atol=1e-12)
+        np.testing.assert_allclose(P, plain_P, atol=1e-12)
+    if mask.all():
+        joint = consider_update(v['x'], v['P'], v['H'], v['R'], v['innovation'], mask)
+        np.testing.assert_allclose(x, joint[0], atol=1e-12)
+        np.testing.assert_allclose(P, joint[1], atol=1e-12)
+    if not mask.any():
+        np.testing.assert_array_equal(x, v['x'])
+
+
+def test_a_considered_bias_is_never_averaged_away():
+    v = vectors('consider_static')
+    P = np.diag([v['p0'], v['bias_var']])
+    for expected in v['out_var']:
+        _, P = consider_update(
+            np.zeros(2), P, np.ones((1, 2)), v['r'][None, None], np.zeros(1),
+            np.array([True, False]),
+        )  # fmt: skip
+        assert P[0, 0] == pytest.approx(expected, rel=1e-9)
+        assert P[0, 0] > v['bias_var'] and P[1, 1] == v['bias_var']
+
+
+def test_covariances_stay_symmetric_and_positive_over_many_updates():
+    rng = np.random.default_rng(1)
+    n, mask = 8, np.arange(8) < 5
+    A = rng.normal(size=(n, n))
+    x, P = np.zeros(n), A @ A.T
+    for _ in range(2000):
+        x, P = consider_update(
+            x, P + 0.01 * np.diag(mask), rng.normal(size=(1, n)), np.eye(1), np.ones(1), mask
+        )
+    assert (P == P.T).all() and np.linalg.eigvalsh(P).min() > 0.0
+
+
+def test_mixing_leaves_what_is_considered_as_it_is():
+    v = vectors('consider_mix')
+    x, P, c = imm.mix(v['X'][None], v['P'][None], v['mu'][None], v['Pi'][None])
+    np.testing.assert_allclose(x[0], v['out_X0'], atol=1e-9)
+    np.testing.assert_allclose(P[0], v['out_P0'], atol=1e-9)
+    np.testing.assert_allclose(c[0], v['out_c'], atol=1e-9)
+
+
+def test_models_with_nothing_considered_are_those_of_imm():
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(1, 3, 4, 4))
+    x, P = rng.normal(size=(1, 3, 4)), A @ np.swapaxes(A, -1, -2)
+    c, H, R = np.array([[0.5, 0.3, 0.2]]), rng.normal(size=(3, 2, 4)), np.eye(2)[None]
+    z = rng.normal(size=(1, 3, 2))
+    got = consider_models(x, P, c, z, H, R, np.ones(4, bool))
+    want = imm.update(x, P, c, z, H[None], R)
+    for a, b in zip(got[:4], (want.x, want.P, want.mu, want.nis)):
+        np.testing.assert_allclose(a, b, atol=1e-10)

@@ -1,0 +1,187 @@
+"""Joint integrated probabilistic data association against an independent prototype, brute force
+and closed forms."""
+
+from itertools import product
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from sonar_imm.estimation import imm, jipda, jipda_kernels
+
+VECTORS = np.load(
+    Path(__file__).parents[1] / 'vectors' / 'diver_sea' / 'association.npz', allow_pickle=False
+)
+CASES = ('jipda_2x2', 'jipda_3x3', 'jipda_1x2', 'jipda_2x0')
+FORMS = (jipda.associate, jipda_kernels.associate)
+EVERYWHERE = 1.0
+
+
+def inside(ratio):
+    """A NIS (T, D) that makes every pair with a likelihood possible."""
+    return np.where(ratio > 0.0, 0.0, np.inf)
+
+
+def brute_force(ratio, existence, pd):
+    """beta, existence by enumeration of everything: who exists, who takes which detection."""
+    T, D = ratio.shape
+    beta, exists, total = np.zeros((T, D)), np.zeros(T), 0.0
+    for there in product((False, True), repeat=T):
+        for taken in product(range(-1, D), repeat=T):
+            used = [d for d in taken if d >= 0]
+            if len(set(used)) < len(used) or any(
+                d >= 0 and not alive for d, alive in zip(taken, there)
+            ):
+                continue
+            weight = 1.0
+            for t, (d, alive) in enumerate(zip(taken, there)):
+                weight *= existence[t] if alive else 1.0 - existence[t]
+                if alive:
+                    weight *= 1.0 - pd[t] if d < 0 else pd[t] * ratio[t, d]
+            total += weight
+            for t, (d, alive) in enumerate(zip(taken, there)):
+                exists[t] += weight * alive
+                if d >= 0:
+                    beta[t, d] += weight
+    return beta / total, exists / total
+
+
+@pytest.mark.parametrize('case', CASES)
+@pytest.mark.parametrize('form', FORMS)
+def test_the_sums_over_events_are_those_of_the_prototype(case, form):
+    ratio, existence, pd = (VECTORS[f'{case}/{name}'] for name in ('ratio', 'existence', 'pd'))
+    beta, missed, after = form(ratio, inside(ratio), existence, pd, EVERYWHERE)
+    np.testing.assert_allclose(beta, VECTORS[f'{case}/out_beta'], rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(missed, VECTORS[f'{case}/out_missed_exists'], rtol=1e-10)
+    np.testing.assert_allclose(after, VECTORS[f'{case}/out_existence'], rtol=1e-10)
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_the_events_are_those_of_the_prototype(case):
+    possible = VECTORS[f'{case}/ratio'] > 0.0
+    events = jipda._events(possible, list(range(len(possible))))
+    assert np.array_equal(np.reshape(events, (-1, len(possible))), VECTORS[f'{case}/out_events'])
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**32 - 1))
+def test_both_forms_agree_with_brute_force_over_existence_and_pairings(seed):
+    rng = np.random.default_rng(seed)
+    T, D = rng.integers(1, 4), rng.integers(0, 4)
+    ratio = rng.gamma(1.0, 4.0, (T, D)) * (rng.uniform(size=(T, D)) < 0.7)
+    existence, pd = rng.uniform(0.01, 0.999, T), rng.uniform(0.1, 0.99, T)
+    beta, exists = brute_force(ratio, existence, pd)
+    for form in FORMS:
+        ours = form(ratio, inside(ratio), existence, pd, EVERYWHERE)
+        np.testing.assert_allclose(ours[0], beta, rtol=1e-9, atol=1e-14)
+        np.testing.assert_allclose(ours[2], exists, rtol=1e-9)
+
+
+def test_one_track_in_a_scan_with_nothing_is_the_bayes_rule_of_a_miss():
+    none = np.empty((1, 0))
+    _, _, after = jipda_kernels.associate(none, none, np.array([0.5]), np.array([0.7]), 9.0)
+    np.testing.assert_allclose(after, 0.5 * 0.3 / (0.5 * 0.3 + 0.5))
+
+
+def test_a_cluster_with_too_many_events_gets_a_smaller_gate():
+    """Eight tracks and eight detections all within the gate: 1441729 events."""
+    rng = np.random.default_rng(3)
+    ratio, nis = rng.gamma(2.0, 3.0, (8, 8)), rng.uniform(0.0, 13.0, (8, 8))
+    existence, pd = np.full(8, 0.9), np.full(8, 0.9)
+    one, two = (form(ratio, nis, existence, pd, 13.8) for form in FORMS)
+    for ours, theirs in zip(one, two):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-14)
+    kept = nis[one[0] > 0.0].max()
+    gates = 13.8 * 0.7 ** np.arange(30)
+    assert 0.0 < kept < 13.8
+    gate = gates[gates >= kept].min()
+    assert len(jipda._events(nis <= gate, list(range(8)))) <= jipda.MOST_EVENTS
+    assert jipda._count(nis <= gate / 0.7, list(range(8))) > jipda.MOST_EVENTS
+
+
+def test_a_cluster_of_equal_pairs_that_no_gate_divides_ends():
+    for form in FORMS[1:]:
+        beta, _, after = form(
+            np.ones((9, 9)), np.zeros((9, 9)), np.full(9, 0.9), np.full(9, 0.9), 13.8
+        )
+        assert not beta.any() and np.isfinite(after).all()
+
+
+def problem(seed, T=3, D=4, M=3, n=3, m=2):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(T, M, n, n))
+    P = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(n)
+    c = rng.dirichlet(np.ones(M), T)
+    H = np.ascontiguousarray(np.broadcast_to(np.eye(m, n), (1, M, m, n)))
+    noise = rng.normal(size=(D, m, m))
+    R = noise @ np.swapaxes(noise, -1, -2) + 0.1 * np.eye(m)
+    x = rng.normal(size=(T, M, n))
+    return x, P, c, np.ascontiguousarray(x[..., :m]), H, rng.normal(size=(D, m)), R
+
+
+def test_the_update_is_that_of_the_prototype():
+    names = ('X', 'P', 'mu', 'Z', 'R', 'beta', 'beta0', 'H')
+    X, P, mu, Z, R, beta, beta0, H = (VECTORS[f'imm_pda/{name}'] for name in names)
+    h = X @ H.T
+    big_R = np.tile(R, (len(Z), 1, 1))
+    ours = jipda.update(X, P, mu, Z[:, None] - h, np.tile(H, (3, 1, 1)), big_R, beta, float(beta0))
+    arrays = (X, P, mu, h, np.tile(H, (3, 1, 1)))
+    kernel = jipda_kernels.update(
+        *(np.ascontiguousarray(one[None]) for one in arrays),
+        Z,
+        big_R,
+        beta[None],
+        np.reshape(beta0, 1),
+        np.zeros(3, bool),
+    )
+    for found, single, name in zip(kernel, ours, ('out_X', 'out_P', 'out_mu')):
+        np.testing.assert_allclose(single, VECTORS[f'imm_pda/{name}'], rtol=1e-10)
+        np.testing.assert_allclose(found[0], VECTORS[f'imm_pda/{name}'], rtol=1e-10)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_both_forms_of_likelihoods_and_update_are_equal(seed):
+    x, P, c, h, H, z, R = problem(seed)
+    ours = jipda.likelihoods(h, H, P, c, z, R)
+    mixture, nis = jipda_kernels.likelihoods(h, H, P, c, z, R)
+    np.testing.assert_allclose(mixture, ours.mixture, rtol=1e-10)
+    np.testing.assert_allclose(nis, ours.nis, rtol=1e-10)
+    existence = np.full(3, 0.7)
+    beta, missed, after = jipda_kernels.associate(
+        mixture / 1e-3, nis, existence, np.full(3, 0.9), 13.8
+    )
+    considered = np.array([False, False, seed % 2 == 1])
+    found = jipda_kernels.update(x, P, c, h, H, z, R, beta, missed, considered)
+    for t in range(3):
+        single = jipda.update(
+            x[t],
+            P[t],
+            c[t],
+            z[:, None] - h[t],
+            H[0],
+            R,
+            beta[t] / after[t],
+            missed[t] / after[t],
+            considered,
+        )
+        for one, other in zip(found, single):
+            np.testing.assert_allclose(one[t], other, rtol=1e-9, atol=1e-12)
+
+
+def test_a_single_certain_detection_is_the_update_of_the_imm_filter():
+    x, P, c, h, H, z, R = problem(7, T=2, D=1)
+    beta, missed = np.ones((2, 1)), np.zeros(2)
+    found = jipda_kernels.update(x, P, c, h, H, z, R, beta, missed, np.zeros(3, bool))
+    plain = imm.update(x, P, c, z[0] - h, H, R)
+    for ours, theirs in zip(found, (plain.x, plain.P, plain.mu)):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
+
+
+def test_without_a_detection_nothing_changes():
+    x, P, c, h, H, z, R = problem(8, D=0)
+    found = jipda_kernels.update(
+        x, P, c, h, H, z, R, np.empty((3, 0)), np.full(3, 0.4), np.zeros(3, bool)
+    )
+    assert all(np.array_equal(ours, theirs) for ours, theirs in zip(found, (x, P, c)))

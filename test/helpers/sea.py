@@ -1,0 +1,70 @@
+"""The recording of a moving ship among the vectors, and small pings of our own from a ship."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sonar_imm.measurements import Navigation, Snapshot
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
+from sonar_imm.trackers.bathymetry.pose_queue import bin_stamps
+from sonar_imm.trackers.bathymetry.swath import ship_swath
+from sonar_imm.trackers.navigation import NavigationBuffer
+
+VECTOR = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'motion_0.npz'
+START_NS = 10**18
+
+
+def motion_case():
+    with np.load(VECTOR) as archive:
+        return dict(archive)
+
+
+def sea_config(case, **values):
+    told = {
+        'sonar_lever': case['lever'].tolist(),
+        'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
+        'tilt_deg': float(case['tilt_deg']),
+        'side': str(case['side']),
+    }
+    return BathymetryConfig.from_mapping({**told, **values})
+
+
+def navigation(case, *, late_s=0.0):
+    """The poses of the case, their stamps wrong by `late_s`."""
+    return [
+        Navigation(
+            stamp_ns=START_NS + round((t + late_s) * 1e9),
+            position=p,
+            orientation=q,
+            frame_id='map',
+        )
+        for t, p, q in zip(case['tn'], case['pn'], case['qn'])
+    ]
+
+
+def snapshots(case):
+    for t, parts in zip(case['t'], case['iq'].astype(np.float64)):
+        yield Snapshot(
+            stamp_ns=START_NS + round(t * 1e9),
+            frame_id='sonar',
+            range=case['r'],
+            iq=parts[..., 0] + 1j * parts[..., 1],
+            noise_variance=np.full(len(case['r']), float(case['sn2'])),
+            sound_speed=float(case['c']),
+        )
+
+
+def swath_of(case, config, snapshot, *, late_s=0.0, pose_of='reception'):
+    """The swath of one ping, right or with a mistake: `pose_of` all bins is that of
+    ``transmission`` or of the ``middle`` of the ping."""
+    poses = navigation(case, late_s=late_s)
+    buffer = NavigationBuffer(tuple(one.stamp_ns for one in poses), tuple(poses))
+    stamps = bin_stamps(snapshot, config)
+    if pose_of == 'transmission':
+        stamps = np.full_like(stamps, stamps[0])
+    elif pose_of == 'middle':
+        stamps = np.full_like(stamps, (stamps[0] + stamps[-1]) // 2)
+    ranges = snapshot.ranges(config.sound_speed)
+    return ship_swath(
+        config, ranges, float(case['c']), config.side, float(case['dlam']), buffer.poses(stamps)
+    )

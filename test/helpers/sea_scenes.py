@@ -1,0 +1,67 @@
+"""The traces of `vectors/fathometer_sea`: records a second apart, and what was there."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_imm.estimation.consistency import ospa
+from sonar_imm.measurements import Trace
+
+SEA = Path(__file__).parents[1] / 'vectors' / 'fathometer_sea'
+
+
+class Scene(NamedTuple):
+    """depth (n,), response (T, n), reflector_depth (T, K), amplitude (K,); file: all it has."""
+
+    depth: np.ndarray
+    response: np.ndarray
+    reflector_depth: np.ndarray
+    amplitude: np.ndarray
+    array_depth: float
+    file: dict
+
+    def traces(self, records=None, sigma=True):
+        for k in range(len(self.response)) if records is None else records:
+            yield Trace(
+                stamp_ns=(k + 1) * 10**9,
+                depth=self.depth,
+                amplitude=self.response[k],
+                sigma=np.ones(len(self.depth)) if sigma else None,
+                reference_depth=self.array_depth,
+            )
+
+    def depth_at(self, stamp_ns):
+        return self.reflector_depth[stamp_ns // 10**9 - 1]
+
+
+class Score(NamedTuple):
+    right: float
+    ospa: float
+
+
+def sea_scene(name):
+    with np.load(SEA / f'{name}.npz') as file:
+        found = {key: file[key] for key in file}
+    return Scene(
+        found['depth'].astype(float),
+        found['amplitude'].astype(float),
+        found['reflector_depth'],
+        found['reflector_amplitude'],
+        float(found['array_depth']),
+        found,
+    )
+
+
+def score_scene(found, scene, after):
+    """Share of the records later than `after` whose number of reflectors is right, and OSPA."""
+    right, distance = [], []
+    for stamp, estimate in found.items():
+        if stamp <= after * 10**9:
+            continue
+        there = scene.depth_at(stamp)
+        order = int(estimate.model_names[estimate.probabilities[0].argmax()].split('_')[1])
+        right.append(order == len(there))
+        seen = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
+        distance.append(ospa(seen, there[:, None], cutoff=2.0, order=2.0))
+    return Score(float(np.mean(right)), float(np.mean(distance)))

@@ -1,0 +1,146 @@
+import math
+
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from msg_adapters.fixes import UNKNOWN_VARIANCE
+from msg_adapters.scans import doubt_scan, read_poses, read_scan, write_poses, write_scan
+from msg_adapters.table import encode_table
+from sonar_imm.measurements import Fixes, Rejection
+from sonar_imm.recordings.messages import ros_message
+
+STAMP = 1_700_000_000_123_456_789
+
+
+def scan(**columns):
+    """Two fixes at (1, 2) and (3, 4); `columns` replace."""
+    full = {
+        'x': np.array([1.0, 3.0]),
+        'y': np.array([2.0, 4.0]),
+        'cov_x_x': np.array([1.0, 4.0], np.float32),
+        'cov_x_y': np.array([0.5, 0.0], np.float32),
+        'cov_y_y': np.array([1.0, 9.0], np.float32),
+    }
+    full.update(columns)
+    full = {name: np.asarray(values) for name, values in full.items() if values is not None}
+    return encode_table(full, stamp_ns=STAMP, frame_id='map', make=ros_message)
+
+
+def reason(message):
+    with pytest.raises(Rejection) as caught:
+        read_scan(message)
+    return caught.value.reason
+
+
+def test_a_table_is_read():
+    got = read_scan(scan(z=[5.0, math.nan], id=np.array([7, -1], np.int32)))
+    assert got.stamp_ns == STAMP and got.frame_id == 'map' and len(got) == 2
+    assert got.position.tolist() == [[1.0, 2.0, 5.0], [3.0, 4.0, 0.0]]
+    assert got.covariance.tolist() == [[[1.0, 0.5], [0.5, 1.0]], [[4.0, 0.0], [0.0, 9.0]]]
+    assert got.target_id.tolist() == [7, -1]
+    assert read_scan(scan()).target_id is None
+
+
+def test_an_empty_scan_is_a_scan_and_an_empty_table_of_something_else_is_none():
+    none = {name: [] for name in ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')}
+    assert len(read_scan(scan(**none))) == 0
+    assert reason(scan(**{name: None for name in none})) == 'missing_column'
+    assert reason(scan(cov_x_y=None)) == 'missing_column'
+
+
+def test_unknown_covariances_are_nan_in_their_rows():
+    got = read_scan(scan(cov_x_x=[-1.0, 4.0]))
+    assert np.isnan(got.covariance[0]).all() and got.covariance[1].tolist() == [[4, 0], [0, 9]]
+    zero = [0.0, 0.0]
+    assert read_scan(scan(cov_x_x=zero, cov_x_y=zero, cov_y_y=zero)).covariance is None
+
+
+@pytest.mark.parametrize(
+    'columns',
+    [
+        {'x': [math.nan, 3.0]},
+        {'y': [math.inf, 4.0]},
+        {'x': [1e9, 3.0]},
+        {'cov_x_y': [2.0, 0.0]},
+        {'cov_x_x': [math.inf, 4.0]},
+        {'cov_x_x': [1e-300, 4.0]},
+    ],
+)
+def test_rows_that_cannot_be_used_are_left_out_and_doubted(columns):
+    got = read_scan(scan(**columns))
+    assert got.position.tolist() == [[3.0, 4.0, 0.0]]
+    assert doubt_scan(scan(**columns)) == 'unusable_rows' and doubt_scan(scan()) is None
+
+
+@pytest.mark.parametrize(
+    'columns, code',
+    [
+        ({'x': [math.nan, math.nan]}, 'nan'),
+        ({'id': [0.5, 1.0]}, 'out_of_range'),
+        ({'id': [3e9, 1.0]}, 'out_of_range'),
+        ({'x': np.ones((2, 2))}, 'bad_field'),
+    ],
+)
+def test_what_cannot_be_used_is_refused_with_its_reason(columns, code):
+    assert reason(scan(**columns)) == code
+
+
+def test_north_east_down_is_turned():
+    message = scan(z=[5.0, 6.0])
+    got = read_scan(message, world_frame='ned')
+    assert got.position.tolist() == [[2.0, 1.0, -5.0], [4.0, 3.0, -6.0]]
+    assert got.covariance[1].tolist() == [[9.0, 0.0], [0.0, 4.0]]
+
+
+@pytest.mark.parametrize('n', [0, 1, 5])
+@pytest.mark.parametrize('named', [False, True])
+def test_writing_and_reading_gives_the_same_scan(n, named):
+    rng = np.random.default_rng(n)
+    one = Fixes(
+        stamp_ns=STAMP,
+        position=rng.normal(size=(n, 3)) * 1e5,
+        covariance=np.tile([[4.0, 0.5], [0.5, 9.0]], (n, 1, 1)),
+        target_id=np.arange(n) if named else None,
+        frame_id='map',
+    )
+    again = read_scan(write_scan(one, ros_message))
+    assert again.stamp_ns == one.stamp_ns and (again.position == one.position).all()
+    assert n == 0 or (again.covariance == one.covariance).all()
+    assert (again.target_id is None) == (not named or n == 0)
+
+
+def test_poses_are_fixes_without_covariance():
+    one = Fixes(stamp_ns=STAMP, position=[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], frame_id='map')
+    message = write_poses(one, ros_message)
+    got = read_poses(message)
+    assert (got.position == one.position).all() and got.covariance is None
+    message.poses[0].position.x = math.nan
+    assert len(read_poses(message)) == 1 and doubt_scan(message) == 'unusable_rows'
+    assert (
+        len(read_poses(write_poses(Fixes(stamp_ns=1, position=np.empty((0, 3))), ros_message)))
+        == 0
+    )
+
+
+NASTY = (1.0, 4.0, 0.5, 0.0, -1.0, 1e-300, 1e9, 1e300, math.nan, math.inf, -math.inf, 1 / 3)
+
+
+@given(
+    values=st.lists(st.sampled_from(NASTY), min_size=14, max_size=14),
+    world=st.sampled_from(['enu', 'ned']),
+)
+@settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck))
+def test_hostile_scans_are_refused_or_finite(values, world):
+    names = ('x', 'y', 'z', 'cov_x_x', 'cov_x_y', 'cov_y_y', 'id')
+    columns = {name: values[2 * k : 2 * k + 2] for k, name in enumerate(names)}
+    try:
+        got = read_scan(scan(**columns), world_frame=world)
+    except Rejection as rejection:
+        assert rejection.reason and rejection.sentence
+        return
+    assert np.isfinite(got.position).all()
+    if got.covariance is not None:
+        known = got.covariance[~np.isnan(got.covariance).any(axis=(1, 2))]
+        assert (np.linalg.eigvalsh(known) > 0.0).all() and (known <= 1e10 * UNKNOWN_VARIANCE).all()

@@ -1,0 +1,70 @@
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.soundings import COLUMNS, soundings_of
+
+
+def estimate(**changed):
+    T = 6
+    extras = {
+        'range': np.linspace(20.0, 30.0, T),
+        'valid': np.array([1, 1, 0, 1, 1, 1], np.uint8),
+        'label': np.array([0, 1, 1, 0, 0, 1], np.uint8),
+        'label_probability': np.full(T, 0.9),
+        'vertical_uncertainty': np.full(T, 0.02),
+        'horizontal_uncertainty': np.full(T, 0.1),
+        'intensity': np.full(T, -3.0),
+        'beam_angle': np.linspace(0.5, 1.2, T),
+        'side': np.ones(T, np.uint8),
+        **changed,
+    }
+    return Estimate(
+        stamp_ns=7,
+        frame_id='map',
+        xyz=np.arange(3 * T, dtype=np.float32).reshape(T, 3),
+        state_names=('height',),
+        state=np.zeros((T, 1)),
+        covariance=np.ones((T, 1, 1)),
+        extras=extras,
+    )
+
+
+def test_one_row_for_each_bin_with_an_echo_in_the_types_of_the_contract():
+    soundings = soundings_of(estimate())
+    assert list(soundings.columns) == list(COLUMNS) and len(soundings) == 5
+    assert all(soundings.columns[name].dtype == kind for name, kind in COLUMNS.items())
+    assert soundings.columns['x'].tolist() == [0.0, 3.0, 9.0, 12.0, 15.0]
+    assert (soundings.stamp_ns, soundings.frame_id) == (7, 'map')
+
+
+def test_rows_that_are_not_known_throughout_are_left_out():
+    vertical = np.array([0.1, np.nan, 0.1, np.inf, 1e300, 0.1])
+    soundings = soundings_of(estimate(vertical_uncertainty=vertical))
+    assert soundings.columns['x'].tolist() == [0.0, 15.0]
+    assert all(np.isfinite(column).all() for column in soundings.columns.values())
+
+
+def test_estimates_without_navigation_have_no_soundings():
+    plain = estimate()
+    extras = {k: v for k, v in plain.extras.items() if 'uncertainty' not in k}
+    assert (
+        soundings_of(
+            Estimate(
+                **{
+                    **{
+                        f: getattr(plain, f)
+                        for f in (
+                            'stamp_ns',
+                            'frame_id',
+                            'xyz',
+                            'state_names',
+                            'state',
+                            'covariance',
+                        )
+                    },
+                    'extras': extras,
+                }
+            )
+        )
+        is None
+    )

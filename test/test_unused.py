@@ -1,0 +1,93 @@
+"""What of the mathematics only tests use says so, or stands here as part of the library."""
+
+import ast
+from collections import defaultdict
+
+from helpers.source import imported_names, module_name, MODULES, ROOT
+import pytest
+
+ROOMS = ('sonar_imm.estimation.', 'sonar_imm.acoustics.')
+ORACLE = 'Oracle for tests'
+
+LIBRARY = {
+    'sonar_imm.acoustics.arrivals_3d.arrival_angles': 'angles of many receivers at once',
+    'sonar_imm.acoustics.arrivals_3d.arrival_paths': 'paths of many receivers at once',
+    'sonar_imm.acoustics.geometry.vertical_offset': 'equation (7), which reconstruct turns round',
+    'sonar_imm.acoustics.multistatic.crlb': 'what a geometry of receivers can attain',
+    'sonar_imm.acoustics.multistatic.difference_measurement': 'a tag, without its emission',
+    'sonar_imm.estimation.consistency.innovation_autocorrelation': 'finds unmodelled dynamics',
+    'sonar_imm.estimation.consistency.nis': 'nees, by its name for innovations',
+    'sonar_imm.estimation.consistency.rmse': 'accuracy of one target',
+    'sonar_imm.estimation.imm.embed': 'model sets of unequal size',
+    'sonar_imm.estimation.kalman.update': 'one Kalman filter, without models',
+    'sonar_imm.estimation.particles.covariance': 'of a weighted set',
+    'sonar_imm.estimation.particles.mean': 'of a weighted set',
+    'sonar_imm.estimation.unscented.predict': 'one unscented filter, without models',
+}
+"""Public functions that this package does not call itself: what they are there for."""
+
+
+def trees():
+    users = [*MODULES, *(ROOT / 'benchmarks').glob('*.py')]
+    return {path: ast.parse(path.read_text(encoding='utf-8')) for path in users}
+
+
+def uses(path, tree):
+    """(function that uses it or None, dotted name used) of every name and attribute."""
+    names = {}
+    for name in imported_names(ast.unparse(tree), path):
+        names[name.rpartition('.')[2]] = name
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            for alias in node.names:
+                if alias.asname and alias.name.rpartition('.')[2] in names:
+                    names[alias.asname] = names[alias.name.rpartition('.')[2]]
+    own = module_name(path)
+    for top in tree.body:
+        owner = f'{own}.{top.name}' if isinstance(top, (ast.FunctionDef, ast.ClassDef)) else None
+        for node in ast.walk(top):
+            if isinstance(node, ast.Name):
+                yield owner, names.get(node.id, f'{own}.{node.id}')
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                if node.value.id in names:
+                    yield owner, f'{names[node.value.id]}.{node.attr}'
+
+
+@pytest.fixture(scope='module')
+def unused():
+    """Public functions of the mathematical rooms that nothing but themselves and other unused ones
+    call, with the first lines of what they say."""
+    users, said = defaultdict(set), {}
+    for path, tree in trees().items():
+        for owner, name in uses(path, tree):
+            if owner != name:
+                users[name].add(owner)
+        if module_name(path).startswith(ROOMS):
+            for node in tree.body:
+                if isinstance(node, ast.FunctionDef) and not node.name.startswith('_'):
+                    said[f'{module_name(path)}.{node.name}'] = ast.get_docstring(node) or ''
+    found, more = set(), True
+    while more:
+        more = {name for name in said if name not in found and users[name] <= found}
+        found |= more
+    return {name: said[name] for name in found}
+
+
+def test_what_only_tests_use_is_an_oracle_or_part_of_the_library(unused):
+    silent = {name for name, text in unused.items() if not text.startswith(ORACLE)}
+    assert silent == set(LIBRARY)
+
+
+def test_what_is_used_does_not_call_itself_an_oracle(unused):
+    for path, tree in trees().items():
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef):
+                text = ast.get_docstring(node) or ''
+                if text.startswith(ORACLE):
+                    assert f'{module_name(path)}.{node.name}' in unused
+
+
+def test_the_search_sees_what_is_used_and_what_is_not(unused):
+    assert 'sonar_imm.estimation.grid.filter_densities' in unused
+    assert 'sonar_imm.estimation.grid.walk_matrix' in unused  # by the one above only
+    assert 'sonar_imm.acoustics.multistatic.range_sum' not in unused

@@ -1,0 +1,327 @@
+"""The tracker on a ship that moves: the vectors of motion, mistakes that must be seen, gaps."""
+
+from attrs import evolve
+from helpers.sea import motion_case, navigation, sea_config, snapshots, START_NS, swath_of
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.likelihood_kernels import likelihood_table
+from sonar_imm.measurements import Altitude, Navigation
+from sonar_imm.parameters import ConfigError
+from sonar_imm.soundings import soundings_of
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
+from sonar_imm.trackers.bathymetry.grid_kernels import _log_likelihoods as log_likelihoods
+from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
+from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
+
+CASE = motion_case()
+
+
+def track(config, *, late_s=0.0, order='nav first'):
+    tracker, estimates = BathymetryTracker(config), []
+    poses, pings = navigation(CASE, late_s=late_s), list(snapshots(CASE))
+    if order == 'by stamp':
+        everything = sorted([*poses, *pings], key=lambda one: one.stamp_ns)
+    else:
+        everything = [*poses, *pings] if order == 'nav first' else [*pings, *poses]
+    for measurement in everything:
+        estimates += tracker.process(measurement)
+    return estimates, tracker
+
+
+def errors(estimates):
+    """rmse of z, share inside two sigma, rms of the place, share inside two sigma."""
+    z = np.array([one.state[:, 0] for one in estimates]) - CASE['X'][..., 2]
+    vertical, horizontal = (
+        np.array([one.extras[f'{name}_uncertainty'] for one in estimates])
+        for name in ('vertical', 'horizontal')
+    )
+    aside = np.linalg.norm(
+        np.array([one.xyz for one in estimates])[..., :2] - CASE['X'][..., :2], axis=-1
+    )
+    return (
+        np.sqrt(np.mean(z**2)),
+        np.mean(np.abs(z) < 2.0 * np.sqrt(vertical)),
+        np.sqrt(np.mean(aside**2)),
+        np.mean(aside < 2.0 * np.sqrt(horizontal)),
+    )
+
+
+@pytest.mark.parametrize(
+    'values', [{'engine': 'grid'}, {}, {'engine': 'grid', 'smoothing': 'states'}], ids=str
+)
+def test_a_rolling_ship_is_taken_out(values):
+    estimates, _ = track(sea_config(CASE, **values))
+    rmse, inside, place, inside_place = errors(estimates)
+    assert rmse <= 0.17 and 0.93 <= inside <= 0.99
+    assert place < 0.12 and inside_place > 0.95
+
+
+def test_the_exact_filter_reaches_what_is_attainable():
+    estimates, _ = track(sea_config(CASE, engine='grid'))
+    rmse, inside, place, _ = errors(estimates)
+    assert rmse == pytest.approx(float(CASE['att_rmse_z']), abs=0.003)
+    assert inside == pytest.approx(float(CASE['att_cov_z']), abs=0.01)
+    assert place == pytest.approx(float(CASE['att_rms_h']), abs=0.003)
+
+
+# -- the mistakes --------------------------------------------------------------------------------
+
+
+def height_error(config=None, **mistake):
+    """Rms error of height without noise of the echoes, when the swath is made with a mistake."""
+    right, found = sea_config(CASE), []
+    for k, snapshot in enumerate(snapshots(CASE)):
+        looks = swath_of(CASE, right, snapshot).looks
+        offset = CASE['X'][k] - looks.position
+        u = np.sum(offset * looks.stave, axis=1) / np.linalg.norm(offset, axis=1)
+        wrong = swath_of(CASE, config or right, snapshot, **mistake).geometry
+        z = wrong.height - wrong.reach * np.sin(np.arcsin(u) + wrong.tilt)
+        found.append(z - CASE['X'][k][:, 2])
+    return float(np.sqrt(np.mean(np.square(found))))
+
+
+def other_order(rpy_deg):
+    """Mount angles that Rx Ry Rz would be, where Rz Ry Rx is right."""
+    roll, pitch, yaw = np.radians(rpy_deg)
+    wrong = geometry.rotation(roll, 0.0, 0.0) @ geometry.rotation(0.0, pitch, 0.0)
+    wrong = wrong @ geometry.rotation(0.0, 0.0, yaw)
+    return tuple(np.degrees(geometry.euler_angles(wrong)).tolist())
+
+
+def test_the_right_swath_has_the_truth_in_it():
+    assert height_error() < 0.02  # what the errors of the navigation leave
+
+
+@pytest.mark.parametrize(
+    'mistake, least',
+    [
+        ('mount sign', 2.0),
+        ('order of mount angles', 0.028),
+        ('side', 3.5),
+        ('pose of transmission', 0.14),
+        ('pose of the middle', 0.055),
+        ('navigation 50 ms off', 0.09),
+    ],
+)
+def test_a_mistake_in_the_swath_is_seen(mistake, least):
+    right = sea_config(CASE)
+    rpy = right.sonar_mount_rpy_deg
+    made = {
+        'mount sign': {'config': evolve(right, sonar_mount_rpy_deg=tuple(-a for a in rpy))},
+        'order of mount angles': {'config': evolve(right, sonar_mount_rpy_deg=other_order(rpy))},
+        'side': {'config': evolve(right, side='port')},
+        'pose of transmission': {'pose_of': 'transmission'},
+        'pose of the middle': {'pose_of': 'middle'},
+        'navigation 50 ms off': {'late_s': 0.05},
+    }[mistake]
+    assert height_error(**made) > least
+
+
+def test_without_the_budget_too_little_truth_is_inside():
+    config = sea_config(
+        CASE,
+        engine='grid',
+        attitude_std_deg=0.0,
+        heave_std=0.0,
+        heading_std_deg=0.0,
+        position_std=0.0,
+        sound_speed_std=0.0,
+    )
+    assert errors(track(config)[0])[1] < 0.9
+
+
+def test_navigation_half_a_tenth_of_a_second_off_costs_more_than_the_limit():
+    config = sea_config(CASE, engine='grid')
+    assert errors(track(config, late_s=0.05)[0])[0] > 0.17
+
+
+def test_a_floor_out_of_reach_is_impossible_not_unknown():
+    """NaN compares false with everything: it must not come out as a likelihood."""
+    T, P = 2, 8
+    g = level_geometry(np.full(T, 20.0), 15.0, 0.5, 0.5)
+    ping = PingLikelihood(
+        ranges=np.full(T, 20.0),
+        heard=np.ones(T, bool),
+        form=np.ones((T, P), complex),
+        base=np.zeros(T),
+        spread=np.empty((T, 0), complex),
+        signal=np.ones(T),
+        noise=np.ones(T),
+        constant=np.zeros(T),
+        table=likelihood_table(P, 'laplace'),
+        geometry=g,
+    )
+    state, out = np.array([-6.0, 0.0, 36.0, np.nan, np.inf]), np.empty(5)
+    log_likelihoods(state, ping, 0, np.empty(5), np.empty((4, 5)), out)
+    assert np.isfinite(out[1]) and np.isneginf(out[[0, 2, 3, 4]]).all()
+
+
+# -- navigation that is late, has gaps, or is none ------------------------------------------------
+
+
+@pytest.mark.parametrize('order', ['by stamp', 'pings first'])
+def test_pings_wait_for_poses_in_whatever_order_they_come(order):
+    config = sea_config(CASE, navigation='required', particles_per_model=20)
+    expected, _ = track(config)
+    found, _ = track(config, order=order)
+    for a, b in zip(expected, found, strict=True):
+        for name, column in a.columns().items():
+            np.testing.assert_array_equal(column, b.columns()[name])
+
+
+def test_a_ping_waits_until_its_last_bin_is_covered():
+    config = sea_config(CASE, navigation='required', particles_per_model=20)
+    ping, poses = next(snapshots(CASE)), navigation(CASE)
+    last = ping.stamp_ns + round(2e9 * CASE['r'][-1] / 1500.0)
+    tracker = BathymetryTracker(config)
+    tracker.process(ping)
+    for pose in poses:
+        made = tracker.process(pose)
+        assert bool(made) == (pose.stamp_ns >= last)
+        if made:
+            break
+        assert tracker.health()['pings_waiting'] == 1
+    assert tracker.counts['used'] == 1 and tracker.health()['pings_waiting'] == 0
+    early = BathymetryTracker(evolve(config, max_extrapolation=0.2))
+    for pose in poses:
+        if pose.stamp_ns < ping.stamp_ns + 10**7:
+            early.process(pose)
+    assert len(early.process(ping)) == 1
+
+
+def test_pings_in_a_gap_are_skipped_and_counted():
+    config = sea_config(CASE, navigation='required', particles_per_model=20)
+    tracker, pings = BathymetryTracker(config), list(snapshots(CASE))
+    middle = pings[2].stamp_ns
+    for pose in navigation(CASE):
+        if abs(pose.stamp_ns - middle) > 6 * 10**8:
+            tracker.process(pose)
+    made = [one for ping in pings for one in tracker.process(ping)]
+    assert [one.stamp_ns for one in made] == [p.stamp_ns for k, p in enumerate(pings) if k != 2]
+    assert tracker.counts['navigation_gap'] == 1 and tracker.counts['used'] == 5
+
+
+def test_without_navigation_nothing_changes_and_with_it_the_columns_say_more():
+    ping = next(snapshots(CASE))
+    config = BathymetryConfig(particles_per_model=20)
+    plain = BathymetryTracker(config).process(ping)[0]
+    ignoring = BathymetryTracker(evolve(config, navigation='ignored'))
+    for pose in navigation(CASE):
+        assert ignoring.process(pose) == []
+    same = ignoring.process(ping)[0]
+    assert list(plain.columns()) == list(same.columns()) and soundings_of(plain) is None
+    for name, column in plain.columns().items():
+        np.testing.assert_array_equal(column, same.columns()[name])
+    posed, _ = track(sea_config(CASE, particles_per_model=20))
+    assert posed[0].frame_id == 'map' and plain.frame_id == 'sonar'
+    extra = [name for name in posed[0].columns() if name not in plain.columns()]
+    assert extra == [
+        'vertical_uncertainty',
+        'horizontal_uncertainty',
+        'intensity',
+        'beam_angle',
+        'side',
+    ]
+
+
+def test_a_clock_set_back_forgets_the_poses():
+    tracker = BathymetryTracker(sea_config(CASE, navigation='required', particles_per_model=20))
+    poses = navigation(CASE)
+    for pose in poses:
+        tracker.process(evolve(pose, stamp_ns=pose.stamp_ns + 4 * 10**12))
+    for pose in poses:
+        tracker.process(pose)
+    assert tracker.counts['restarts'] == 1
+    assert len(tracker.process(next(snapshots(CASE)))) == 1
+
+
+# -- start and nadir ------------------------------------------------------------------------------
+
+
+def test_the_altitude_replaces_the_height_for_the_start():
+    config = sea_config(CASE, navigation='required', sonar_height=100.0, initial_std=0.3)
+    tracker = BathymetryTracker(config)
+    for pose in navigation(CASE):
+        tracker.process(pose)
+    ping = next(snapshots(CASE))
+    lost = tracker.process(ping)[0]
+    tracker.process(Altitude(stamp_ns=START_NS + 10**9, altitude=15.2))
+    found = tracker.process(ping)[0]
+    assert abs(found.state[5, 0] + 20.0) < 0.3 < abs(lost.state[5, 0] + 20.0)
+
+
+def test_angles_drift_as_a_flat_floor_turns():
+    ranges = np.array([15.1, 15.15, 15.2])
+    g = level_geometry(ranges, 15.0, np.radians(30.0), 0.5, of_heights=False)
+    angle = np.arcsin(15.0 / ranges) - np.radians(30.0)
+    out = np.empty(1)
+    drift(angle[:1], 1, g, out)
+    assert out[0] == pytest.approx(angle[1], abs=1e-12)
+    assert np.degrees(angle[0] - angle[1]) > 1.4
+    past = np.array([np.radians(60.0) + 0.05])  # beyond straight down: it stays there
+    drift(past, 1, g, out)
+    assert np.pi - np.arcsin(np.sin(np.pi / 2 + 0.05) * 15.1 / 15.15) == pytest.approx(
+        out[0] + np.radians(30.0)
+    )
+
+
+def test_drifting_poses_keep_the_height_too():
+    rng = np.random.default_rng(3)
+    g = level_geometry(np.array([20.0, 20.05]), 15.0, 0.5, 0.5, of_heights=False)
+    g = g._replace(
+        height=np.array([-5.0, -5.3]), tilt=np.array([0.5, 0.53]), reach=np.array([19.9, 20.02])
+    )
+    angle = rng.uniform(-0.2, 0.3, 20)
+    out = np.empty(20)
+    drift(angle, 1, g, out)
+    z = [g.height[t] - g.reach[t] * np.sin(a + g.tilt[t]) for t, a in ((0, angle), (1, out))]
+    assert z[0] == pytest.approx(z[1], abs=1e-12)
+
+
+@pytest.mark.parametrize('of_heights', [True, False])
+def test_kernels_agree_with_the_formulas_of_the_array(of_heights):
+    g = level_geometry(np.array([20.0, 25.0]), 15.0, 0.5, 0.5, of_heights=of_heights)
+    g = g._replace(reach=np.array([19.0, 24.0]), tilt=np.array([0.4, 0.6]))
+    g = g._replace(cos_tilt=np.cos(g.tilt), sin_tilt=np.sin(g.tilt), height=np.array([1.0, 2.0]))
+    state = np.linspace(-0.9, 0.9, 7)
+    out = np.empty(7)
+    sines_of(state, 1, g, np.empty((1, 7)), out)
+    s = (2.0 - state) / 24.0
+    expected = np.sin(np.arcsin(s) - 0.6) if of_heights else np.sin(state)
+    assert out == pytest.approx(expected, abs=1e-12)
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'values, word',
+    [
+        ({'sonar_lever': [1.0, 2.0]}, 'sonar_lever needs three'),
+        ({'sound_speed_profile': [0.0, 1500.0, 1.0]}, 'in turn'),
+        ({'sound_speed_profile': [5.0, 1500.0, 1.0, 1500.0]}, 'increasing'),
+        ({'sound_speed_profile': [0.0, 15.0]}, 'between'),
+        ({'sound_speed_profile': [0.0, 1500.0], 'navigation': 'ignored'}, 'needs navigation'),
+    ],
+)
+def test_mistakes_in_the_parameters_are_named(values, word):
+    with pytest.raises(ConfigError, match=word):
+        BathymetryConfig.from_mapping(values)
+
+
+def test_a_recording_says_whether_there_is_navigation():
+    assert BathymetryConfig().for_inputs(frozenset({'snapshot'})).navigation == 'ignored'
+    assert BathymetryConfig().for_inputs(frozenset({'snapshot', 'nav'})).navigation == 'required'
+    told = BathymetryConfig(navigation='ignored')
+    assert told.for_inputs(frozenset({'nav'})) == told
+
+
+def test_navigation_in_another_frame_is_counted():
+    tracker = BathymetryTracker(BathymetryConfig())
+    pose = {'position': np.zeros(3), 'orientation': [0.0, 0.0, 0.0, 1.0]}
+    tracker.process(Navigation(stamp_ns=1, frame_id='map', **pose))
+    tracker.process(Navigation(stamp_ns=2, frame_id='odom', **pose))
+    assert tracker.counts['other_frame'] == 1 and tracker.counts['poses'] == 1

@@ -1,0 +1,144 @@
+"""Where the filter starts, near nadir, and which floor is called rough."""
+
+from attrs import evolve
+from helpers.bathymetry_cases import floor
+import numpy as np
+import pytest
+from scipy.stats import kstest, truncnorm
+
+from sonar_imm.acoustics import coherence
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers.bathymetry.models import UnknownHeight
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+
+WATER = 5.0 + 0.05 * np.arange(900)
+
+
+def run(name, values, **config):
+    made = scenario(name, values)
+    scene = simulate(made, 1)
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping({**made.told(), **config}))
+    pings = [tracker.process(one.measurement) for one in scene.measurements]
+    return [one for ping in pings for one in ping], scene.truth
+
+
+def rmse(estimate, truth):
+    error = (estimate.columns()['height'] - truth.height)[truth.valid]
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+@pytest.mark.parametrize('staves', [2, 8])
+def test_the_first_return_is_found_in_the_water_column(staves):
+    shadow = slice(0, 200)  # up to 15 m there is water
+    snapshot = floor(0.0, ranges=WATER, P=staves, shadow=shadow, snr_db=30.0)
+    snapshot.iq.flags.writeable = True
+    rng = np.random.default_rng(1)
+    snapshot.iq[shadow] = rng.normal(size=(200, staves)) + 1j * rng.normal(size=(200, staves))
+    gamma = coherence.coherence(snapshot.iq, 0.5)[0]
+    first = coherence.first_return(gamma, staves)
+    assert abs(WATER[first] - 15.0) <= (0.3 if staves == 2 else 0.15)
+
+
+def test_without_any_echo_the_first_bin_stands_for_the_return():
+    assert coherence.first_return(np.full(50, 0.2), 8) == 0
+    assert coherence.first_return(np.ones(3), 8) == 0
+    assert coherence.first_return(np.full(50, np.nan), 8) == 0
+
+
+def test_an_unknown_height_is_a_normal_law_cut_at_the_first_return():
+    start = UnknownHeight(mean=-20.0, std=5.0, lowest=-17.0, view=None)
+    levels = (np.arange(4000) + 0.5) / 4000
+    law = truncnorm((-17.0 + 20.0) / 5.0, np.inf, loc=-20.0, scale=5.0)
+    assert kstest(start.quantile(levels), law.cdf).statistic < 1e-3
+    z = np.linspace(-25.0, 5.0, 3001)
+    shape = start.density(z)
+    assert (shape[z < -17.0] == 0.0).all()
+    assert shape / shape.sum() == pytest.approx(law.pdf(z) / law.pdf(z).sum(), abs=1e-5)
+
+
+def test_the_same_law_as_angles():
+    start = UnknownHeight(mean=-20.0, std=3.0, lowest=-21.0, view=(-5.0, 17.0, 0.5))
+    levels = (np.arange(4000) + 0.5) / 4000
+    angles = start.quantile(levels)
+    cells = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 6001)
+    shape = start.density(cells)
+    mean = (shape * cells).sum() / shape.sum()
+    assert angles.mean() == pytest.approx(mean, abs=2e-3)
+
+
+@pytest.mark.parametrize('model_set', ['height_two_rw', 'angle_two_rw'])
+@pytest.mark.parametrize('height', [10.0, 20.0])
+def test_a_wrong_height_of_the_sonar_is_survived(model_set, height):
+    values = {'pings': 2, 'ping_rate': 0.3, 'patch_along': [], 'moving': True}
+    made = scenario('moving', {**values, 'sonar_height': height, 'first_range': 5.0})
+    scene = simulate(made, 2)
+    told = {**made.told(), 'sonar_height': 15.0, 'sonar_height_std': 5.0, 'model_set': model_set}
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(told))
+    made = [one for item in scene.measurements for one in tracker.process(item.measurement)]
+    assert len(made) == 2
+    assert max(rmse(a, b) for a, b in zip(made, scene.truth)) < 0.3
+
+
+def test_without_navigation_the_unknown_height_is_in_the_variance():
+    snapshot = floor(0.0)
+    sure = BathymetryTracker(BathymetryConfig()).process(snapshot)[0]
+    config = BathymetryConfig(sonar_height_std=2.0)
+    unsure = BathymetryTracker(config).process(snapshot)[0]
+    assert (unsure.covariance[:, 0, 0] > 4.0).all() and (sure.covariance[20:, 0, 0] < 0.1).all()
+
+
+@pytest.mark.parametrize('engine', ['particles', 'grid'])
+def test_angles_hold_the_floor_near_nadir(engine):
+    values = {'model_set': 'angle_two_rw', 'engine': engine}
+    made, truth = run('paper', {'pings': 5, 'first_range': 15.1}, **values)
+    assert max(rmse(a, b) for a, b in zip(made, truth)) < 0.3
+    near = truth[0].range < 20.0
+    flat = np.mean([one.probabilities[near, 1] > 0.5 for one in made])
+    assert flat < 0.15
+    made, truth = run('paper', {'pings': 5, 'first_range': 15.1}, **values, angle_drift=False)
+    rough = np.mean([one.probabilities[near, 1] > 0.5 for one in made])
+    assert rough > 0.6  # the paper's walk cannot follow: a flat floor is called rough
+
+
+def test_grid_and_particles_agree_on_drifting_angles():
+    made, truth = run('paper', {'pings': 1, 'first_range': 15.1}, model_set='angle_two_rw')
+    config = {'model_set': 'angle_two_rw', 'particles_per_model': 2000}
+    many, _ = run('paper', {'pings': 1, 'first_range': 15.1}, **config)
+    exact, _ = run(
+        'paper', {'pings': 1, 'first_range': 15.1}, model_set='angle_two_rw', engine='grid'
+    )
+    std = np.sqrt(exact[0].covariance[:, 0, 0])
+    off = np.abs(many[0].state[:, 0] - exact[0].state[:, 0]) / std
+    assert np.mean(off) < 0.05
+    assert np.mean(np.abs(many[0].probabilities - exact[0].probabilities)) < 0.01
+
+
+def overlap(name, values, **config):
+    made, truth = run(name, {'pings': 4, **values}, **config)
+    rough = np.concatenate([one.extras['rough'] > 0.5 for one in made])
+    patch = np.concatenate([one.patch for one in truth])
+    return (rough & patch).sum() / (rough | patch).sum()
+
+
+def test_the_bank_finds_correlated_and_white_roughness():
+    bank = {'model_set': 'height_bank'}
+    assert overlap('paper', {}, **bank) > 0.93
+    assert overlap('correlated', {'correlation_length': 0.3}, **bank) > 0.85
+    assert overlap('correlated', {}, **bank) > 0.66
+    assert overlap('slope', {'slope': 0.05}, **bank) > 0.9
+
+
+def test_which_walks_are_rough_and_what_a_bank_defaults_to():
+    bank = BathymetryConfig(model_set='height_bank')
+    assert (bank.runs_on_grid, bank.smoothing_used, bank.stay_used) == (True, 'states', 0.998)
+    other = BathymetryConfig()
+    assert (other.runs_on_grid, other.smoothing_used, other.stay_used) == (False, 'none', 0.995)
+    particles = evolve(bank, engine='particles')
+    assert particles.smoothing_used == 'none'
+    snapshot = floor(0.0, ranges=20.0 + 0.05 * np.arange(40))
+    estimate = BathymetryTracker(bank).process(snapshot)[0]
+    assert estimate.extras['rough'] == pytest.approx(estimate.probabilities[:, 2:].sum(axis=1))
+    later = BathymetryTracker(evolve(bank, rough_sigma=0.5)).process(snapshot)[0]
+    assert later.extras['rough'] == pytest.approx(estimate.probabilities[:, 3])
+    plain = BathymetryTracker(other).process(snapshot)[0]
+    assert 'rough' not in plain.extras

@@ -1,0 +1,214 @@
+"""Pings as numbers and their updates: kernels against the plain forms, order, quadrature."""
+
+from attrs import evolve
+from helpers.sea_vectors import vectors
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.arrivals_3d import observe
+from sonar_imm.estimation.student_t import student_t_maximum
+from sonar_imm.estimation.subset_update import subset_update
+from sonar_imm.measurements import Arrivals
+from sonar_imm.simulation.diver.simulator import RECEIVERS
+from sonar_imm.trackers.diver.instruments import Instruments
+from sonar_imm.trackers.diver.models import build_models
+from sonar_imm.trackers.diver.ping_kernels import Numbers, subset_ping
+from sonar_imm.trackers.diver.pings import optima, ping_numbers, update_by_ping
+from sonar_imm.trackers.diver.robust_kernels import student_t_ping
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+N = 14
+
+
+def case(seed=0):
+    """A state with all nuisances, and six numbers of four kinds, one of them wild."""
+    rng = np.random.default_rng(seed)
+    A = 0.3 * rng.normal(size=(N, N))
+    P = A @ A.T + 0.1 * np.eye(N)
+    x = np.concatenate([[31.0, -12.0, 0.5, -9.0, 0.1], 0.1 * rng.normal(size=N - 5)])
+    kind = np.array([0, 1, 0, 0, 2, 3])
+    rx = np.vstack([RECEIVERS, RECEIVERS[:2] + 3.0])
+    tx = np.zeros((6, 3))
+    columns = np.array([[0, 1, 3, 5 + 2 * (r % 3), 11, 12, 13] for r in range(6)])
+    value = [observe(k, x, c, 0.0, t, r, np.empty(N)) for k, c, t, r in zip(kind, columns, tx, rx)]
+    value = np.array(value) + rng.normal(size=6) * np.where(kind < 2, 0.3, 0.01)
+    value[2] += 9.0
+    variance = np.where(kind < 2, 0.09, 1e-4)
+    nobody = np.full(6, -1)
+    numbers = Numbers(
+        np.arange(6), nobody, kind, value, variance, np.full(6, 0.02), tx, rx, columns
+    )
+
+    def plain(c):
+        def of(state):
+            gradient = np.empty(N)
+            h = observe(kind[c], state, columns[c], 0.0, tx[c], rx[c], gradient)
+            return h, gradient
+
+        return of, value[c], variance[c]
+
+    return x, P, numbers, [plain(c) for c in range(6)]
+
+
+@pytest.mark.parametrize('considered', [0, 6])
+def test_the_subset_kernel_is_the_plain_update(considered):
+    x, P, numbers, plain = case()
+    mask = np.ones(N, bool)
+    mask[5 : 5 + considered] = False
+    got = subset_ping(x[None], P[None], mask, 0.0, numbers, 0.05, 128)
+    want = subset_update(
+        x, P, plain, outlier_probability=0.05, outlier_density=0.02, estimated=mask
+    )
+    np.testing.assert_allclose(got[0][0], want.x, atol=1e-10)
+    np.testing.assert_allclose(got[1][0], want.P, atol=1e-10)
+    assert got[2][0] == pytest.approx(want.log_evidence)
+    np.testing.assert_allclose(got[3][0], want.good, atol=1e-10)
+    assert got[3][0][2] < 0.05
+
+
+def test_numbers_of_a_node_exclude_each_other_and_angles_follow_their_echo():
+    """Two echoes of a pair, the second of which is late, and the bearing of the first."""
+    x, P, numbers, _ = case()
+    two = np.array([0, 2, 4])
+    some = Numbers(*(np.ascontiguousarray(column[two]) for column in numbers))
+    some = some._replace(node=np.array([0, 0, 1]), parent=np.array([-1, -1, 0]))
+    _, _, _, good = subset_ping(x[None], P[None], np.ones(N, bool), 0.0, some, 0.05, 128)
+    assert good[0, 0] + good[0, 1] <= 1.0 + 1e-12
+    assert good[0, 0] > 0.95 and 0.9 * good[0, 0] < good[0, 2] <= good[0, 0]
+
+
+def test_too_many_explanations_keep_the_best():
+    x, P, numbers, _ = case()
+    mask = np.ones(N, bool)
+    few = subset_ping(x[None], P[None], mask, 0.0, numbers, 0.05, 4)
+    many = subset_ping(x[None], P[None], mask, 0.0, numbers, 0.05, 128)
+    np.testing.assert_allclose(few[0], many[0], atol=0.05)
+
+
+def test_the_heavy_tailed_kernel_is_the_plain_one():
+    x, P, numbers, plain = case()
+    P = P + np.diag(np.arange(N) == 13) * 1e6
+    got = student_t_ping(x[None], P[None], np.ones(N, bool), 0.0, numbers, x[None, :2], 4.0)
+    want = student_t_maximum(x, P, plain, [x])
+    np.testing.assert_allclose(got[0][0], want.x, atol=2e-3)
+    np.testing.assert_allclose(got[3][0], want.weights, atol=2e-3)
+    assert got[1][0][0, 0] > want.P[0, 0]  # widened
+
+
+def ping_of(position, receivers=RECEIVERS, tx=(0.0, 0.0, 0.0), std=2e-4, rng=None, **more):
+    n = len(receivers)
+    path = np.linalg.norm(position - receivers, axis=1)
+    if np.isfinite(tx).all():
+        path = path + np.linalg.norm(position - np.array(tx))
+    noise = np.zeros(n) if rng is None else std * rng.normal(size=n)
+    return Arrivals(
+        stamp_ns=10**9,
+        tx_id=np.zeros(n),
+        rx_id=np.arange(n),
+        tx=np.tile(tx, (n, 1)),
+        rx=receivers,
+        toa=path / 1500.0 + noise,
+        var_toa=np.full(n, std**2),
+        bearing=np.full(n, np.nan),
+        var_bearing=np.full(n, np.nan),
+        frame_id='map',
+        **more,
+    )
+
+
+@pytest.mark.parametrize('passive', [False, True])
+@pytest.mark.parametrize('many', [False, True])
+def test_the_order_of_arrivals_changes_no_bit(passive, many):
+    rng = np.random.default_rng(3)
+    receivers = np.vstack([RECEIVERS, RECEIVERS + [13.0, 7.0, 0.0]]) if many else RECEIVERS
+    tx = (np.nan,) * 3 if passive else (0.0, 0.0, 0.0)
+    trackers = [DiverTracker(DiverConfig(max_tracks=1)) for _ in range(2)]
+    for second in range(1, 8):
+        place = np.array([0.7 * second, 30.0, 0.0])
+        ping = evolve(ping_of(place, receivers, tx, rng=rng), stamp_ns=second * 10**9)
+        late = ping.toa.copy()
+        late[second % len(late)] += 0.008 * (second > 4)
+        order = rng.permutation(len(ping))
+        shuffled = {
+            name: getattr(ping, name)[order]
+            for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing')
+        }
+        one = trackers[0].process(evolve(ping, toa=late))[-1]
+        other = trackers[1].process(evolve(ping, toa=late[order], **shuffled))[-1]
+        assert one.state.tobytes() == other.state.tobytes()
+        assert one.covariance.tobytes() == other.covariance.tobytes()
+        assert one.probabilities.tobytes() == other.probabilities.tobytes()
+    assert np.hypot(*(one.state[0, :2] - place[:2])) < 2.0
+
+
+def test_many_good_arrivals_outvote_any_prior():
+    """A track that is ten standard deviations off comes to where nine receivers hear the tag."""
+    config = DiverConfig(max_tracks=1)
+    models = build_models(config)
+    layout = Instruments().layout(config, models.n)
+    rng = np.random.default_rng(4)
+    receivers = rng.uniform(-80.0, 80.0, (9, 3)) * [1.0, 1.0, 0.0]
+    measurement = ping_of(np.array([20.0, 35.0, 0.0]), receivers, (np.nan,) * 3, rng=rng)
+    numbers = ping_numbers(measurement, np.arange(9), config, 1.0, models, layout)
+    x, P, mu = models.new_track(np.array([-30.0, 10.0]), 25.0 * np.eye(2))
+    after = update_by_ping(x, P, mu, numbers, config, layout)
+    assert np.hypot(*(after.mu @ after.x[:, :2] - [20.0, 35.0])) < 1.0
+    assert np.hypot(*(optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
+
+
+def test_wild_echoes_only_leave_the_prediction():
+    config = DiverConfig(max_tracks=1)
+    models = build_models(config)
+    layout = Instruments().layout(config, models.n)
+    measurement = ping_of(np.array([20.0, 35.0, 0.0]))
+    measurement = evolve(measurement, toa=measurement.toa + [0.02, 0.03, 0.025, 0.022])
+    numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
+    x, P, mu = models.new_track(np.array([20.0, 35.0]), 0.25 * np.eye(2))
+    after = update_by_ping(x, P, mu, numbers, config, layout)
+    assert (after.good < 1e-3).all()
+    np.testing.assert_allclose(after.x, x, atol=0.01)
+    np.testing.assert_allclose(after.P, P, atol=0.05)
+
+
+def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
+    v = vectors('depth_one_ping')
+    low, high = (float(one) for one in v['depth_range'])
+    config = DiverConfig(
+        max_tracks=1, dimensions=3, depth_min=low, depth_max=high, outlier_probability=1e-6
+    )
+    models = build_models(config)
+    layout = Instruments().layout(config, models.n)
+    sigma = float(v['sigma'])
+    measurement = ping_of(v['truth'], v['rx'], tuple(v['tx']), sigma / 1500.0)
+    measurement = evolve(measurement, toa=v['path'] / 1500.0)
+    numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
+    x, P, mu = models.new_track(v['prior_mean'], float(v['prior_var']) * np.eye(2), False)
+    after = update_by_ping(x, P, mu, numbers, config, layout)
+    mean = after.mu @ after.x
+    spread = after.x - mean
+    covariance = np.einsum('j,jab->ab', after.mu, after.P + spread[:, :, None] * spread[:, None])
+    z = models.height
+    assert np.abs(mean[:2] - v['out_mean']).max() < 0.2
+    assert abs(mean[z] - float(v['out_z_mean'])) < 1.5
+    for axis in range(2):
+        assert 0.5 < covariance[axis, axis] / v['out_cov'][axis, axis] < 3.0
+
+
+def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
+    config = DiverConfig(max_tracks=1, dimensions=3)
+    models = build_models(config)
+    layout = Instruments().layout(config, models.n)
+    place = np.array([20.0, 35.0, -11.0])
+    beside = {'depth': np.full(4, 11.0), 'var_depth': np.full(4, 0.04)}
+    beside |= {'elevation': np.full(4, -0.2), 'var_elevation': np.full(4, 1e-4)}
+    numbers = ping_numbers(
+        ping_of(place, **beside), np.arange(4), config, 1.0, models, layout
+    ).numbers
+    assert numbers.kind.tolist() == [4, 0, 3, 0, 3, 0, 3, 0, 3]
+    assert numbers.value[0] == -11.0
+    flat = DiverConfig(max_tracks=1)
+    models = build_models(flat)
+    numbers = ping_numbers(
+        ping_of(place, **beside), np.arange(4), flat, 1.0, models, Instruments().layout(flat, 3)
+    ).numbers
+    assert numbers.kind.tolist() == [0, 0, 0, 0]

@@ -1,0 +1,215 @@
+"""Scans: empty ones, soft association, and fixes that say whose they are."""
+
+from helpers.diver_runs import fix, run, SECOND
+from helpers.estimates import same
+import numpy as np
+import pytest
+
+from sonar_imm.estimation.association import TrackStatus
+from sonar_imm.measurements import Fixes
+from sonar_imm.simulation.diver.simulator import scenario, simulate
+from sonar_imm.trackers.diver import soft
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+ASSOCIATIONS = ('gnn', 'jipda')
+
+
+def scan(second, *places, ids=None, std=0.5):
+    position = np.array([[x, y, 0.0] for x, y in places]).reshape(-1, 3)
+    return Fixes(
+        stamp_ns=round(second * SECOND),
+        position=position,
+        covariance=np.tile(std**2 * np.eye(2), (len(position), 1, 1)),
+        target_id=ids,
+        frame_id='map',
+    )
+
+
+def ids_of(estimate):
+    return estimate.extras['track_id'].tolist()
+
+
+def test_a_scan_is_the_same_as_its_fixes_one_by_one():
+    scene = simulate(scenario('several', {'duration': 30.0}), seed=2)
+    single = [one.measurement for one in scene.measurements]
+    stamps = sorted({one.stamp_ns for one in single})
+    scans = []
+    for stamp in stamps:
+        own = sorted((one for one in single if one.stamp_ns == stamp), key=lambda one: one.key())
+        scans.append(
+            Fixes(
+                stamp_ns=stamp,
+                position=[one.position for one in own],
+                covariance=[one.covariance for one in own],
+                frame_id='map',
+            )
+        )
+    one, other = (run(DiverTracker(DiverConfig()), items) for items in (single, scans))
+    assert len(one) == len(other) == len(stamps)
+    assert all(same(*pair) for pair in zip(one, other))
+
+
+@pytest.mark.parametrize('association', ASSOCIATIONS)
+def test_an_empty_scan_is_a_missed_detection(association):
+    tracker = DiverTracker(DiverConfig(association=association))
+    for second in range(1, 8):
+        tracker.process(scan(second, (0.1 * second, 0.0)))
+    (estimate,) = tracker.process(scan(8))
+    assert estimate.extras['track_state'].tolist() == [TrackStatus.COASTING]
+    for second in range(9, 20):
+        (estimate,) = tracker.process(scan(second))
+    assert len(estimate) == 0 and len(tracker._stream.state.life) == 0
+
+
+def test_no_scan_is_no_evidence():
+    """A gap ends nothing; as many empty scans do."""
+    tracker = DiverTracker(DiverConfig(association='jipda'))
+    for second in range(1, 8):
+        tracker.process(scan(second, (0.1 * second, 0.0)))
+    (estimate,) = tracker.process(scan(18, (1.8, 0.0)))
+    assert estimate.extras['track_state'].tolist() == [TrackStatus.CONFIRMED]
+    assert ids_of(estimate) == [1]
+
+
+def test_existence_is_published_and_not_a_number_where_hits_are_counted():
+    soft_one, hard = (DiverTracker(DiverConfig(association=name)) for name in ('jipda', 'gnn'))
+    for second in range(1, 6):
+        for tracker in (soft_one, hard):
+            (estimate,) = tracker.process(scan(second, (0.0, 0.0)))
+            known = estimate.extras['existence']
+            assert len(known) == 1 and (np.isfinite(known).all() == (tracker is soft_one))
+            assert tracker is hard or 0.5 < known[0] <= 1.0
+
+
+def test_a_false_fix_in_clutter_is_not_published():
+    tracker = DiverTracker(DiverConfig(association='jipda', clutter_density=4e-4))
+    (estimate,) = tracker.process(scan(1, (0.0, 0.0)))
+    assert len(estimate) == 0
+    (row,) = tracker._stream.state.existence
+    assert row == pytest.approx(1.2e-5 / (1.2e-5 + 4e-4))
+
+
+def test_a_diver_is_confirmed_by_existence_and_evidence():
+    tracker = DiverTracker(DiverConfig(association='jipda'))
+    states = []
+    for second in range(1, 5):
+        (estimate,) = tracker.process(scan(second, (0.5 * second, 0.0)))
+        states.append(estimate.extras['track_state'].tolist())
+    assert states == [[0], [0], [1], [1]]
+
+
+def confirmed_ids(estimate):
+    return estimate.extras['track_id'][estimate.extras['track_state'] > 0].tolist()
+
+
+def test_a_second_track_on_one_diver_is_not_confirmed():
+    tracker = DiverTracker(DiverConfig(association='jipda'))
+    confirmed = []
+    for second in range(1, 40):
+        # Two fixes of one diver, as of two sensors that share a stamp.
+        (estimate,) = tracker.process(scan(second, (0.3 * second, 0.0), (0.3 * second, 0.05)))
+        confirmed.append(confirmed_ids(estimate))
+    assert confirmed[2:] == [[1]] * 37
+
+
+def test_two_confirmed_tracks_on_one_diver_become_the_older_one():
+    tracker = DiverTracker(DiverConfig(association='jipda'))
+    confirmed = []
+    for second in range(1, 60):
+        apart = max(0.0, 6.0 - 0.4 * second)
+        (estimate,) = tracker.process(scan(second, (0.0, 0.0), (apart, 0.0)))
+        confirmed.append(confirmed_ids(estimate))
+    assert confirmed[5] == [1, 2] and confirmed[14] == [1, 2]
+    assert confirmed[-1] == [1]
+
+
+@pytest.mark.parametrize('association', ASSOCIATIONS)
+def test_late_scans_give_the_same_bits(association):
+    scene = simulate(scenario('crossing', {'duration': 25.0, 'clutter': 3.0}), seed=4)
+    items = [one.measurement for one in scene.measurements]
+    config = DiverConfig(association=association, **scenario('crossing', {'clutter': 3.0}).told())
+    order = np.argsort(np.arange(len(items)) + np.random.default_rng(1).uniform(0, 8, len(items)))
+    one = run(DiverTracker(config), items)
+    other = run(DiverTracker(config), [items[k] for k in order])
+    assert all(same(*pair) for pair in zip(one, other)) and len(one) == len(other)
+
+
+def test_crossing_in_clutter_is_better_softly():
+    from benchmarks.diver_crossing import case
+
+    hard, soft_one = (case(0.9, 10.0, name, 2) for name in ASSOCIATIONS)
+    assert soft_one['GOSPA, rms'] <= 2.7 < 3.5 < hard['GOSPA, rms']
+    assert soft_one['false tracks/h'] == 0.0 and soft_one['identities kept'] == 1.0
+    assert soft_one['NEES'] < 2.6
+
+
+def test_a_smoother_takes_scans_and_hides_what_does_not_exist():
+    scene = simulate(scenario('crossing', {'duration': 30.0}), seed=1)
+    config = DiverConfig(association='jipda', **scenario('crossing').told())
+    tracker = SmoothingDiverTracker(config)
+    forward = run(tracker, [one.measurement for one in scene.measurements])
+    smooth = tracker.smoothed()
+    assert [ids_of(one) for one in smooth] == [ids_of(one) for one in forward]
+
+
+# -- names ---------------------------------------------------------------------------------------
+
+
+def test_named_fixes_make_a_track_each_though_they_cross_and_come_in_turn():
+    tracker = DiverTracker(DiverConfig())
+    for second in range(1, 60):
+        name = second % 4
+        place = (0.1 * second * (-1) ** name, 0.2 * name)
+        (estimate,) = tracker.process(scan(second, place, ids=[name]))
+    assert sorted(estimate.extras['target_id'].tolist()) == [0, 1, 2, 3]
+    assert (estimate.extras['track_state'] > 0).all()
+    assert tracker._stream.state.life.next_id == 5  # none was lost and found again
+
+
+@pytest.mark.parametrize('association', ASSOCIATIONS)
+def test_a_named_track_is_not_missed_by_scans_and_takes_no_other_fix(association):
+    tracker = DiverTracker(DiverConfig(association=association))
+    for second in range(1, 6):
+        tracker.process(scan(second, (0.0, 0.0), ids=[9]))
+    for second in range(6, 25):
+        (estimate,) = tracker.process(scan(second, (0.1, 0.0)))
+    named = estimate.extras['target_id'] == 9
+    assert named.sum() == 1 and len(estimate) == 2
+    assert estimate.extras['nis_dof'][named].tolist() == [0]
+    alone = DiverTracker(DiverConfig(association=association))
+    for second in range(1, 6):
+        alone.process(scan(second, (0.0, 0.0), ids=[9]))
+    row = alone.process(scan(24, (50.0, 0.0), ids=[5]))[0]
+    own = row.extras['target_id'] == 9
+    assert own.sum() == 1
+
+
+def test_a_named_track_ends_after_max_coast():
+    tracker = DiverTracker(DiverConfig(max_coast=10.0))
+    tracker.process(scan(1, (0.0, 0.0), ids=[9]))
+    (estimate,) = tracker.process(scan(12, (50.0, 0.0), ids=[5]))
+    assert estimate.extras['target_id'].tolist() == [5]
+
+
+def test_a_scan_with_names_and_without():
+    tracker = DiverTracker(DiverConfig())
+    for second in range(1, 10):
+        places = ((0.1 * second, 0.0), (20.0, 20.0), (0.1 * second, 0.1))
+        (estimate,) = tracker.process(scan(second, *places, ids=[3, -1, 3]))
+    assert sorted(estimate.extras['target_id'].tolist()) == [-1, 3]
+    assert len(estimate) == 2
+
+
+def test_the_column_of_fixes_may_be_mixed_with_single_fixes():
+    tracker = DiverTracker(DiverConfig(association='jipda'))
+    for second in range(1, 10):
+        tracker.process(fix(second, 0.0, 0.0))
+        (estimate,) = tracker.process(scan(second, (30.0, 0.0), ids=[3]))[-1:]
+    assert sorted(estimate.extras['target_id'].tolist()) == [-1, 3]
+
+
+def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
+    status = np.array([TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED])
+    known = soft.known_existence(np.array([np.nan, np.nan, 0.3]), status)
+    assert known.tolist() == [0.5, 0.9, 0.3]

@@ -1,0 +1,171 @@
+"""Depth, instruments that are off, errors that last: what the tracker says of itself is true."""
+
+from attrs import evolve
+from helpers.diver_runs import fix
+from helpers.estimates import same
+import numpy as np
+import pytest
+
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.diver.simulator import scenario, simulate
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.instruments import Instruments
+from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.tracker import DiverTracker
+
+OFF = {'receiver_position_std': 1.0, 'receiver_clock_std': 5e-4, 'sound_speed_std': 5.0}
+
+
+def judged(name, scene, config, seeds=range(4), smooth=False):
+    """Horizontal RMSE and NEES from 10 s on, and the estimates of the last run."""
+    squared, nees, estimates = [], [], []
+    for seed in seeds:
+        made = simulate(scenario(name, {'duration': 60.0, **scene}), seed)
+        tracker, final = SmoothingDiverTracker(DiverConfig(max_tracks=1, **config)), {}
+        for one in made.measurements:
+            final.update((e.stamp_ns, e) for e in tracker.process(one.measurement))
+        estimates = tracker.smoothed() if smooth else [final[stamp] for stamp in sorted(final)]
+        track = made.truth[0]
+        at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
+        for estimate in estimates:
+            rows = np.flatnonzero(estimate.extras['track_state'] > 0)
+            if len(rows) and at[estimate.stamp_ns] >= 10:
+                error = estimate.state[rows[0], :2] - track.position[at[estimate.stamp_ns], :2]
+                squared.append(error @ error)
+                nees.append(error @ np.linalg.solve(estimate.covariance[rows[0], :2, :2], error))
+    return np.sqrt(np.mean(squared)), np.mean(nees), estimates
+
+
+def test_a_diver_at_an_unknown_depth_is_found_and_its_covariance_is_true():
+    told_wrong = judged('at_depth', {}, {})
+    rmse, nees, estimates = judged('at_depth', {}, {'dimensions': 3})
+    assert told_wrong[1] > 5.0 and rmse < 0.4 and nees < 2.6
+    assert estimates[-1].state_names == ('px', 'py', 'pz', 'vx', 'vy', 'vz')
+    assert estimates[-1].model_names[0] == 'heading_000'
+    np.testing.assert_allclose(estimates[-1].probabilities.sum(axis=1), 1.0)
+    assert estimates[-1].xyz[0, 2] == np.float32(estimates[-1].state[0, 2])
+
+
+def test_a_depth_report_fixes_the_depth():
+    _, nees, estimates = judged('at_depth', {'depth_std': 0.2}, {'dimensions': 3})
+    assert nees < 2.6 and estimates[-1].covariance[0, 2, 2] < 0.04
+
+
+def test_where_nothing_is_said_of_the_depth_it_stays_as_wide_as_the_water():
+    tracker = DiverTracker(DiverConfig(max_tracks=1, dimensions=3, depth_max=30.0))
+    for second in range(1, 60):
+        estimate = tracker.process(fix(second, 0.5 * second, 0.0))[-1]
+        assert estimate.covariance[0, 2, 2] >= 0.9 * 30.0**2 / 12.0
+
+
+@pytest.mark.parametrize('errors', ['mixed', 'consider', 'estimate'])
+def test_misplaced_instruments_are_in_the_covariance(errors):
+    ignored = judged('misplaced_receivers', {}, {})
+    rmse, nees, _ = judged('misplaced_receivers', {}, {**OFF, 'systematic_errors': errors})
+    assert ignored[1] > 8.0 and nees < 2.6 and rmse < ignored[0]
+
+
+def test_what_is_considered_is_the_same_in_all_models_and_times():
+    config = DiverConfig(max_tracks=1, **OFF, systematic_errors='consider')
+    tracker = DiverTracker(config)
+    made = simulate(scenario('misplaced_receivers', {'duration': 30.0}), 1)
+    for one in made.measurements:
+        tracker.process(one.measurement)
+    state = tracker._stream.state
+    layout = state.instruments.layout(config, tracker.models.n)
+    assert layout.size == 3 + 1 + 3 * 2 + 4  # the receiver at the transmitter has no offset
+    considered = slice(tracker.models.n, layout.size)
+    assert (state.x[..., considered] == 0.0).all()
+    np.testing.assert_allclose(
+        state.P[..., considered, considered],
+        np.broadcast_to(np.diag(layout.variances), (*state.mu.shape, 11, 11)),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+    assert np.abs(state.P[..., :2, considered]).max() > 0.1
+
+
+def test_receivers_that_come_later_bring_their_prior():
+    config = DiverConfig(max_tracks=1, receiver_clock_std=1e-3)
+    made = simulate(scenario('multistatic', {'duration': 5.0, 'detection_probability': 1.0}), 1)
+    ping = made.measurements[0].measurement
+    first = Instruments().heard(evolve(ping, rx_id=[7, 7, 3, 3]), config)
+    assert [one for one, _ in first.known] == [3, 7]
+    both = first.heard(ping, config)
+    assert [one for one, _ in both.known] == [3, 7, 0, 1, 2]
+    x, P = both.layout(config, 3).widened(np.ones((2, 5)), np.ones((2, 5, 5)))
+    assert x.shape == (2, 8) and (P[:, :5, 5:] == 0.0).all()
+    np.testing.assert_allclose(P[0, 5:, 5:], 1.5**2 * np.eye(3))
+
+
+def test_lasting_errors_of_fixes_are_in_the_covariance():
+    scene = {'duration': 200.0}
+    white = judged('lasting_errors', scene, {})
+    rmse, nees, _ = judged('lasting_errors', scene, {'fix_bias_std': 1.0})
+    assert white[1] > 8.0 and nees < 2.6 and rmse < 1.05 * white[0]
+
+
+@pytest.mark.parametrize(
+    'name, config',
+    [
+        ('at_depth', {'dimensions': 3}),
+        ('misplaced_receivers', OFF),
+        ('lasting_errors', {'fix_bias_std': 1.0}),
+        ('misplaced_receivers', {**OFF, 'dimensions': 3, 'fix_bias_std': 1.0}),
+    ],
+)
+def test_looking_back_is_better_and_as_true(name, config):
+    forward = judged(name, {}, config, seeds=range(3))
+    back = judged(name, {}, config, seeds=range(3), smooth=True)
+    assert back[0] < forward[0] and back[1] < 2.6
+
+
+@pytest.mark.parametrize('config', [{'dimensions': 3, **OFF}, {'fix_bias_std': 1.0, **OFF}])
+def test_late_input_gives_the_same_bits(config):
+    made = simulate(scenario('at_depth', {'duration': 15.0}), 2)
+    heard = [one.measurement for one in made.measurements]
+    heard += [fix(heard[0].stamp_ns * 1e-9 + second, 20.0, 30.0) for second in (3.5, 7.5)]
+    heard.sort(key=lambda one: one.stamp_ns)
+    order = np.random.default_rng(1).permutation(len(heard))
+    ends = []
+    for items in (heard, [heard[0], *(heard[k] for k in order)]):
+        tracker, final = DiverTracker(DiverConfig(max_tracks=1, history=30.0, **config)), {}
+        for item in items:
+            final.update((e.stamp_ns, e) for e in tracker.process(item))
+        ends.append(final)
+    assert list(sorted(ends[0])) == list(sorted(ends[1]))
+    assert all(same(ends[0][stamp], ends[1][stamp]) for stamp in ends[0])
+
+
+def run_fixes(total, white, bias, **config):
+    rng = np.random.default_rng(5)
+    tracker, b = DiverTracker(DiverConfig(max_tracks=1, **config)), bias * rng.normal(size=2)
+    for second in range(1, 200):
+        b = 0.9835 * b + bias * np.sqrt(1.0 - 0.9835**2) * rng.normal(size=2)
+        x, y = np.array([0.5 * second, 0.0]) + b + white * rng.normal(size=2)
+        tracker.process(fix(second, x, y, covariance=total * np.eye(2)))
+    return tracker
+
+
+def test_covariances_of_fixes_that_cannot_be_true_are_named():
+    assert run_fixes(0.25, 0.5, 0.0).warnings() == []
+    optimistic = run_fixes(0.01, 0.8, 0.0)
+    assert 'miss by more than they state' in optimistic.warnings()[0]
+    assert optimistic.health()['fixes_mean_nis'] > 2.0
+    lasting = run_fixes(4.0, 0.05, 2.0)
+    assert 'the data cannot tell which' in lasting.warnings()[0]
+    pessimistic = run_fixes(4.0, 0.5, 0.0)
+    assert 'the data cannot tell which' in pessimistic.warnings()[0]
+    assert run_fixes(0.25, 0.5, 1.0, fix_bias_std=1.0).warnings() == []
+
+
+def test_without_anything_stated_no_state_is_added():
+    tracker = DiverTracker(DiverConfig())
+    tracker.process(simulate(scenario('multistatic'), 1).measurements[0].measurement)
+    assert tracker.models.n == 3 and tracker._stream.state.x.shape[1:] == (17, 3)
+    assert tracker._stream.state.instruments == Instruments()
+
+
+def test_depths_that_do_not_fit_are_refused():
+    with pytest.raises(ConfigError, match='depth_min'):
+        DiverConfig.from_mapping({'depth_min': 30.0})

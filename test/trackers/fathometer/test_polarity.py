@@ -1,0 +1,125 @@
+"""Reflectors of either sign: the likelihood, the filter and the scene of the vectors."""
+
+from pathlib import Path
+
+from helpers.fathometer_runs import run
+from helpers.sea_scenes import score_scene, sea_scene
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimation.set_filter import SetFilter
+from sonar_imm.estimation.set_model import SetModel, Sets
+from sonar_imm.estimation.set_particles import weigh
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.fathometer.config import FathometerConfig
+
+SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
+
+
+@pytest.mark.parametrize('compiled', [False, True])
+def test_a_set_with_a_wrong_sign_is_impossible(compiled):
+    with np.load(SEA / 'signed_likelihood.npz') as file:
+        v = {name: file[name] for name in file}
+    n = v['response'].shape[1]
+    edges = float(v['frequency_min']), float(v['frequency_max'])
+    pulse = band_pulse(*edges, float(v['sound_speed']))
+    for k, order in enumerate(v['order']):
+        model = SetModel(
+            cells=n,
+            separation=1,
+            order_min=int(order),
+            transition=np.eye(1),
+            move=np.ones(1),
+            gram=pulse(float(v['depth_step']) * np.arange(n)),
+            amplitude_std=float(v['amplitude_std_sigmas']),
+            negative_probability=0.05,
+        )
+        sets = Sets.empty(model, 1)
+        sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
+        sets.sign[0] = v['sign'][k, :order]
+        if compiled:
+            found = np.zeros(1)
+            amplitude = SetFilter(model, 1)._weigh(sets, v['response'][k], found)
+        else:
+            found, amplitude = weigh(model, v['response'][k], sets)
+        assert found[0] == pytest.approx(v['log_likelihood'][k], abs=1e-9)
+        if np.isfinite(v['log_likelihood'][k]):
+            assert amplitude[0] == pytest.approx(v['amplitude_mean'][k, :order], abs=1e-9)
+    assert np.count_nonzero(np.isinf(v['log_likelihood'])) == 24
+
+
+def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
+    """One member or none, on 12 cells: the posterior of place and sign by enumeration."""
+    n, prior, std = 12, 0.2, 3.0
+    switch = np.array([[0.7, 0.3], [0.2, 0.8]])
+    move = np.array([0.25, 0.5, 0.25])
+    model = SetModel(
+        cells=n,
+        separation=2,
+        order_min=0,
+        transition=switch,
+        move=move,
+        gram=np.exp(-0.5 * np.arange(n) ** 2.0),
+        amplitude_std=std,
+        negative_probability=prior,
+    )
+    rng = np.random.default_rng(3)
+    b = rng.standard_normal((3, n))
+    b[:, 4] -= 3.5
+    none, one = 0.5, 0.5 * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
+    K = sum(w * np.eye(n, k=shift) for w, shift in zip(move, (-1, 0, 1)))
+    tracker, before = SetFilter(model, 200_000), None
+    for name, record in enumerate(b):
+        born = none * switch[0, 1] * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
+        none = none * switch[0, 0] + one.sum() * switch[1, 0]
+        one = one @ K * switch[1, 1] + born
+        variance = 1.0 / (1.0 + std**-2)
+        likelihood = np.exp(0.5 * variance * record**2) / np.sqrt(1.0 + std**2)
+        one = one * np.where(np.array([[1.0], [-1.0]]) * record > 0.0, likelihood, 0.0)
+        total = none + one.sum()
+        none, one = none / total, one / total
+        step = tracker.step(before, record, (5, name))
+        before = step.after
+        there = step.sets.order == 1
+        found = np.zeros((2, n))
+        row = (step.sets.sign[there, 0] < 0).astype(int)
+        np.add.at(found, (row, step.sets.cell[there, 0]), step.w[there])
+        assert step.log_evidence == pytest.approx(np.log(total), abs=0.02)
+        assert np.abs(found - one).sum() < 0.03
+    assert one[1].sum() > 0.3
+
+
+def test_negative_layers_are_found_where_they_are_looked_for():
+    scene = sea_scene('negative')
+    _, found = run(scene.traces(), particles=3000, polarity='both')
+    score = score_scene(found, scene, after=5)
+    assert score.right >= 0.95 and score.ospa <= 0.03
+    for stamp, estimate in found.items():
+        if stamp > 5 * 10**9:
+            near = np.abs(estimate.state[:, :1] - scene.depth_at(stamp)).argmin(axis=1)
+            expected = np.sign(scene.amplitude[near])
+            assert np.array_equal(estimate.extras['polarity'], expected)
+            assert np.array_equal(np.sign(estimate.state[:, 1]), expected)
+            assert estimate.extras['polarity'].dtype == np.int8
+    _, found = run(scene.traces(range(30)), particles=2000, polarity='positive')
+    assert score_scene(found, scene, after=5).right == 0.0
+    assert all((one.extras['polarity'] >= 0).all() for one in found.values())
+
+
+def test_envelopes_have_no_negative_reflectors():
+    assert FathometerConfig(polarity='both').negative_share == 0.05
+    assert FathometerConfig(polarity='both', remove_background=True).negative_share == 0.0
+    assert FathometerConfig(polarity='positive').negative_share == 0.0
+    with pytest.raises(ConfigError, match='negative_probability'):
+        FathometerConfig(negative_probability=1.0)
+
+
+def test_threads_do_not_change_a_byte_of_either_sign():
+    scene = sea_scene('negative')
+
+    def columns(**parameters):
+        _, found = run(scene.traces(range(6)), particles=1001, polarity='both', **parameters)
+        return [c.tobytes() for one in found.values() for c in one.columns().values()]
+
+    assert columns() == columns(threads=4)

@@ -1,0 +1,90 @@
+"""What is reported of a reflector: times, and depths in the sediment."""
+
+from pathlib import Path
+
+from helpers.fathometer_runs import run
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.fathometer import sediment_thickness
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.measurements import Trace
+from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm.trackers.fathometer.reflectors import Reflectors, sediment_depths
+
+SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
+
+
+def test_the_thickness_of_sediment_is_that_of_the_vectors():
+    with np.load(SEA / 'sediment.npz') as file:
+        time, speeds, gradients, thickness = (
+            file[name]
+            for name in ('two_way_time_below_bottom', 'sound_speed', 'gradient', 'thickness')
+        )
+    assert (gradients > 0.0).any() and (gradients == 0.0).any()
+    for speed, gradient, expected in zip(speeds, gradients, thickness, strict=True):
+        found = sediment_thickness(time, float(speed), float(gradient))
+        assert np.abs(found - expected).max() < 1e-9
+
+
+def test_sound_takes_as_long_through_the_thickness_as_was_measured():
+    """dt = dz / (c0 + g z), integrated over the thickness by steps."""
+    z = np.linspace(0.0, float(sediment_thickness(0.05, 1600.0, 1.2)), 100_001)
+    slowness = 1.0 / (1600.0 + 1.2 * z)
+    one_way = float(np.sum(0.5 * (slowness[1:] + slowness[:-1]) * np.diff(z)))
+    assert 2.0 * one_way == pytest.approx(0.05, abs=1e-9)
+
+
+def reflectors(depth, is_bottom):
+    covariance = np.tile(np.diag([0.01, 1.0]), (len(depth), 1, 1))
+    ones = np.ones(len(depth))
+    return Reflectors(np.array(depth), ones, covariance, ones, np.array(is_bottom))
+
+
+def test_depths_below_the_bottom_are_those_of_the_sediment():
+    config = FathometerConfig(sediment_sound_speed=1600.0, sediment_sound_speed_std=80.0)
+    depth, std = sediment_depths(reflectors([55.0, 60.0, 100.0], [0.2, 0.8, 0.0]), config)
+    thickness = 40.0 * 1600.0 / 1500.0
+    assert depth == pytest.approx([55.0, 60.0, 60.0 + thickness], abs=1e-12)
+    assert std == pytest.approx([0.1, 0.1, np.hypot(0.1, 0.05 * thickness)])
+
+
+def test_without_a_speed_the_sediment_is_as_the_water():
+    depth, std = sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
+    assert depth == pytest.approx([60.0, 100.0]) and std == pytest.approx([0.1, 0.1])
+    nothing = sediment_depths(reflectors([], []), FathometerConfig())
+    assert [len(one) for one in nothing] == [0, 0]
+
+
+def layers(depths, amplitudes, records=4, reference_depth=25.0):
+    depth = np.arange(40.0, 72.0, 1.0 / 64.0)
+    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    clean = sum(a * pulse(depth - z) for z, a in zip(depths, amplitudes))
+    rng = np.random.default_rng(1)
+    for k in range(1, records + 1):
+        amplitude = clean + 0.3 * rng.standard_normal(len(depth))
+        sigma = np.ones(len(depth))
+        yield Trace(
+            stamp_ns=k * 10**9,
+            depth=depth,
+            amplitude=amplitude,
+            sigma=sigma,
+            reference_depth=reference_depth,
+        )
+
+
+def test_times_and_the_bottom_in_the_estimate():
+    _, found = run(layers([47.0, 58.0], [20.0, 10.0]), particles=2000, sediment_sound_speed=1650.0)
+    last = found[4 * 10**9]
+    assert last.state[:, 0] == pytest.approx([47.0, 58.0], abs=0.05)
+    assert last.extras['two_way_time'] == pytest.approx(
+        2.0 * (last.state[:, 0] - 25.0) / 1500.0, abs=1e-12
+    )
+    assert last.extras['is_bottom'] == pytest.approx([1.0, 0.0], abs=0.02)
+    thickness = 1.1 * (last.state[1, 0] - last.state[0, 0])
+    assert last.extras['sediment_depth'][1] == pytest.approx(last.state[0, 0] + thickness)
+
+
+def test_without_an_array_depth_there_is_no_two_way_time():
+    _, found = run(layers([47.0], [20.0], reference_depth=None), particles=500)
+    assert all(np.isnan(one.extras['two_way_time']).all() for one in found.values())
