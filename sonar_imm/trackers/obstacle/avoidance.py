@@ -15,10 +15,10 @@ from functools import cache
 import numpy as np
 
 from ...estimation.arrays import FloatArray
+from ..navigation import NavigationBuffer
 from . import avoidance_kernels
 from .avoidance_kernels import Safety
 from .config import ObstacleConfig
-from .navigation import NavigationBuffer
 
 DRAWS = 256
 CLIMBING = 0.15

@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.measurements import Navigation
+from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle import avoidance, avoidance_kernels
 from sonar_imm.trackers.obstacle.avoidance_kernels import Safety
-from sonar_imm.trackers.obstacle.navigation import NavigationBuffer
 
 GOLDEN = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'cpa_golden.npz'
 
