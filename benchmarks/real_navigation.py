@@ -126,7 +126,12 @@ def judged(path: Path3D, start: float, seed: int) -> tuple[float, float, bool, f
     width of the band in m; None when the track was lost."""
     offset = float(np.random.default_rng(seed + 1000).uniform(-1.2, 1.2))
     measurements, place = encounter(path, start, offset, seed)
-    tracker, last = ObstacleTracker(ObstacleConfig(range_step=0.0, bearing_step_deg=0.0)), None
+    tracker, last = (
+        ObstacleTracker(
+            ObstacleConfig(range_step=0.0, bearing_step_deg=0.0, behaviours=('fixed',))
+        ),
+        None,
+    )
     for one in measurements:
         for estimate in tracker.process(one):
             if (estimate.extras['track_state'] > 0).any():

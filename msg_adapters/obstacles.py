@@ -1,7 +1,8 @@
 """Displays of obstacles: a PoseArray, and markers that show the band of the vertical offset.
 
 A point in a display would suggest that the height is known. So each obstacle is drawn as a bar
-over the 90 % band of its vertical offset, with a ball at the mean and a label. The id of a marker
+over the 90 % band of its vertical offset, coloured by whether it is above or below, with a ball at
+the mean, coloured by the probability of a collision, and a label. The id of a marker
 is the track id. Markers have a lifetime: they vanish when the obstacle is no longer published.
 """
 
@@ -21,6 +22,9 @@ _CUBE, _SPHERE, _TEXT = 1, 2, 9
 LIFETIME = 5
 """Seconds."""
 _ABOVE, _BELOW, _UNKNOWN = (0.84, 0.37, 0.0), (0.0, 0.45, 0.7), (0.6, 0.6, 0.6)
+_CLEAR, _NEAR, _DANGER = (0.3, 0.75, 0.4), (0.95, 0.75, 0.1), (0.85, 0.1, 0.1)
+DANGERS = (0.05, 0.2)
+"""Probabilities of a collision from which a ball is yellow, and red."""
 SURE = 0.9
 """Probability of above or below from which an obstacle has its colour."""
 
@@ -72,12 +76,17 @@ def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
         f'{track_id}: {estimate.state[row, 0]:.0f} m ahead, {estimate.state[row, 2]:+.1f} m down'
     )
 
+    risk = float(estimate.extras.get('collision_probability', np.full(len(estimate), np.nan))[row])
+    if np.isfinite(risk):
+        label += f', collision {100.0 * risk:.0f} %'
+
     def marker(
         name: str,
         kind: int,
         height: float,
         size: tuple[float, float, float],
         alpha: float,
+        colour: tuple[float, float, float] = colour,
         **more: Any,
     ) -> Any:
         return make(
@@ -96,7 +105,7 @@ def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
 
     return [
         marker('band', _CUBE, 0.5 * (bottom + top), (0.4, 0.4, max(top - bottom, 0.05)), 0.5),
-        marker('obstacle', _SPHERE, z, (0.8, 0.8, 0.8), 1.0),
+        marker('obstacle', _SPHERE, z, (0.8, 0.8, 0.8), 1.0, _danger(risk)),
         marker(
             'label',
             _TEXT,
@@ -112,6 +121,12 @@ def _colour(above: float) -> tuple[float, float, float]:
     if max(above, 1.0 - above) < SURE:
         return _UNKNOWN
     return _ABOVE if above > 0.5 else _BELOW
+
+
+def _danger(risk: float) -> tuple[float, float, float]:
+    if not np.isfinite(risk):
+        return _UNKNOWN
+    return _CLEAR if risk < DANGERS[0] else _NEAR if risk < DANGERS[1] else _DANGER
 
 
 def _pose(make: Make, x: float, y: float, z: float) -> Any:

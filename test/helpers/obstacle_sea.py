@@ -9,6 +9,13 @@ from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle_sea'
+ENCOUNTERS = (
+    ('swaying_approach', 0),
+    ('moving_target', 0),
+    ('starts_moving', 0),
+    ('seabed_and_fixed', 0),
+    ('seabed_and_fixed', 1),
+)
 KINDS = ('fixed', 'swaying', 'moving', 'seabed')
 
 

@@ -144,3 +144,11 @@ def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker
     ]
     values = {pair.key: pair.value for pair in heard[-1].status[0].values}
     assert values['fix topic'] == '/auv1/fix'
+
+
+def test_obstacles_that_all_move_alike_warn_of_the_navigation(desk):
+    desk.report(0.0, health={'moving_alike': 1})
+    assert desk.tracker.level == DiagnosticStatus.WARN
+    assert 'navigation' in desk.tracker.message
+    desk.report(1.0, health={'moving_alike': 0})
+    assert desk.tracker.level == DiagnosticStatus.OK

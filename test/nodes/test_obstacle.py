@@ -107,6 +107,18 @@ def test_colours_tell_above_from_below_from_unknown():
     assert colours[1].r == colours[1].b
 
 
+@pytest.mark.parametrize('risk, colour', [(0.01, 'g'), (0.5, 'r'), (np.nan, None)])
+def test_the_ball_tells_how_probable_a_collision_is(risk, colour):
+    one = an_estimate([1], [1])
+    one = evolve(one, extras={**one.extras, 'collision_probability': np.array([risk])})
+    _, ball, label = write_markers(one, [0], make).markers
+    strongest = max('rgb', key=lambda name: getattr(ball.color, name))
+    if colour is None:
+        assert ball.color.r == ball.color.g == ball.color.b and 'collision' not in label.text
+    else:
+        assert strongest == colour and label.text.endswith(f'collision {100 * risk:.0f} %')
+
+
 def test_confirmed_obstacles_are_shown_and_the_oldest_gives_the_probabilities(rig):
     rig.node.show(an_estimate([9, 3, 5, 2], [1, 2, 1, 0]))
     rig.bench.spin_until(lambda: rig.poses and rig.markers and rig.probabilities)

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...estimation.arrays import FloatArray
 from ...estimation.covariance import symmetrise
-from . import behaviour_kernels
+from . import avoidance_kernels, behaviour_kernels
 from .behaviour_kernels import COMMON, Motion, Step
 from .config import BEHAVIOURS, ObstacleConfig
 from .filters import depth_slices, depth_span, DepthSlices, Filter, Landmark, Mixture, Sonar, View
@@ -108,6 +108,9 @@ class BehaviourSlices(DepthSlices):
             .view(common, sonar)
             ._replace(behaviour=behaviour, velocity=velocity, velocity_covariance=covariance)
         )
+
+    def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        return avoidance_kernels.relative(*mixture, self._is['moving'], *sonar.pose, self.cone)
 
     def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
         x, P, mu = mixture

@@ -191,6 +191,27 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
         0.01, 'random walk of the depth', unit='m/sqrt(s)', low=0.0, high=10.0
     )
 
+    # -- avoidance -------------------------------------------------------------------------------
+    safety_radius: float = live(
+        3.0, 'collision: nearer than this horizontally', unit='m', low=0.01, high=1000.0
+    )
+    safety_height: float = live(
+        2.0, 'collision: and less than this above or below', unit='m', low=0.01, high=1000.0
+    )
+    cpa_horizon: float = live(
+        120.0, 'time ahead that is looked at', unit='s', low=1.0, high=3600.0
+    )
+    course_window: float = parameter(
+        10.0,
+        'time over which positions of the vehicle make its course',
+        unit='s',
+        low=1.0,
+        high=600.0,
+    )
+    course_std: float = live(
+        0.05, 'error of the velocity along the course, each axis', unit='m/s', low=0.0, high=5.0
+    )
+
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 40)
     confirm_hits: int = inherited(TrackLifeParameters, 'confirm_hits', 4)

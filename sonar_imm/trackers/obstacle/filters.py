@@ -26,6 +26,7 @@ from ...estimation import kalman, unscented
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
 from ...estimation.covariance import symmetrise
+from . import avoidance_kernels
 from . import kernels as kernels
 from .config import ObstacleConfig
 
@@ -36,16 +37,21 @@ BEAM_MARGIN = 1.6
 """A new obstacle lies within this many half beams of the axis: an edge is not sharp."""
 
 
+NOWHERE = np.full(3, np.nan)
+
+
 class Sonar(NamedTuple):
     """The sonar during a ping: its pose at the transmission, the altitude above the sea floor (NaN
     when unknown), and for two-way timing its pose `late_by` seconds later, None otherwise.
-    reference: how far below the navigation reference, whose altitude it is, the sonar lies, m."""
+    reference: how far below the navigation reference, whose altitude it is, the sonar lies, m.
+    course: (3,) m/s, velocity of the vehicle along its course, NaN when unknown."""
 
     pose: Pose
     altitude: float = np.nan
     late: Pose | None = None
     late_by: float = 0.0
     reference: float = 0.0
+    course: FloatArray = NOWHERE
 
     def seabed_below(self) -> float:
         """Depth of the sea floor below the sonar, m, NaN when unknown."""
@@ -179,6 +185,12 @@ class DepthSlices:
         covariance (T, 2, 2)."""
         return _still(len(mixture.mu))
 
+    def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        """Mean (T, K, 5) and covariance (T, K, 5, 5) of place and velocity as
+        `avoidance_kernels` has them."""
+        still = np.zeros(self.K, np.bool_)
+        return avoidance_kernels.relative(*mixture, still, *sonar.pose, self.cone)
+
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
         m = kernels.points(mixture.x, *sonar.pose, self.cone)
@@ -283,6 +295,13 @@ class Landmark:
 
     def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
         return _still(len(mixture.mu))
+
+    def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        T = len(mixture.mu)
+        mean, covariance = np.zeros((T, 1, 5)), np.zeros((T, 1, 5, 5))
+        mean[..., :3] = mixture.x[..., :3] - sonar.pose.position
+        covariance[..., :3, :3] = mixture.P[..., :3, :3]
+        return mean, covariance
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         m = geometry.to_body(sonar.pose, mixture.x[:, 0, :3])

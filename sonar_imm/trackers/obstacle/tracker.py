@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from attrs import evolve, frozen
 import numpy as np
 
+from ...acoustics import geometry
 from ...estimates import Estimate
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
@@ -35,6 +36,7 @@ from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navi
 from ..model_checks import track_rules
 from ..navigation import NavigationBuffer
 from ..stream import ReplayStream, StreamRules
+from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
@@ -185,7 +187,7 @@ class ObstacleTracker:
         return ObstacleState(
             last=last,
             done=tuple(done),
-            navigation=buffer.since(oldest),
+            navigation=buffer.since(oldest - nanoseconds(self.config.course_window)),
             altitude=altitude,
             waiting=tuple(waiting),
             skipped=skipped,
@@ -213,6 +215,7 @@ class ObstacleTracker:
         vehicle = buffer.pose(ping.stamp_ns)
         pose = self.mount.sonar(vehicle)
         reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
+        straight = geometry.flip_world(course(buffer, ping.stamp_ns, self.config.course_window))
         height = np.nan
         if altitude is not None:
             age = ping.stamp_ns - altitude.stamp_ns
@@ -220,9 +223,9 @@ class ObstacleTracker:
                 height = altitude.altitude
         late_ns = self._late_ns()
         if not late_ns:
-            return Sonar(pose, height, reference=reference)
+            return Sonar(pose, height, reference=reference, course=straight)
         late = self.mount.sonar(buffer.pose(ping.stamp_ns + late_ns))
-        return Sonar(pose, height, late, late_ns * 1e-9, reference)
+        return Sonar(pose, height, late, late_ns * 1e-9, reference, straight)
 
     def _ping(
         self, before: PingState | None, ping: Detections, sonar: Sonar
@@ -332,10 +335,12 @@ class ObstacleTracker:
 
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
+        near = self.filter.relative(ping.mixture, ping.sonar)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
             **behaviour_columns(view, self.filter.behaviours),
+            **closest_approach(*near, ping.mixture.mu, ping.sonar.course, self.config),
             'track_id': ping.life.track_id,
             'track_state': ping.life.status,
             'vertical_offset_lo': view.low,

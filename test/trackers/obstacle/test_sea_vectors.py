@@ -1,17 +1,10 @@
 """The whole tracker on recorded encounters, beside what an independent filter made of them."""
 
-from helpers.obstacle_sea import column, encounter, KINDS, track
+from helpers.obstacle_sea import column, encounter, ENCOUNTERS, KINDS, track
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-ENCOUNTERS = (
-    ('swaying_approach', 0),
-    ('moving_target', 0),
-    ('starts_moving', 0),
-    ('seabed_and_fixed', 0),
-    ('seabed_and_fixed', 1),
-)
 SETTLED = 30
 """Pings after which the answers are compared."""
 

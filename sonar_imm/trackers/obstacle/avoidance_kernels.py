@@ -1,0 +1,249 @@
+"""The arithmetic of `avoidance`, compiled.
+
+A component is a Gaussian over what decides a collision, g = (r_N, r_E, dz, v_N, v_E): where the
+obstacle lies from the sonar, m, depth downwards, and its velocity, m/s.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.jit import kernel
+from ...estimation.small_matrices import semidefinite_root
+from .kernels import _sigma_point, _to_world, KAPPA, point
+
+SIZE = 5
+SLICES = 16
+"""Of the vertical offset, in the closed form."""
+WEIGHT = 1e-6
+"""A component that weighs less plays no part."""
+LITTLE = 1e-18
+
+
+class Safety(NamedTuple):
+    """velocity: (3,) m/s of the vehicle, NED, the last one 0 unless it climbs or dives; std: m/s
+    an axis, of its course; radius, half height m, horizon s; draws (n, 5): standard normal."""
+
+    velocity: FloatArray
+    std: float
+    radius: float
+    height: float
+    horizon: float
+    draws: FloatArray
+
+
+@kernel
+def relative(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    moves: BoolArray,
+    p: FloatArray,
+    R: FloatArray,
+    cone: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, K, 5) and covariance (T, K, 5, 5) of g, by the unscented transform, of components
+    whose states are (d, delta, z, s) and, where `moves` (K,), the velocity; zeros where the
+    weight mu (T, K) is too small."""
+    T, K, size = x.shape
+    mean, covariance = np.zeros((T, K, SIZE)), np.zeros((T, K, SIZE, SIZE))
+    whole, images = np.zeros((size, size)), np.zeros((2 * size + 1, SIZE))
+    y, m, world = np.empty(size), np.empty(3), np.empty(3)
+    for t in range(T):
+        for j in range(K):
+            if mu[t, j] < WEIGHT:
+                continue
+            n = size if moves[j] else 4
+            weight, centre = 0.5 / (n + KAPPA), KAPPA / (n + KAPPA)
+            L = whole[:n, :n]
+            semidefinite_root(P[t, j, :n, :n], L)
+            images[:] = 0.0
+            for number in range(2 * n + 1):
+                _sigma_point(x[t, j, :n], L, number, y)
+                point(y[0], y[1], y[2] - p[2], R, cone, m)
+                _to_world(R, m, world)
+                images[number, 0], images[number, 1] = world[0], world[1]
+                images[number, 2] = y[2] - p[2]
+                for i in range(4, n):
+                    images[number, i - 1] = y[i]
+            for number in range(2 * n + 1):
+                share = centre if number == 0 else weight
+                for a in range(SIZE):
+                    mean[t, j, a] += share * images[number, a]
+            for number in range(2 * n + 1):
+                share = centre if number == 0 else weight
+                for a in range(SIZE):
+                    for b in range(SIZE):
+                        off = images[number, b] - mean[t, j, b]
+                        covariance[t, j, a, b] += share * (images[number, a] - mean[t, j, a]) * off
+    return mean, covariance
+
+
+@kernel
+def closest(r0: float, r1: float, w0: float, w1: float, horizon: float) -> tuple[float, float]:
+    """When (s) and how near (m) a point at r that moves with w comes to the origin."""
+    square = w0 * w0 + w1 * w1
+    t = -(r0 * w0 + r1 * w1) / square if square > LITTLE else 0.0
+    t = min(max(t, 0.0), horizon)
+    return t, math.sqrt((r0 + w0 * t) ** 2 + (r1 + w1 * t) ** 2)
+
+
+@kernel
+def collides(
+    r0: float,
+    r1: float,
+    dz: float,
+    w0: float,
+    w1: float,
+    wz: float,
+    radius: float,
+    height: float,
+    horizon: float,
+) -> bool:
+    """Whether at some time up to the horizon the point is within the radius and the half height
+    at once: two intervals of time that overlap."""
+    first, last = 0.0, horizon
+    square = w0 * w0 + w1 * w1
+    outside = r0 * r0 + r1 * r1 - radius * radius
+    if square > LITTLE:
+        towards = r0 * w0 + r1 * w1
+        # b^2 - a c, without the cancellation: the miss distance squared against the radius.
+        cross = r0 * w1 - r1 * w0
+        root = square * radius * radius - cross * cross
+        if root < 0.0:
+            return False
+        root = math.sqrt(root)
+        first = max(first, (-towards - root) / square)
+        last = min(last, (-towards + root) / square)
+    elif outside > 0.0:
+        return False
+    if abs(wz) > 1e-12:
+        ends = (-height - dz) / wz, (height - dz) / wz
+        first, last = max(first, min(ends)), min(last, max(ends))
+    elif abs(dz) > height:
+        return False
+    return first <= last
+
+
+@kernel
+def _normal(u: float) -> float:
+    return 0.5 * math.erfc(-u / math.sqrt(2.0))
+
+
+@kernel
+def _between(low: float, high: float, mean: float, std: float) -> float:
+    """Probability of a Gaussian in an interval."""
+    if std <= 1e-12:
+        return 1.0 if low <= mean <= high else 0.0
+    return _normal((high - mean) / std) - _normal((low - mean) / std)
+
+
+@kernel
+def sampled(g: FloatArray, L: FloatArray, safety: Safety) -> float:
+    """Share of the draws of a component, g (5,) with the root L of its covariance, that collide;
+    the error of the course is in L."""
+    hits = 0
+    y = np.empty(SIZE)
+    V = safety.velocity
+    for k in range(len(safety.draws)):
+        for a in range(SIZE):
+            y[a] = g[a]
+            for b in range(a + 1):
+                y[a] += L[a, b] * safety.draws[k, b]
+        if collides(
+            y[0], y[1], y[2], y[3] - V[0], y[4] - V[1], -V[2],
+            safety.radius, safety.height, safety.horizon,
+        ):  # fmt: skip
+            hits += 1
+    return hits / len(safety.draws)
+
+
+@kernel
+def closed_form(g: FloatArray, L: FloatArray, safety: Safety) -> float:
+    """Probability that a component, g (5,) with the root L of its covariance, collides with a
+    vehicle that keeps its depth: miss distance, vertical offset and the time of the closest
+    approach as Gaussians by sigma points."""
+    V, horizon = safety.velocity, safety.horizon
+    y = np.empty(SIZE)
+    miss, drop, when = np.empty(2 * SIZE + 1), np.empty(2 * SIZE + 1), np.empty(2 * SIZE + 1)
+    for number in range(2 * SIZE + 1):
+        _sigma_point(g, L, number, y)
+        w0, w1 = y[3] - V[0], y[4] - V[1]
+        square = max(w0 * w0 + w1 * w1, LITTLE)
+        miss[number] = (y[0] * w1 - y[1] * w0) / math.sqrt(square)
+        drop[number] = y[2]
+        when[number] = -(y[0] * w0 + y[1] * w1) / square
+    weight, centre = 0.5 / (SIZE + KAPPA), KAPPA / (SIZE + KAPPA)
+    b = z = t = 0.0
+    for number in range(2 * SIZE + 1):
+        share = centre if number == 0 else weight
+        b, z, t = b + share * miss[number], z + share * drop[number], t + share * when[number]
+    var_b = var_z = var_t = both = 0.0
+    for number in range(2 * SIZE + 1):
+        share = centre if number == 0 else weight
+        var_b += share * (miss[number] - b) ** 2
+        var_z += share * (drop[number] - z) ** 2
+        var_t += share * (when[number] - t) ** 2
+        both += share * (miss[number] - b) * (drop[number] - z)
+    std_z = math.sqrt(var_z)
+    low, high = max(-safety.height, z - 6.0 * std_z), min(safety.height, z + 6.0 * std_z)
+    if not low <= high:
+        return 0.0
+    slope = both / var_z if var_z > LITTLE else 0.0
+    rest = math.sqrt(max(var_b - slope * both, 0.0))
+    total, width = 0.0, (high - low) / SLICES
+    if std_z <= 1e-9:
+        total = _between(-safety.radius, safety.radius, b, rest)
+    else:
+        for k in range(SLICES):
+            start = low + k * width
+            given = b + slope * (start + 0.5 * width - z)
+            total += _between(start, start + width, z, std_z) * _between(
+                -safety.radius, safety.radius, given, rest
+            )
+    return total * _between(0.0, horizon, t, math.sqrt(var_t))
+
+
+@kernel
+def probability(g: FloatArray, C: FloatArray, safety: Safety) -> float:
+    """Probability that one component, mean g (5,) and covariance C (5, 5), collides."""
+    L, total = np.zeros((SIZE, SIZE)), C.copy()
+    for i in (3, 4):
+        total[i, i] += safety.std * safety.std
+    semidefinite_root(total, L)
+    w0, w1 = g[3] - safety.velocity[0], g[4] - safety.velocity[1]
+    # A course that may be any has no miss distance to be Gaussian in.
+    unsure = w0 * w0 + w1 * w1 <= 4.0 * (total[3, 3] + total[4, 4])
+    inside = g[0] * g[0] + g[1] * g[1] <= safety.radius * safety.radius
+    if safety.velocity[2] != 0.0 or inside or unsure:
+        return sampled(g, L, safety)
+    return closed_form(g, L, safety)
+
+
+@kernel
+def assess(
+    mean: FloatArray, covariance: FloatArray, mu: FloatArray, safety: Safety
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Distance (T,) m and time (T,) s of the closest approach, and the probability (T,) of a
+    collision, of mixtures (T, K) of g."""
+    T, K, _ = mean.shape
+    distance, when, risk = np.zeros(T), np.zeros(T), np.zeros(T)
+    V = safety.velocity
+    for t in range(T):
+        known = 0.0
+        for j in range(K):
+            if mu[t, j] < WEIGHT:
+                continue
+            g = mean[t, j]
+            time, near = closest(g[0], g[1], g[3] - V[0], g[4] - V[1], safety.horizon)
+            distance[t] += mu[t, j] * near
+            when[t] += mu[t, j] * time
+            risk[t] += mu[t, j] * probability(g, covariance[t, j], safety)
+            known += mu[t, j]
+        distance[t], when[t], risk[t] = distance[t] / known, when[t] / known, risk[t] / known
+        risk[t] = min(max(risk[t], 0.0), 1.0)
+    return distance, when, risk

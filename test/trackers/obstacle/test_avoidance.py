@@ -1,0 +1,119 @@
+"""Closest approach and collision against exact answers, sampling and an independent tracker."""
+
+from pathlib import Path
+
+from helpers.obstacle_sea import column, encounter, ENCOUNTERS, track
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.measurements import Navigation
+from sonar_imm.trackers.navigation import NavigationBuffer
+from sonar_imm.trackers.obstacle import avoidance, avoidance_kernels
+from sonar_imm.trackers.obstacle.avoidance_kernels import Safety
+
+GOLDEN = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'cpa_golden.npz'
+
+
+@pytest.fixture(scope='module')
+def golden():
+    with np.load(GOLDEN) as file:
+        return dict(file)
+
+
+def test_closest_approach_is_exact(golden):
+    for k in range(len(golden['dz'])):
+        time, distance = avoidance_kernels.closest(
+            *golden['r'][k], *golden['w'][k], golden['horizon'][k]
+        )
+        assert time == pytest.approx(golden['cpa_time'][k], abs=1e-9)
+        assert distance == pytest.approx(golden['cpa_distance'][k], abs=1e-9)
+
+
+def test_collision_of_a_point_is_exact(golden):
+    inside = [
+        avoidance_kernels.collides(
+            *golden['r'][k], golden['dz'][k], *golden['w'][k], golden['wz'][k],
+            golden['radius'][k], golden['half_height'][k], golden['horizon'][k],
+        )
+        for k in range(len(golden['dz']))
+    ]  # fmt: skip
+    assert np.array_equal(inside, golden['inside'])
+
+
+def safety_of(golden, k):
+    V = golden['g_vehicle'][k]
+    return Safety(
+        np.array([V[0], V[1], V[2]]), float(golden['g_vehicle_std'][k]),
+        float(golden['g_radius'][k]), float(golden['g_half_height'][k]),
+        float(golden['g_horizon']), avoidance.draws(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize('k', range(9))
+def test_collision_of_a_gaussian(golden, k):
+    stated = avoidance_kernels.probability(
+        golden['g_mean'][k], golden['g_cov'][k], safety_of(golden, k)
+    )
+    assert stated == pytest.approx(golden['g_probability'][k], abs=0.02 if k == 7 else 0.01)
+
+
+def test_the_closed_form_knows_no_climb(golden):
+    """Why a climbing vehicle is sampled."""
+    safety, C = safety_of(golden, 7), golden['g_cov'][7].copy()
+    C[3:, 3:] += np.eye(2) * safety.std**2
+    stated = avoidance_kernels.closed_form(golden['g_mean'][7], np.linalg.cholesky(C), safety)
+    assert abs(stated - golden['g_probability'][7]) > 0.03
+
+
+def test_the_closed_form_agrees_with_sampling():
+    rng = np.random.default_rng(1)
+    errors = []
+    for _ in range(40):
+        g = np.array([rng.uniform(15.0, 80.0), rng.normal(0.0, 4.0), rng.normal(0.0, 2.5), 0, 0])
+        g[3:] = rng.normal(0.0, 0.3, 2)
+        A = rng.normal(size=(5, 5)) * np.array([0.1, 0.4, 0.5, 0.03, 0.03])[:, None]
+        C = A @ A.T + np.diag([0.01, 0.05, 0.05, 1e-4, 1e-4])
+        many = rng.normal(size=(20_000, 5))
+        settings = np.array([1.5, 0.0, 0.0]), 0.05, 3.0, 2.0, 120.0
+        L = np.linalg.cholesky(C + np.diag([0, 0, 0, 0.05**2, 0.05**2]))
+        exact = avoidance_kernels.sampled(g, L, Safety(*settings, many))
+        stated = avoidance_kernels.probability(g, C, Safety(*settings, avoidance.draws()))
+        errors.append(stated - exact)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.01
+    assert np.max(np.abs(errors)) < 0.04
+
+
+def pose(seconds, position):
+    return Navigation(
+        stamp_ns=round(seconds * 1e9), position=position, orientation=[0.0, 0.0, 0.0, 1.0]
+    )
+
+
+def test_the_course_is_the_line_and_not_the_swing():
+    buffer = NavigationBuffer()
+    for t in np.arange(0.1, 20.0, 0.1):
+        swing = 0.1 * np.sin(2.0 * np.pi * t / 5.0)
+        buffer = buffer.added(pose(t, [1.2 * t, -0.9 * t + swing, -20.0 + 0.05 * t]))
+    stamp = 20 * 10**9
+    velocity = avoidance.course(buffer, stamp, 10.0)
+    assert_allclose(velocity, [1.2, -0.9, 0.05], atol=0.03)
+    assert np.isnan(avoidance.course(NavigationBuffer(), stamp, 10.0)).all()
+    assert np.isnan(avoidance.course(buffer, 2 * stamp, 10.0)).all()
+
+
+def test_the_tracker_says_what_an_independent_one_does():
+    """At the pings for which it told; its course is made a little differently."""
+    off = {'cpa_distance': [], 'cpa_time': [], 'collision_probability': []}
+    for name, number in ENCOUNTERS:
+        data = encounter(name, number)
+        estimates = track(data)
+        told = np.flatnonzero(np.isfinite(data['ref_collision']))
+        for key, reference in zip(off, ('cpa_distance', 'cpa_time', 'collision')):
+            off[key].extend(column(estimates, key, told) - data[f'ref_{reference}'][told])
+    rms = {key: float(np.sqrt(np.mean(np.square(values)))) for key, values in off.items()}
+    assert len(off['cpa_time']) == 15
+    assert rms['cpa_distance'] < 0.4
+    assert rms['cpa_time'] < 0.1
+    assert rms['collision_probability'] < 0.02
+    assert np.abs(off['collision_probability']).max() < 0.06
