@@ -127,8 +127,7 @@ class RunFolder:
 
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
-        topic = f'/{self.read_run()["system"]}/estimate'
-        return _read_estimates(self.path / BAG, [topic])
+        return _read_estimates(self.path / BAG)
 
 
 class CsvTable:
@@ -198,6 +197,8 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
 def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimate]:
     try:
         with BagReader(path) as bag:
+            if topics is None:  # of a run: everything but the estimates is there for others
+                topics = [topic.name for topic in bag.topics if topic.name.endswith('/estimate')]
             return [read_estimate(item.message) for item in bag.messages(topics)]
     except Rejection as rejection:
         raise BagError(f'{path}: {rejection}') from None
