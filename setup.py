@@ -53,12 +53,12 @@ def version() -> str:
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
-    """What goes below `share/`: the ament index marker, package.xml, all of config/ and bags/."""
+    """What goes below `share/`: the ament index marker, package.xml, all of bags/, config/ and launch/."""
     files = {
         'share/ament_index/resource_index/packages': [f'resource/{PACKAGE}'],
         f'share/{PACKAGE}': ['package.xml'],
     }
-    for room in ('bags', 'config'):
+    for room in ('bags', 'config', 'launch'):
         for path in sorted((ROOT / room).rglob('*')):
             if path.is_file():
                 name = path.relative_to(ROOT)
