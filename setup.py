@@ -53,7 +53,7 @@ def version() -> str:
 
 
 def shared_files() -> list[tuple[str, list[str]]]:
-    """What goes below `share/`: the ament index marker, package.xml, all of bags/, config/ and launch/."""
+    """What goes below `share/`: the ament index marker, package.xml and whole folders."""
     files = {
         'share/ament_index/resource_index/packages': [f'resource/{PACKAGE}'],
         f'share/{PACKAGE}': ['package.xml'],

@@ -146,7 +146,7 @@ def test_passive_fix_minimises_the_augmented_sum_of_squares():
     tag=st.booleans(),
 )
 def test_fix_turns_and_moves_with_the_scene(angle, east, north, order, tag):
-    more = dict(sigma=SIGMA, seed=8)
+    more = {'sigma': SIGMA, 'seed': 8}
     scene = passive(5, emission=4.0, **more) if tag else active(5, **more)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     moved = dict(scene)

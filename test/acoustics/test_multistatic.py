@@ -335,7 +335,7 @@ def test_unmeasured_rows_change_nothing():
     tx, rx, position, variance = scene(5, seed=51)
     blank = np.where(np.arange(5) == 2, np.nan, variance)
     kept = np.arange(5) != 2
-    common = dict(target_z=-4.0, sound_speed=1500.0)
+    common = {'target_z': -4.0, 'sound_speed': 1500.0}
     assert_allclose(
         multistatic.crlb(position, tx, rx, blank, **common),
         multistatic.crlb(position, tx[kept], rx[kept], variance[kept], **common),

@@ -46,7 +46,7 @@ def test_a_table_is_read():
 def test_an_empty_scan_is_a_scan_and_an_empty_table_of_something_else_is_none():
     none = {name: [] for name in ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')}
     assert len(read_scan(scan(**none))) == 0
-    assert reason(scan(**{name: None for name in none})) == 'missing_column'
+    assert reason(scan(**dict.fromkeys(none))) == 'missing_column'
     assert reason(scan(cov_x_y=None)) == 'missing_column'
 
 

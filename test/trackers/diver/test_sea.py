@@ -133,7 +133,7 @@ def test_late_input_gives_the_same_bits(config):
         for item in items:
             final.update((e.stamp_ns, e) for e in tracker.process(item))
         ends.append(final)
-    assert list(sorted(ends[0])) == list(sorted(ends[1]))
+    assert sorted(ends[0]) == sorted(ends[1])
     assert all(same(ends[0][stamp], ends[1][stamp]) for stamp in ends[0])
 
 

@@ -160,12 +160,12 @@ def test_quantiles_of_mixtures():
     mu[0] = [1.0, 0.0, 0.0]
     mean[1], std[1], mu[1] = [-500.0, 0.0, 500.0], 1e-3, [0.05 - 1e-9, 0.9, 0.05 + 1e-9]
     low, high, negative = kernels.bands(mean, std, mu, 0.05)
+
+    def beyond(value, t, probability):
+        return float(mu[t] @ ndtr((value - mean[t]) / std[t])) - probability
+
     for t in range(6):
-
-        def below(value):
-            return float(mu[t] @ ndtr((value - mean[t]) / std[t]))  # noqa: B023
-
-        assert_allclose(negative[t], below(0.0), atol=1e-12)
+        assert_allclose(negative[t], beyond(0.0, t, 0.0), atol=1e-12)
         for quantile, probability in ((low[t], 0.05), (high[t], 0.95)):
-            exact = brentq(lambda value: below(value) - probability, -1e3, 1e3, xtol=1e-12)  # noqa: B023
+            exact = brentq(beyond, -1e3, 1e3, args=(t, probability), xtol=1e-12)
             assert_allclose(quantile, exact, atol=1e-6)
