@@ -15,7 +15,7 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .set_model import Sets
 from .set_particles import Proposals
-from .set_shifts import draw_shift
+from .set_shifts import draw_shift, empty_memory
 
 SUMS, SHIFTED_SUMS = 5, 8
 """Rows of what `moments` adds up, without a shift and with one."""
@@ -215,7 +215,7 @@ def propagate(
     )
     J, G = new.cell.shape[1], len(proposals.shifts.start)
     last_cell = cells - 1 - proposals.shifts.step * (G - 1)
-    parent, rows, q = np.empty(J, np.int64), np.empty(J, np.int64), np.empty(G)
+    parent, rows, memory = np.empty(J, np.int64), np.empty(J, np.int64), empty_memory(J, G)
     for i in range(first, last):
         before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
         m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
@@ -232,8 +232,9 @@ def propagate(
             negative = int(old.sign[i, parent[k]] < 0)
             rows[k] = old.cell[i, parent[k]] + negative * cells
         if G > 1:
+            drawn_at = u[1 + changes + J]
             offset, ratio = draw_shift(
-                proposals.shifts, old.shift[i], rows, left, cells, u[1 + changes + J], q
+                proposals.shifts, old.shift[i], rows, left, cells, drawn_at, memory
             )
         new.shift[i] = offset
         for k in range(left):
