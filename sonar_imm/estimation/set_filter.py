@@ -20,7 +20,7 @@ from typing import NamedTuple
 from attrs import frozen
 import numpy as np
 
-from . import set_particles_kernels as kernels
+from . import set_amplitudes as amplitudes, set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic
@@ -75,7 +75,7 @@ class SetFilter:
             most_changes=model.most_changes,
             cumulative=np.cumsum(model.transition, axis=1),
         )
-        self._amplitudes = kernels.AmplitudeModel(
+        self._amplitudes = amplitudes.AmplitudeModel(
             gram=model.gram,
             ridge=float(model.ridge),
             penalty=float(model.penalty),
@@ -188,7 +188,7 @@ class SetFilter:
     def _weigh(self, sets: Sets, b: FloatArray, log_weight: FloatArray) -> FloatArray:
         amplitude = np.zeros(sets.cell.shape)
         self._split(
-            lambda first, last: kernels.weigh(
+            lambda first, last: amplitudes.weigh(
                 first, last, b, self._amplitudes, sets, log_weight, amplitude
             )
         )
@@ -197,7 +197,7 @@ class SetFilter:
     def _remembered(self, sets: Sets, amplitude: FloatArray) -> Sets:
         if self.model.amplitude_memory > 0.0:
             self._split(
-                lambda first, last: kernels.remember(
+                lambda first, last: amplitudes.remember(
                     first, last, self._amplitudes, amplitude, sets
                 )
             )
