@@ -68,7 +68,12 @@ class FathometerConfig(StampParameters):
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
     snapshot_seconds: float = parameter(
-        1.4, 'length of a snapshot', unit='s', low=1e-3, high=1000.0
+        0.0,
+        'length of a snapshot; 0: as the depths to be tracked and the number of hydrophones need, '
+        'of cross-spectra one over the spacing of their frequencies',
+        unit='s',
+        low=0.0,
+        high=1000.0,
     )
     overlap: float = parameter(0.5, 'share that snapshots have in common', low=0.0, high=0.95)
     window: str = parameter('hann', 'window of a snapshot', choices=WINDOWS)
@@ -124,9 +129,9 @@ class FathometerConfig(StampParameters):
     noise_depth_min: float = live(
         180.0,
         'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
-        'the whole trace when it does not reach there. 0 together with noise_depth_max: where '
-        'the depths tracked have their mirror image at the array, or in what reflectors leave of '
-        'a trace',
+        'the whole trace when it does not reach there. 0 together with noise_depth_max, and with '
+        'automatic snapshots that are too short for it: where the depths tracked have their '
+        'mirror image at the array, or in what reflectors leave of a trace',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -284,6 +289,8 @@ class FathometerConfig(StampParameters):
             problems.append('amplitude_memory needs amplitude_prior marginal')
         if self.preview_seconds > self.record_seconds:
             problems.append('preview_seconds cannot exceed record_seconds')
+        if 0.0 < self.snapshot_seconds < 1e-3:
+            problems.append('snapshot_seconds is 0 or at least 0.001')
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems

@@ -55,7 +55,7 @@ class Response:
 
     depth, amplitude, sigma (n,): on the lattice, with the standard deviation of the noise.
     reference_depth: of the array, m, NaN when not known. aperture: length of the array, m, 0 for
-    traces. noise_unknown: sigma is that of the whole trace, reflectors included.
+    traces; snapshot_seconds: of what was averaged, 0 for traces. noise_unknown: sigma is that of the whole trace, reflectors included.
     """
 
     stamp_ns: int
@@ -65,6 +65,7 @@ class Response:
     sigma: FloatArray = field(repr=False)
     reference_depth: float = np.nan
     aperture: float = 0.0
+    snapshot_seconds: float = 0.0
     noise_unknown: bool = False
 
 
@@ -99,9 +100,14 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
 
 def lattice_of_array(reference_depth: float, config: FathometerConfig) -> Lattice:
     """The depths in the window. Raises `Rejection` when there are none."""
-    low, high = _window(config, (reference_depth + 10.0, reference_depth + 110.0))
+    low, high = depths_wanted(config, reference_depth)
     step = config.depth_step or config.sound_speed / (12.0 * config.frequency_max)
     return _checked(low, step, high, config)
+
+
+def depths_wanted(config: FathometerConfig, reference_depth: float) -> tuple[float, float]:
+    """First and last depth to be tracked below an array, m."""
+    return _window(config, (reference_depth + 10.0, reference_depth + 110.0))
 
 
 def trace_response(
@@ -140,11 +146,18 @@ def trace_response(
 
 
 def array_response(
-    record: CrossSpectra, lattice: Lattice, config: FathometerConfig, reference_depth: float
+    record: CrossSpectra,
+    lattice: Lattice,
+    config: FathometerConfig,
+    reference_depth: float,
+    *,
+    mirrored: bool = False,
 ) -> Response:
-    """Look up and down with the array and correlate. Raises `Rejection` ('bad_band',
+    """Look up and down with the array and correlate. mirrored: noise is measured in the mirror
+    window even where depths are configured for it. Raises `Rejection` ('bad_band',
     'bad_frequency', 'singular', 'no_noise')."""
     gamma, first, spacing, aperture = array_coherence(record, config)
+    seconds = config.snapshot_seconds or 1.0 / spacing
 
     def at(low: float, step: float, count: int) -> FloatArray:
         return fathometer.depth_response(
@@ -153,13 +166,13 @@ def array_response(
 
     def taper(depth: FloatArray) -> FloatArray:
         way = 2.0 * (depth - reference_depth) / config.sound_speed
-        return noise_taper(config.window, config.overlap, way / config.snapshot_seconds)
+        return noise_taper(config.window, config.overlap, way / seconds)
 
     b = at(lattice.first, lattice.step, lattice.cells)
     # Nearer than its own length the array hears itself.
     b[lattice.depth - reference_depth < aperture] = 0.0
     sigma = np.full(lattice.cells, config.noise_sigma)
-    if not config.noise_sigma and config.noise_from_mirror:
+    if not config.noise_sigma and (mirrored or config.noise_from_mirror):
         sigma[:] = mirror_sigma(at, lattice, reference_depth, aperture)
     elif not config.noise_sigma:
         span = config.noise_depth_max - config.noise_depth_min
@@ -177,6 +190,7 @@ def array_response(
         sigma,
         reference_depth,
         aperture,
+        seconds,
     )
 
 

@@ -47,7 +47,8 @@ def test_response_and_noise_from_pressure_are_those_of_the_vectors(vectors, reco
         pressure=vectors['p'][record] * vectors['scale'][record],
         sample_rate=float(vectors['sample_rate']),
     )
-    (spectra,), _ = PressureStream(config, Counter()).push(block)
+    (collected,), _ = PressureStream(config, Counter()).push(block, 40.0)
+    spectra = collected.spectra
     assert spectra.snapshots == vectors['snapshots']
     found = array_response(spectra, lattice, config, float(vectors['array_depth'][record]))
     expected = vectors['response'][record]
