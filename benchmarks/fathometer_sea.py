@@ -73,7 +73,9 @@ def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -
     told.pop('snapshot_seconds', None)
     settings = FathometerConfig(**{**told, **options}, seed=seed)
     if level == 'csdm':
-        seconds = automatic_snapshot(settings, config.phones, config.depth_max - config.array_depth)
+        seconds = automatic_snapshot(
+            settings, config.phones, config.depth_max - config.array_depth
+        )
         count = int(config.record_seconds / seconds / (1.0 - settings.overlap)) - 1
         worth = round(effective_snapshots(settings.window, settings.overlap, count))
         config = evolve(config, snapshot_seconds=seconds, snapshots=worth)

@@ -122,9 +122,7 @@ class ShiftMemory(NamedTuple):
 @kernel
 def empty_memory(members: int, shifts: int) -> ShiftMemory:
     key = np.full((SLOTS if shifts > 1 else 1, members + 2), -1, np.int64)
-    return ShiftMemory(
-        key, np.empty((len(key), 2, shifts)), np.empty((len(key), 2), np.int64)
-    )
+    return ShiftMemory(key, np.empty((len(key), 2, shifts)), np.empty((len(key), 2), np.int64))
 
 
 @kernel

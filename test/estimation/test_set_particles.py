@@ -188,7 +188,7 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
             assert np.array_equal(moved.prior_mean[i, :m], expected.prior_mean[i, :m])
 
     weight = np.where(possible, 0.0, -np.inf)
-    amplitude = tracker._weigh(moved, b, weight)
+    amplitude = tracker._weigh(moved, b, weight, tracker._amplitudes)
     log_likelihood, mean = weigh(changed, b, moved.take(np.flatnonzero(possible)))
     assert np.allclose(weight[possible], log_likelihood)
     alive = np.isfinite(log_likelihood)
@@ -207,7 +207,7 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
     moved, ratio = tracker._propagate(sets, b, np.random.default_rng(3))
     uniform = np.random.default_rng(3).random((N, changed.uniforms))
     weight = np.zeros(N)
-    amplitude = tracker._weigh(moved, b, weight)
+    amplitude = tracker._weigh(moved, b, weight, tracker._amplitudes)
     alone = SetFilter(changed, 1)
     for i in range(0, N, 7):
         given = _Given(uniform[i : i + 1])
@@ -215,7 +215,7 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
         assert paid[0] == ratio[i] and one.shift[0] == moved.shift[i]
         assert one.cell[0].tobytes() == moved.cell[i].tobytes()
         value = np.zeros(1)
-        found = alone._weigh(moved.take(np.array([i])), b, value)
+        found = alone._weigh(moved.take(np.array([i])), b, value, alone._amplitudes)
         assert value[0] == weight[i]
         if np.isfinite(value[0]):
             assert found[0].tobytes() == amplitude[i].tobytes()

@@ -75,8 +75,7 @@ def bench_record(records: int = 12) -> dict[str, Any]:
         'worst_ms': {name: float(np.max(each[3:])) for name, each in times.items()},
         'us_a_particle': 1e3 * median['defaults'] / PARTICLES,
         'wanted_ms': RECORD_WANTED_MS,
-        'good': max(median.values()) <= RECORD_WANTED_MS
-        and set(orders.values()) == {REFLECTORS},
+        'good': max(median.values()) <= RECORD_WANTED_MS and set(orders.values()) == {REFLECTORS},
     }
 
 

@@ -15,7 +15,7 @@ from ..shared_parameters import StampParameters
 
 live = partial(parameter, read_only=False)
 
-PULSES = ('band', 'gaussian', 'file')
+PULSES = ('band', 'processor', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
 POLARITIES = ('positive', 'both')
 MULTIPLES = ('mark', 'off')
@@ -152,8 +152,8 @@ class FathometerConfig(StampParameters):
     # -- pulse ------------------------------------------------------------------------------------
     pulse: str = parameter(
         'band',
-        'what one reflector leaves on the response: that of a flat band, a Gaussian, or from a '
-        'file',
+        'what one reflector leaves on the response: that of a flat band; what the mvdr processor '
+        'makes of each record of an array (of other records, band); a Gaussian; or from a file',
         choices=PULSES,
     )
     pulse_width: float = parameter(

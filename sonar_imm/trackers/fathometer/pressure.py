@@ -149,6 +149,11 @@ class PressureStream:
         seconds = config.snapshot_seconds or automatic_snapshot(config, block.hydrophones, reach)
         length = max(2, round(seconds * rate))
         hop = max(1, round(length * (1.0 - config.overlap)))
+        if not config.snapshot_seconds:
+            # A whole number of them to a record, so that it ends where the pressure does.
+            samples = config.record_seconds * rate
+            hop = max(1, math.floor(samples / math.ceil(samples / hop - 1e-9) + 1e-9))
+            length = max(2, round(hop / (1.0 - config.overlap)))
         self._spacing = rate / length
         first = max(1, math.ceil(config.frequency_min / self._spacing - 1e-9))
         last = min(length // 2, math.floor(config.frequency_max / self._spacing + 1e-9))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from attrs import evolve, field, frozen
 import numpy as np
@@ -55,7 +56,8 @@ class Response:
 
     depth, amplitude, sigma (n,): on the lattice, with the standard deviation of the noise.
     reference_depth: of the array, m, NaN when not known. aperture: length of the array, m, 0 for
-    traces; snapshot_seconds: of what was averaged, 0 for traces. noise_unknown: sigma is that of the whole trace, reflectors included.
+    traces; snapshot_seconds: of what was averaged, 0 for traces. pulse: of this record, None for
+    the one that is configured. noise_unknown: sigma is that of the whole trace, reflectors included.
     """
 
     stamp_ns: int
@@ -66,12 +68,13 @@ class Response:
     reference_depth: float = np.nan
     aperture: float = 0.0
     snapshot_seconds: float = 0.0
+    pulse: Pulse | None = field(default=None, repr=False)
     noise_unknown: bool = False
 
 
 def pulse_of(config: FathometerConfig) -> Pulse:
-    """The pulse that is configured. Raises `ConfigError` for a file that cannot be used."""
-    if config.pulse == 'band':
+    """The pulse that is configured, that of the band where each record has its own. Raises `ConfigError` for a file that cannot be used."""
+    if config.pulse in ('band', 'processor'):
         return band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
     if config.pulse == 'gaussian':
         return gaussian_pulse(config.pulse_width)
@@ -156,8 +159,12 @@ def array_response(
     """Look up and down with the array and correlate. mirrored: noise is measured in the mirror
     window even where depths are configured for it. Raises `Rejection` ('bad_band',
     'bad_frequency', 'singular', 'no_noise')."""
-    gamma, first, spacing, aperture = array_coherence(record, config)
+    heard = array_coherence(record, config)
+    gamma, first, spacing, aperture = heard[:4]
     seconds = config.snapshot_seconds or 1.0 / spacing
+    pulse = None
+    if config.pulse == 'processor' and config.processor == 'mvdr':
+        pulse = processor_pulse(heard, lattice, config.sound_speed)
 
     def at(low: float, step: float, count: int) -> FloatArray:
         return fathometer.depth_response(
@@ -191,7 +198,20 @@ def array_response(
         reference_depth,
         aperture,
         seconds,
+        pulse,
     )
+
+
+def processor_pulse(heard: ArrayCoherence, lattice: Lattice, sound_speed: float) -> Pulse:
+    """The pulse that the processor leaves of a reflector, by its spectrum: a table over all lags
+    of the lattice, four to a cell."""
+    step, count = 0.25 * lattice.step, 4 * lattice.cells
+    spectrum = np.where(np.isfinite(heard.gamma), heard.weight, np.nan).astype(np.complex128)
+    value = fathometer.depth_response(
+        spectrum, heard.first, heard.spacing, (0.0, step, count), 0.0, sound_speed
+    )
+    lags = step * np.arange(count)
+    return lambda delta: np.interp(np.abs(delta), lags, value / value[0], right=0.0)
 
 
 def mirror_sigma(
@@ -226,11 +246,20 @@ def residual_sigma(response: Response, fitted: FloatArray) -> Response:
     return evolve(response, sigma=np.full(len(response.depth), sigma))
 
 
-def array_coherence(
-    record: CrossSpectra, config: FathometerConfig
-) -> tuple[NDArray[np.complexfloating], float, float, float]:
+class ArrayCoherence(NamedTuple):
     """gamma (F,) at the frequencies ``first + spacing * row``, NaN where there is none; first and
-    spacing in Hz; and the length of the array, m."""
+    spacing in Hz; aperture: length of the array, m; weight (F,): the spectrum of an echo, NaN as
+    gamma."""
+
+    gamma: NDArray[np.complexfloating]
+    first: float
+    spacing: float
+    aperture: float
+    weight: FloatArray
+
+
+def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCoherence:
+    """What the array hears from above and below at once. Raises `Rejection`."""
     rows = np.flatnonzero(
         (record.frequency >= config.frequency_min - 1e-6)
         & (record.frequency <= config.frequency_max + 1e-6)
@@ -252,7 +281,7 @@ def array_coherence(
     csdm = record.csdm[rows[use]][:, alive[:, None], alive]
     w = fathometer.steering(record.frequency[rows[use]], heights, config.sound_speed)
     try:
-        heard = fathometer.coherence(
+        heard, power = fathometer.coherence_and_power(
             csdm,
             w,
             config.processor,
@@ -260,14 +289,20 @@ def array_coherence(
             gain_db=config.white_noise_gain_db,
         )
     except np.linalg.LinAlgError:
-        heard = np.full(len(csdm), np.nan)
+        heard, power = np.full(len(csdm), np.nan), np.full(len(csdm), np.nan)
     # A coherence above one is rounding: nothing was left of the matrix.
     heard[np.abs(heard) > 1.0 + 1e-6] = np.nan
     if not np.isfinite(heard).any():
         raise Rejection('singular', _SINGULAR)
     gamma = np.full(index[-1] + 1, np.nan, np.complex128)
     gamma[index[use]] = heard
-    return gamma, float(record.frequency[rows[0]]), spacing, float(heights[-1] - heights[0])
+    weight, there = np.full(len(gamma), np.nan), np.isfinite(heard)
+    frequency = record.frequency[rows[use]]
+    weight[index[use][there]] = fathometer.echo_spectrum(
+        csdm[there], frequency[there], power[there]
+    )
+    aperture = float(heights[-1] - heights[0])
+    return ArrayCoherence(gamma, float(record.frequency[rows[0]]), spacing, aperture, weight)
 
 
 def rank_deficient(record: CrossSpectra) -> bool:

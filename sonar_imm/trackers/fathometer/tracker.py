@@ -212,7 +212,7 @@ class FathometerTracker:
         record = collected.spectra
         if rank_deficient(record):
             self.counts['rank_deficient'] += 1
-        self.counts['few_snapshots'] += 0.0 < collected.snapshots < record.alive.sum()
+        self.counts['few_snapshots'] += bool(0.0 < collected.snapshots < record.alive.sum())
         spread = max(collected.depth_std, self._depths.spread(record.stamp_ns, span_ns))
         self.counts['heave_within_record'] += spread > MOST_HEAVE
         depth = self._array_depth(record, span_ns) or 0.0
@@ -254,7 +254,12 @@ class FathometerTracker:
         with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
             b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
         b = np.ascontiguousarray(np.nan_to_num(b))
-        return self._filter.step(self._before, b, (self.config.seed, response.stamp_ns))
+        key, gram = (self.config.seed, response.stamp_ns), None
+        if response.pulse is not None:
+            assert self._lattice is not None
+            lags = self._lattice.step * np.arange(self._lattice.cells)
+            gram = np.ascontiguousarray(response.pulse(lags))
+        return self._filter.step(self._before, b, key, gram)
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step = self._try(response)
@@ -329,7 +334,8 @@ class FathometerTracker:
         if self._filter.model.shift:
             mean, std = self._filter.shift(w, sets)
             heave = self._lattice.step * mean, self._lattice.step * std
-        found = reflectors_of(members, response, self._lattice, self.pulse, self.config, heave)
+        pulse = response.pulse or self.pulse
+        found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
         return found, pmf
 
 
