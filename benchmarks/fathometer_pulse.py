@@ -1,6 +1,6 @@
 """Which pulse: that of the band, or what the processor makes of each record.
 
-    python -m benchmarks.fathometer_pulse --runs 2 --records 300 --out docs/results/fathometer_pulse.json
+    python -m benchmarks.fathometer_pulse --out docs/results/fathometer_pulse.json
 
 Two scenes as cross-spectra, tracked with either pulse and either polarity. ``drift``: the drift of
 the paper, 32 hydrophones, seven to nine layers, MVDR. ``strong`` and ``signed``: 16 hydrophones

@@ -6,10 +6,12 @@ The scene: 16 hydrophones 0.25 m apart, 100 Hz to 2800 Hz, at 30 m and half a me
 to 0.03 m; layers of amplitude 0.35, 0.25 and 0.2 at 52 m, 58.5 m and 66 m that walk by 0.05 m from
 record to record; ships and noise of the hydrophones. Pressure is drawn from the cross-spectral
 model over each whole record, in whole numbers of 2.5 steps to a standard deviation where it says
-so; cross-spectra are drawn from the same model, of as many snapshots as those of the pressure are
-worth. Every row has the same floors. P is the share of records whose number of reflectors is
-right, OSPA of second order with a cutoff of 2 m; SNR the median amplitude of each layer in units of
-the noise.
+so; cross-spectra are drawn from the same model frequency by frequency, of as many snapshots as fit
+into the record side by side, which gives a response of the same noise; "as at one frequency" means
+as many as the overlapping ones of the pressure are worth at one frequency (but not over all, since
+the window makes neighbouring frequencies alike). Every row has the same floors. P is the share of
+records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m; SNR the
+median amplitude of each layer in units of the noise.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ MIRROR: dict[str, Any] = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
 ROWS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     '8 s, pressure': ('pressure', {}, {}),
     '8 s, cross-spectra': ('csdm', {}, MIRROR),
+    '8 s, cross-spectra, as at one frequency': ('csdm at one frequency', {}, MIRROR),
     '8 s, pressure, int8': ('pressure', {'steps_per_sigma': 2.5}, {}),
     '8 s, pressure, pulse of the processor': ('pressure', {}, {'pulse': 'processor'}),
     '8 s, pressure, snapshots of 1.4 s': (
@@ -66,18 +69,21 @@ def floor_of(config: FathometerScenario, seed: int) -> Drift:
 
 def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -> dict[str, Any]:
     """One run; numbers of each record."""
-    config = scenario('pressure', {'level': level, 'steps_per_sigma': 0.0, **scene})
+    kind = level.split()[0]
+    config = scenario('pressure', {'level': kind, 'steps_per_sigma': 0.0, **scene})
     floor, rng = floor_of(config, seed), np.random.default_rng([seed, 1])
     told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
     told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     told.pop('snapshot_seconds', None)
     settings = FathometerConfig(**{**told, **options}, seed=seed)
-    if level == 'csdm':
+    if kind == 'csdm':
         seconds = automatic_snapshot(
             settings, config.phones, config.depth_max - config.array_depth
         )
         count = int(config.record_seconds / seconds / (1.0 - settings.overlap)) - 1
         worth = round(effective_snapshots(settings.window, settings.overlap, count))
+        if level == 'csdm':
+            worth = round(config.record_seconds / seconds)
         config = evolve(config, snapshot_seconds=seconds, snapshots=worth)
         # Drawn frequency by frequency, their noise does not fade.
         settings = evolve(settings, window='rectangular', overlap=0.0)
@@ -85,7 +91,7 @@ def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -
     right, distance, snr = [], [], []
     for record in range(config.records):
         depth = float(floor.array_depth_told[record])
-        if level == 'csdm':
+        if kind == 'csdm':
             measured: list[Any] = [cross_spectra(config, floor, record, depth, rng)]
         else:
             measured = pressure_blocks(config, floor, record, depth, rng)

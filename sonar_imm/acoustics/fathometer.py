@@ -43,6 +43,7 @@ from ..estimation.arrays import FloatArray
 ComplexArray = NDArray[np.complexfloating]
 
 PROCESSORS = ('conventional', 'mvdr', 'white_noise')
+OUTPUTS = ('coherence', 'correlation', 'printed')
 
 _MAD_OF_UNIT_NORMAL = 0.6744897501960817
 _LOADINGS = (1e-6, 1e2)
@@ -140,6 +141,25 @@ def coherence_and_power(
     with np.errstate(invalid='ignore', divide='ignore'):
         gamma = turn * C / power
     return np.where(np.isfinite(gamma), gamma, np.nan), power
+
+
+def printed_correlation(
+    csdm: ComplexArray, w: ComplexArray, processor: str, *, loading: float = 1e-2
+) -> ComplexArray:
+    """C (F,) as the paper prints it: equation (2), w^T R w, or for mvdr equation (4), w_+^H R w_-
+    with the weights of equation (3), in which R is loaded, and R itself between them. Its echoes
+    lie at negative times."""
+    if processor == 'conventional':
+        return conventional(csdm, w)[0]
+    M = csdm.shape[-1]
+    power = np.einsum('fmm->f', csdm).real / M
+    loaded = csdm + (loading * power)[:, None, None].astype(csdm.dtype) * np.eye(
+        M, dtype=csdm.dtype
+    )
+    beams = np.stack([w, w.conj()], axis=-1).astype(csdm.dtype)
+    weights = np.linalg.solve(loaded, beams)
+    weights = weights / np.einsum('fmk,fmk->fk', beams.conj(), weights)[:, None, :]
+    return _form(weights[..., 0], csdm, weights[..., 1])
 
 
 def echo_spectrum(csdm: ComplexArray, frequency: ArrayLike, power: FloatArray) -> FloatArray:

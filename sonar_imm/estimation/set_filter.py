@@ -20,7 +20,8 @@ from typing import NamedTuple
 from attrs import frozen
 import numpy as np
 
-from . import set_amplitudes as amplitudes, set_particles_kernels as kernels
+from . import set_amplitudes as amplitudes
+from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
 from .resampling import systematic

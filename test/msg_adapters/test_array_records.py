@@ -1,8 +1,8 @@
 """Tables of arrays and traces: read back as written, and hostile ones named."""
 
+from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from attrs import evolve
 import numpy as np
 import pytest
 

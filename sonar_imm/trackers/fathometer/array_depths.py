@@ -11,8 +11,8 @@ from ...measurements import ArrayDepth
 from .config import FathometerConfig
 
 MOST_HEAVE = 0.05
-"""Standard deviation of the depth within a record, m, above which it is said: a sinusoid of so much
-leaves 0.62 of an echo in 50 Hz to 4 kHz (the mean of J0(2 k A), A its amplitude)."""
+"""Standard deviation of the depth within a record, m, above which it is said: a sinusoid of so
+much leaves 0.62 of an echo in 50 Hz to 4 kHz (the mean of J0(2 k A), A its amplitude)."""
 _DEPTHS_KEPT = 10_000
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 from attrs import frozen
 
-from ...acoustics.fathometer import PROCESSORS
+from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
 from ...estimation.set_model import PRIORS
 from ...parameters import inherited, parameter
@@ -15,7 +15,7 @@ from ..shared_parameters import StampParameters
 
 live = partial(parameter, read_only=False)
 
-PULSES = ('band', 'processor', 'gaussian', 'file')
+PULSES = ('band', 'processor', 'envelope', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
 POLARITIES = ('positive', 'both')
 MULTIPLES = ('mark', 'off')
@@ -90,6 +90,16 @@ class FathometerConfig(StampParameters):
 
     # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
+    output: str = parameter(
+        'coherence',
+        'what is made of both beams: their coherence; their correlation, which red noise spoils; '
+        'or printed, equations (2) and (4) of the paper to the letter: for mvdr the echoes lie '
+        'above the array then',
+        choices=OUTPUTS,
+    )
+    envelope: bool = parameter(
+        False, 'of arrays: the envelope of the response, as the paper has it, in place of it'
+    )
     loading: float = live(
         1e-2,
         'mvdr: diagonal loading, in units of the mean power of a hydrophone',
@@ -153,7 +163,8 @@ class FathometerConfig(StampParameters):
     pulse: str = parameter(
         'band',
         'what one reflector leaves on the response: that of a flat band; what the mvdr processor '
-        'makes of each record of an array (of other records, band); a Gaussian; or from a file',
+        'makes of each record of an array (of other records, band); that of the envelope of a '
+        'band; a Gaussian; or from a file',
         choices=PULSES,
     )
     pulse_width: float = parameter(
@@ -283,6 +294,8 @@ class FathometerConfig(StampParameters):
             problems.append(
                 f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'
             )
+        if self.output == 'printed' and self.processor == 'white_noise':
+            problems.append('output printed needs processor conventional or mvdr')
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':

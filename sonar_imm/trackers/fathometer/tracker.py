@@ -34,6 +34,7 @@ from ...estimation.set_model import banded_transition, gaussian_move, SetModel, 
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
+from .array_response import array_response, rank_deficient
 from .config import FathometerConfig
 from .multiples import Multiples
 from .pressure import Collected, PressureStream
@@ -48,7 +49,6 @@ from .reflectors import (
     write_estimate,
 )
 from .response import (
-    array_response,
     depths_wanted,
     heave_shift,
     Lattice,
@@ -56,7 +56,6 @@ from .response import (
     lattice_of_trace,
     MAX_SIGMAS,
     pulse_of,
-    rank_deficient,
     residual_sigma,
     Response,
     trace_response,

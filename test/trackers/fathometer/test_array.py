@@ -7,7 +7,8 @@ import pytest
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.simulation.fathometer.simulator import scenario, simulate
-from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
+from sonar_imm.trackers.fathometer.array_response import array_response
+from sonar_imm.trackers.fathometer.response import lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 SMALL = {**scenario('small').told(), 'particles': 2000}
