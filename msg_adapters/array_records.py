@@ -4,8 +4,8 @@
 hydrophones row by row, real and imaginary parts in turn, hydrophone 0 the deepest; optional
 ``snapshots`` u4, the same in every row.
 
-``pressure``, one row per sample: ``p`` f4 x N, or i2 x N with ``scale`` f4; ``sample_rate`` f4
-[Hz]. The stamp is that of the first sample.
+``pressure``, one row per sample: ``p`` f4 x N, or i1 or i2 x N with ``scale`` f4; ``sample_rate``
+f4 [Hz]. The stamp is that of the first sample.
 
 ``trace``, one row per depth: ``depth`` f4 [m, down positive]; ``amplitude`` f4; optional ``sigma``
 f4, the standard deviation of its noise.
@@ -70,6 +70,7 @@ def read_pressure(message: Any, *, world_frame: str = 'enu') -> Pressure:
     columns = decode_table(message, ('p', 'scale', 'sample_rate', *_DEPTHS), most_rows=MAX_SAMPLES)
     require_columns(columns, ('p', 'sample_rate'), 'pressure')
     samples = _two_dimensional(columns['p'])
+    scale: float | None = 0.0
     if samples.dtype.kind in 'iu':
         require_columns(columns, ('scale',), 'pressure in whole numbers')
         scale = constant_column(columns, 'scale')
@@ -83,17 +84,22 @@ def read_pressure(message: Any, *, world_frame: str = 'enu') -> Pressure:
         pressure=samples,
         sample_rate=0.0 if rate is None else rate,
         reference_depth=_array_depth(columns, samples.shape[1]),
+        scale=scale,
     )
 
 
-def write_pressure(block: Pressure, make: Make, *, scale: float | None = None) -> Any:
-    """Write the table of a block; with `scale` as whole numbers of 16 bits, clipped at their
-    limits."""
+def write_pressure(block: Pressure, make: Make) -> Any:
+    """Write the table of a block; with a `scale` as whole numbers of 8 bits, of 16 where they do
+    not fit, clipped at their limits."""
     rows = len(block)
     columns: dict[str, NDArray] = {'p': block.pressure}
-    if scale is not None:
-        whole = np.clip(np.round(block.pressure / scale), -(2**15), 2**15 - 1)
-        columns = {'p': whole.astype(np.int16), 'scale': np.full(rows, scale, np.float32)}
+    if block.scale:
+        whole = np.clip(np.round(block.pressure / np.float32(block.scale)), -(2**15), 2**15 - 1)
+        small = np.abs(whole).max() < 2**7
+        columns = {
+            'p': whole.astype(np.int8 if small else np.int16),
+            'scale': np.full(rows, block.scale, np.float32),
+        }
     columns['sample_rate'] = np.full(rows, block.sample_rate, np.float32)
     return _encode(block, columns, rows, make)
 

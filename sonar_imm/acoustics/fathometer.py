@@ -43,9 +43,11 @@ from ..estimation.arrays import FloatArray
 ComplexArray = NDArray[np.complexfloating]
 
 PROCESSORS = ('conventional', 'mvdr', 'white_noise')
+OUTPUTS = ('coherence', 'correlation', 'printed')
 
 _MAD_OF_UNIT_NORMAL = 0.6744897501960817
 _LOADINGS = (1e-6, 1e2)
+_RUNNING = 31
 
 
 def steering(frequency: ArrayLike, heights: ArrayLike, sound_speed: float) -> ComplexArray:
@@ -115,6 +117,18 @@ def coherence(
     """gamma (F,): normalised, quarter turned, echoes positive; NaN where a beam has no power.
 
     Raises numpy.linalg.LinAlgError for MVDR when a loaded matrix is singular."""
+    return coherence_and_power(csdm, w, processor, loading=loading, gain_db=gain_db)[0]
+
+
+def coherence_and_power(
+    csdm: ComplexArray,
+    w: ComplexArray,
+    processor: str,
+    *,
+    loading: float = 1e-2,
+    gain_db: float = -3.0,
+) -> tuple[ComplexArray, FloatArray]:
+    """See `coherence`; and sqrt(P_+ P_-) (F,), by which the correlation was divided."""
     if processor == 'conventional':
         C, power = conventional(csdm, w)
         turn = -1j
@@ -126,7 +140,43 @@ def coherence(
         raise ValueError(f'a processor is one of {PROCESSORS}, not {processor!r}')
     with np.errstate(invalid='ignore', divide='ignore'):
         gamma = turn * C / power
-    return np.where(np.isfinite(gamma), gamma, np.nan)
+    return np.where(np.isfinite(gamma), gamma, np.nan), power
+
+
+def printed_correlation(
+    csdm: ComplexArray, w: ComplexArray, processor: str, *, loading: float = 1e-2
+) -> ComplexArray:
+    """C (F,) as the paper prints it: equation (2), w^T R w, or for mvdr equation (4), w_+^H R w_-
+    with the weights of equation (3), in which R is loaded, and R itself between them. Its echoes
+    lie at negative times."""
+    if processor == 'conventional':
+        return conventional(csdm, w)[0]
+    M = csdm.shape[-1]
+    power = np.einsum('fmm->f', csdm).real / M
+    loaded = csdm + (loading * power)[:, None, None].astype(csdm.dtype) * np.eye(
+        M, dtype=csdm.dtype
+    )
+    beams = np.stack([w, w.conj()], axis=-1).astype(csdm.dtype)
+    weights = np.linalg.solve(loaded, beams)
+    weights = weights / np.einsum('fmk,fmk->fk', beams.conj(), weights)[:, None, :]
+    return _form(weights[..., 0], csdm, weights[..., 1])
+
+
+def echo_spectrum(csdm: ComplexArray, frequency: ArrayLike, power: FloatArray) -> FloatArray:
+    """W (F,), mean one: how much of an echo MVDR lets through at each frequency, so that the pulse
+    of a reflector is ``sum W cos(4 pi f delta / c) / sum W``.
+
+    W = tr R / (M f sqrt(P_+ P_-)), P the MVDR powers of the two beams, `power` their root, as a
+    running mean over 31 rows: where MVDR is sharper than a plain sum, at low frequencies, the echo
+    is stronger. `frequency` (F,) Hz. The response itself stays unweighted: weights make it ring.
+    """
+    M = csdm.shape[-1]
+    f = np.maximum(np.asarray(frequency, np.float64), 1e-3)
+    W = np.einsum('fmm->f', csdm).real.astype(np.float64) / (M * f * power)
+    half = min(_RUNNING // 2, len(W) - 1)
+    padded = np.pad(W, half, 'reflect')
+    smooth = np.convolve(padded, np.full(2 * half + 1, 1.0 / (2 * half + 1)), 'valid')
+    return np.asarray(smooth / smooth.mean())
 
 
 def depth_response(

@@ -36,6 +36,14 @@ def band_pulse(frequency_min: float, frequency_max: float, sound_speed: float) -
     return pulse
 
 
+def envelope_pulse(frequency_min: float, frequency_max: float, sound_speed: float) -> Pulse:
+    """Pulse of the envelope of a response of a flat spectrum: |sinc(B tau)|, B the bandwidth."""
+    if not 0.0 <= frequency_min < frequency_max:
+        raise ValueError('a band needs 0 <= frequency_min < frequency_max')
+    width = 2.0 * (frequency_max - frequency_min) / sound_speed
+    return lambda delta: np.abs(np.sinc(width * np.asarray(delta, np.float64)))
+
+
 def gaussian_pulse(width: float) -> Pulse:
     """A hump of standard deviation `width`, m."""
     if not width > 0.0:

@@ -30,6 +30,7 @@ from .common import example, json_option, print_json, say, set_option, typed_ove
     help='The same scenario and seed give the same bag.',
 )
 @set_option
+@click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
 @click.option(
     '--list',
     'list_scenarios',
@@ -43,6 +44,7 @@ def command(
     scenario: str | None,
     seed: int,
     overrides: dict[str, str],
+    compress: bool,
     list_scenarios: bool,
     as_json: bool,
 ) -> None:
@@ -63,6 +65,7 @@ def command(
     report = write_scene(
         scene,
         out_bag,
+        compressed=compress,
         provenance={
             'source': f'simulated: {system} {name}',
             'seed': str(seed),

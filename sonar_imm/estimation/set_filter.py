@@ -20,6 +20,7 @@ from typing import NamedTuple
 from attrs import frozen
 import numpy as np
 
+from . import set_amplitudes as amplitudes
 from . import set_particles_kernels as kernels
 from .arrays import FloatArray, IntArray
 from .particles import effective_sample_size, normalise
@@ -75,7 +76,7 @@ class SetFilter:
             most_changes=model.most_changes,
             cumulative=np.cumsum(model.transition, axis=1),
         )
-        self._amplitudes = kernels.AmplitudeModel(
+        self._amplitudes = amplitudes.AmplitudeModel(
             gram=model.gram,
             ridge=float(model.ridge),
             penalty=float(model.penalty),
@@ -91,14 +92,22 @@ class SetFilter:
         )
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def step(self, before: Weighted | None, b: FloatArray, key: tuple[int, int]) -> SetStep:
+    def step(
+        self,
+        before: Weighted | None,
+        b: FloatArray,
+        key: tuple[int, int],
+        gram: FloatArray | None = None,
+    ) -> SetStep:
         """Take in the record b (n,), or (n + 2 pad,) with a shift, in units of its noise. before:
-        None before the first record. key: seed and name of the record, each in 0 .. 2^64 - 1."""
+        None before the first record. key: seed and name of the record, each in 0 .. 2^64 - 1.
+        gram (n,): of this record, where it is not the model's."""
+        answer = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
         if before is None:
             before = self._start(b, key)
         sets, log_ratio = self._propagate(before.sets, b, _uniform(key, _STEP))
         log_weight = before.log_weight + log_ratio
-        amplitude = self._weigh(sets, b, log_weight)
+        amplitude = self._weigh(sets, b, log_weight, answer)
         w, log_sum = normalise(log_weight)
         _, log_before = normalise(before.log_weight)
         ok = bool(np.isfinite(log_sum))
@@ -107,7 +116,7 @@ class SetFilter:
         if ok and effective < 0.5 * self.particles:
             source = systematic(w, self.particles, _uniform(key, _RESAMPLE))
             log_weight = np.zeros(self.particles)
-        after = self._remembered(sets.take(source), amplitude[source])
+        after = self._remembered(sets.take(source), amplitude[source], answer)
         evidence = float(log_sum - log_before)
         return SetStep(
             sets, w, amplitude, Weighted(after, log_weight), source, evidence, effective, ok
@@ -185,21 +194,27 @@ class SetFilter:
         )
         return new, log_ratio
 
-    def _weigh(self, sets: Sets, b: FloatArray, log_weight: FloatArray) -> FloatArray:
+    def _weigh(
+        self,
+        sets: Sets,
+        b: FloatArray,
+        log_weight: FloatArray,
+        answer: amplitudes.AmplitudeModel,
+    ) -> FloatArray:
         amplitude = np.zeros(sets.cell.shape)
         self._split(
-            lambda first, last: kernels.weigh(
-                first, last, b, self._amplitudes, sets, log_weight, amplitude
+            lambda first, last: amplitudes.weigh(
+                first, last, b, answer, sets, log_weight, amplitude
             )
         )
         return amplitude
 
-    def _remembered(self, sets: Sets, amplitude: FloatArray) -> Sets:
+    def _remembered(
+        self, sets: Sets, amplitude: FloatArray, answer: amplitudes.AmplitudeModel
+    ) -> Sets:
         if self.model.amplitude_memory > 0.0:
             self._split(
-                lambda first, last: kernels.remember(
-                    first, last, self._amplitudes, amplitude, sets
-                )
+                lambda first, last: amplitudes.remember(first, last, answer, amplitude, sets)
             )
         return sets
 

@@ -56,7 +56,7 @@ all that particle i uses, so that particles may be worked on in any order, by an
 threads.
 
 This module is the readable form, one array operation for all particles; `set_particles_kernels`
-is the compiled one, and `set_filter` runs it.
+(with `set_amplitudes`) is the compiled one, and `set_filter` runs it.
 
 Sources: C. Yardim, P. Gerstoft, Z.-H. Michalopoulou, *Passive fathometer reflector identification
 with multiple model particle filtering* (2012); the weights by first principles.

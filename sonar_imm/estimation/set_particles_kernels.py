@@ -13,9 +13,10 @@ import numpy as np
 
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
+from .set_amplitudes import AmplitudeModel
 from .set_model import Sets
 from .set_particles import Proposals
-from .set_shifts import draw_shift
+from .set_shifts import draw_shift, empty_memory
 
 SUMS, SHIFTED_SUMS = 5, 8
 """Rows of what `moments` adds up, without a shift and with one."""
@@ -30,19 +31,6 @@ class SetMotion(NamedTuple):
     separation: int
     most_changes: int
     cumulative: FloatArray
-
-
-class AmplitudeModel(NamedTuple):
-    """How members answer: gram (n,) by lag; ridge, added to its diagonal; penalty in log
-    likelihood for each member; marginal: amplitudes are integrated out; memory: phi of a' = phi a
-    + noise, 0 for amplitudes drawn anew; variance of the amplitude of a new member."""
-
-    gram: FloatArray
-    ridge: float
-    penalty: float
-    marginal: bool
-    memory: float
-    variance: float
 
 
 @kernel
@@ -215,7 +203,7 @@ def propagate(
     )
     J, G = new.cell.shape[1], len(proposals.shifts.start)
     last_cell = cells - 1 - proposals.shifts.step * (G - 1)
-    parent, rows, q = np.empty(J, np.int64), np.empty(J, np.int64), np.empty(G)
+    parent, rows, memory = np.empty(J, np.int64), np.empty(J, np.int64), empty_memory(J, G)
     for i in range(first, last):
         before, u, here, sign = old.order[i], uniform[i], new.cell[i], new.sign[i]
         m = order_min + min(_search(cumulative[before - order_min], 0, orders, u[0]), orders - 1)
@@ -232,8 +220,9 @@ def propagate(
             negative = int(old.sign[i, parent[k]] < 0)
             rows[k] = old.cell[i, parent[k]] + negative * cells
         if G > 1:
+            drawn_at = u[1 + changes + J]
             offset, ratio = draw_shift(
-                proposals.shifts, old.shift[i], rows, left, cells, u[1 + changes + J], q
+                proposals.shifts, old.shift[i], rows, left, cells, drawn_at, memory
             )
         new.shift[i] = offset
         for k in range(left):
@@ -276,90 +265,6 @@ def propagate(
                 new.prior_mean[i, k] = 0.0 if born else old.prior_mean[i, j]
                 variance = amplitudes.variance if born else old.prior_variance[i, j]
                 new.prior_variance[i, k] = variance
-
-
-@kernel
-def weigh(
-    first: int,
-    last: int,
-    b: FloatArray,
-    amplitudes: AmplitudeModel,
-    sets: Sets,
-    log_weight: FloatArray,
-    amplitude: FloatArray,
-) -> None:
-    """See `set_particles.weigh`: adds the log likelihood to log_weight (N,), whose -inf are left
-    alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
-    order, cell, mean, variance, sign, shift = sets
-    gram, memory = amplitudes.gram, amplitudes.memory > 0.0
-    J = cell.shape[1]
-    L, y = np.empty((J, J)), np.empty(J)
-    for i in range(first, last):
-        m = order[i]
-        if not log_weight[i] > -math.inf:
-            continue
-        value = 0.0
-        for r in range(m):
-            z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
-            if memory:
-                precision = 1.0 / variance[i, r]
-                h += precision * mean[i, r]
-                value += 0.5 * (math.log(precision) - precision * mean[i, r] * mean[i, r])
-            row = L[r]
-            for c in range(r):
-                other = L[c]
-                value_rc = gram[z - cell[i, c]]
-                for k in range(c):
-                    value_rc -= row[k] * other[k]
-                value_rc *= other[c]
-                row[c] = value_rc
-                h -= value_rc * y[c]
-            pivot = gram[0] + precision
-            for k in range(r):
-                pivot -= row[k] * row[k]
-            if not pivot > 1e-12:
-                value = -math.inf
-                break
-            # The diagonal of L is kept as its reciprocal.
-            row[r] = 1.0 / math.sqrt(pivot)
-            y[r] = h * row[r]
-            value += 0.5 * y[r] * y[r]
-            if amplitudes.marginal:
-                value -= 0.5 * math.log(pivot)
-            if not memory:
-                value -= amplitudes.penalty
-        if value > -math.inf:
-            a = amplitude[i]
-            for r in range(m - 1, -1, -1):
-                rest = y[r]
-                for k in range(r + 1, m):
-                    rest -= L[k, r] * a[k]
-                a[r] = rest * L[r, r]
-                if not a[r] * sign[i, r] > 0.0:
-                    value = -math.inf
-                    break
-        log_weight[i] += value
-
-
-@kernel
-def remember(
-    first: int,
-    last: int,
-    amplitudes: AmplitudeModel,
-    amplitude: FloatArray,
-    sets: Sets,
-) -> None:
-    """Amplitudes (N, J) after a record become those expected before the next, a' = phi a + noise:
-    prior_mean and prior_variance of `sets`, in place. Each is kept for itself, given the others:
-    in place of their full covariance that costs less than 0.1 % of accuracy while neighbouring
-    pulses overlap by less than 0.3 (band pulses at the default separation: 0.06), and 2 to 6 % at
-    0.7."""
-    phi, stationary = amplitudes.memory, amplitudes.variance
-    for i in range(first, last):
-        for k in range(sets.order[i]):
-            after = 1.0 / (amplitudes.gram[0] + 1.0 / sets.prior_variance[i, k])
-            sets.prior_mean[i, k] = phi * amplitude[i, k]
-            sets.prior_variance[i, k] = phi * phi * after + (1.0 - phi * phi) * stationary
 
 
 @kernel

@@ -24,6 +24,7 @@ from .jit import kernel
 
 _REACH = 4.0
 MAX_SHIFTS = 401
+SLOTS = 256
 
 
 @frozen(kw_only=True)
@@ -74,21 +75,25 @@ def _log_normal(x: FloatArray, std: float) -> FloatArray:
 
 class ShiftTables(NamedTuple):
     """Of one record: step; start (G,) running sum of p(shift) before the first record; log_prior
-    (G, G); log_sum (S, n + 2 pad) log Z by sign, in the cells of the record; share of the
-    data-driven proposal. Without a shift G is 1."""
+    (G, G), a single row where nothing is remembered, and prior, the running sums of its rows;
+    log_sum (S, n + 2 pad) log Z by sign, in the cells of the record; share of the data-driven
+    proposal. Without a shift G is 1."""
 
     step: int
     start: FloatArray
     log_prior: FloatArray
+    prior: FloatArray
     log_sum: FloatArray
     share: float
 
 
 def shift_tables(shift: Shift | None, log_sum: FloatArray, share: float) -> ShiftTables:
     if shift is None:
-        return ShiftTables(1, np.ones(1), np.zeros((1, 1)), log_sum, share)
+        return ShiftTables(1, np.ones(1), np.zeros((1, 1)), np.ones((1, 1)), log_sum, share)
     start = np.cumsum(np.exp(shift.log_start()))
-    return ShiftTables(shift.step, start, shift.log_prior(), log_sum, share)
+    log_prior = shift.log_prior() if shift.memory else shift.log_start()[None]
+    prior = np.cumsum(np.exp(log_prior), axis=1)
+    return ShiftTables(shift.step, start, log_prior, prior, log_sum, share)
 
 
 def propose_shift(
@@ -96,7 +101,7 @@ def propose_shift(
 ) -> tuple[FloatArray, FloatArray]:
     """Oracle for tests: q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
     `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
-    prior = tables.log_prior[before // tables.step]
+    prior = tables.log_prior[before // tables.step if len(tables.log_prior) > 1 else 0]
     at = cells[:, None] + tables.step * np.arange(len(prior))
     score = prior + tables.log_sum[negative[:, None], at].sum(axis=0)
     driven = np.exp(score - score.max())
@@ -105,46 +110,100 @@ def propose_shift(
         return q, prior - np.log(q)
 
 
+class ShiftMemory(NamedTuple):
+    """What `score_shifts` found for sets that are likely to come again: sets that were resampled
+    from one have one proposal. For each of the SLOTS: key (J + 2,), driven (2, G), span (2,)."""
+
+    key: IntArray
+    driven: FloatArray
+    span: IntArray
+
+
+@kernel
+def empty_memory(members: int, shifts: int) -> ShiftMemory:
+    key = np.full((SLOTS if shifts > 1 else 1, members + 2), -1, np.int64)
+    return ShiftMemory(key, np.empty((len(key), 2, shifts)), np.empty((len(key), 2), np.int64))
+
+
+@kernel
+def score_shifts(
+    tables: ShiftTables, before: int, rows: IntArray, count: int, cells: int, driven: FloatArray
+) -> tuple[int, int]:
+    """The data-driven part of `propose_shift` for the members rows[:count], their cell plus
+    `cells` (n + 2 pad) where they are negative: driven (2, G) gets its weights and their running
+    sums, both divided by their total, from the first place that has any to the last, which are
+    given."""
+    step, (weight, running) = tables.step, driven
+    G = len(weight)
+    weight[:] = tables.log_prior[before]
+    for k in range(count):
+        negative = rows[k] // cells
+        z = rows[k] - negative * cells
+        there = tables.log_sum[negative, z : z + (G - 1) * step + 1 : step]
+        for g in range(G):
+            weight[g] += there[g]
+    best = weight[0]
+    for g in range(1, G):
+        best = weight[g] if weight[g] > best else best
+    # What is less than e^-40 of the best is never drawn by these numbers.
+    first, last = 0, G - 1
+    while first < last and weight[first] < best - 40.0:
+        first += 1
+    while last > first and weight[last] < best - 40.0:
+        last -= 1
+    total = 0.0
+    for g in range(first, last + 1):
+        weight[g] = math.exp(weight[g] - best)
+        total += weight[g]
+        running[g] = total
+    for g in range(first, last + 1):
+        weight[g] /= total
+        running[g] /= total
+    return first, last
+
+
 @kernel
 def draw_shift(
     tables: ShiftTables,
-    before: int,
+    shift: int,
     rows: IntArray,
     count: int,
     cells: int,
     uniform: float,
-    q: FloatArray,
+    memory: ShiftMemory,
 ) -> tuple[int, float]:
     """The shift plus pad, and log of model to proposal: `propose_shift` for the members
-    rows[:count], their cell plus `cells` (n + 2 pad) where they are negative. q (G,) is scratch.
-    """
-    step, G = tables.step, len(q)
-    prior = tables.log_prior[before // step]
-    for g in range(G):
-        q[g] = prior[g]
+    rows[:count], their cell plus `cells` (n + 2 pad) where they are negative; shift: that of the
+    record before, plus pad. `memory` changes the time and nothing else."""
+    before = shift // tables.step if len(tables.prior) > 1 else 0
+    slot = before
     for k in range(count):
-        negative = rows[k] // cells
-        z = rows[k] - negative * cells
-        table = tables.log_sum[negative]
-        for g in range(G):
-            q[g] += table[z + g * step]
-    best, total = -math.inf, 0.0
-    for g in range(G):
-        best = max(best, q[g])
-    for g in range(G):
-        # What is less than e^-40 of the best is never drawn by these numbers.
-        q[g] = math.exp(q[g] - best) if q[g] > best - 40.0 else 0.0
-        total += q[g]
-    running, mass = 0.0, 0.0
-    for g in range(G):
-        likely = math.exp(prior[g]) if prior[g] > -40.0 else 0.0
-        q[g] = tables.share * q[g] / total + (1.0 - tables.share) * likely
-        mass += q[g]
-    chosen = -1
-    for g in range(G):
-        if q[g] > 0.0:
-            chosen = g
-            running += q[g]
-            if running > uniform * mass:
-                break
-    return chosen * step, prior[chosen] - math.log(q[chosen] / mass)
+        slot = (31 * slot + rows[k]) % 1_000_003
+    slot %= len(memory.key)
+    key, driven, span = memory.key[slot], memory.driven[slot], memory.span[slot]
+    known = key[0] == count and key[1] == before
+    for k in range(count):
+        known = known and key[2 + k] == rows[k]
+    if not known:
+        span[0], span[1] = score_shifts(tables, before, rows, count, cells, driven)
+        key[0], key[1] = count, before
+        for k in range(count):
+            key[2 + k] = rows[k]
+    share, prior, running = tables.share, tables.prior[before], driven[1]
+    first, last = span
+    low, high = 0, len(prior) - 1
+    point = uniform * (share + (1.0 - share) * prior[high])
+    while low < high:
+        middle = (low + high) // 2
+        below = 0.0 if middle < first else 1.0
+        if first <= middle < last:
+            below = running[middle]
+        if share * below + (1.0 - share) * prior[middle] > point:
+            high = middle
+        else:
+            low = middle + 1
+    log_prior = tables.log_prior[before, low]
+    q = (1.0 - share) * math.exp(log_prior)
+    if first <= low <= last:
+        q += share * driven[0, low]
+    return low * tables.step, log_prior - math.log(q)

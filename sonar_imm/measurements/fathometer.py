@@ -205,7 +205,8 @@ class Pressure:
 
     pressure (n, M) in any linear unit, hydrophone 0 the deepest, samples that are not finite made
     zero; sample_rate Hz; the stamp is that of the first sample; reference_depth: of hydrophone 0,
-    m, None when not known. alive (M,): hydrophones that are finite throughout and not constant.
+    m, None when not known; scale: what a step of whole numbers is worth, 0 for real ones.
+    alive (M,): hydrophones that are finite throughout and not constant.
     """
 
     stamp_ns: int
@@ -213,6 +214,7 @@ class Pressure:
     sample_rate: float
     frame_id: str = ''
     reference_depth: float | None = field(default=None, converter=_depth)
+    scale: float = 0.0
     alive: NDArray[np.bool_] = field(init=False)
 
     def __attrs_post_init__(self) -> None:

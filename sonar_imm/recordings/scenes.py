@@ -14,7 +14,9 @@ from .truth import namespaced, records_of
 from .writer import BagWriter
 
 
-def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) -> ConversionReport:
+def write_scene(
+    scene: Scene, out: str | Path, *, provenance: dict[str, str], compressed: bool = False
+) -> ConversionReport:
     """Write measurements and truth, in the order of reception. Raises `BagError`."""
     report = ConversionReport(Path(out))
     inputs: dict[type, InputTopic] = {}
@@ -28,7 +30,7 @@ def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) ->
         records.append((one.received_ns, topic, entry.write(one.measurement, ros_message)))
     for true in scene.truth:
         records += records_of(true, scene.frame_id)
-    with BagWriter(out, custom_data=provenance) as bag:
+    with BagWriter(out, compressed=compressed, custom_data=provenance) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)
             report.messages[topic] = report.messages.get(topic, 0) + 1

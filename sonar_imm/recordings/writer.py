@@ -17,7 +17,13 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer,
+    WriterError,
+)
 
 from .messages import ros_message, typestore
 from .sources import BagError
@@ -55,6 +61,7 @@ def naming(path: Path) -> Iterator[None]:
 class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
+    compressed: mcap only, by chunks, as ``ros2 bag record`` does with the profile zstd_fast.
     custom_data: notes kept in the metadata of the bag, e.g. where the data come from. What was
     written before an exception is still a whole bag. Raises `BagError` when the bag cannot be
     made.
@@ -65,6 +72,7 @@ class BagWriter:
         path: str | Path,
         *,
         storage: str = 'mcap',
+        compressed: bool = False,
         custom_data: Mapping[str, str] | None = None,
     ):
         if storage not in STORAGES:
@@ -76,6 +84,8 @@ class BagWriter:
             self._writer = Writer(
                 self.path, version=8, storage_plugin=StoragePlugin[storage.upper()]
             )
+            if compressed:
+                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             for key, note in sorted((custom_data or {}).items()):
                 self._writer.set_custom_data(key, str(note))
             self._writer.open()

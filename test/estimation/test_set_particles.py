@@ -188,12 +188,48 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
             assert np.array_equal(moved.prior_mean[i, :m], expected.prior_mean[i, :m])
 
     weight = np.where(possible, 0.0, -np.inf)
-    amplitude = tracker._weigh(moved, b, weight)
+    amplitude = tracker._weigh(moved, b, weight, tracker._amplitudes)
     log_likelihood, mean = weigh(changed, b, moved.take(np.flatnonzero(possible)))
     assert np.allclose(weight[possible], log_likelihood)
     alive = np.isfinite(log_likelihood)
     assert 50 < np.count_nonzero(alive) < N
     assert np.allclose(amplitude[possible][alive], mean[alive])
+
+
+@pytest.mark.parametrize('change', [{}, {'shift': Shift(std=1.5, memory=0.9)}])
+def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
+    """Sets that come again, and those that compete for a slot, are moved and weighed as if each
+    came alone."""
+    changed = evolve(model, negative_probability=0.3, **change)
+    tracker, N = SetFilter(changed, 600), 600
+    b = np.pad(exact['B'][3], changed.pad)
+    sets = tracker._start(b, (1, 2)).sets.take(np.random.default_rng(0).integers(0, 90, N))
+    moved, ratio = tracker._propagate(sets, b, np.random.default_rng(3))
+    uniform = np.random.default_rng(3).random((N, changed.uniforms))
+    weight = np.zeros(N)
+    amplitude = tracker._weigh(moved, b, weight, tracker._amplitudes)
+    alone = SetFilter(changed, 1)
+    for i in range(0, N, 7):
+        given = _Given(uniform[i : i + 1])
+        one, paid = alone._propagate(sets.take(np.array([i])), b, given)
+        assert paid[0] == ratio[i] and one.shift[0] == moved.shift[i]
+        assert one.cell[0].tobytes() == moved.cell[i].tobytes()
+        value = np.zeros(1)
+        found = alone._weigh(moved.take(np.array([i])), b, value, alone._amplitudes)
+        assert value[0] == weight[i]
+        if np.isfinite(value[0]):
+            assert found[0].tobytes() == amplitude[i].tobytes()
+
+
+class _Given:
+    """Random numbers that are told."""
+
+    def __init__(self, uniform):
+        self.uniform = uniform
+
+    def random(self, shape):
+        assert self.uniform.shape == shape
+        return self.uniform
 
 
 def test_the_likelihood_is_that_of_the_whole_record():

@@ -1,5 +1,6 @@
 """Tables of arrays and traces: read back as written, and hostile ones named."""
 
+from attrs import evolve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
@@ -153,9 +154,12 @@ def test_pressure_comes_back_as_floats_or_as_scaled_whole_numbers():
     )
     back = read_pressure(write_pressure(block, ros_message))
     assert (back.pressure == block.pressure).all() and back.sample_rate == 12e3
-    message = write_pressure(block, ros_message, scale=1e-3)
-    assert decode_table(message)['p'].dtype == np.int16
-    assert np.abs(read_pressure(message).pressure - block.pressure).max() < 0.51e-3
+    for scale, whole in ((1e-3, np.int16), (0.1, np.int8)):
+        message = write_pressure(evolve(block, scale=scale), ros_message)
+        assert decode_table(message)['p'].dtype == whole
+        again = read_pressure(message)
+        assert np.abs(again.pressure - block.pressure).max() < 0.51 * scale
+        assert write_pressure(again, ros_message).data.tobytes() == message.data.tobytes()
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,10 @@ def test_pressure_makes_records_and_previews_between_them(make_bench):
     rig = rig_of(
         make_bench, *SMALL, 'snapshot_seconds:=0.4', 'record_seconds:=4.0', 'preview_seconds:=1.0'
     )
-    rig.send('pressure', *[write_pressure(one, make, scale=1e-3) for one in blocks_of(10.0)])
+    rig.send(
+        'pressure',
+        *[write_pressure(attrs.evolve(one, scale=1e-3), make) for one in blocks_of(10.0)],
+    )
     preview = [int(read_estimate(one).extras['preview'][0]) for one in rig.tables]
     assert preview.count(0) == 2
     assert preview.count(1) >= 2
@@ -153,11 +156,13 @@ HEARD = (
 
 @pytest.fixture(scope='module')
 def heard():
-    """Twenty seconds of pressure over two layers, at 132 m and 137 m, in blocks of 0.5 s."""
+    """Twenty seconds of pressure over two layers, at 132 m and 136 m, in blocks of 0.5 s."""
     array = {'phones': 12, 'element_spacing': 0.36, 'sample_rate': 6000.0}
-    times = {'snapshot_seconds': 0.5, 'record_seconds': 19.5}
-    scene = simulate(scenario('pressure', {**array, **times, 'frequency_max': 2000.0}), 1)
-    assert scene.truth[0].depth == pytest.approx([131.8, 137.3], abs=0.05)
+    times = {'records': 1, 'block_seconds': 0.5, 'record_seconds': 19.5}
+    floor = {'array_depth': 73.5, 'first_depth': 130.0, 'layers': 2, 'first_amplitude': 0.6}
+    sound = {'frequency_min': 50.0, 'frequency_max': 2000.0, 'amplitude': 0.6}
+    scene = simulate(scenario('pressure', {**array, **times, **floor, **sound}), 1)
+    assert scene.truth[0].depth == pytest.approx([131.6, 136.4], abs=0.05)
     return [write_pressure(one.measurement, make) for one in scene.measurements]
 
 
@@ -183,16 +188,21 @@ def test_pressure_gives_the_estimate_of_its_cross_spectra(make_bench, heard):
     rig.send('pressure', *heard)
     assert len(rig.tables) == 1 and not rig.node._meter.refused
     live = read_estimate(rig.tables[0])
-    assert live.state[:, 0] == pytest.approx([131.8, 137.3], abs=0.2)
+    assert live.state[:, 0] == pytest.approx([131.6, 136.4], abs=0.2)
+    response = rig.node.tracker.response
     rig.bench.call(Trigger, '/fathometer/reset', Trigger.Request())
     rig.send('csdm', write_csdm(spectra_of(heard, live.stamp_ns), make))
     other = read_estimate(rig.tables[1])
     assert other.stamp_ns == live.stamp_ns
     columns, expected = live.columns(), other.columns()
     assert list(columns) == list(expected)
-    for name, column in columns.items():
-        # Single precision, and what it moves on 2000 particles.
-        assert np.allclose(column, expected[name], rtol=1e-3, atol=1e-4), name
+    # Single precision moves the response by a thousandth of its noise, and of 2000 particles that
+    # begin blindly some draws with it.
+    sigma = columns['sigma'][0]
+    assert expected['sigma'][0] == pytest.approx(sigma, rel=1e-3)
+    again = rig.node.tracker.response
+    assert np.abs(again.amplitude - response.amplitude).max() < 1e-3 * sigma
+    assert columns['depth'] == pytest.approx(expected['depth'], abs=0.02)
 
 
 def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, heard):
@@ -207,7 +217,7 @@ def test_lost_repeated_and_late_blocks_are_counted_and_survived(make_bench, hear
     assert counts['gaps'] == 2 and not counts['records_abandoned']
     assert counts['blocks'] == len(order) - 2
     assert len(rig.tables) == 1 and not rig.node._errors
-    assert read_estimate(rig.tables[0]).state[0, 0] == pytest.approx(131.8, abs=0.2)
+    assert read_estimate(rig.tables[0]).state[0, 0] == pytest.approx(131.6, abs=0.2)
 
 
 def follow(messages, count):

@@ -23,7 +23,10 @@ from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from ..benches import Bench
 
 REFLECTORS, PARTICLES = 8, 20_000
-RECORD_WANTED_MS = 40.0
+RECORD_WANTED_MS = 30.0
+HEAVE: Mapping[str, Any] = {'polarity': 'both', 'heave': 'independent', 'array_depth_std': 0.5}
+"""The dearest options: reflectors of either sign below an array whose told depth is half a metre
+wrong."""
 SAMPLES, STEP = 1600, 0.03125
 FIRST_STAMP_NS, RECORD_NS = 1_700_000_000_000_000_000, 90 * 10**9
 
@@ -45,26 +48,34 @@ def trace(record: int, rng: np.random.Generator) -> Trace:
 
 
 def bench_record(records: int = 12) -> dict[str, Any]:
-    """Milliseconds of one record of the tracker at its defaults, on one core."""
-    rng = np.random.default_rng(0)
-    tracker = FathometerTracker(FathometerConfig(particles=PARTICLES))
-    times, orders = [], []
+    """Milliseconds of processor time for one record, at the defaults and with `HEAVE`, turn by
+    turn."""
+    cases: dict[str, Mapping[str, Any]] = {'defaults': {}, 'both and heave': HEAVE}
+    rngs = {name: np.random.default_rng(0) for name in cases}
+    trackers = {
+        name: FathometerTracker(FathometerConfig(particles=PARTICLES, **options))
+        for name, options in cases.items()
+    }
+    times: dict[str, list[float]] = {name: [] for name in cases}
+    orders: dict[str, int] = {}
     for record in range(records + 3):
-        one = trace(record, rng)
-        begin = time.perf_counter()
-        estimates = tracker.process(one)
-        times.append(1e3 * (time.perf_counter() - begin))
-        orders.append(int(np.argmax(estimates[-1].probabilities[0])) + tracker.config.order_min)
-    median = float(np.median(times[3:]))
+        for name, tracker in trackers.items():
+            one = trace(record, rngs[name])
+            begin = time.process_time()
+            estimates = tracker.process(one)
+            times[name].append(1e3 * (time.process_time() - begin))
+            likely = int(np.argmax(estimates[-1].probabilities[0]))
+            orders[name] = likely + tracker.config.order_min
+    median = {name: float(np.median(each[3:])) for name, each in times.items()}
     return {
         'particles': PARTICLES,
-        'reflectors': orders[-1],
+        'reflectors': orders,
         'records': records,
         'median_ms': median,
-        'worst_ms': float(np.max(times[3:])),
-        'us_a_particle': 1e3 * median / PARTICLES,
+        'worst_ms': {name: float(np.max(each[3:])) for name, each in times.items()},
+        'us_a_particle': 1e3 * median['defaults'] / PARTICLES,
         'wanted_ms': RECORD_WANTED_MS,
-        'good': median <= RECORD_WANTED_MS and orders[-1] == REFLECTORS,
+        'good': max(median.values()) <= RECORD_WANTED_MS and set(orders.values()) == {REFLECTORS},
     }
 
 
@@ -189,10 +200,13 @@ def _seconds(function: Any, *arguments: Any) -> float:
 
 
 def _record_sentence(result: Mapping[str, Any]) -> str:
+    each = ', '.join(
+        f'{name} {median:.1f} ms (worst {result["worst_ms"][name]:.1f} ms)'
+        for name, median in result['median_ms'].items()
+    )
     return (
-        f'a record, {result["particles"]} particles, {result["reflectors"]} reflectors: '
-        f'{result["median_ms"]:.1f} ms, worst {result["worst_ms"]:.1f} ms '
-        f'(wanted: at most {result["wanted_ms"]:g} ms)'
+        f'a record, {result["particles"]} particles, {result["reflectors"]["defaults"]} '
+        f'reflectors: {each}; wanted: at most {result["wanted_ms"]:g} ms'
     )
 
 

@@ -99,6 +99,18 @@ class FathometerScenario(Scenario):
     ship_pass: tuple[int, ...] = parameter(
         (), 'records between which a ship comes by, a hundred times louder', kind='int[]', low=0
     )
+    whitened: bool = parameter(
+        False, 'csdm, pressure: spectra made even, as a recorder does that has few bits'
+    )
+    steps_per_sigma: float = parameter(
+        0.0,
+        'pressure: whole numbers with so many steps to a standard deviation; 0: real numbers',
+        low=0.0,
+        high=1e4,
+    )
+    block_seconds: float = parameter(
+        1.0, 'pressure: length of a message', unit='s', low=1e-3, high=60.0
+    )
     noise_sigma: float = parameter(
         1.3e-3, 'trace: standard deviation of the noise', low=1e-9, high=1.0
     )
@@ -138,6 +150,10 @@ class FathometerScenario(Scenario):
         if self.level == 'csdm':
             # They are drawn frequency by frequency: no window makes their noise fade with depth.
             told |= {'window': 'rectangular', 'overlap': 0.0}
+        if self.level == 'pressure':
+            # Snapshots are the tracker's own; they are as long as the depths to be tracked need.
+            del told['snapshot_seconds']
+            told |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
         return told
 
     def spectra_bytes(self) -> float:
@@ -145,8 +161,6 @@ class FathometerScenario(Scenario):
         rows = (self.frequency_max - self.frequency_min) * self.snapshot_seconds
         return 8.0 * self.records * rows * self.phones**2
 
-
-_SHORT = {'records': 1, 'appearing': (), 'fading': (), 'heave': 0.0}
 
 SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     'drift': ('300 records of the drift of the paper, processed by MVDR: 2 s per record', {}),
@@ -179,15 +193,33 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     'ship_pass': ('drift with a ship that comes by', {'ship_pass': (150, 190)}),
     'pressure': (
-        'ten seconds of pressure over two strong layers',
+        'twelve records of eight seconds of pressure at 16 hydrophones over three layers',
         {
-            **_SHORT,
             'level': 'pressure',
-            'record_seconds': 9.8,
-            'layers': 2,
-            'layer_spacing': 8.0,
-            'first_amplitude': 0.6,
-            'amplitude': 0.4,
+            'records': 12,
+            'record_seconds': 8.0,
+            'phones': 16,
+            'element_spacing': 0.25,
+            'sample_rate': 6000.0,
+            'frequency_min': 100.0,
+            'frequency_max': 2800.0,
+            'whitened': True,
+            'steps_per_sigma': 3.0,
+            'ship_noise': 0.5,
+            'phone_noise': 1e-3,
+            'array_depth': 30.0,
+            'heave': 0.5,
+            'heave_records': 12.0,
+            'first_depth': 52.0,
+            'layers': 3,
+            'layer_spacing': 7.0,
+            'depth_walk': 0.05,
+            'tilt_walk': 0.0,
+            'amplitude': 0.3,
+            'depth_min': 42.0,
+            'depth_max': 74.0,
+            'appearing': (),
+            'fading': (),
         },
     ),
 }

@@ -6,7 +6,7 @@ written of a scene:
               noise of ships from the horizontal and noise of the hydrophones;
     response  traces processed from such cross-spectra;
     trace     traces made directly, of pulses and noise in the same band: hundreds per second;
-    pressure  time series from many plane waves: slow, for short scenes.
+    pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from typing import Any
 import numpy as np
 
 from ...acoustics import fathometer
-from ...acoustics.ambient import horizontal_noise_csdm, sample_csdm, surface_noise_csdm
+from ...acoustics.ambient import sample_csdm
 from ...acoustics.pulse import band_pulse
 from ...estimation.arrays import FloatArray
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from ..scene import Received, Scene, TrueReflectors
+from .field import expected_csdm, pressure_field
 from .scenario import Drift, drift_of, FathometerScenario, PRESENT, scenario, SCENARIOS
 
 __all__ = [
     'cross_spectra',
     'FathometerScenario',
     'PRESENT',
+    'pressure_blocks',
     'scenario',
     'SCENARIOS',
     'simulate',
@@ -85,7 +87,7 @@ def _measurements(
     for record in range(config.records):
         told = None if config.depth_companion else float(drift.array_depth_told[record])
         if config.level == 'pressure':
-            yield _pressure(config, drift, record, told, rng)
+            yield pressure_blocks(config, drift, record, told, rng)
         elif config.level == 'trace':
             yield [_trace(config, drift, record, told, rng)]
         else:
@@ -106,21 +108,7 @@ def cross_spectra(
     first = int(np.ceil(config.frequency_min / spacing - 1e-9))
     last = int(np.floor(config.frequency_max / spacing + 1e-9))
     frequency = spacing * np.arange(first, last + 1)
-    there = drift.amplitude[record] > 0.0
-    array = config.phones, config.element_spacing
-    R = surface_noise_csdm(
-        frequency,
-        *array,
-        drift.depth[record, there] - drift.array_depth[record],
-        drift.amplitude[record, there],
-        config.sound_speed,
-    )
-    passing = config.ship_pass and config.ship_pass[0] <= record <= config.ship_pass[1]
-    ships = (100.0 if passing else 1.0) * config.ship_noise / (1.0 + (frequency / 200.0) ** 2)
-    R += ships[:, None, None] * horizontal_noise_csdm(frequency, *array, 0.03, config.sound_speed)
-    R += config.phone_noise * np.eye(config.phones)
-    # Surface noise is red: it falls by 5 dB per octave.
-    R *= ((frequency / 1000.0) ** -1.6)[:, None, None]
+    R = expected_csdm(config, drift, record, frequency)
     return CrossSpectra(
         stamp_ns=stamp_of(config, record),
         frame_id=FRAME_ID,
@@ -192,61 +180,31 @@ def _trace(
     )
 
 
-def _pressure(
+def pressure_blocks(
     config: FathometerScenario,
     drift: Drift,
     record: int,
     told: float | None,
     rng: np.random.Generator,
 ) -> list[Pressure]:
-    """Blocks of one snapshot's length, summed up from plane waves (`_rays`)."""
-    length = round(config.record_seconds * config.sample_rate)
-    frequency = np.fft.rfftfreq(length, 1.0 / config.sample_rate)
-    heard = (frequency >= 0.5 * config.frequency_min) & (frequency < 1.2 * config.frequency_max)
-    k = 2.0 * np.pi * frequency[heard] / config.sound_speed
-    height = drift.depth[record] - drift.array_depth[record]
-    spectra = np.zeros((config.phones, len(k)), np.complex64)
-    for u, power in _rays(height.max(), 0.125 * config.sound_speed / config.frequency_max, rng):
-        down = np.sqrt(0.5 * power) * (rng.standard_normal((len(k), 2)) @ np.array([1.0, 1j]))
-        down = down.astype(np.complex64)
-        # The phase of numpy's transform: a later arrival turns by exp(-i w t).
-        up = down * (np.exp(-2j * u * np.outer(k, height)) @ drift.amplitude[record])
-        step = np.exp(1j * u * k * config.element_spacing).astype(np.complex64)
-        back = step.conj()
-        up = up.astype(np.complex64)
-        for m in range(config.phones):
-            spectra[m] += down + up
-            down *= step
-            up *= back
-    noise = rng.standard_normal((config.phones, 2 * len(k)), np.float32).view(np.complex64)
-    spectra += np.float32(np.sqrt(0.5 * config.phone_noise)) * noise
-    full = np.zeros((config.phones, len(frequency)), np.complex64)
-    full[:, heard] = spectra * (np.maximum(frequency[heard], 1.0) / 1000.0) ** -0.8
-    pressure = np.fft.irfft(full, length, axis=1).T * np.sqrt(length)
-    block = round(config.snapshot_seconds * config.sample_rate)
+    """The pressure of one record in blocks of `block_seconds`, the last ends with the record."""
+    pressure = pressure_field(config, drift, record, rng)
+    scale = 0.0
+    if config.steps_per_sigma:
+        scale = float(np.std(pressure)) / config.steps_per_sigma
+        # What is stored is a multiple of a number in single precision.
+        scale = float(np.float32(scale))
+        pressure = np.round(pressure / np.float32(scale)) * np.float32(scale)
+    block = max(2, round(config.block_seconds * config.sample_rate))
     end_ns = stamp_of(config, record)
     return [
         Pressure(
-            stamp_ns=end_ns - round((length - first) / config.sample_rate * 1e9),
+            stamp_ns=end_ns - round((len(pressure) - first) / config.sample_rate * 1e9),
             frame_id=FRAME_ID,
             pressure=pressure[first : first + block],
             sample_rate=config.sample_rate,
             reference_depth=told,
+            scale=scale,
         )
-        for first in range(0, length - 1, block)
+        for first in range(0, len(pressure) - 1, block)
     ]
-
-
-def _rays(
-    height: float, resolution: float, rng: np.random.Generator
-) -> Iterator[tuple[float, float]]:
-    """Sines u of the angles at which plane waves come down, and their powers, one in all.
-
-    The steep ones make the echo. They stand so close that the echoes of neighbours, H du apart,
-    are not told apart, or each would look like a layer of its own; 48 do for the others.
-    """
-    steep = 0.8
-    count = int(np.ceil((1.0 - steep) * height / resolution))
-    edges = np.concatenate([np.linspace(0.0, steep, 48), np.linspace(steep, 1.0, count + 1)[1:]])
-    for low, high in zip(edges, edges[1:]):
-        yield float(rng.uniform(low, high)), float(high**2 - low**2)

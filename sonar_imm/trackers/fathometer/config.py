@@ -6,7 +6,7 @@ from functools import partial
 
 from attrs import frozen
 
-from ...acoustics.fathometer import PROCESSORS
+from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
 from ...estimation.set_model import PRIORS
 from ...parameters import inherited, parameter
@@ -15,7 +15,7 @@ from ..shared_parameters import StampParameters
 
 live = partial(parameter, read_only=False)
 
-PULSES = ('band', 'gaussian', 'file')
+PULSES = ('band', 'processor', 'envelope', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
 POLARITIES = ('positive', 'both')
 MULTIPLES = ('mark', 'off')
@@ -68,7 +68,12 @@ class FathometerConfig(StampParameters):
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
     snapshot_seconds: float = parameter(
-        1.4, 'length of a snapshot', unit='s', low=1e-3, high=1000.0
+        0.0,
+        'length of a snapshot; 0: as the depths to be tracked and the number of hydrophones need, '
+        'of cross-spectra one over the spacing of their frequencies',
+        unit='s',
+        low=0.0,
+        high=1000.0,
     )
     overlap: float = parameter(0.5, 'share that snapshots have in common', low=0.0, high=0.95)
     window: str = parameter('hann', 'window of a snapshot', choices=WINDOWS)
@@ -85,6 +90,16 @@ class FathometerConfig(StampParameters):
 
     # -- from cross-spectra to a depth response ---------------------------------------------------
     processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
+    output: str = parameter(
+        'coherence',
+        'what is made of both beams: their coherence; their correlation, which red noise spoils; '
+        'or printed, equations (2) and (4) of the paper to the letter: for mvdr the echoes lie '
+        'above the array then',
+        choices=OUTPUTS,
+    )
+    envelope: bool = parameter(
+        False, 'of arrays: the envelope of the response, as the paper has it, in place of it'
+    )
     loading: float = live(
         1e-2,
         'mvdr: diagonal loading, in units of the mean power of a hydrophone',
@@ -124,9 +139,9 @@ class FathometerConfig(StampParameters):
     noise_depth_min: float = live(
         180.0,
         'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
-        'the whole trace when it does not reach there. 0 together with noise_depth_max: where '
-        'the depths tracked have their mirror image at the array, or in what reflectors leave of '
-        'a trace',
+        'the whole trace when it does not reach there. 0 together with noise_depth_max, and with '
+        'automatic snapshots that are too short for it: where the depths tracked have their '
+        'mirror image at the array, or in what reflectors leave of a trace',
         unit='m',
         low=0.0,
         high=12000.0,
@@ -147,8 +162,9 @@ class FathometerConfig(StampParameters):
     # -- pulse ------------------------------------------------------------------------------------
     pulse: str = parameter(
         'band',
-        'what one reflector leaves on the response: that of a flat band, a Gaussian, or from a '
-        'file',
+        'what one reflector leaves on the response: that of a flat band; what the mvdr processor '
+        'makes of each record of an array (of other records, band); that of the envelope of a '
+        'band; a Gaussian; or from a file',
         choices=PULSES,
     )
     pulse_width: float = parameter(
@@ -278,12 +294,16 @@ class FathometerConfig(StampParameters):
             problems.append(
                 f'particles times order_max cannot exceed {MAX_MEMBERS}, for lack of memory'
             )
+        if self.output == 'printed' and self.processor == 'white_noise':
+            problems.append('output printed needs processor conventional or mvdr')
         if self.pulse == 'file' and not self.pulse_file:
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
             problems.append('amplitude_memory needs amplitude_prior marginal')
         if self.preview_seconds > self.record_seconds:
             problems.append('preview_seconds cannot exceed record_seconds')
+        if 0.0 < self.snapshot_seconds < 1e-3:
+            problems.append('snapshot_seconds is 0 or at least 0.001')
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
         return problems

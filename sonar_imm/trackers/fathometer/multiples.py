@@ -12,6 +12,7 @@ there are share the prior probability evenly. A multiple is marked, never delete
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from attrs import evolve, frozen
@@ -61,11 +62,10 @@ class Multiples:
         """Probability (K,) that each reflector of `record` is a multiple of others; span: of the
         depths that are tracked, m."""
         K, found = len(record.depth), np.zeros(len(record.depth))
+        if not K:
+            return found
         past = (*self.seen, record)[-RECORDS:]
-        depth, variance = np.full((len(past), K), np.nan), np.full((len(past), K), np.nan)
-        for row, one in enumerate(past):
-            _, here, there = np.intersect1d(record.track_id, one.track_id, return_indices=True)
-            depth[row, here], variance[row, here] = one.depth[there], one.variance[there]
+        depth, variance = _histories(past, record.track_id)
         datum = np.array([one.datum for one in past])
         for target in range(1, K):
             ways = ways_above(record.depth, record.sign, target)
@@ -130,21 +130,33 @@ def _log_odds(
     """Log likelihood ratio (H,) of a multiple to a primary."""
     off, spread = _offsets(depth, variance, datum, ways, target)
     walk = config.depth_std**2 * (1.0 + np.square(ways.factor).sum(axis=1))
-    found = np.zeros(len(ways.sign))
-    last, last_spread = np.full(found.shape, np.nan), np.zeros(found.shape)
-    records = np.zeros(found.shape)
-    for r, s in zip(off, spread, strict=True):
-        records += 1.0
-        seen = np.isfinite(r)
-        # Before the first a primary can be anywhere.
-        anywhere = np.isnan(last)
-        primary = _density(r - last, s + last_spread + records * walk, span)
-        primary = np.where(anywhere, 1.0 / span, primary)
-        ratio = np.log(_density(r, s, span)) - np.log(primary)
-        found += np.where(seen, ratio, 0.0)
-        last, last_spread = np.where(seen, r, last), np.where(seen, s, last_spread)
-        records = np.where(seen, 0.0, records)
-    return found
+    seen = np.isfinite(off)
+    # The last record before, at which the target and its way were seen; -1 for none.
+    record = np.arange(len(off))[:, None]
+    last = np.maximum.accumulate(np.where(seen, record, -1), axis=0)
+    last = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
+    there, way = np.maximum(last, 0), np.arange(off.shape[1])
+    walked = spread + spread[there, way] + (record - last) * walk
+    # Before the first a primary can be anywhere.
+    primary = np.where(last >= 0, _density(off - off[there, way], walked, span), 1.0 / span)
+    ratio = np.log(_density(off, spread, span)) - np.log(primary)
+    # Summed up in the order of the records, whatever the number of ways.
+    return np.asarray(np.cumsum(np.where(seen, ratio, 0.0), axis=0)[-1])
+
+
+def _histories(past: Sequence[Seen], track_id: NDArray[np.uint32]) -> tuple[FloatArray, ...]:
+    """Depth and variance (T, K) of the reflectors `track_id` (K,) in `past` records, NaN where
+    they were not seen."""
+    found = np.full((2, len(past), len(track_id)), np.nan)
+    every = np.concatenate([one.track_id for one in past])
+    row = np.repeat(np.arange(len(past)), [len(one.track_id) for one in past])
+    order = np.argsort(track_id)
+    place = np.minimum(np.searchsorted(track_id, every, sorter=order), len(track_id) - 1)
+    column = order[place]
+    use = track_id[column] == every
+    for values, name in zip(found, ('depth', 'variance')):
+        values[row[use], column[use]] = np.concatenate([getattr(one, name) for one in past])[use]
+    return tuple(found)
 
 
 def _density(x: FloatArray, variance: FloatArray, span: float) -> FloatArray:

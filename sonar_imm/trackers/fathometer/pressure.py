@@ -3,19 +3,92 @@
 Blocks may have any length; snapshots run on across them. Between blocks that do not meet the
 snapshot that was being filled is given up, and what was averaged before goes on to count; after a
 gap longer than a record, it does not.
+
+Where the length of a snapshot is not given, it follows from the deepest depth that is tracked and
+from how many snapshots the array needs (`automatic_snapshot`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...acoustics.spectra import Average, BlockAverage, SlidingAverage, SnapshotStream
+from ...acoustics.spectra import (
+    Average,
+    BlockAverage,
+    effective_snapshots,
+    SlidingAverage,
+    SnapshotStream,
+)
 from ...measurements import CrossSpectra, Pressure, Rejection
+from ...measurements.fathometer import MAX_FREQUENCIES
 from .config import FathometerConfig
+
+LEAST_REACH, MOST_REACH = 10.0, 12_000.0
+"""m below the array for which automatic snapshots are made, whatever depths are told."""
+MAX_BYTES = 1 << 30
+"""Of what waits for the end of a record: samples, cross-spectra, snapshots of the preview."""
+_SAMPLES_AT_ONCE = 1 << 24
+_MOST_WAYS, _LEAST_WAYS, _SNAPSHOTS_PER_PHONE = 7.0, 5.0, 2.5
+
+
+class Collected(NamedTuple):
+    """Cross-spectra of a record; snapshots: how many independent ones they are worth; seconds:
+    length of a snapshot of pressure; depth_std: how much the told depth of the array varied
+    between the blocks, m, 0 when not told."""
+
+    spectra: CrossSpectra
+    snapshots: float
+    seconds: float = 0.0
+    depth_std: float = 0.0
+
+
+class _Depths:
+    """Mean and standard deviation of told depths, each counted as often as it has samples."""
+
+    def __init__(self) -> None:
+        self._told = True
+        self._first, self._sums = 0.0, np.zeros(3)
+
+    def add(self, depth: float | None, samples: int) -> None:
+        self._told &= depth is not None
+        if depth is not None:
+            if not self._sums[0]:
+                self._first = depth
+            away = depth - self._first
+            self._sums += samples * np.array([1.0, away, away * away])
+
+    @property
+    def mean(self) -> float | None:
+        """None when a block did not tell one."""
+        if not self._told or not self._sums[0]:
+            return None
+        return self._first + float(self._sums[1] / self._sums[0])
+
+    @property
+    def std(self) -> float:
+        if not self._sums[0]:
+            return 0.0
+        _, mean, square = self._sums / self._sums[0]
+        return math.sqrt(max(0.0, square - mean * mean))
+
+
+def automatic_snapshot(config: FathometerConfig, hydrophones: int, reach: float) -> float:
+    """Length of a snapshot, s, to hear what lies `reach` m below hydrophone 0: seven times the way
+    there and back; when that leaves fewer than 2.5 snapshots for each hydrophone, as much shorter
+    as it takes, but not less than five times. Shorter ones bend the pulse, longer ones leave
+    cross-spectra of too few."""
+    way = 2.0 * min(max(reach, LEAST_REACH), MOST_REACH) / config.sound_speed
+    share = 1.0 - config.overlap
+    wanted = _SNAPSHOTS_PER_PHONE * hydrophones
+    wanted *= 1000 / effective_snapshots(config.window, config.overlap, 1000)
+    enough = config.record_seconds / (share * wanted + config.overlap)
+    seconds = min(max(enough, _LEAST_WAYS * way), _MOST_WAYS * way)
+    return min(seconds, config.record_seconds)
 
 
 class PressureStream:
@@ -28,51 +101,66 @@ class PressureStream:
         self._shape: tuple[int, float] | None = None
         self._next_ns = 0
 
-    def push(self, block: Pressure) -> tuple[list[CrossSpectra], list[CrossSpectra]]:
-        """Records and previews that `block` completes, each with the stamp of the block. Raises
-        `Rejection` for one without a living hydrophone in common with the record."""
-        self._follow(block)
+    def push(self, block: Pressure, reach: float) -> tuple[list[Collected], list[Collected]]:
+        """Records and previews that `block` completes, each with the stamp of the block. reach: m
+        from hydrophone 0 to the deepest depth that is tracked. Raises `Rejection` for a block
+        without a living hydrophone in common with the record, and for one that would take too much
+        memory."""
+        self._follow(block, reach)
         self._alive &= block.alive
-        spectra = self._snapshots.push(block.pressure)
-        records = [self._record(one, block) for one in self._blocks.push(spectra)]
-        sliding = self._sliding.push(spectra) if self._sliding else []
-        previews = [] if records else [self._record(one, block) for one in sliding[-1:]]
+        self._depths.add(block.reference_depth, len(block))
+        records, previews = [], []
+        size = max(self._snapshots.length, _SAMPLES_AT_ONCE // block.hydrophones)
+        for first in range(0, len(block), size):
+            spectra = self._snapshots.push(block.pressure[first : first + size])
+            records += [self._record(one, block) for one in self._blocks.push(spectra)]
+            sliding = self._sliding.push(spectra) if self._sliding else []
+            previews = [self._record(one, block) for one in sliding[-1:]] or previews
         if records:
             self._alive = block.alive.copy()
-        return records, previews
+            self._depths = _Depths()
+        return records, [] if records else previews
 
     @property
     def waiting(self) -> int:
         """Snapshots that wait for the rest of their record."""
         return 0 if self._shape is None else self._blocks.waiting
 
-    def _follow(self, block: Pressure) -> None:
+    def _follow(self, block: Pressure, reach: float) -> None:
         """Begin anew when the array is another one or time has leapt."""
         shape = block.hydrophones, block.sample_rate
         gap_ns = block.stamp_ns - self._next_ns
         if shape != self._shape:
             if self._shape is not None:
                 self.counts['restarted_array'] += 1
-            self._begin(block)
+            self._begin(block, reach)
         elif 2 * abs(gap_ns) > block.duration_ns:
             self.counts['gaps'] += 1
             self._snapshots.restart()
             if abs(gap_ns) > self.config.record_seconds * 1e9:
                 self.counts['records_abandoned'] += 1
-                self._begin(block)
+                self._begin(block, reach)
         self._next_ns = block.stamp_ns + block.duration_ns
 
-    def _begin(self, block: Pressure) -> None:
+    def _begin(self, block: Pressure, reach: float) -> None:
         config, rate = self.config, block.sample_rate
-        length = max(2, round(config.snapshot_seconds * rate))
+        # Nothing is kept of an array that is refused.
+        self._shape = None
+        seconds = config.snapshot_seconds or automatic_snapshot(config, block.hydrophones, reach)
+        length = max(2, round(seconds * rate))
         hop = max(1, round(length * (1.0 - config.overlap)))
+        if not config.snapshot_seconds:
+            # A whole number of them to a record, so that it ends where the pressure does.
+            samples = config.record_seconds * rate
+            hop = max(1, math.floor(samples / math.ceil(samples / hop - 1e-9) + 1e-9))
+            length = max(2, round(hop / (1.0 - config.overlap)))
         self._spacing = rate / length
         first = max(1, math.ceil(config.frequency_min / self._spacing - 1e-9))
         last = min(length // 2, math.floor(config.frequency_max / self._spacing + 1e-9))
         if last - first < 1:
             raise Rejection(
                 'bad_band',
-                f'{rate:g} samples a second in snapshots of {config.snapshot_seconds:g} s leave '
+                f'{rate:g} samples a second in snapshots of {seconds:g} s leave '
                 'less than 2 frequencies in the band',
             )
         straddling = math.ceil(length / hop) - 1
@@ -81,20 +169,35 @@ class PressureStream:
         self._snapshots = SnapshotStream(length, hop, slice(first, last + 1), config.window)
         self._blocks = BlockAverage(count, straddling)
         step = round(config.preview_seconds * rate / hop)
+        self._check_memory(block.hydrophones, length, last - first + 1, count if step else 0)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
         self._alive: NDArray[np.bool_] = np.ones(block.hydrophones, np.bool_)
+        self._depths = _Depths()
         self._shape = block.hydrophones, rate
 
-    def _record(self, average: Average, block: Pressure) -> CrossSpectra:
+    def _check_memory(self, phones: int, length: int, rows: int, kept: int) -> None:
+        needed = 4 * length * phones + 8 * rows * phones * (phones + kept)
+        if needed > MAX_BYTES or rows > MAX_FREQUENCIES:
+            raise Rejection(
+                'too_large',
+                f'{phones} hydrophones in snapshots of {length} samples with {rows} frequencies '
+                f'need {needed / 2**20:.0f} MiB; {MAX_BYTES >> 20} MiB and {MAX_FREQUENCIES} '
+                'frequencies at most: use shorter snapshots or a narrower band',
+            )
+
+    def _record(self, average: Average, block: Pressure) -> Collected:
         csdm = average.csdm.copy()
         # A hydrophone that failed in any of the blocks is out for the whole record.
         csdm[:, ~self._alive] = 0.0
         csdm[:, :, ~self._alive] = 0.0
-        return CrossSpectra(
+        spectra = CrossSpectra(
             stamp_ns=block.stamp_ns,
             frame_id=block.frame_id,
             frequency=self._frequency,
             csdm=csdm,
             snapshots=average.snapshots,
-            reference_depth=block.reference_depth,
+            reference_depth=self._depths.mean,
         )
+        config = self.config
+        worth = effective_snapshots(config.window, config.overlap, average.snapshots)
+        return Collected(spectra, worth, 1.0 / self._spacing, self._depths.std)

@@ -145,8 +145,8 @@ def relative_amplitude(
     below the array of length L, tau = 2 H / c, T the length of a snapshot. NaN when the depth of
     the array is not known."""
     height = reflectors.depth - response.reference_depth + reflectors.heave
-    share = 2.0 * height / (config.sound_speed * config.snapshot_seconds)
     with np.errstate(divide='ignore', invalid='ignore'):
+        share = 2.0 * height / (config.sound_speed * response.snapshot_seconds)
         taper = window_overlap(config.window, share) if response.aperture else 1.0
         return np.asarray(reflectors.amplitude * (2.0 * height + response.aperture) / taper)
 

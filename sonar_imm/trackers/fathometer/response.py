@@ -6,20 +6,17 @@ was, is put onto it: its `Response` is what the particles see.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from attrs import evolve, field, frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from ...acoustics import fathometer
-from ...acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
-from ...acoustics.spectra import noise_taper
+from ...acoustics.pulse import band_pulse, envelope_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...estimation.arrays import FloatArray
 from ...estimation.set_model import move_reach
 from ...estimation.set_shifts import Shift
-from ...measurements import CrossSpectra, Rejection, Trace
+from ...measurements import Rejection, Trace
 from ...parameters import ConfigError
 from .config import FathometerConfig
 
@@ -28,7 +25,7 @@ MAX_MOVES = 8_000_000
 """Of a lattice: cells times the cells that a reflector can move to. Each takes 16 bytes in the
 tables of moves, 32 where reflectors of either sign are looked for."""
 MAX_SIGMAS = 1e6
-_LEAST_NOISE_SAMPLES = 50
+LEAST_NOISE_SAMPLES = 50
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
 
 
@@ -55,7 +52,9 @@ class Response:
 
     depth, amplitude, sigma (n,): on the lattice, with the standard deviation of the noise.
     reference_depth: of the array, m, NaN when not known. aperture: length of the array, m, 0 for
-    traces. noise_unknown: sigma is that of the whole trace, reflectors included.
+    traces; snapshot_seconds: of what was averaged, 0 for traces. pulse: of this record, None for
+    the one that is configured. noise_unknown: sigma is that of the whole trace, reflectors
+    included.
     """
 
     stamp_ns: int
@@ -65,13 +64,18 @@ class Response:
     sigma: FloatArray = field(repr=False)
     reference_depth: float = np.nan
     aperture: float = 0.0
+    snapshot_seconds: float = 0.0
+    pulse: Pulse | None = field(default=None, repr=False)
     noise_unknown: bool = False
 
 
 def pulse_of(config: FathometerConfig) -> Pulse:
-    """The pulse that is configured. Raises `ConfigError` for a file that cannot be used."""
-    if config.pulse == 'band':
+    """The pulse that is configured, that of the band where each record has its own.
+    Raises `ConfigError` for a file that cannot be used."""
+    if config.pulse in ('band', 'processor'):
         return band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
+    if config.pulse == 'envelope':
+        return envelope_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
     if config.pulse == 'gaussian':
         return gaussian_pulse(config.pulse_width)
     try:
@@ -99,9 +103,14 @@ def lattice_of_trace(trace: Trace, config: FathometerConfig) -> Lattice:
 
 def lattice_of_array(reference_depth: float, config: FathometerConfig) -> Lattice:
     """The depths in the window. Raises `Rejection` when there are none."""
-    low, high = _window(config, (reference_depth + 10.0, reference_depth + 110.0))
+    low, high = depths_wanted(config, reference_depth)
     step = config.depth_step or config.sound_speed / (12.0 * config.frequency_max)
     return _checked(low, step, high, config)
+
+
+def depths_wanted(config: FathometerConfig, reference_depth: float) -> tuple[float, float]:
+    """First and last depth to be tracked below an array, m."""
+    return _window(config, (reference_depth + 10.0, reference_depth + 110.0))
 
 
 def trace_response(
@@ -113,7 +122,7 @@ def trace_response(
     noise_unknown = False
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)
     quiet &= np.isfinite(trace.amplitude)
-    if np.count_nonzero(quiet) < _LEAST_NOISE_SAMPLES:
+    if np.count_nonzero(quiet) < LEAST_NOISE_SAMPLES:
         quiet = np.isfinite(trace.amplitude)
     if config.remove_background:
         amplitude = amplitude - np.median(amplitude[quiet])
@@ -126,7 +135,7 @@ def trace_response(
             finite = np.isfinite(trace.sigma)
             sigma = np.interp(depth, trace.depth[finite], trace.sigma[finite])
         else:
-            sigma[:] = _measured_sigma(amplitude[quiet])
+            sigma[:] = measured_sigma(amplitude[quiet])
             noise_unknown = config.noise_from_mirror
     return Response(
         trace.stamp_ns,
@@ -139,147 +148,18 @@ def trace_response(
     )
 
 
-def array_response(
-    record: CrossSpectra, lattice: Lattice, config: FathometerConfig, reference_depth: float
-) -> Response:
-    """Look up and down with the array and correlate. Raises `Rejection` ('bad_band',
-    'bad_frequency', 'singular', 'no_noise')."""
-    gamma, first, spacing, aperture = array_coherence(record, config)
-
-    def at(low: float, step: float, count: int) -> FloatArray:
-        return fathometer.depth_response(
-            gamma, first, spacing, (low, step, count), reference_depth, config.sound_speed
-        )
-
-    def taper(depth: FloatArray) -> FloatArray:
-        way = 2.0 * (depth - reference_depth) / config.sound_speed
-        return noise_taper(config.window, config.overlap, way / config.snapshot_seconds)
-
-    b = at(lattice.first, lattice.step, lattice.cells)
-    # Nearer than its own length the array hears itself.
-    b[lattice.depth - reference_depth < aperture] = 0.0
-    sigma = np.full(lattice.cells, config.noise_sigma)
-    if not config.noise_sigma and config.noise_from_mirror:
-        sigma[:] = mirror_sigma(at, lattice, reference_depth, aperture)
-    elif not config.noise_sigma:
-        span = config.noise_depth_max - config.noise_depth_min
-        step = max(lattice.step, span / MAX_CELLS)
-        low = max(config.noise_depth_min, reference_depth + 2.0 * aperture)
-        quiet = Lattice(low, step, max(int(span / step), _LEAST_NOISE_SAMPLES))
-        # The deeper, the less is left of the noise, too: it is measured deeper than it is needed.
-        flat = at(quiet.first, quiet.step, quiet.cells) / taper(quiet.depth)
-        sigma = _measured_sigma(flat) * taper(lattice.depth)
-    return Response(
-        record.stamp_ns,
-        record.frame_id,
-        lattice.depth,
-        b,
-        sigma,
-        reference_depth,
-        aperture,
-    )
-
-
-def mirror_sigma(
-    at: Callable[[float, float, int], FloatArray],
-    lattice: Lattice,
-    reference_depth: float,
-    aperture: float,
-) -> float:
-    """Noise of a response where it holds no echo: at the lags of the lattice, negative, that is at
-    the depths 2 reference_depth - z. It fades there as it does on the lattice. Left out: what is
-    nearer than the aperture. at(first, step, count): the response."""
-    # A short lattice is made longer.
-    count = max(lattice.cells, 4 * _LEAST_NOISE_SAMPLES)
-    first = 2.0 * reference_depth - lattice.first - lattice.step * (count - 1)
-    depth = first + lattice.step * np.arange(count)
-    quiet = reference_depth - depth >= aperture
-    if np.count_nonzero(quiet) < _LEAST_NOISE_SAMPLES:
-        raise Rejection('no_noise', 'nothing of the mirrored depths is free of the array itself')
-    noise = at(first, lattice.step, count)[quiet]
-    # The noise of a coherence has mean zero: no median of it is taken off.
-    return _measured_sigma(np.append(noise, -noise))
-
-
 def residual_sigma(response: Response, fitted: FloatArray) -> Response:
     """`response` with the noise that is left where the reflectors' own response `fitted` (n,) is
     taken off; as it was when that has no noise."""
     heard = response.amplitude != 0.0
     try:
-        sigma = _measured_sigma((response.amplitude - fitted)[heard])
+        sigma = measured_sigma((response.amplitude - fitted)[heard])
     except Rejection:
         return response
     return evolve(response, sigma=np.full(len(response.depth), sigma))
 
 
-def array_coherence(
-    record: CrossSpectra, config: FathometerConfig
-) -> tuple[NDArray[np.complexfloating], float, float, float]:
-    """gamma (F,) at the frequencies ``first + spacing * row``, NaN where there is none; first and
-    spacing in Hz; and the length of the array, m."""
-    rows = np.flatnonzero(
-        (record.frequency >= config.frequency_min - 1e-6)
-        & (record.frequency <= config.frequency_max + 1e-6)
-    )
-    if len(rows) < 2:
-        raise Rejection(
-            'bad_band',
-            f'{len(rows)} frequencies lie between {config.frequency_min:g} Hz and '
-            f'{config.frequency_max:g} Hz; 2 are needed',
-        )
-    index, spacing = _comb(record.frequency[rows])
-    use = record.usable[rows]
-    if not use.any():
-        raise Rejection('nan', 'no frequency of the band has only finite, positive powers')
-    if config.processor == 'mvdr' and config.loading < 1e-9 and rank_deficient(record):
-        raise Rejection('singular', _SINGULAR)
-    alive = np.flatnonzero(record.alive)
-    heights = config.element_spacing * alive
-    csdm = record.csdm[rows[use]][:, alive[:, None], alive]
-    w = fathometer.steering(record.frequency[rows[use]], heights, config.sound_speed)
-    try:
-        heard = fathometer.coherence(
-            csdm,
-            w,
-            config.processor,
-            loading=config.loading,
-            gain_db=config.white_noise_gain_db,
-        )
-    except np.linalg.LinAlgError:
-        heard = np.full(len(csdm), np.nan)
-    # A coherence above one is rounding: nothing was left of the matrix.
-    heard[np.abs(heard) > 1.0 + 1e-6] = np.nan
-    if not np.isfinite(heard).any():
-        raise Rejection('singular', _SINGULAR)
-    gamma = np.full(index[-1] + 1, np.nan, np.complex128)
-    gamma[index[use]] = heard
-    return gamma, float(record.frequency[rows[0]]), spacing, float(heights[-1] - heights[0])
-
-
-def rank_deficient(record: CrossSpectra) -> bool:
-    """True when the matrix in the middle of the band says less than its size: fewer snapshots than
-    hydrophones, or hydrophones that hear the same."""
-    middle = np.flatnonzero(record.usable)[record.usable.sum() // 2]
-    values = np.linalg.eigvalsh(record.csdm[middle][np.ix_(record.alive, record.alive)])
-    return bool(values[0] < 1e-6 * values[-1])
-
-
-def _comb(frequency: FloatArray) -> tuple[NDArray[np.int64], float]:
-    """Whole numbers (F,), from 0 on, and the spacing they multiply."""
-    apart = np.diff(frequency)
-    steps = np.round(apart / np.min(apart))
-    # The smallest of many distances in single precision is too small: round twice.
-    steps = np.round(apart / (apart[steps == 1.0].mean()))
-    index = np.append(0, np.cumsum(steps)).astype(np.int64)
-    spacing = float(frequency[-1] - frequency[0]) / float(index[-1])
-    if index[-1] > 1_000_000 or (
-        np.abs(frequency - frequency[0] - spacing * index).max() > 0.01 * spacing
-    ):
-        raise Rejection('bad_frequency', 'the frequencies are no multiples of one spacing')
-    return index, spacing
-
-
-def _measured_sigma(quiet: FloatArray) -> float:
+def measured_sigma(quiet: FloatArray) -> float:
     sigma = fathometer.noise_sigma(quiet)
     if not sigma > 0.0:
         # Coarse steps of a converter leave no deviation of the median.

@@ -18,7 +18,6 @@ reflector identification with multiple model particle filtering*.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right, insort
 from collections import deque
 import math
 from typing import Any
@@ -34,9 +33,11 @@ from ...estimation.set_members import find_members
 from ...estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
+from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
+from .array_response import array_response, rank_deficient
 from .config import FathometerConfig
 from .multiples import Multiples
-from .pressure import PressureStream
+from .pressure import Collected, PressureStream
 from .reflectors import (
     IdArray,
     Identified,
@@ -48,22 +49,19 @@ from .reflectors import (
     write_estimate,
 )
 from .response import (
-    array_response,
+    depths_wanted,
     heave_shift,
     Lattice,
     lattice_of_array,
     lattice_of_trace,
     MAX_SIGMAS,
     pulse_of,
-    rank_deficient,
     residual_sigma,
     Response,
     trace_response,
 )
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
-
-_DEPTHS_KEPT = 10_000
 
 
 @frozen(eq=False)
@@ -92,7 +90,7 @@ class FathometerTracker:
         self.counts = self._stream.counts
         self.response: Response | None = None
         self._ids = Identities()
-        self._array_depths: list[tuple[int, float]] = []
+        self._depths = ToldDepths()
         self._forget()
 
     def _forget(self) -> None:
@@ -138,9 +136,14 @@ class FathometerTracker:
         noise, most probable number of reflectors; and hydrophones left out, snapshots waiting."""
         return {**self._health, 'snapshots_waiting': float(self._pressure.waiting)}
 
+    def warnings(self) -> list[str]:
+        """What of the input leads to estimates that are worse than they say."""
+        return array_warnings(self.counts)
+
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
-            self._hear_depth(measurement)
+            self._depths.hear(measurement)
+            self.counts['array_depths'] += 1
             return []
         admitted = self._stream.admit(measurement)
         if admitted.restarted:
@@ -165,12 +168,21 @@ class FathometerTracker:
             return self._record(trace_response(item, self._heard, self.config, reference))
         self._count_hydrophones(item)
         if isinstance(item, CrossSpectra):
-            return self._record(self._hear(item, 0))
-        records, previews = self._pressure.push(item)
+            return self._record(self._hear(Collected(item, item.snapshots), 0))
+        records, previews = self._pressure.push(item, self._reach(item))
         self.counts['blocks'] += 1
         span_ns = round(self.config.record_seconds * 1e9)
         estimates = [one for each in records for one in self._record(self._hear(each, span_ns))]
         return estimates + [self._preview(self._hear(each, span_ns)) for each in previews]
+
+    def _reach(self, block: Pressure) -> float:
+        """From hydrophone 0 to the deepest depth that is tracked, m."""
+        depth = block.reference_depth
+        if depth is None:
+            depth = self._depths.nearest(block.stamp_ns, self.config) or self.config.array_depth
+        if self._lattice is not None:
+            return float(self._lattice.depth[-1]) - depth
+        return depths_wanted(self.config, depth)[1] - depth
 
     def _count_hydrophones(self, item: Pressure | CrossSpectra) -> None:
         if self._hydrophones and item.hydrophones != self._hydrophones:
@@ -183,41 +195,35 @@ class FathometerTracker:
             self.counts['dead_hydrophones_masked'] += 1
         self._health['dead_hydrophones'] = float((~item.alive).sum())
 
-    # -- where the array is -----------------------------------------------------------------------
-
-    def _hear_depth(self, depth: ArrayDepth) -> None:
-        insort(self._array_depths, (depth.stamp_ns, depth.depth))
-        del self._array_depths[:-_DEPTHS_KEPT]
-        self.counts['array_depths'] += 1
-
     def _array_depth(self, item: CrossSpectra | Trace, span_ns: int) -> float | None:
-        """As the record says; else the mean of what the companion said over `span_ns` before its
-        stamp; else the companion's nearest word, unless too old; else as configured."""
+        """As the record says; else as the companion does; else as configured."""
         if item.reference_depth is not None:
             return item.reference_depth
-        stamps = [stamp for stamp, _ in self._array_depths]
-        low = bisect_left(stamps, item.stamp_ns - span_ns)
-        high = bisect_right(stamps, item.stamp_ns)
-        if high > low:
-            return float(np.mean([depth for _, depth in self._array_depths[low:high]]))
-        near = self._array_depths[max(0, low - 1) : high + 1]
-        if near:
-            stamp, depth = min(near, key=lambda one: abs(one[0] - item.stamp_ns))
-            if abs(stamp - item.stamp_ns) <= self.config.array_depth_age * 1e9:
-                return depth
-        self.counts['array_depth_unknown'] += not self.config.array_depth
-        return self.config.array_depth or None
+        depth = self._depths.over(item.stamp_ns, span_ns, self.config)
+        if depth is None:
+            self.counts['array_depth_unknown'] += not self.config.array_depth
+            depth = self.config.array_depth or None
+        return depth
 
     # -- one record -------------------------------------------------------------------------------
 
-    def _hear(self, record: CrossSpectra, span_ns: int) -> Response:
+    def _hear(self, collected: Collected, span_ns: int) -> Response:
+        record = collected.spectra
         if rank_deficient(record):
             self.counts['rank_deficient'] += 1
+        self.counts['few_snapshots'] += bool(0.0 < collected.snapshots < record.alive.sum())
+        spread = max(collected.depth_std, self._depths.spread(record.stamp_ns, span_ns))
+        self.counts['heave_within_record'] += spread > MOST_HEAVE
         depth = self._array_depth(record, span_ns) or 0.0
         if self._lattice is None:
             self._begin(lattice_of_array(depth, self.config))
         assert self._heard is not None
-        return array_response(record, self._heard, self.config, depth)
+        # Lags beyond half a snapshot are those of the other side: automatic snapshots of pressure
+        # can be too short for the depths of noise.
+        way = 2.0 * (self.config.noise_depth_max - depth) / self.config.sound_speed
+        folded = span_ns > 0 and not self.config.snapshot_seconds
+        folded = folded and way > 0.5 * collected.seconds
+        return array_response(record, self._heard, self.config, depth, mirrored=folded)
 
     def _begin(self, lattice: Lattice) -> None:
         try:
@@ -247,7 +253,12 @@ class FathometerTracker:
         with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
             b = np.clip(response.amplitude / response.sigma, -MAX_SIGMAS, MAX_SIGMAS)
         b = np.ascontiguousarray(np.nan_to_num(b))
-        return self._filter.step(self._before, b, (self.config.seed, response.stamp_ns))
+        key, gram = (self.config.seed, response.stamp_ns), None
+        if response.pulse is not None:
+            assert self._lattice is not None
+            lags = self._lattice.step * np.arange(self._lattice.cells)
+            gram = np.ascontiguousarray(response.pulse(lags))
+        return self._filter.step(self._before, b, key, gram)
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step = self._try(response)
@@ -322,7 +333,8 @@ class FathometerTracker:
         if self._filter.model.shift:
             mean, std = self._filter.shift(w, sets)
             heave = self._lattice.step * mean, self._lattice.step * std
-        found = reflectors_of(members, response, self._lattice, self.pulse, self.config, heave)
+        pulse = response.pulse or self.pulse
+        found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
         return found, pmf
 
 

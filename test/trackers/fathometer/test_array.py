@@ -7,16 +7,27 @@ import pytest
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.simulation.fathometer.simulator import scenario, simulate
-from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
+from sonar_imm.trackers.fathometer.array_response import array_response
+from sonar_imm.trackers.fathometer.response import lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
-SMALL = {'phones': 8, 'element_spacing': 0.36, 'frequency_max': 2000.0, 'particles': 2000}
+SMALL = {**scenario('small').told(), 'particles': 2000}
 
 
 @pytest.fixture(scope='module')
 def pressure_scene():
-    config = scenario('pressure', {'phones': 12, 'sample_rate': 6000.0, 'frequency_max': 2000.0})
-    return simulate(evolve(config, snapshot_seconds=0.7), 1)
+    changes = {
+        'records': 1,
+        'record_seconds': 9.8,
+        'phones': 12,
+        'element_spacing': 0.18,
+        'frequency_max': 2000.0,
+        'steps_per_sigma': 0.0,
+        'block_seconds': 0.7,
+        'array_depth': 73.5,
+        'first_depth': 130.0,
+    }
+    return simulate(scenario('pressure', changes), 1)
 
 
 PRESSURE = {
@@ -81,6 +92,7 @@ def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
 def test_the_noise_is_measured_right_though_it_fades_with_depth():
     """What windows do to noise: between 180 m and 300 m there is an eighth less of it."""
     options = {'phones': 8, 'frequency_max': 2900.0, 'depth_min': 122.0, 'depth_max': 172.0}
+    options['snapshot_seconds'] = 1.4
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(4):

@@ -11,9 +11,10 @@ import pytest
 from sonar_imm.acoustics.fathometer import depth_response
 from sonar_imm.measurements import Pressure, Rejection, Trace
 from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.fathometer.array_response import array_response, mirror_sigma
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import array_response, Lattice, mirror_sigma
+from sonar_imm.trackers.fathometer.response import Lattice
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
@@ -47,7 +48,8 @@ def test_response_and_noise_from_pressure_are_those_of_the_vectors(vectors, reco
         pressure=vectors['p'][record] * vectors['scale'][record],
         sample_rate=float(vectors['sample_rate']),
     )
-    (spectra,), _ = PressureStream(config, Counter()).push(block)
+    (collected,), _ = PressureStream(config, Counter()).push(block, 40.0)
+    spectra = collected.spectra
     assert spectra.snapshots == vectors['snapshots']
     found = array_response(spectra, lattice, config, float(vectors['array_depth'][record]))
     expected = vectors['response'][record]

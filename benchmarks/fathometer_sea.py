@@ -1,0 +1,150 @@
+"""The fathometer at sea: pressure against cross-spectra of the same model, run by run.
+
+    python -m benchmarks.fathometer_sea --runs 8 --out docs/results/fathometer_sea.json
+
+The scene: 16 hydrophones 0.25 m apart, 100 Hz to 2800 Hz, at 30 m and half a metre about it, told
+to 0.03 m; layers of amplitude 0.35, 0.25 and 0.2 at 52 m, 58.5 m and 66 m that walk by 0.05 m from
+record to record; ships and noise of the hydrophones. Pressure is drawn from the cross-spectral
+model over each whole record, in whole numbers of 2.5 steps to a standard deviation where it says
+so; cross-spectra are drawn from the same model frequency by frequency, of as many snapshots as fit
+into the record side by side, which gives a response of the same noise; "as at one frequency" means
+as many as the overlapping ones of the pressure are worth at one frequency (but not over all, since
+the window makes neighbouring frequencies alike). Every row has the same floors. P is the share of
+records whose number of reflectors is right, OSPA of second order with a cutoff of 2 m; SNR the
+median amplitude of each layer in units of the noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from attrs import evolve
+import numpy as np
+
+from benchmarks.tables import markdown, write_json
+from sonar_imm.acoustics.spectra import effective_snapshots
+from sonar_imm.estimation.consistency import ospa
+from sonar_imm.simulation.fathometer.scenario import Drift, FathometerScenario
+from sonar_imm.simulation.fathometer.simulator import cross_spectra, pressure_blocks, scenario
+from sonar_imm.trackers.fathometer.pressure import automatic_snapshot
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+
+LAYERS, AMPLITUDES = np.array([52.0, 58.5, 66.0]), np.array([0.35, 0.25, 0.2])
+SETTLED = 4
+"""Records after which a run is scored once more."""
+MIRROR: dict[str, Any] = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+ROWS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    '8 s, pressure': ('pressure', {}, {}),
+    '8 s, cross-spectra': ('csdm', {}, MIRROR),
+    '8 s, cross-spectra, as at one frequency': ('csdm at one frequency', {}, MIRROR),
+    '8 s, pressure, int8': ('pressure', {'steps_per_sigma': 2.5}, {}),
+    '8 s, pressure, pulse of the processor': ('pressure', {}, {'pulse': 'processor'}),
+    '8 s, pressure, snapshots of 1.4 s': (
+        'pressure',
+        {},
+        {'snapshot_seconds': 1.4, **MIRROR},
+    ),
+    '20 s, pressure': ('pressure', {'record_seconds': 20.0, 'records': 20}, {}),
+    '20 s, cross-spectra': ('csdm', {'record_seconds': 20.0, 'records': 20}, MIRROR),
+    '20 s, pressure, conventional': (
+        'pressure',
+        {'record_seconds': 20.0, 'records': 20},
+        {'processor': 'conventional'},
+    ),
+}
+"""Name: level, what differs of the scene, what differs of the tracker."""
+
+
+def floor_of(config: FathometerScenario, seed: int) -> Drift:
+    rng = np.random.default_rng([seed, 0])
+    T = config.records
+    depth = LAYERS + np.cumsum(0.05 * rng.standard_normal((T, 3)), axis=0)
+    array = config.array_depth + rng.uniform(-0.5, 0.5, T)
+    told = array + config.array_depth_std * rng.standard_normal(T)
+    amplitude = np.tile(AMPLITUDES, (T, 1))
+    return Drift(depth, amplitude, amplitude > 0.0, array, told)
+
+
+def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -> dict[str, Any]:
+    """One run; numbers of each record."""
+    kind = level.split()[0]
+    config = scenario('pressure', {'level': kind, 'steps_per_sigma': 0.0, **scene})
+    floor, rng = floor_of(config, seed), np.random.default_rng([seed, 1])
+    told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
+    told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
+    told.pop('snapshot_seconds', None)
+    settings = FathometerConfig(**{**told, **options}, seed=seed)
+    if kind == 'csdm':
+        seconds = automatic_snapshot(
+            settings, config.phones, config.depth_max - config.array_depth
+        )
+        count = int(config.record_seconds / seconds / (1.0 - settings.overlap)) - 1
+        worth = round(effective_snapshots(settings.window, settings.overlap, count))
+        if level == 'csdm':
+            worth = round(config.record_seconds / seconds)
+        config = evolve(config, snapshot_seconds=seconds, snapshots=worth)
+        # Drawn frequency by frequency, their noise does not fade.
+        settings = evolve(settings, window='rectangular', overlap=0.0)
+    tracker = FathometerTracker(settings)
+    right, distance, snr = [], [], []
+    for record in range(config.records):
+        depth = float(floor.array_depth_told[record])
+        if kind == 'csdm':
+            measured: list[Any] = [cross_spectra(config, floor, record, depth, rng)]
+        else:
+            measured = pressure_blocks(config, floor, record, depth, rng)
+        found = [one for each in measured for one in tracker.process(each)]
+        for estimate in found:
+            z = estimate.state[np.isfinite(estimate.state[:, 0])]
+            order = settings.order_min + int(estimate.probabilities[0].argmax())
+            right.append(float(order == len(LAYERS)))
+            distance.append(ospa(z[:, :1], floor.depth[record][:, None], cutoff=2.0, order=2.0))
+            near = np.abs(z[:, :1] - floor.depth[record]) < 0.4
+            sigma = float(estimate.extras['sigma'][0])
+            snr.append(
+                [z[near[:, k], 1].max() / sigma if near[:, k].any() else np.nan for k in range(3)]
+            )
+    return {'right': right, 'ospa': distance, 'snr': snr, 'counts': dict(tracker.counts)}
+
+
+def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
+    def mean(name: str, first: int) -> tuple[float, float]:
+        each = [float(np.mean(one[name][first:])) for one in runs]
+        return float(np.mean(each)), float(np.std(each) / max(1, len(each) - 1) ** 0.5)
+
+    row: dict[str, float] = {}
+    for first, label in ((0, ''), (SETTLED, f' from record {SETTLED}')):
+        for name, title in (('right', 'P'), ('ospa', 'OSPA')):
+            value, error = mean(name, first)
+            row[f'{title}{label}'] = value
+            row[f'{title}{label}, s.e.'] = error
+    snr = np.nanmedian(np.concatenate([one['snr'] for one in runs]), axis=0)
+    return row | {f'SNR {k + 1}': float(value) for k, value in enumerate(snr)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--runs', type=int, default=8, help='of 8 s; of 20 s half as many')
+    parser.add_argument('--particles', type=int, default=4000)
+    parser.add_argument('--rows', nargs='*', help='only rows with one of these words in the name')
+    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
+    options = parser.parse_args()
+    table, made = {}, {}
+    for name, (level, scene, changes) in ROWS.items():
+        if options.rows and not any(word in name for word in options.rows):
+            continue
+        count = options.runs if name.startswith('8 s') else max(1, options.runs // 2)
+        given = {'particles': options.particles, **changes}
+        runs = [run(level, scene, given, seed) for seed in range(count)]
+        table[name], made[name] = {'runs': count, **row_of(runs)}, count
+        print(f'{name}: {table[name]}', flush=True)
+    print(f'\n{markdown(table)}')
+    write_json(options.out, {'particles': options.particles, 'table': table})
+
+
+if __name__ == '__main__':
+    main()

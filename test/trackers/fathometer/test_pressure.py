@@ -1,0 +1,253 @@
+"""From pressure to cross-spectra: how long a snapshot is, what is warned of, what is refused."""
+
+from collections import Counter
+from pathlib import Path
+
+from attrs import evolve
+from helpers.fathometer_runs import run
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.spectra import effective_snapshots, window_of
+from sonar_imm.measurements import ArrayDepth, Pressure, Rejection
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.fathometer.field import expected_csdm
+from sonar_imm.simulation.fathometer.scenario import Drift
+from sonar_imm.simulation.fathometer.simulator import scenario
+from sonar_imm.trackers.fathometer.array_response import array_coherence, processor_pulse
+from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm.trackers.fathometer.pressure import automatic_snapshot, MAX_BYTES, PressureStream
+from sonar_imm.trackers.fathometer.response import Lattice
+
+SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
+SHORT = {
+    'phones': 6,
+    'frequency_max': 900.0,
+    'record_seconds': 4.0,
+    'depth_min': 85.0,
+    'depth_max': 100.0,
+    'particles': 100,
+}
+
+
+def noise(seconds, *, rate=2000.0, phones=6, depths=None, block=0.5, start=10**18, seed=0):
+    """Blocks of white noise; depths: told of the array, one for each block."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds / block)
+    return [
+        Pressure(
+            stamp_ns=start + round(k * block * 1e9),
+            frame_id='array',
+            pressure=rng.standard_normal((round(block * rate), phones)),
+            sample_rate=rate,
+            reference_depth=80.0 if depths is None else depths[k],
+        )
+        for k in range(count)
+    ]
+
+
+# -- the length of a snapshot ---------------------------------------------------------------------
+
+
+def test_a_snapshot_is_as_long_as_the_depths_need_and_the_array_allows():
+    config = FathometerConfig(record_seconds=89.6)
+    way = 2.0 * 30.0 / 1500.0
+    assert automatic_snapshot(config, 16, 30.0) == pytest.approx(7.0 * way)
+    # In 10 s, 2.5 snapshots for each hydrophone make it shorter, but not below five ways.
+    short = evolve(config, record_seconds=10.0)
+    seconds = automatic_snapshot(short, 30, 30.0)
+    assert 5.0 * way < seconds < 7.0 * way
+    count = 2.0 * 10.0 / seconds - 1.0
+    assert 0.947 * count == pytest.approx(2.5 * 30, rel=0.01)
+    assert automatic_snapshot(short, 40, 30.0) == pytest.approx(5.0 * way)
+    assert automatic_snapshot(evolve(config, record_seconds=0.1), 32, 30.0) == 0.1
+    # Whatever depth is told: 10 m to 12 km.
+    assert automatic_snapshot(config, 3, -1e9) == automatic_snapshot(config, 3, 10.0)
+    assert automatic_snapshot(evolve(config, record_seconds=1e4), 3, 1e9) < 113.0
+
+
+def test_what_overlapping_snapshots_are_worth():
+    assert effective_snapshots('rectangular', 0.0, 40) == 40.0
+    assert effective_snapshots('hann', 0.5, 1000) == pytest.approx(947.0, abs=1.0)
+    # Drawn: the variance of a mean power against that of one.
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((4000, 64 * 6)) + 1j * rng.standard_normal((4000, 64 * 6))
+    window = window_of('hann', 64)
+    power = [np.abs(x[:, k : k + 64] @ window) ** 2 for k in range(0, 64 * 5 + 1, 16)]
+    worth = np.var(power[0]) / np.var(np.mean(power, axis=0))
+    assert effective_snapshots('hann', 0.75, len(power)) == pytest.approx(worth, rel=0.12)
+
+
+def test_the_tracker_takes_the_depths_it_tracks_and_the_mirror_window():
+    tracker, found = run(noise(8.0), **SHORT)
+    assert len(found) == 2
+    seconds = 7.0 * 2.0 * 20.0 / 1500.0
+    assert 0.95 * seconds < tracker.response.snapshot_seconds <= seconds
+    # 180 m to 300 m would lie beyond half a snapshot.
+    mirrored, _ = run(noise(8.0), **SHORT, noise_depth_min=0.0, noise_depth_max=0.0)
+    assert tracker.response.sigma[0] == mirrored.response.sigma[0]
+    given, _ = run(noise(8.0), **SHORT, snapshot_seconds=0.2)
+    assert given.response.sigma[0] != tracker.response.sigma[0]
+
+
+def test_a_companion_tells_how_far_down_snapshots_must_reach():
+    blocks = [evolve(one, reference_depth=None) for one in noise(4.0)]
+    told = ArrayDepth(stamp_ns=blocks[0].stamp_ns - 10**9, depth=70.0)
+    tracker, found = run([told, *blocks], **SHORT)
+    assert len(found) == 1 and tracker.response.reference_depth == 70.0
+    seconds = 7.0 * 2.0 * 30.0 / 1500.0
+    assert 0.95 * seconds < tracker.response.snapshot_seconds <= seconds
+
+
+def test_a_length_is_automatic_or_long_enough():
+    with pytest.raises(ConfigError, match='0.001'):
+        FathometerConfig(snapshot_seconds=1e-4)
+
+
+# -- warnings -------------------------------------------------------------------------------------
+
+
+def test_too_few_snapshots_are_said():
+    options = {**SHORT, 'record_seconds': 0.3}
+    tracker, _ = run(noise(2.0), **options)
+    assert tracker.counts['few_snapshots'] == tracker.counts['used'] > 1
+    assert len(tracker.warnings()) == 1 and 'hydrophones' in tracker.warnings()[0]
+    tracker, _ = run(noise(8.0), **SHORT)
+    assert not tracker.counts['few_snapshots'] and tracker.warnings() == []
+
+
+def test_an_array_that_heaves_within_a_record_is_said_and_its_mean_is_taken():
+    depths = 80.0 + 0.2 * np.sin(np.arange(8))
+    tracker, _ = run(noise(4.0, depths=depths), **SHORT)
+    assert tracker.counts['heave_within_record'] == 1
+    assert tracker.response.reference_depth == pytest.approx(depths.mean())
+    assert 'heaves' in tracker.warnings()[0]
+    still, _ = run(noise(4.0, depths=80.0 + 0.02 * np.sin(np.arange(8))), **SHORT)
+    assert not still.counts['heave_within_record'] and still.warnings() == []
+    # From record to record it may heave.
+    slow, _ = run(noise(8.0, depths=np.repeat([80.0, 81.0], 8)), **SHORT)
+    assert not slow.counts['heave_within_record'] and slow.counts['used'] == 2
+
+
+def test_heave_that_a_companion_tells_counts_as_well():
+    blocks = [evolve(one, reference_depth=None) for one in noise(4.0)]
+    told = [
+        ArrayDepth(stamp_ns=one.stamp_ns, depth=80.0 + 0.2 * (k % 2))
+        for k, one in enumerate(blocks)
+    ]
+    tracker, _ = run([x for pair in zip(told, blocks) for x in pair], **SHORT)
+    assert tracker.counts['heave_within_record'] == 1
+
+
+# -- bounds ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'rate, phones, options',
+    [
+        (1e7, 250, {'snapshot_seconds': 4.0}),  # 10^10 samples would wait for the first snapshot
+        (12e3, 250, {'snapshot_seconds': 3.0}),  # the cross-spectra
+        (12e3, 100, {'snapshot_seconds': 0.2, 'preview_seconds': 1.0, 'record_seconds': 86400.0}),
+        (1e6, 3, {'snapshot_seconds': 1.0, 'frequency_max': 4e5}),  # frequencies
+        (1.0, 6, {}),  # no frequency at all
+    ],
+)
+def test_arrays_that_would_take_too_much_are_refused_and_others_go_on(rate, phones, options):
+    given = {**SHORT, 'phones': 0, **options}
+    rng = np.random.default_rng(0)
+    hostile = Pressure(
+        stamp_ns=10**17, pressure=rng.standard_normal((100, phones)), sample_rate=rate
+    )
+    stream = PressureStream(FathometerConfig(**given), Counter())
+    with pytest.raises(Rejection) as refused:
+        stream.push(hostile, 20.0)
+    assert refused.value.reason in ('too_large', 'bad_band')
+    assert stream.waiting == 0
+    if not options:
+        tracker, found = run([hostile, *noise(4.0)], **{**given, 'phones': 6})
+        assert tracker.counts['bad_band'] == 1 and len(found) == 1
+
+
+def test_a_long_block_is_taken_in_pieces_with_the_same_result(monkeypatch):
+    from sonar_imm.trackers.fathometer import pressure
+
+    config = FathometerConfig(**SHORT)
+    (block,) = noise(8.0, block=8.0)
+    (whole, *_), _ = PressureStream(config, Counter()).push(block, 20.0)
+    monkeypatch.setattr(pressure, '_SAMPLES_AT_ONCE', 6 * 900)
+    (pieces, *_), _ = PressureStream(config, Counter()).push(block, 20.0)
+    assert pieces.spectra.snapshots == whole.spectra.snapshots
+    scale = np.abs(whole.spectra.csdm).max()
+    assert np.abs(pieces.spectra.csdm - whole.spectra.csdm).max() < 1e-5 * scale
+    assert MAX_BYTES <= 1 << 30
+
+
+# -- against the vectors --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def vectors():
+    with np.load(SEA / 'pressure.npz') as file:
+        return {name: file[name] for name in file}
+
+
+def collected(vectors, record):
+    config = FathometerConfig(
+        phones=16,
+        element_spacing=float(vectors['element_spacing']),
+        snapshot_seconds=float(vectors['snapshot_seconds']),
+        record_seconds=float(vectors['record_seconds']),
+        frequency_min=float(vectors['frequency_min']),
+        frequency_max=float(vectors['frequency_max']),
+    )
+    block = Pressure(
+        stamp_ns=1,
+        pressure=vectors['p'][record] * vectors['scale'][record],
+        sample_rate=float(vectors['sample_rate']),
+    )
+    (found,), _ = PressureStream(config, Counter()).push(block, 40.0)
+    return config, found
+
+
+@pytest.mark.parametrize('record', [0, 1])
+def test_spectrum_and_pulse_of_the_processor_are_those_of_the_vectors(vectors, record):
+    config, found = collected(vectors, record)
+    heard = array_coherence(found.spectra, config)
+    weight = heard.weight / heard.weight.max()
+    expected = vectors['weight'][record] / vectors['weight'][record].max()
+    assert np.abs(weight - expected).max() < 1e-4
+    step = float(vectors['depth'][1] - vectors['depth'][0])
+    pulse = processor_pulse(heard, Lattice(40.0, step, 320), 1500.0)
+    assert pulse(step * np.arange(320)) == pytest.approx(
+        vectors['pulse_processor'][record], abs=1e-4
+    )
+    # It is not the pulse of the band.
+    assert pulse(np.array([0.14]))[0] > 0.0
+
+
+@pytest.mark.parametrize('record', [0, 1])
+def test_the_model_of_the_scene_is_that_of_the_vectors_and_its_draw_scatters_as_it_should(
+    vectors, record
+):
+    """The record was drawn by another program; ships differ in shape by a thousandth."""
+    config = scenario('pressure', {'record_seconds': float(vectors['record_seconds'])})
+    amplitude = vectors['reflector_amplitude']
+    floor = Drift(
+        vectors['reflector_depth'],
+        amplitude,
+        amplitude > 0.0,
+        vectors['array_depth_true'],
+        vectors['array_depth'],
+    )
+    expected = vectors['csdm_expected'][record]
+    ours = expected_csdm(config, floor, record, vectors['csdm_frequency'])
+    power = np.sqrt(np.einsum('fii->fi', expected).real)
+    scale = power[:, :, None] * power[:, None, :]
+    assert (np.abs(ours - expected) / scale).max() < 2e-3
+    _, found = collected(vectors, record)
+    rows = np.searchsorted(found.spectra.frequency, vectors['csdm_frequency'] - 0.1)
+    sample = found.spectra.csdm[rows]
+    # Steps of eight bits, and the window's unit mean square, leave a level to be fitted.
+    level = np.einsum('fii->', sample).real / np.einsum('fii->', expected).real
+    scatter = np.sqrt(np.mean(np.square(np.abs(sample / level - expected) / scale)))
+    assert scatter == pytest.approx(1.0 / np.sqrt(found.snapshots), rel=0.2)
