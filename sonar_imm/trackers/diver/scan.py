@@ -82,15 +82,13 @@ class Scan:
 
     def learn(self) -> DiverState:
         """What is known now; the transitions have learnt from the tracks that were hit."""
-        hit = np.flatnonzero(self.nis_dof > 0)
-        learnt = self.before.learnt.copy()
-        shared = len(self.transition) == 1
-        learnt[hit] = self.chain.learn(
-            learnt[hit],
-            self.transition if shared else self.transition[hit],
-            self.models.by_model(self.before.mu)[hit],
-            self.models.by_model(self.mu)[hit],
+        learnt = self.chain.learn(
+            self.before.learnt,
+            self.transition,
+            self.models.by_model(self.before.mu),
+            self.models.by_model(self.mu),
             self.dt,
+            np.flatnonzero(self.nis_dof > 0),
         )
         return evolve(
             self.before,

@@ -20,7 +20,7 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...estimation import imm_kernels, jipda_kernels
+from ...estimation import adaptation_kernels, imm_kernels, jipda_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
@@ -73,6 +73,7 @@ class DiverTracker:
     def warm(self) -> None:
         imm_kernels.warm()
         jipda_kernels.warm()
+        adaptation_kernels.warm()
         # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
         rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
