@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
+from .association_kernels import count
 from .kalman import BoolArray, factorise, log_density
 
 
@@ -280,34 +281,21 @@ class Tracks:
         Returns the tracks that live on and the mask ``kept`` (T,) of those, to select the states
         that the caller keeps beside them.
         """
-        looked = np.ones(len(self), np.bool_) if looked is None else looked | hit
-        age = self.age + looked
-        before = _window(self.seen, rules.confirm_window)
-        seen = np.where(looked[:, None], np.column_stack([before[:, 1:], hit]), before)
-        misses = np.where(hit, 0, self.misses + looked)
-        last_hit_ns = np.where(hit, stamp_ns, self.last_hit_ns)
-        hits = seen.sum(axis=1)
-        confirmed = (self.status != TrackStatus.TENTATIVE) | (hits >= rules.confirm_hits)
-        status = np.where(
-            confirmed,
-            np.where(
-                hit, TrackStatus.CONFIRMED, np.where(looked, TrackStatus.COASTING, self.status)
-            ),
-            TrackStatus.TENTATIVE,
+        looked = np.ones(len(self), np.bool_) if looked is None else looked
+        *counted, kept = count(
+            self.age,
+            _window(self.seen, rules.confirm_window),
+            self.misses,
+            self.last_hit_ns,
+            self.status,
+            hit,
+            looked,
+            stamp_ns,
+            rules.confirm_hits,
+            rules.delete_misses,
+            rules.max_coast_ns,
         )
-        missed_in_window = np.minimum(age, rules.confirm_window) - hits
-        hopeless = missed_in_window > rules.confirm_window - rules.confirm_hits
-        ended = np.where(confirmed, misses >= rules.delete_misses, hopeless)
-        kept = ~ended & (stamp_ns - last_hit_ns <= rules.max_coast_ns)
-        return Tracks(
-            self.track_id[kept],
-            status[kept].astype(np.uint8),
-            age[kept],
-            seen[kept],
-            misses[kept],
-            last_hit_ns[kept],
-            self.next_id,
-        ), kept
+        return Tracks(self.track_id[kept], *counted, self.next_id), kept
 
     def none_left(self) -> Tracks:
         """No tracks any more; identities go on."""

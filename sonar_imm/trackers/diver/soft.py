@@ -63,15 +63,8 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
     hit = np.flatnonzero(detected > 0.5 * after)
     if len(hit):
         best = beta[hit].argmax(axis=1)
-        x, P, mu = scan.x[hit], scan.P[hit], scan.mu[hit]
-        scan.watch(x, P, mu, z[best], H, R[best], hit)
-        mean, covariance = imm_kernels.combine(x, P, mu, H[0])
-        innovation = z[best] - mean
-        scan.nis[hit] += np.einsum(
-            'ta,ta->t',
-            innovation,
-            np.linalg.solve(covariance + R[best], innovation[..., None])[..., 0],
-        )
+        scan.watch(group, hit, best, H)
+        scan.nis[hit] += np.square(scan.white[hit]).sum(axis=1)
         scan.nis_dof[hit] += np.uint16(2)
     scan.x, scan.P, scan.mu, repairs = jipda_kernels.update(
         scan.x, scan.P, scan.mu, h, H, z, R, beta, missed, ~scan.layout.mask

@@ -20,14 +20,19 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...estimation import adaptation_kernels, imm_kernels, jipda_kernels
+from ...estimation import (
+    adaptation_kernels,
+    association_kernels,
+    imm_kernels,
+    jipda_kernels,
+)
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks, TrackStatus
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
-from . import soft
+from . import fix_kernels, soft
 from .births import Birth, births_from_ping
 from .config import DiverConfig
 from .fix_consistency import FixConsistency
@@ -74,6 +79,8 @@ class DiverTracker:
         imm_kernels.warm()
         jipda_kernels.warm()
         adaptation_kernels.warm()
+        association_kernels.warm()
+        fix_kernels.warm()
         # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
         rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -170,7 +177,7 @@ class DiverTracker:
     def _prune(self, now: DiverState, items: Sequence[Measurement]) -> DiverState:
         """End the tracks that are over, broken, or too many."""
         config = self.config
-        sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
+        sound = fix_kernels.finite(now.x, now.P)
         broken = now.broken + int((~sound).sum())
         hit = now.nis_dof > 0
         looked = any(shows_all(item, config) for item in items) & (now.target_id == NOBODY)
