@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
-from .association_kernels import count
+from .association_kernels import COASTING, CONFIRMED, count, TENTATIVE
 from .kalman import BoolArray, factorise, log_density
 
 
@@ -190,9 +190,9 @@ def _solve_cluster(
 class TrackStatus(IntEnum):
     """State of a track. The numbers are those of the column ``track_state``."""
 
-    TENTATIVE = 0
-    CONFIRMED = 1
-    COASTING = 2
+    TENTATIVE = TENTATIVE
+    CONFIRMED = CONFIRMED
+    COASTING = COASTING
 
 
 @frozen
@@ -257,18 +257,19 @@ class Tracks:
 
     def born(self, count: int, stamp_ns: int, rules: TrackRules) -> Tracks:
         """Append `count` tracks, each with its first hit."""
-        seen = np.zeros((count, rules.confirm_window), np.bool_)
-        seen[:, -1] = True
-        status = TrackStatus.CONFIRMED if rules.confirm_hits == 1 else TrackStatus.TENTATIVE
+        window = rules.confirm_window
+        seen = np.zeros((len(self) + count, window), np.bool_)
+        seen[: len(self)] = _window(self.seen, window)
+        seen[len(self) :, -1] = True
+        track_id = np.arange(self.next_id, self.next_id + count, dtype=np.uint32)
+        status = np.full(count, CONFIRMED if rules.confirm_hits == 1 else TENTATIVE, np.uint8)
         return Tracks(
-            np.append(
-                self.track_id, np.arange(self.next_id, self.next_id + count, dtype=np.uint32)
-            ),
-            np.append(self.status, np.full(count, status, np.uint8)),
-            np.append(self.age, np.ones(count, np.int64)),
-            np.concatenate([_window(self.seen, rules.confirm_window), seen]),
-            np.append(self.misses, np.zeros(count, np.int64)),
-            np.append(self.last_hit_ns, np.full(count, stamp_ns, np.int64)),
+            np.concatenate([self.track_id, track_id]),
+            np.concatenate([self.status, status]),
+            np.concatenate([self.age, np.ones(count, np.int64)]),
+            seen,
+            np.concatenate([self.misses, np.zeros(count, np.int64)]),
+            np.concatenate([self.last_hit_ns, np.full(count, stamp_ns, np.int64)]),
             self.next_id + count,
         )
 
@@ -304,6 +305,8 @@ class Tracks:
     def only(self, kept: BoolArray) -> Tracks:
         """The tracks where `kept` (T,) is True. For callers that end tracks by rules of their
         own."""
+        if kept.all():
+            return self
         return evolve(
             self,
             track_id=self.track_id[kept],

@@ -10,8 +10,8 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 
-TENTATIVE, CONFIRMED, COASTING = np.uint8(0), np.uint8(1), np.uint8(2)
-"""As `association.TrackStatus`."""
+TENTATIVE, CONFIRMED, COASTING = 0, 1, 2
+"""The numbers of `association.TrackStatus`, plain: a scan asks for them often."""
 
 
 @kernel

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 import math
 
-from attrs import evolve
 import numpy as np
 
 from ...acoustics.multistatic import difference_projection
@@ -17,9 +16,8 @@ from ...estimation.association import (
     assign_by_rank,
     association_cost,
     gate_threshold,
-    TrackStatus,
 )
-from ...estimation.association_kernels import choose
+from ...estimation.association_kernels import choose, TENTATIVE
 from ...estimation.consider import consider_models
 from ...measurements import Arrivals, NOBODY
 from . import fix_kernels
@@ -69,14 +67,15 @@ class Scan:
         steps = list(cross(models, chain, before, self.dt, config.longest_step))
         self.x, self.P, self.mu, transition, *_ = steps[-1]
         self.repairs = sum(step.repairs for step in steps)
-        self.transition = np.linalg.matrix_power(transition, len(steps))
+        single = len(steps) == 1
+        self.transition = transition if single else np.linalg.matrix_power(transition, len(steps))
         self.nis = np.zeros(len(self.x))
         self.nis_dof = np.zeros(len(self.x), np.uint16)
         self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
         self.white = before.white.copy()
         self.fixes = before.fixes
-        self.tentative = before.life.status == TrackStatus.TENTATIVE
+        self.tentative = before.life.status == TENTATIVE
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
         self.named = before.target_id != NOBODY
@@ -93,9 +92,10 @@ class Scan:
             self.dt,
             np.flatnonzero(self.nis_dof > 0),
         )
-        return evolve(
-            self.before,
+        before = self.before
+        return DiverState(
             stamp_ns=self.stamp_ns,
+            life=before.life,
             x=self.x,
             P=self.P,
             mu=self.mu,
@@ -106,10 +106,14 @@ class Scan:
             scale=self.scale,
             existence=self.existence,
             evidence=self.evidence,
+            target_id=before.target_id,
+            near_to=before.near_to,
+            near_for=before.near_for,
             white=self.white,
             fixes=self.fixes,
+            broken=before.broken,
+            repairs=before.repairs + self.repairs,
             instruments=self.instruments,
-            repairs=self.before.repairs + self.repairs,
         )
 
     # -- fixes ---------------------------------------------------------------------------------
