@@ -83,30 +83,54 @@ def take(
 
 
 @kernel
+def keep_score(
+    score: FloatArray,
+    fit: FloatArray,
+    chosen: IntArray,
+    named: BoolArray,
+    missed: float,
+    gain: float,
+    log_clutter: float,
+) -> None:
+    """Add to score (T,), in place: ln of P_D N(nu; 0, S) / clutter for a hit, ln of 1 - P_D, which
+    is `missed`, for a miss; gain: ln of P_D / (1 - P_D). Not for tracks that are `named` (T,)."""
+    for t in range(len(score)):
+        if not named[t]:
+            score[t] += missed
+        if chosen[t] >= 0:
+            score[t] += fit[t, chosen[t]] + gain
+            score[t] -= log_clutter
+
+
+@kernel
 def watch(
-    mean: FloatArray,
-    covariance: FloatArray,
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    H: FloatArray,
     z: FloatArray,
     R: FloatArray,
     tracks: IntArray,
+    detection: IntArray,
     tentative: BoolArray,
     white: FloatArray,
     sums: Sums,
     memory: float,
 ) -> Sums:
-    """Whiten the innovations of fixes z (t, 2), R (t, 2, 2) that the mixture of their `tracks`
-    (t,) expects at mean (t, 2) with covariance (t, 2, 2): into white (T, 2), in place. Gives the
-    sums with those of confirmed tracks; tentative (T,)."""
+    """Whiten the innovations that the mixture of each of `tracks` (t,) sees in its `detection`
+    (t,), into white (T, 2), in place. Gives the sums with those of confirmed tracks, of which
+    about the last `memory` count; tentative (T,), the rest as in `take`."""
+    mean, covariance = imm_kernels.combine(x[tracks], P[tracks], mu[tracks], H[0])
     one, other = np.empty((len(tracks), 2)), np.empty((len(tracks), 2))
     count, pairs = 0, 0
     for k in range(len(tracks)):
-        t = tracks[k]
+        t, row = tracks[k], detection[k]
         # The inverse of the Cholesky factor of 2 x 2, written out.
-        a = math.sqrt(covariance[k, 0, 0] + R[k, 0, 0])
-        b = (covariance[k, 1, 0] + R[k, 1, 0]) / a
-        c = math.sqrt(covariance[k, 1, 1] + R[k, 1, 1] - b * b)
-        first = (z[k, 0] - mean[k, 0]) / a
-        second = (z[k, 1] - mean[k, 1] - b * first) / c
+        a = math.sqrt(covariance[k, 0, 0] + R[row, 0, 0])
+        b = (covariance[k, 1, 0] + R[row, 1, 0]) / a
+        c = math.sqrt(covariance[k, 1, 1] + R[row, 1, 1] - b * b)
+        first = (z[row, 0] - mean[k, 0]) / a
+        second = (z[row, 1] - mean[k, 1] - b * first) / c
         if not tentative[t] and math.isfinite(first) and math.isfinite(second):
             one[count, 0], one[count, 1] = first, second
             count += 1
@@ -138,5 +162,6 @@ def warm() -> None:
     H, z, R, first = P.copy(), np.zeros((1, 2)), np.eye(2)[None], np.zeros(1, np.int64)
     take(x, P, mu, expected(x, H), H, z, R, first, first, np.zeros(1), np.zeros(1, np.uint16))
     no, sums = np.zeros(1, np.bool_), (0.0, 0.0, 0.0, 0.0, 0.0)
-    watch(z, R, z, R, first, no, np.full((1, 2), np.nan), sums, 1.0)
+    watch(x, P, mu, H, z, R, first, first, no, np.full((1, 2), np.nan), sums, 1.0)
+    keep_score(np.zeros(1), z, first, no, 0.0, 0.0, 0.0)
     finite(x, P)

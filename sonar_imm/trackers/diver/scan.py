@@ -126,7 +126,11 @@ class Scan:
         if self.named.any():
             fit[self.named] = -np.inf  # they know their own
         chosen = self._associate(fit, group.clutter)
-        self._keep_score(fit, chosen, group.clutter)
+        p_detection = self.config.detection_probability
+        missed, gain = np.log1p(-p_detection), np.log(p_detection / (1.0 - p_detection))
+        fix_kernels.keep_score(
+            self.score, fit, chosen, self.named, missed, gain, np.log(group.clutter)
+        )
         tracks = np.flatnonzero(chosen >= 0)
         taken = np.zeros(len(group.z), bool)
         if len(tracks):
@@ -160,14 +164,6 @@ class Scan:
         rank = self.tentative.astype(np.int64)
         return assign_by_rank(target, detection, cost, rank, fit.shape[1])
 
-    def _keep_score(self, fit: FloatArray, chosen: IntArray, clutter: float) -> None:
-        """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""
-        p_detection = self.config.detection_probability
-        hit = np.flatnonzero(chosen >= 0)
-        self.score[~self.named] += np.log1p(-p_detection)
-        self.score[hit] += fit[hit, chosen[hit]] + np.log(p_detection / (1.0 - p_detection))
-        self.score[hit] -= np.log(clutter)
-
     def _update(
         self,
         group: Positions,
@@ -185,7 +181,13 @@ class Scan:
         else:
             innovation = z[detection][:, None, :] - h[tracks]
             x, P, mu, nis, ok = consider_models(
-                self.x[tracks], self.P[tracks], self.mu[tracks], innovation, H[0], R[detection], mask
+                self.x[tracks],
+                self.P[tracks],
+                self.mu[tracks],
+                innovation,
+                H[0],
+                R[detection],
+                mask,
             )
             self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
             self.nis[tracks] += np.where(ok, nis, 0.0)
@@ -201,14 +203,9 @@ class Scan:
         self, group: Positions, tracks: IndexArray, detection: IntArray, H: FloatArray
     ) -> None:
         """Keep account of whitened innovations, of the mixture as it was predicted."""
-        x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
-        mean, covariance = imm_kernels.combine(x, P, mu, H[0])
-        z, R = group.z[detection], group.R[detection]
-        self.fixes = FixConsistency(
-            *fix_kernels.watch(
-                mean, covariance, z, R, tracks, self.tentative, self.white, self.fixes.sums, MEMORY
-            )
-        )
+        where = group.z, group.R, tracks, detection, self.tentative, self.white
+        sums = fix_kernels.watch(self.x, self.P, self.mu, H, *where, self.fixes.sums, MEMORY)
+        self.fixes = FixConsistency(*sums)
 
     def _learn_scale(
         self, kind: int, residual: FloatArray, covariance: FloatArray, stated: FloatArray

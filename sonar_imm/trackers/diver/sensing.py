@@ -44,15 +44,16 @@ def position_groups(
         groups.append(_group(position, R * factor, config, factor, whole=config.fixes_are_scans))
     for scan in (item for item in items if isinstance(item, Fixes)):
         R = _covariances(scan, config) * factor
-        said = np.empty(0, np.intp)
-        if scan.target_id is not None:
-            said = np.flatnonzero(scan.target_id != NOBODY)
-            names, first = np.unique(scan.target_id[said], return_index=True)
-            rows = said[first]
-            if len(rows):
-                groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
+        if scan.target_id is None:
+            groups.append(_group(scan.position, R, config, factor))
+            continue
+        said = np.flatnonzero(scan.target_id != NOBODY)
+        names, first = np.unique(scan.target_id[said], return_index=True)
+        rows = said[first]
+        if len(rows):
+            groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
         if len(said) < len(scan) or not len(scan):
-            rows = np.setdiff1d(np.arange(len(scan)), said)
+            rows = np.flatnonzero(scan.target_id == NOBODY)
             groups.append(_group(scan.position[rows], R[rows], config, factor))
     return groups
 
