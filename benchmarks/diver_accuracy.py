@@ -50,8 +50,11 @@ TRACKERS = {
     'heading_speed (default)': {},
     'heading_speed, fixed transitions': {'adaptation': 'fixed'},
     'heading_speed, paper (guarded)': {'adaptation': 'paper'},
+    'heading_speed, ratio (guarded)': {'adaptation': 'ratio'},
     'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
 }
+LITERAL = {'product': 'paper', 'ratio': 'ratio', 'not adapted': 'fixed'}
+"""How eq. (1), which is lost in the source, may have read, and what it is compared with."""
 
 
 def load(names: list[str], seeds: range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -78,10 +81,7 @@ def forward(config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarra
     if matrix is not None:
         models.chain.matrix = matrix
         models.chain.transition = lambda dt: matrix
-    x, P, mu = (
-        np.array(part)
-        for part in zip(*(models.new_track(*first) for first in zip(z[:, 0], R[:, 0])))
-    )
+    x, P, mu = models.new_tracks(z[:, 0], R[:, 0])
     H, motion = np.ascontiguousarray(models.E[:, :2]), models.motion(1.0)
     learnt = chain.fresh(len(z))
     yield (*imm_kernels.combine(x, P, mu, models.E), x, P, mu, None, motion, models)
@@ -131,10 +131,9 @@ def tuned(model_set: str, names: list[str]) -> DiverConfig:
     return min(candidates, key=lambda config: rmse(track(config, z, R)[0], truth))
 
 
-def paper_literal(z: np.ndarray, R: np.ndarray, rng: np.random.Generator, uniform: bool):
-    """Eq. (1) unguarded, from a matrix of uniform random numbers, or a flat one."""
-    config = DiverConfig(model_set='world_headings', adaptation='paper', adaptation_guard=0.0)
-    matrix = np.full((16, 16), 1.0 / 16.0) if uniform else rng.uniform(size=(16, 16))
+def paper_literal(z: np.ndarray, R: np.ndarray, form: str, matrix: np.ndarray) -> np.ndarray:
+    """The paper's set with eq. (1) unguarded, from transition probabilities `matrix` (M, M)."""
+    config = DiverConfig(model_set='world_headings', adaptation=form, adaptation_guard=0.0)
     return track(config, z, R, matrix / matrix.sum(axis=1, keepdims=True))[0]
 
 
@@ -142,14 +141,20 @@ def main_table(runs: int) -> dict[str, dict[str, float]]:
     table: dict[str, dict[str, float]] = {}
     for column, names in COLUMNS.items():
         truth, z, R = load(names, range(runs))
-        rng = np.random.default_rng(1)
+        first = {
+            'random': np.random.default_rng(1).uniform(size=(16, 16)),
+            'flat': np.ones((16, 16)),
+        }
         estimates = {'raw fix': z}
         for model_set, label in BASELINES.items():
             estimates[label] = track(tuned(model_set, names), z, R)[0]
         for label, values in TRACKERS.items():
             estimates[label] = track(DiverConfig(**values), z, R)[0]
-        estimates['paper literal, random P0'] = paper_literal(z, R, rng, False)
-        estimates['paper literal, flat P0'] = paper_literal(z, R, rng, True)
+        for kind, matrix in first.items():
+            for label, form in LITERAL.items():
+                estimates[f'eq. (1) literal, {label}, {kind} P0'] = paper_literal(
+                    z, R, form, matrix
+                )
         for label, estimate in estimates.items():
             table.setdefault(label, {})[column] = rmse(estimate, truth)
     return table

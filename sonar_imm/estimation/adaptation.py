@@ -4,28 +4,36 @@ Learning does not change the chain. It gives a *correction*, a factor for each t
 applied to the matrix of the next step: ``P(dt) = rownorm(P0(dt) * correction)``. So it works at
 irregular steps too.
 
-Three forms (`AdaptiveChain`):
+Four forms (`AdaptiveChain`):
 
 counts
     Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight`
     transitions per row. At a constant step it is ``P = rownorm(n + weight P0)``. Sound, and the
     default of the diver tracker.
 paper
-    Eq. (1) of the diver paper, ``P_ij <- P_ij mu_j / sum``, guarded by
-    ``P <- (1 - guard) P + guard P0``.
+    Eq. (1) of the diver paper read as a product, ``P_ij <- P_ij mu_j / sum``, guarded by
+    ``P <- (1 - guard) P + guard P0``. The equation is lost in the source.
+ratio
+    The same equation read as a ratio, ``P_ij <- P_ij mu_j(k) / mu_j(k-1) / sum``, guarded alike.
 fixed
     The chain as it is.
+
+`adaptation_kernels` compiles what `counts` does at each step.
 """
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import get_args, Literal, Protocol
 
 import numpy as np
 
-from .arrays import FloatArray
+from .adaptation_kernels import counts_transition, learn_counts
+from .arrays import FloatArray, IndexArray
 
-Form = Literal['counts', 'paper', 'fixed']
+Form = Literal['counts', 'paper', 'ratio', 'fixed']
+
+LEAST = 1e-12
+"""A model less probable than this before a step counts as this probable in a ratio."""
 
 
 class Chain(Protocol):
@@ -43,25 +51,25 @@ class AdaptiveChain:
     """A chain and the way the data of T targets correct it. What was learnt is a value that the
     caller keeps: `fresh` makes it, `learn` updates it.
 
-    weight: counts only, how many transitions per row the prior is worth; guard: paper only, share
-    of the prior that is kept at each step.
+    weight: counts only, how many transitions per row the prior is worth; guard: paper and ratio,
+    share of the prior that is kept at each step.
     """
 
     def __init__(self, chain: Chain, form: Form, *, weight: float = 2.0, guard: float = 0.7):
-        if form not in ('counts', 'paper', 'fixed'):
-            raise ValueError(f"the form of adaptation is counts, paper or fixed, not '{form}'")
+        if form not in get_args(Form):
+            raise ValueError(f"the form of adaptation is one of {get_args(Form)}, not '{form}'")
         self.chain = chain
         self.form = form
         self.weight = weight
         self.guard = guard
 
     def fresh(self, targets: int) -> FloatArray:
-        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 1 for paper,
-        0 for fixed."""
+        """Nothing learnt yet: (targets, K, M, M), K = 2 for counts (seen, expected), 1 for paper
+        and ratio, 0 for fixed."""
         M = len(self.chain.matrix)
         if self.form == 'counts':
             return np.zeros((targets, 2, M, M))
-        return np.ones((targets, 1 if self.form == 'paper' else 0, M, M))
+        return np.ones((targets, 0 if self.form == 'fixed' else 1, M, M))
 
     def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
         """The matrices of a step of dt seconds: (targets, M, M), or (1, M, M) when nothing can be
@@ -69,11 +77,9 @@ class AdaptiveChain:
         nominal = self.chain.transition(dt)
         if self.form == 'fixed':
             return np.array(nominal[None])
-        if self.form == 'paper':
-            return corrected(nominal, learnt[:, 0])
-        return corrected(
-            nominal, counts_correction(learnt[:, 0], learnt[:, 1], self.chain.matrix, self.weight)
-        )
+        if self.form == 'counts':
+            return counts_transition(nominal, learnt, self.chain.matrix, self.weight)
+        return corrected(nominal, learnt[:, 0])
 
     def learn(
         self,
@@ -82,22 +88,27 @@ class AdaptiveChain:
         mu_before: FloatArray,
         mu_after: FloatArray,
         dt: float,
+        hit: IndexArray | None = None,
     ) -> FloatArray:
-        """What is learnt after a step that used `transition` and took the model probabilities
-        (targets, M) from `mu_before` to `mu_after`. Only for targets that were measured: a miss
-        holds no information on transitions."""
+        """What is learnt after a step that used `transition` (targets or 1, M, M) and took the
+        model probabilities (targets, M) from `mu_before` to `mu_after`. Only the targets `hit`
+        (all by default), which were measured, learn: a miss holds no information on
+        transitions."""
         if self.form == 'fixed':
             return learnt
-        if self.form == 'paper':
-            return adapt_product(learnt[:, 0], mu_after, self.chain.matrix, self.guard)[:, None]
-        posterior = transition_posterior(transition, mu_before, mu_after)
-        return np.stack(
-            adapt_counts(learnt[:, 0], learnt[:, 1], posterior, self.chain.transition(dt)), axis=1
-        )
+        hit = np.arange(len(learnt)) if hit is None else hit
+        if self.form == 'counts':
+            nominal = self.chain.transition(dt)
+            return learn_counts(learnt, hit, transition, mu_before, mu_after, nominal)
+        learnt, factor = learnt.copy(), mu_after[hit]
+        if self.form == 'ratio':
+            factor = factor / np.maximum(mu_before[hit], LEAST)
+        learnt[hit, 0] = adapt_product(learnt[hit, 0], factor, self.chain.matrix, self.guard)
+        return learnt
 
 
 def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatArray) -> FloatArray:
-    """Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights.
+    """Oracle for tests: Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights.
 
     P: (..., M, M); mu_before, mu_after: (..., M). Gives (..., M, M).
     """
@@ -112,7 +123,7 @@ def adapt_counts(
     posterior: FloatArray,
     nominal: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal matrix predicts for
+    """Oracle for tests: Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal matrix predicts for
     the same step.
 
     All (..., M, M); gives the new (counts, expected). See `counts_correction`.
@@ -123,8 +134,8 @@ def adapt_counts(
 def counts_correction(
     counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float
 ) -> FloatArray:
-    """Factor for each transition, (n + N0 P0) / (e + N0 P0). `prior` P0 is the matrix of the
-    reference step, `weight` N0.
+    """Oracle for tests: factor for each transition, (n + N0 P0) / (e + N0 P0). `prior` P0 is the
+    matrix of the reference step, `weight` N0.
 
     At a constant step e_ij = n_i. P0_ij, and the corrected matrix is the Dirichlet posterior mean,
     rownorm(n + N0 P0). At irregular steps the factor still compares counts of the same steps.
@@ -136,14 +147,15 @@ def counts_correction(
 
 
 def adapt_product(
-    correction: FloatArray, mu_after: FloatArray, prior: FloatArray, guard: float
+    correction: FloatArray, factor: FloatArray, prior: FloatArray, guard: float
 ) -> FloatArray:
-    """Eq. (1) of the diver paper as a factor on P0: P_ij <- P_ij mu_j / sum, then the guard
-    P <- (1 - guard) P + guard P0.
+    """Eq. (1) of the diver paper as a factor on P0: P_ij <- P_ij f_j / sum, then the guard
+    P <- (1 - guard) P + guard P0; f (..., M) is mu(k), or mu(k) / mu(k-1).
 
-    Without the guard the exponent of mu doubles at each step, and rows become one-hot within five.
+    Without the guard the exponent of f = mu doubles at each step, and rows become one-hot within
+    five; ratios telescope to mu(k) / mu(0), whatever the chain.
     """
-    P = corrected(prior, correction) * mu_after[..., None, :]
+    P = corrected(prior, correction) * factor[..., None, :]
     total = P.sum(axis=-1, keepdims=True)
     P = np.where(total > 0.0, P / np.where(total > 0.0, total, 1.0), prior)
     P = (1.0 - guard) * P + guard * prior

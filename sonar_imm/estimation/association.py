@@ -34,6 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
+from .association_kernels import COASTING, CONFIRMED, count, TENTATIVE
 from .kalman import BoolArray, factorise, log_density
 
 
@@ -189,9 +190,9 @@ def _solve_cluster(
 class TrackStatus(IntEnum):
     """State of a track. The numbers are those of the column ``track_state``."""
 
-    TENTATIVE = 0
-    CONFIRMED = 1
-    COASTING = 2
+    TENTATIVE = TENTATIVE
+    CONFIRMED = CONFIRMED
+    COASTING = COASTING
 
 
 @frozen
@@ -256,18 +257,19 @@ class Tracks:
 
     def born(self, count: int, stamp_ns: int, rules: TrackRules) -> Tracks:
         """Append `count` tracks, each with its first hit."""
-        seen = np.zeros((count, rules.confirm_window), np.bool_)
-        seen[:, -1] = True
-        status = TrackStatus.CONFIRMED if rules.confirm_hits == 1 else TrackStatus.TENTATIVE
+        window = rules.confirm_window
+        seen = np.zeros((len(self) + count, window), np.bool_)
+        seen[: len(self)] = _window(self.seen, window)
+        seen[len(self) :, -1] = True
+        track_id = np.arange(self.next_id, self.next_id + count, dtype=np.uint32)
+        status = np.full(count, CONFIRMED if rules.confirm_hits == 1 else TENTATIVE, np.uint8)
         return Tracks(
-            np.append(
-                self.track_id, np.arange(self.next_id, self.next_id + count, dtype=np.uint32)
-            ),
-            np.append(self.status, np.full(count, status, np.uint8)),
-            np.append(self.age, np.ones(count, np.int64)),
-            np.concatenate([_window(self.seen, rules.confirm_window), seen]),
-            np.append(self.misses, np.zeros(count, np.int64)),
-            np.append(self.last_hit_ns, np.full(count, stamp_ns, np.int64)),
+            np.concatenate([self.track_id, track_id]),
+            np.concatenate([self.status, status]),
+            np.concatenate([self.age, np.ones(count, np.int64)]),
+            seen,
+            np.concatenate([self.misses, np.zeros(count, np.int64)]),
+            np.concatenate([self.last_hit_ns, np.full(count, stamp_ns, np.int64)]),
             self.next_id + count,
         )
 
@@ -280,34 +282,21 @@ class Tracks:
         Returns the tracks that live on and the mask ``kept`` (T,) of those, to select the states
         that the caller keeps beside them.
         """
-        looked = np.ones(len(self), np.bool_) if looked is None else looked | hit
-        age = self.age + looked
-        before = _window(self.seen, rules.confirm_window)
-        seen = np.where(looked[:, None], np.column_stack([before[:, 1:], hit]), before)
-        misses = np.where(hit, 0, self.misses + looked)
-        last_hit_ns = np.where(hit, stamp_ns, self.last_hit_ns)
-        hits = seen.sum(axis=1)
-        confirmed = (self.status != TrackStatus.TENTATIVE) | (hits >= rules.confirm_hits)
-        status = np.where(
-            confirmed,
-            np.where(
-                hit, TrackStatus.CONFIRMED, np.where(looked, TrackStatus.COASTING, self.status)
-            ),
-            TrackStatus.TENTATIVE,
+        looked = np.ones(len(self), np.bool_) if looked is None else looked
+        *counted, kept = count(
+            self.age,
+            _window(self.seen, rules.confirm_window),
+            self.misses,
+            self.last_hit_ns,
+            self.status,
+            hit,
+            looked,
+            stamp_ns,
+            rules.confirm_hits,
+            rules.delete_misses,
+            rules.max_coast_ns,
         )
-        missed_in_window = np.minimum(age, rules.confirm_window) - hits
-        hopeless = missed_in_window > rules.confirm_window - rules.confirm_hits
-        ended = np.where(confirmed, misses >= rules.delete_misses, hopeless)
-        kept = ~ended & (stamp_ns - last_hit_ns <= rules.max_coast_ns)
-        return Tracks(
-            self.track_id[kept],
-            status[kept].astype(np.uint8),
-            age[kept],
-            seen[kept],
-            misses[kept],
-            last_hit_ns[kept],
-            self.next_id,
-        ), kept
+        return Tracks(self.track_id[kept], *counted, self.next_id), kept
 
     def none_left(self) -> Tracks:
         """No tracks any more; identities go on."""
@@ -316,6 +305,8 @@ class Tracks:
     def only(self, kept: BoolArray) -> Tracks:
         """The tracks where `kept` (T,) is True. For callers that end tracks by rules of their
         own."""
+        if kept.all():
+            return self
         return evolve(
             self,
             track_id=self.track_id[kept],

@@ -46,47 +46,48 @@ def mix(
     """
     T, M, n = x.shape
     x0, P0, c = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
-    centre, e = np.empty(n), np.empty(n)
-    d, W, total, moment = np.empty((M, n)), np.empty(M), np.empty(n * n), np.empty((M, n * n))
-    L = np.empty((n, n))
+    centre, L = np.empty(n), np.empty((n, n))
+    # What is summed for every j lies in a row, j last: such loops are vectorised.
+    W, w, reach = np.empty((M, M)), np.empty(M), np.empty(M)
+    d, e, total = np.empty(n), np.empty((n, M)), np.empty((n, n, M))
     for t in range(T):
         p = t % transition.shape[0]
         for a in range(n):
             centre[a] = 0.0
             for i in range(M):
                 centre[a] += mu[t, i] * x[t, i, a]
+        reach[:] = 0.0
         for i in range(M):
+            for j in range(M):
+                W[i, j] = transition[p, i, j] * mu[t, i]
+                reach[j] += W[i, j]
+        e[:] = 0.0
+        total[:] = 0.0
+        for i in range(M):
+            for j in range(M):
+                w[j] = W[i, j] / reach[j] if reach[j] > DEAD else mu[t, i]
             for a in range(n):
-                d[i, a] = x[t, i, a] - centre[a]
+                d[a] = x[t, i, a] - centre[a]
+                for j in range(M):
+                    e[a, j] += w[j] * d[a]
             for a in range(n):
-                for b in range(n):
-                    moment[i, a * n + b] = P[t, i, a, b] + d[i, a] * d[i, b]
+                for b in range(a + 1):
+                    moment = P[t, i, a, b] + d[a] * d[b]
+                    for j in range(M):
+                        total[a, b, j] += w[j] * moment
         for j in range(M):
-            reach = 0.0
-            for i in range(M):
-                W[i] = transition[p, i, j] * mu[t, i]
-                reach += W[i]
-            c[t, j] = reach
-            for a in range(n):
-                e[a] = 0.0
-            for k in range(n * n):
-                total[k] = 0.0
-            for i in range(M):
-                w = W[i] / reach if reach > DEAD else mu[t, i]
-                for a in range(n):
-                    e[a] += w * d[i, a]
-                for k in range(n * n):
-                    total[k] += w * moment[i, k]
+            c[t, j] = reach[j]
             most = 0.0
             for a in range(n):
-                x0[t, j, a] = centre[a] + e[a]
-                for b in range(n):
-                    P0[t, j, a, b] = total[a * n + b] - e[a] * e[b]
-                if not total[a * n + a] <= most * P0[t, j, a, a]:
+                x0[t, j, a] = centre[a] + e[a, j]
+                for b in range(a + 1):
+                    P0[t, j, a, b] = total[a, b, j] - e[a, j] * e[b, j]
+                    P0[t, j, b, a] = P0[t, j, a, b]
+                if not total[a, a, j] <= most * P0[t, j, a, a]:
                     positive = P0[t, j, a, a] > 0.0
-                    most = total[a * n + a] / P0[t, j, a, a] if positive else np.inf
+                    most = total[a, a, j] / P0[t, j, a, a] if positive else np.inf
             if not (most <= CANCELLED or (most <= MOST_CANCELLED and sound(P0[t, j], L))):
-                _mix_directly(x[t], P[t], W, mu[t], reach, x0[t, j], P0[t, j])
+                _mix_directly(x[t], P[t], W[:, j], mu[t], reach[j], x0[t, j], P0[t, j])
     return x0, P0, c
 
 

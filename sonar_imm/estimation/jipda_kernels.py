@@ -26,22 +26,41 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 @kernel
 def likelihoods(
-    h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray
+    h: FloatArray,
+    H: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    threshold: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """See `jipda.likelihoods`: mixture and nis (T, D)."""
+    """See `jipda.likelihoods`: mixture and nis (T, D). A pair whose nis is sure to be above
+    `threshold` has none: mixture 0, nis infinite."""
     T, M, m = h.shape
     D, n = len(z), P.shape[2]
     mixture, least = np.zeros((T, D)), np.full((T, D), np.inf)
-    PHt, nothing, S0 = np.empty((n, m)), np.zeros((m, m)), np.empty((m, m))
+    PHt, nothing, S0 = np.empty((n, m)), np.zeros((m, m)), np.empty((M, m, m))
     S, L, v, w = np.empty((m, m)), np.zeros((m, m)), np.empty(m), np.empty(m)
     for t in range(T):
         for j in range(M):
-            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0)
-            for d in range(D):
+            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
+        for d in range(D):
+            # nis is at least v_r^2 / S_rr: most fixes are far from most tracks.
+            near = threshold == np.inf
+            j = 0
+            while not near and j < M:
+                near = c[t, j] > OPENS_GATE
+                for r in range(m):
+                    gap = z[d, r] - h[t, j, r]
+                    near = near and not gap * gap > threshold * (S0[j, r, r] + R[d, r, r])
+                j += 1
+            if not near:
+                continue
+            for j in range(M):
                 for r in range(m):
                     v[r] = z[d, r] - h[t, j, r]
                     for s in range(m):
-                        S[r, s] = S0[r, s] + R[d, r, s]
+                        S[r, s] = S0[j, r, s] + R[d, r, s]
                 if not cholesky_lifted(S, L):
                     continue
                 nis = whitened_square(L, v, w)
@@ -288,10 +307,52 @@ def update(
     return x1, P1, mu, repairs
 
 
+@kernel
+def nearest_older(
+    mean: FloatArray, covariance: FloatArray, ids: IntArray, free: BoolArray, firm: BoolArray
+) -> tuple[IntArray, FloatArray]:
+    """For each track (T,) the older one that is nearest, -1 for none, and how far it is
+    (Mahalanobis distance squared of their difference).
+
+    mean (T, 2), covariance (T, 2, 2); ids (T,) rise with age; of `free` (T,) tracks alone; a
+    `firm` (T,) one is compared with firm ones only.
+    """
+    T = len(ids)
+    partner, distance = np.full(T, -1, dtype=np.int64), np.full(T, np.inf)
+    for t in range(T):
+        for u in range(T):
+            if not (free[t] and free[u] and ids[u] < ids[t] and (firm[u] or not firm[t])):
+                continue
+            x, y = mean[t, 0] - mean[u, 0], mean[t, 1] - mean[u, 1]
+            a = covariance[t, 0, 0] + covariance[u, 0, 0]
+            b = covariance[t, 0, 1] + covariance[u, 0, 1]
+            d = covariance[t, 1, 1] + covariance[u, 1, 1]
+            # By the Cholesky factor, written out.
+            y -= b / a * x
+            now = x * x / a + y * y / (d - b / a * b)
+            if now < distance[t]:
+                partner[t], distance[t] = u, now
+    return partner, distance
+
+
+@kernel
+def log_odds(existence: FloatArray) -> FloatArray:
+    """ln r / (1 - r) of probabilities (T,), minus infinity at 0."""
+    out = np.empty(len(existence))
+    for t in range(len(existence)):
+        out[t] = -np.inf
+        if existence[t] > 0.0:
+            out[t] = math.log(existence[t]) - math.log(max(1.0 - existence[t], 1e-300))
+    return out
+
+
 def warm() -> None:
     """Run the kernels once on tiny input: compiled or loaded from the cache."""
     x, P, c = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
     H, R, z = np.tile(np.eye(2), (1, 2, 1, 1)), np.eye(2)[None], np.zeros((1, 2))
-    mixture, nis = likelihoods(x, H, P, c, z, R)
+    mixture, nis = likelihoods(x, H, P, c, z, R, 9.0)
     beta, missed, _ = associate(mixture, nis, np.full(1, 0.5), np.full(1, 0.9), 9.0)
     update(x, P, c, x, H, z, R, beta, missed, np.zeros(2, np.bool_))
+    yes = np.ones(1, np.bool_)
+    log_odds(missed)
+    nearest_older(z, R, np.ones(1, np.int64), yes, yes)

@@ -7,7 +7,7 @@ estimates have to agree, which shows that both did the same work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import time
 from typing import Any
 
@@ -17,7 +17,8 @@ import numpy as np
 from ...estimation import imm, imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import assign, association_cost, gate_threshold
-from ...measurements import Fix
+from ...measurements import Fix, Fixes
+from ...simulation.diver.simulator import scenario, simulate
 from ...trackers.diver.config import DiverConfig
 from ...trackers.diver.tracker import DiverTracker
 from ..benches import Bench
@@ -26,6 +27,7 @@ MODELS, STATES, STEP = 16, 4, 1.0
 RATIO_WANTED = 100.0
 SCAN_WANTED_MS = 25.0
 STAMPS_WANTED = 1.5
+CLUTTER_WANTED_MS = 0.3
 
 
 @frozen(eq=False)
@@ -199,6 +201,29 @@ def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
     }
 
 
+def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
+    """CPU milliseconds that a whole tracker takes for a scan of four divers and three false fixes
+    on average, with either association in turn."""
+    told = scenario('crossing', {'duration': scans - 1.0, 'clutter': 3.0})
+    scene = [one.measurement for one in simulate(told, 0).measurements]
+    configs = [
+        DiverConfig(**{**told.told(), 'association': association})
+        for association in ('gnn', 'jipda')
+    ]
+    DiverTracker(configs[1]).warm()
+    spent = np.array([[_cpu_of_tracking(scene, one) for one in configs] for _ in range(rounds)])
+    gnn, jipda = np.median(spent, axis=0) * 1e3 / len(scene)
+    return {
+        'scans': len(scene),
+        'fixes': sum(len(scan) for scan in scene if isinstance(scan, Fixes)),
+        'rounds': rounds,
+        'gnn_cpu_ms': float(gnn),
+        'jipda_cpu_ms': float(jipda),
+        'wanted_ms': CLUTTER_WANTED_MS,
+        'good': bool(max(gnn, jipda) <= CLUTTER_WANTED_MS),
+    }
+
+
 def _fixes(steps: FloatArray) -> list[Fix]:
     """A diver at .4 m/s, seen after each of `steps` (K,) seconds."""
     noise = np.random.default_rng(3).normal(0.0, 0.5, (len(steps), 2))
@@ -213,12 +238,12 @@ def _fixes(steps: FloatArray) -> list[Fix]:
     ]
 
 
-def _cpu_of_tracking(fixes: list[Fix]) -> float:
+def _cpu_of_tracking(items: Sequence[Any], config: DiverConfig | None = None) -> float:
     """CPU seconds of this process, all its threads, for a new tracker."""
-    tracker = DiverTracker(DiverConfig())
+    tracker = DiverTracker(config or DiverConfig())
     begin = time.process_time()
-    for fix in fixes:
-        tracker.process(fix)
+    for item in items:
+        tracker.process(item)
     return time.process_time() - begin
 
 
@@ -255,8 +280,17 @@ def _stamps_sentence(stamps: Mapping[str, Any]) -> str:
     )
 
 
+def _clutter_sentence(clutter: Mapping[str, Any]) -> str:
+    return (
+        f'tracker, CPU for a scan of 4 divers and 3 false fixes: {clutter["gnn_cpu_ms"]:.2f} ms '
+        f'with gnn, {clutter["jipda_cpu_ms"]:.2f} ms with jipda (wanted '
+        f'{clutter["wanted_ms"]:.1f}; median of {clutter["rounds"]} rounds)'
+    )
+
+
 BENCHES = (
     Bench('step', bench_step, _step_sentence),
     Bench('scan', lambda rounds: bench_scan(), _scan_sentence),
     Bench('stamps', bench_stamps, _stamps_sentence),
+    Bench('clutter', bench_clutter, _clutter_sentence),
 )

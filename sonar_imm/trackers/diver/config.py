@@ -22,7 +22,7 @@ MODEL_SETS = (
 BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
 """The single-direction sets and how many models they have."""
 
-ADAPTATIONS = ('counts', 'paper', 'fixed')
+ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
 
 
 @frozen(kw_only=True)
@@ -81,8 +81,8 @@ class DiverConfig(
     )
     adaptation: str = parameter(
         'counts',
-        'how the data correct the transition matrix: counts (Dirichlet), paper (guarded '
-        'eq. 1) or fixed',
+        'how the data correct the transition matrix: counts (Dirichlet), eq. 1 of the paper '
+        'as a product (paper) or as a ratio (ratio), both guarded, or fixed',
         choices=ADAPTATIONS,
     )
     adaptation_prior: float = parameter(
@@ -90,7 +90,7 @@ class DiverConfig(
     )
     adaptation_guard: float = parameter(
         0.7,
-        'paper: share of the prior matrix kept at each step; below 0.3 it degenerates',
+        'paper, ratio: share of the prior matrix kept at each step; below 0.3 they degenerate',
         low=0.0,
         high=1.0,
     )

@@ -11,9 +11,8 @@ covariance is never scaled down on this evidence; `warnings` says what the user 
 from __future__ import annotations
 
 from attrs import frozen
-import numpy as np
 
-from ...estimation.arrays import FloatArray
+from .fix_kernels import Sums
 
 MEMORY = 50.0
 """Fixes over which the evidence is gathered and forgotten."""
@@ -34,22 +33,10 @@ class FixConsistency:
     cross: float = 0.0
     square: float = 0.0
 
-    def after(self, before: FloatArray, white: FloatArray) -> FixConsistency:
-        """With the whitened innovations `white` (t, 2) of fixes, and those of the fixes `before`
-        (t, 2) of the same tracks, NaN for none."""
-        old = np.array([self.count, self.nis, self.pairs, self.cross, self.square])
-        paired = np.isfinite(before).all(axis=1)
-        one, other = before[paired], white[paired]
-        new = old + [
-            len(white),
-            0.5 * float(np.square(white).sum()),
-            len(one),
-            float((one * other).sum()),
-            0.5 * float((np.square(one) + np.square(other)).sum()),
-        ]
-        if new[0] > MEMORY:
-            new *= MEMORY / new[0]
-        return FixConsistency(*new.tolist())
+    @property
+    def sums(self) -> Sums:
+        """All of them, as `fix_kernels.watch` takes and gives them."""
+        return self.count, self.nis, self.pairs, self.cross, self.square
 
     @property
     def mean_nis(self) -> float:

@@ -81,25 +81,28 @@ class ModelSet:
                 self._cache.popitem(last=False)
         return found
 
-    def new_track(
+    def new_tracks(
         self, position: FloatArray, covariance: FloatArray, from_fix: bool = True
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x (K M, n), P (K M, n, n), mu (K M,) of a track first seen at `position` (2,) with
-        `covariance` (2, 2)."""
+        """x (k, K M, n), P (k, K M, n, n), mu (k, K M) of tracks first seen at `position` (k, 2)
+        with `covariance` (k, 2, 2)."""
         M, n, K = len(self.names), self.n, self.copies
-        x = np.tile(np.concatenate([position, self.start_mean]), (K * M, 1))
-        P = np.zeros((K * M, n, n))
-        P[:, :2, :2] = covariance
-        P[:, range(2, n), range(2, n)] = self.start_variance
+        shape = len(position), K * M
+        x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
+        x[..., :2], x[..., 2:] = position[:, None], self.start_mean
+        P[..., :2, :2] = covariance[:, None]
+        P[..., range(2, n), range(2, n)] = self.start_variance
         if self.height >= 0:
-            x[:, self.height] = np.repeat(self.heights, M)
+            x[..., self.height] = np.repeat(self.heights, M)
         if self.bias >= 0 and from_fix:
             # A fix is position and bias: as much as one is larger the other is smaller.
             shared = np.diag(self.start_variance[self.bias - 2 : self.bias])
             there = slice(self.bias, self.bias + 2)
-            P[:, :2, :2] += shared
-            P[:, :2, there] = P[:, there, :2] = -shared
-        return x, P, np.tile(self.initial / K, K) if K > 1 else self.initial.copy()
+            P[..., :2, :2] += shared
+            P[..., :2, there] = P[..., there, :2] = -shared
+        mu = np.empty(shape)
+        mu[:] = np.tile(self.initial / K, K) if K > 1 else self.initial
+        return x, P, mu
 
 
 DEPTH_COPIES = 3

@@ -100,14 +100,16 @@ def _heading_speed(config: DiverConfig) -> ModelSet:
     if config.hover:
         wander[-1] = config.hover_noise**2 * np.eye(2)
     speed_rate = config.speed_noise**2 / T
+    # Irregular stamps ask for a new step at each fix.
+    still, along, nothing = np.tile(np.eye(3), (M, 1, 1)), _outer(u), np.zeros((M, 3))
 
     def motion(dt: float) -> Motion:
-        F, Q = np.tile(np.eye(3), (M, 1, 1)), np.zeros((M, 3, 3))
+        F, Q = still.copy(), np.zeros((M, 3, 3))
         F[:, :2, 2] = dt * u
-        Q[:, :2, :2] = wander * (dt / T) + speed_rate * dt**3 / 3.0 * _outer(u)
+        Q[:, :2, :2] = wander * (dt / T) + speed_rate * dt**3 / 3.0 * along
         Q[:, :2, 2] = Q[:, 2, :2] = speed_rate * dt**2 / 2.0 * u
         Q[:, 2, 2] = speed_rate * dt
-        return Motion(F, Q, np.zeros((M, 3)))
+        return Motion(F, Q, nothing)
 
     return ModelSet(
         names,

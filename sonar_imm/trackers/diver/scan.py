@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 import math
 
-from attrs import evolve
 import numpy as np
 
 from ...acoustics.multistatic import difference_projection
@@ -17,12 +16,14 @@ from ...estimation.association import (
     assign_by_rank,
     association_cost,
     gate_threshold,
-    TrackStatus,
 )
+from ...estimation.association_kernels import choose, TENTATIVE
 from ...estimation.consider import consider_models
 from ...measurements import Arrivals, NOBODY
+from . import fix_kernels
 from .config import DiverConfig
 from .expectation_kernels import fit_numbers
+from .fix_consistency import FixConsistency, MEMORY
 from .model_set import ModelSet
 from .pings import Ping, ping_numbers, PingUpdate, residuals, update_by_ping
 from .sensing import Positions
@@ -66,14 +67,15 @@ class Scan:
         steps = list(cross(models, chain, before, self.dt, config.longest_step))
         self.x, self.P, self.mu, transition, *_ = steps[-1]
         self.repairs = sum(step.repairs for step in steps)
-        self.transition = np.linalg.matrix_power(transition, len(steps))
+        single = len(steps) == 1
+        self.transition = transition if single else np.linalg.matrix_power(transition, len(steps))
         self.nis = np.zeros(len(self.x))
         self.nis_dof = np.zeros(len(self.x), np.uint16)
         self.score = SCORE_MEMORY * before.score
         self.scale = before.scale.copy()
         self.white = before.white.copy()
         self.fixes = before.fixes
-        self.tentative = before.life.status == TrackStatus.TENTATIVE
+        self.tentative = before.life.status == TENTATIVE
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
         self.named = before.target_id != NOBODY
@@ -82,19 +84,18 @@ class Scan:
 
     def learn(self) -> DiverState:
         """What is known now; the transitions have learnt from the tracks that were hit."""
-        hit = np.flatnonzero(self.nis_dof > 0)
-        learnt = self.before.learnt.copy()
-        shared = len(self.transition) == 1
-        learnt[hit] = self.chain.learn(
-            learnt[hit],
-            self.transition if shared else self.transition[hit],
-            self.models.by_model(self.before.mu)[hit],
-            self.models.by_model(self.mu)[hit],
+        learnt = self.chain.learn(
+            self.before.learnt,
+            self.transition,
+            self.models.by_model(self.before.mu),
+            self.models.by_model(self.mu),
             self.dt,
+            np.flatnonzero(self.nis_dof > 0),
         )
-        return evolve(
-            self.before,
+        before = self.before
+        return DiverState(
             stamp_ns=self.stamp_ns,
+            life=before.life,
             x=self.x,
             P=self.P,
             mu=self.mu,
@@ -105,10 +106,14 @@ class Scan:
             scale=self.scale,
             existence=self.existence,
             evidence=self.evidence,
+            target_id=before.target_id,
+            near_to=before.near_to,
+            near_for=before.near_for,
             white=self.white,
             fixes=self.fixes,
+            broken=before.broken,
+            repairs=before.repairs + self.repairs,
             instruments=self.instruments,
-            repairs=self.before.repairs + self.repairs,
         )
 
     # -- fixes ---------------------------------------------------------------------------------
@@ -118,19 +123,25 @@ class Scan:
         H, h = self.expected_fixes()
         threshold = gate_threshold(self.config.gate_probability, 2)
         fit = imm_kernels.gate(h, H, self.P, self.mu, group.z, group.R, threshold)
-        fit[self.named] = -np.inf  # they know their own
-        rank = 2 * ~(fit.max(axis=1, initial=-np.inf) > -np.inf) + self.tentative
-        chosen = self._associate(fit, rank, group.clutter)
-        self._keep_score(fit, chosen, group.clutter)
+        if self.named.any():
+            fit[self.named] = -np.inf  # they know their own
+        chosen = self._associate(fit, group.clutter)
+        p_detection = self.config.detection_probability
+        missed, gain = np.log1p(-p_detection), np.log(p_detection / (1.0 - p_detection))
+        fix_kernels.keep_score(
+            self.score, fit, chosen, self.named, missed, gain, np.log(group.clutter)
+        )
         tracks = np.flatnonzero(chosen >= 0)
+        taken = np.zeros(len(group.z), bool)
         if len(tracks):
-            self._update(group, tracks, chosen[tracks], H, h[tracks])
-        return np.isin(np.arange(len(group.z)), chosen)
+            taken[chosen[tracks]] = True
+            self._update(group, tracks, chosen[tracks], H, h)
+        return taken
 
     def update_by_fixes(self, group: Positions, tracks: IndexArray, detection: IntArray) -> None:
         """Update `tracks` (t,), each with its `detection` (t,), without association."""
         H, h = self.expected_fixes()
-        self._update(group, tracks, detection, H, h[tracks])
+        self._update(group, tracks, detection, H, h)
 
     def expected_fixes(self) -> tuple[FloatArray, FloatArray]:
         """H (1, M, 2, n + q), what a fix measures of the whole state, and the fix h (T, M, 2) that
@@ -138,21 +149,20 @@ class Scan:
         fix, extra = self.models.fix, self.layout.size - self.models.n
         if extra:
             fix = np.concatenate([fix, np.zeros((*fix.shape[:2], extra))], axis=2)
-        return np.ascontiguousarray(fix[None]), np.einsum('jma,tja->tjm', fix, self.x)
+        H = np.ascontiguousarray(fix[None])
+        return H, fix_kernels.expected(self.x, H)
 
-    def _associate(self, fit: FloatArray, rank: IntArray, clutter: float) -> IntArray:
-        """The detection of each track (T,), -1 for none; tracks choose in the order of `rank`."""
+    def _associate(self, fit: FloatArray, clutter: float) -> IntArray:
+        """The detection of each track (T,), -1 for none; confirmed tracks choose first."""
+        missed = math.log1p(-self.config.detection_probability)
+        missed -= math.log(self.config.detection_probability)
+        chosen, clear = choose(fit, self.tentative, missed, math.log(clutter))
+        if clear:
+            return chosen
         target, detection = imm.pairs_inside(fit)
         cost = association_cost(fit[target, detection], self.config.detection_probability, clutter)
+        rank = self.tentative.astype(np.int64)
         return assign_by_rank(target, detection, cost, rank, fit.shape[1])
-
-    def _keep_score(self, fit: FloatArray, chosen: IntArray, clutter: float) -> None:
-        """ln of P_D N(nu; 0, S) / clutter for a hit, of 1 - P_D for a miss."""
-        p_detection = self.config.detection_probability
-        hit = np.flatnonzero(chosen >= 0)
-        self.score += np.where(self.named, 0.0, np.log1p(-p_detection))
-        self.score[hit] += fit[hit, chosen[hit]] + np.log(p_detection / (1.0 - p_detection))
-        self.score[hit] -= np.log(clutter)
 
     def _update(
         self,
@@ -162,50 +172,40 @@ class Scan:
         H: FloatArray,
         h: FloatArray,
     ) -> None:
-        """Update `tracks` (t,), each with its `detection` (t,); h (t, M, 2) what they expect."""
-        x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
-        R = np.ascontiguousarray(group.R[detection])
-        innovation = group.z[detection][:, None, :] - h
-        self.watch(x, P, mu, group.z[detection], H, R, tracks)
-        mask = self.layout.mask
+        """Update `tracks` (t,), each with its `detection` (t,); h (T, M, 2) what all expect."""
+        mask, z, R = self.layout.mask, group.z, group.R
+        self.watch(group, tracks, detection, H)
         if mask.all():
-            x, P, mu, _, nis, ok, repaired = imm_kernels.update(x, P, mu, innovation, H, R)
-            self.repairs += int(repaired.sum())
+            parts = self.x, self.P, self.mu, h, H, z, R, tracks, detection, self.nis, self.nis_dof
+            self.repairs += fix_kernels.take(*parts)
         else:
-            x, P, mu, nis, ok = consider_models(x, P, mu, innovation, H[0], R, mask)
-        self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
-        self.nis[tracks] += np.where(ok, nis, 0.0)
-        self.nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
+            innovation = z[detection][:, None, :] - h[tracks]
+            x, P, mu, nis, ok = consider_models(
+                self.x[tracks],
+                self.P[tracks],
+                self.mu[tracks],
+                innovation,
+                H[0],
+                R[detection],
+                mask,
+            )
+            self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
+            self.nis[tracks] += np.where(ok, nis, 0.0)
+            self.nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
         if self.config.estimate_covariance_scale:
+            x, P, mu = self.x[tracks], self.P[tracks], self.mu[tracks]
             mean, covariance = imm_kernels.combine(x, P, mu, np.ascontiguousarray(H[0]))
-            residual = group.z[detection] - mean
-            stated = group.R[detection] / group.factor
+            residual = z[detection] - mean
+            stated = R[detection] / group.factor
             self._learn_scale(FIXES, residual, covariance, stated)
 
     def watch(
-        self,
-        x: FloatArray,
-        P: FloatArray,
-        mu: FloatArray,
-        z: FloatArray,
-        H: FloatArray,
-        R: FloatArray,
-        tracks: IndexArray,
+        self, group: Positions, tracks: IndexArray, detection: IntArray, H: FloatArray
     ) -> None:
         """Keep account of whitened innovations, of the mixture as it was predicted."""
-        mean, covariance = imm_kernels.combine(x, P, mu, np.ascontiguousarray(H[0]))
-        nu, S = z - mean, covariance + R
-        # The inverse of the Cholesky factor of 2 x 2, written out: this runs at every fix.
-        with np.errstate(invalid='ignore', divide='ignore'):
-            a = np.sqrt(S[:, 0, 0])
-            b = S[:, 1, 0] / a
-            first = nu[:, 0] / a
-            second = (nu[:, 1] - b * first) / np.sqrt(S[:, 1, 1] - b * b)
-        white = np.column_stack([first, second])
-        counted = ~self.tentative[tracks] & np.isfinite(white).all(axis=1)
-        if counted.any():
-            self.fixes = self.fixes.after(self.white[tracks][counted], white[counted])
-        self.white[tracks] = white
+        where = group.z, group.R, tracks, detection, self.tentative, self.white
+        sums = fix_kernels.watch(self.x, self.P, self.mu, H, *where, self.fixes.sums, MEMORY)
+        self.fixes = FixConsistency(*sums)
 
     def _learn_scale(
         self, kind: int, residual: FloatArray, covariance: FloatArray, stated: FloatArray

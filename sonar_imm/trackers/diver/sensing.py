@@ -10,7 +10,7 @@ import numpy as np
 
 from ...acoustics.localisation import Localisation, localise
 from ...estimation.arrays import FloatArray, IndexArray, IntArray
-from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from .config import DiverConfig
 from .model_set import heights_of
 
@@ -36,22 +36,24 @@ def position_groups(
     """The fixes of one stamp: all single ones together, then scan by scan those that say whose
     they are, of each diver the first, and those that do not. factor: on their covariances."""
     groups = []
-    single = [scan_of(item) for item in items if isinstance(item, Fix)]
+    single = [item for item in items if isinstance(item, Fix)]
     if single:
-        position = np.concatenate([scan.position for scan in single])
-        R = np.concatenate([_covariances(scan, config) for scan in single])
+        unknown = np.eye(2) * config.fix_std**2
+        position = np.array([fix.position for fix in single])
+        R = np.array([unknown if fix.covariance is None else fix.covariance for fix in single])
         groups.append(_group(position, R * factor, config, factor, whole=config.fixes_are_scans))
     for scan in (item for item in items if isinstance(item, Fixes)):
         R = _covariances(scan, config) * factor
-        said = np.empty(0, np.intp)
-        if scan.target_id is not None:
-            said = np.flatnonzero(scan.target_id != NOBODY)
-            names, first = np.unique(scan.target_id[said], return_index=True)
-            rows = said[first]
-            if len(rows):
-                groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
+        if scan.target_id is None:
+            groups.append(_group(scan.position, R, config, factor))
+            continue
+        said = np.flatnonzero(scan.target_id != NOBODY)
+        names, first = np.unique(scan.target_id[said], return_index=True)
+        rows = said[first]
+        if len(rows):
+            groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
         if len(said) < len(scan) or not len(scan):
-            rows = np.setdiff1d(np.arange(len(scan)), said)
+            rows = np.flatnonzero(scan.target_id == NOBODY)
             groups.append(_group(scan.position[rows], R[rows], config, factor))
     return groups
 

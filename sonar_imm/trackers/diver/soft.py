@@ -12,7 +12,8 @@ import numpy as np
 
 from ...estimation import imm_kernels, jipda_kernels
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.association import gate_threshold, TrackStatus
+from ...estimation.association import gate_threshold
+from ...estimation.association_kernels import COASTING, CONFIRMED, TENTATIVE
 from ...measurements import NOBODY
 from .config import DiverConfig
 from .sensing import Positions
@@ -46,10 +47,10 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
     that a fix is of a diver that is tracked already."""
     config = scan.config
     z, R = np.ascontiguousarray(group.z), np.ascontiguousarray(group.R)
-    H, h = (np.ascontiguousarray(one) for one in scan.expected_fixes())
-    mixture, nis = jipda_kernels.likelihoods(h, H, scan.P, scan.mu, z, R)
-    nis[scan.named] = np.inf
+    H, h = scan.expected_fixes()
     threshold = gate_threshold(config.gate_probability, 2)
+    mixture, nis = jipda_kernels.likelihoods(h, H, scan.P, scan.mu, z, R, threshold)
+    nis[scan.named] = np.inf
     seen = ~scan.named & (group.whole | (nis <= threshold).any(axis=1))
     existence = known_existence(scan.existence, scan.before.life.status)
     beta, missed, after = jipda_kernels.associate(
@@ -63,15 +64,8 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
     hit = np.flatnonzero(detected > 0.5 * after)
     if len(hit):
         best = beta[hit].argmax(axis=1)
-        x, P, mu = scan.x[hit], scan.P[hit], scan.mu[hit]
-        scan.watch(x, P, mu, z[best], H, R[best], hit)
-        mean, covariance = imm_kernels.combine(x, P, mu, H[0])
-        innovation = z[best] - mean
-        scan.nis[hit] += np.einsum(
-            'ta,ta->t',
-            innovation,
-            np.linalg.solve(covariance + R[best], innovation[..., None])[..., 0],
-        )
+        scan.watch(group, hit, best, H)
+        scan.nis[hit] += np.square(scan.white[hit]).sum(axis=1)
         scan.nis_dof[hit] += np.uint16(2)
     scan.x, scan.P, scan.mu, repairs = jipda_kernels.update(
         scan.x, scan.P, scan.mu, h, H, z, R, beta, missed, ~scan.layout.mask
@@ -79,16 +73,13 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
     scan.repairs += repairs
     scan.existence = np.where(scan.named, scan.existence, after)
     scan.evidence = scan.evidence + detected
-    with np.errstate(divide='ignore'):
-        scan.score = np.where(
-            scan.named, scan.score, np.log(after) - np.log(np.maximum(1.0 - after, 1e-300))
-        )
+    scan.score = np.where(scan.named, scan.score, jipda_kernels.log_odds(after))
     return np.asarray(beta.sum(axis=0))
 
 
 def known_existence(existence: FloatArray, status: IntArray) -> FloatArray:
     """Existence (T,), where it is not known (a track that began otherwise) by the status."""
-    guess = np.where(status == TrackStatus.TENTATIVE, 0.5, CONFIRMS)
+    guess = np.where(status == TENTATIVE, 0.5, CONFIRMS)
     return np.where(np.isnan(existence), guess, existence)
 
 
@@ -120,13 +111,12 @@ def judge(now: DiverState, hit: BoolArray, looked: BoolArray, E: FloatArray) -> 
     hit (T,): a detection is more probable than a miss; looked (T,): whether one would have been
     seen; E (M, 2, n): to the position.
     """
-    was = now.life.status != TrackStatus.TENTATIVE
-    with np.errstate(invalid='ignore'):
-        confirmed = was | (now.existence > CONFIRMS) & (now.evidence >= EVIDENCE)
-        alive = ~(now.existence < ENDS)
-    seen = np.where(looked, TrackStatus.COASTING, now.life.status)
-    seen = np.where(hit | (seen == TrackStatus.TENTATIVE), TrackStatus.CONFIRMED, seen)
-    status = np.where(confirmed, seen, TrackStatus.TENTATIVE).astype(np.uint8)
+    was = now.life.status != TENTATIVE
+    confirmed = was | (now.existence > CONFIRMS) & (now.evidence >= EVIDENCE)
+    alive = ~(now.existence < ENDS)
+    seen = np.where(looked, COASTING, now.life.status)
+    seen = np.where(hit | (seen == TENTATIVE), CONFIRMED, seen)
+    status = np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
     if not looked.any():
         return Judged(status, alive, now.near_to, now.near_for)
     n = E.shape[-1]
@@ -144,16 +134,9 @@ def coalescence(
 
     mean (T, 2) and covariance (T, 2, 2) of the positions. Named tracks take no part.
     """
-    apart = mean[:, None] - mean[None]
-    both = covariance[:, None] + covariance[None]
-    distance = np.einsum('tua,tua->tu', apart, np.linalg.solve(both, apart[..., None])[..., 0])
     ids, free = now.life.track_id.astype(np.int64), now.target_id == NOBODY
-    older = (ids[None] < ids[:, None]) & free[None] & free[:, None]
-    older &= confirmed[None] | ~confirmed[:, None]
-    distance = np.where(older, distance, np.inf)
-    partner = distance.argmin(axis=1)
-    limit = np.where(confirmed, NEAR_CONFIRMED, NEAR_TENTATIVE)
-    near = distance[np.arange(len(mean)), partner] < limit
+    partner, distance = jipda_kernels.nearest_older(mean, covariance, ids, free, confirmed)
+    near = distance < np.where(confirmed, NEAR_CONFIRMED, NEAR_TENTATIVE)
     near_to = np.where(near, ids[partner], 0)
     near_for = np.where(near, np.where(near_to == now.near_to, now.near_for, 0) + 1, 0)
     return near_to, near_for

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
@@ -25,6 +25,9 @@ MOST_STEPS = 300
 
 LIFE = ('existence', 'evidence', 'target_id', 'near_to', 'near_for')
 """What is known of the life of a track beside `Tracks`, by the names in `DiverState`."""
+
+ROWS = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', 'white', *LIFE)
+"""What of `DiverState` has a row for each track."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -69,12 +72,22 @@ class DiverState:
         """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
         return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
 
-    def rows(self, kept: BoolArray) -> DiverState:
-        """The numbers of the tracks where `kept` (T,) is True; `life` is left to the caller."""
-        if kept.all():
-            return self
-        names = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', 'white', *LIFE)
-        return evolve(self, **{name: getattr(self, name)[kept] for name in names})
+    def rows(self, kept: BoolArray, **changes: Any) -> DiverState:
+        """With `changes`, those of `ROWS` for all tracks, and then only the tracks where `kept`
+        (T,) is True; `life` is left to the caller."""
+        if not kept.all():
+            index = np.flatnonzero(kept)
+            for name in ROWS:
+                changes[name] = changes.get(name, getattr(self, name)).take(index, axis=0)
+        return evolve(self, **changes)
+
+    def with_rows(self, life: Tracks, new: Mapping[str, FloatArray | IntArray]) -> DiverState:
+        """With more tracks, `life` is that of all: `new` holds an array for each of `ROWS`."""
+        return evolve(
+            self,
+            life=life,
+            **{name: np.concatenate([getattr(self, name), new[name]]) for name in ROWS},
+        )
 
 
 class Step(NamedTuple):

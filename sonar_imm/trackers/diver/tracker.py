@@ -20,19 +20,25 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...estimation import imm_kernels, jipda_kernels
+from ...estimation import (
+    adaptation_kernels,
+    association_kernels,
+    imm_kernels,
+    jipda_kernels,
+)
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
-from ...estimation.association import Tracks, TrackStatus
+from ...estimation.association import Tracks
+from ...estimation.association_kernels import TENTATIVE
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
-from . import soft
+from . import fix_kernels, soft
 from .births import Birth, births_from_ping
 from .config import DiverConfig
 from .fix_consistency import FixConsistency
 from .fix_scans import each_name_once, shows_all, take_fixes
-from .instruments import Instruments
+from .instruments import Layout
 from .models import build_models
 from .pings import begin_from_ping, FAR, ping_numbers
 from .scan import Scan
@@ -73,6 +79,9 @@ class DiverTracker:
     def warm(self) -> None:
         imm_kernels.warm()
         jipda_kernels.warm()
+        adaptation_kernels.warm()
+        association_kernels.warm()
+        fix_kernels.warm()
         # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
         rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -101,7 +110,7 @@ class DiverTracker:
         hit = now.nis_dof > 0
         return {
             'tracks': len(now.life),
-            'confirmed': int((now.life.status != TrackStatus.TENTATIVE).sum()),
+            'confirmed': int((now.life.status != TENTATIVE).sum()),
             'nis_mean': float(np.mean(now.nis[hit] / now.nis_dof[hit]))
             if hit.any()
             else float('nan'),
@@ -161,7 +170,7 @@ class DiverTracker:
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
         now = self._prune(scan.learn(), items)
-        return self._spawn(now, births)
+        return self._spawn(now, births, scan.layout)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
         return Scan(self.config, self.models, self._chain, before, stamp_ns)
@@ -169,7 +178,7 @@ class DiverTracker:
     def _prune(self, now: DiverState, items: Sequence[Measurement]) -> DiverState:
         """End the tracks that are over, broken, or too many."""
         config = self.config
-        sound = np.isfinite(now.x).all(axis=(1, 2)) & np.isfinite(now.P).all(axis=(1, 2, 3))
+        sound = fix_kernels.finite(now.x, now.P)
         broken = now.broken + int((~sound).sum())
         hit = now.nis_dof > 0
         looked = any(shows_all(item, config) for item in items) & (now.target_id == NOBODY)
@@ -177,72 +186,89 @@ class DiverTracker:
         life, kept = now.life.scan(
             hit, now.stamp_ns, track_rules(config), looked=looked & ~by_existence
         )
+        near = {'near_to': now.near_to, 'near_for': now.near_for}
         if by_existence.any():
             judged = soft.judge(now, hit, looked, self.models.E[:, :2])
             status = np.where(by_existence[kept], judged.status[kept], life.status)
             life = evolve(life, status=status)
-            now = evolve(now, near_to=judged.near_to, near_for=judged.near_for)
+            near = {'near_to': judged.near_to, 'near_for': judged.near_for}
             sound = sound & (judged.alive | ~by_existence)
-        life, kept = life.only(sound[kept]), kept & sound
-        confirmed = np.flatnonzero(life.status != TrackStatus.TENTATIVE)
+        if not sound.all():
+            life, kept = life.only(sound[kept]), kept & sound
+        confirmed = np.flatnonzero(life.status != TENTATIVE)
         if len(confirmed) > config.max_tracks:
             known = np.where(now.target_id == NOBODY, now.score, np.inf)[kept][confirmed]
             best = np.argsort(-known, kind='stable')[: config.max_tracks]
-            room = life.status == TrackStatus.TENTATIVE
+            room = life.status == TENTATIVE
             room[confirmed[best]] = True
             kept[kept] = room
             life = life.only(room)
-        return evolve(now.rows(kept), life=life, broken=broken)
+        return now.rows(kept, life=life, broken=broken, **near)
 
-    def _spawn(self, now: DiverState, births: list[Birth]) -> DiverState:
+    def _spawn(self, now: DiverState, births: list[Birth], layout: Layout) -> DiverState:
         """Begin a tentative track at each birth, as long as there is room."""
         config = self.config
         births = each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
         if not births:
             return now
-        new = [self._new_track(birth, now.instruments) for birth in births]
-        M, n, count = now.x.shape[1], now.x.shape[2], len(new)
-        return evolve(
-            now,
-            life=now.life.born(count, now.stamp_ns, track_rules(config)),
-            x=np.concatenate([now.x, np.reshape([one[0] for one in new], (count, M, n))]),
-            P=np.concatenate([now.P, np.reshape([one[1] for one in new], (count, M, n, n))]),
-            mu=np.concatenate([now.mu, np.reshape([one[2] for one in new], (count, M))]),
-            learnt=np.concatenate([now.learnt, self._chain.fresh(count)]),
-            nis=np.append(now.nis, np.full(count, np.nan)),
-            nis_dof=np.append(now.nis_dof, np.zeros(count, np.uint16)),
-            score=np.append(now.score, np.zeros(count)),
-            white=np.concatenate([now.white, np.full((count, 2), np.nan)]),
-            existence=np.append(now.existence, [birth.existence for birth in births]),
-            evidence=np.append(now.evidence, np.ones(count)),
-            target_id=np.append(now.target_id, [birth.target_id for birth in births]),
-            near_to=np.append(now.near_to, np.zeros(count, np.int64)),
-            near_for=np.append(now.near_for, np.zeros(count, np.int64)),
+        x, P, mu = self._new_tracks(births, layout)
+        count = len(births)
+        return now.with_rows(
+            now.life.born(count, now.stamp_ns, track_rules(config)),
+            {
+                'x': x,
+                'P': P,
+                'mu': mu,
+                'learnt': self._chain.fresh(count),
+                'nis': np.full(count, np.nan),
+                'nis_dof': np.zeros(count, np.uint16),
+                'score': np.zeros(count),
+                'white': np.full((count, 2), np.nan),
+                'existence': np.array([birth.existence for birth in births]),
+                'evidence': np.ones(count),
+                'target_id': np.array([birth.target_id for birth in births]),
+                'near_to': np.zeros(count, np.int64),
+                'near_for': np.zeros(count, np.int64),
+            },
         )
 
-    def _new_track(
-        self, birth: Birth, instruments: Instruments
+    def _new_tracks(
+        self, births: list[Birth], layout: Layout
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x, P and mu of a track that begins."""
-        layout = instruments.layout(self.config, self.models.n)
+        """x, P and mu of tracks that begin."""
         plain = self.models.height < 0 and layout.size == self.models.n
-        if birth.ping is None or birth.rows is None or plain:
-            x, P, mu = self.models.new_track(birth.position, birth.covariance, birth.ping is None)
+        if all(birth.ping is None for birth in births) or (plain and self.models.bias < 0):
+            position = np.array([birth.position for birth in births])
+            covariance = np.array([birth.covariance for birth in births])
+            x, P, mu = self.models.new_tracks(position, covariance)
             return *layout.widened(x, P), mu
-        x, P, mu = self.models.new_track(birth.position, np.eye(2) * FAR**2, False)
+        parts = [self._new_track(birth, layout, plain) for birth in births]
+        x, P, mu = (np.concatenate(one) for one in zip(*parts))
+        return x, P, mu
+
+    def _new_track(
+        self, birth: Birth, layout: Layout, plain: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x, P and mu of one track, with a row."""
+        where = birth.position[None]
+        if birth.ping is None or birth.rows is None or plain:
+            x, P, mu = self.models.new_tracks(where, birth.covariance[None], birth.ping is None)
+            return *layout.widened(x, P), mu
+        x, P, mu = self.models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
         x, P = layout.widened(x, P)
         factor = self.config.covariance_scale
         ping = ping_numbers(birth.ping, birth.rows, self.config, factor, self.models, layout)
         # All models of a copy begin alike: one of each is enough to ask.
         M = len(self.models.names)
-        first = begin_from_ping(x[::M], P[::M], ping, birth.position, self.config, layout)
+        first = begin_from_ping(x[0, ::M], P[0, ::M], ping, birth.position, self.config, layout)
         share = np.exp(first[2] - first[2].max())
         mu = mu * np.repeat(share / share.sum() * len(share), M)
-        return np.repeat(first[0], M, axis=0), np.repeat(first[1], M, axis=0), mu
+        return np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None], mu
 
     def _estimate(self, state: DiverState) -> Estimate:
         n, shown = self.models.n, soft.published(state.existence)
-        state = evolve(state.rows(shown), life=state.life.only(shown))
+        if not shown.all():
+            state = state.rows(shown, life=state.life.only(shown))
         x, P = state.x, state.P
         if x.shape[-1] > n:
             x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])

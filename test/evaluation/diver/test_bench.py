@@ -30,3 +30,10 @@ def test_both_kinds_of_stamps_are_tracked():
     assert result['regular_cpu_ms'] > 0.0 and result['irregular_cpu_ms'] > 0.0
     fixes = bench._fixes(np.array([1.0, 0.6, 1.4]))
     np.testing.assert_array_equal(np.diff([fix.stamp_ns for fix in fixes]), [6e8, 14e8])
+
+
+def test_scans_in_clutter_are_tracked_with_both_associations():
+    result = bench.bench_clutter(rounds=1, scans=15)
+    assert result['scans'] == 15 and result['fixes'] > 15
+    assert result['gnn_cpu_ms'] > 0.0 and result['jipda_cpu_ms'] > 0.0
+    assert len(bench.BENCHES[-1].sentence(result)) > 40

@@ -1,0 +1,165 @@
+"""Boats in clutter (Autoferry scenario 13): trackers tuned on one half and scored on the other.
+
+    SONAR_IMM_DATA=../shared/data python -m benchmarks.real_boats
+
+Radar and lidar by themselves, two boats with GNSS. Each tracker has the same number of settings,
+and the one with the best GOSPA in the first half of the recording is scored in the second, and the
+other way round. `PlainKalman` is what one writes in an afternoon: it shows what the rest is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from benchmarks.real_recordings import boat_scores, BOATS, DATA, header, load, row
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fixes
+from sonar_imm.recordings.convert import convert_autoferry
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+STDS, LIVES = (2.0, 3.0, 4.0, 6.0), ((3, 5), (4, 6))
+OFFSETS = {'radar': (0.0, -1.5), 'lidar': (0.0,)}
+"""Seconds added to the stamps: those of the radar are known to be about one scan late."""
+
+
+class PlainKalman:
+    """A constant-velocity Kalman filter a track, global nearest neighbours, M of N hits."""
+
+    def __init__(self, noise: float, std: float, hits: int, window: int):
+        self.noise, self.R, self.hits, self.window = noise, std**2 * np.eye(2), hits, window
+        self.tracks: list[dict[str, Any]] = []
+        self.stamp_ns, self.number = 0, 0
+
+    def process(self, scan: Fixes) -> list[Estimate]:
+        dt = (scan.stamp_ns - self.stamp_ns) * 1e-9 if self.stamp_ns else 0.0
+        self.stamp_ns = scan.stamp_ns
+        F, z = np.eye(4) + dt * np.eye(4, k=2), scan.position[:, :2]
+        Q = self.noise**2 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
+        cost = np.full((len(self.tracks), len(z)), 1e3)
+        for t, one in enumerate(self.tracks):
+            one['x'], one['P'] = F @ one['x'], F @ one['P'] @ F.T + Q
+            v = z - one['x'][:2]
+            S = one['P'][:2, :2] + self.R
+            nis = np.einsum('da,ab,db->d', v, np.linalg.inv(S), v)
+            cost[t] = np.where(nis < 13.8, nis + np.log(np.linalg.det(S)), 1e3)
+        pairs = {t: d for t, d in zip(*linear_sum_assignment(cost)) if cost[t, d] < 1e3}
+        for t, one in enumerate(self.tracks):
+            one['seen'] = [*one['seen'][1 - self.window :], t in pairs]
+            if t in pairs:
+                K = one['P'][:, :2] @ np.linalg.inv(one['P'][:2, :2] + self.R)
+                one['x'] = one['x'] + K @ (z[pairs[t]] - one['x'][:2])
+                one['P'] = one['P'] - K @ one['P'][:2]
+            one['firm'] = one['firm'] or sum(one['seen']) >= self.hits
+        for d in set(range(len(z))) - set(pairs.values()):
+            self.number += 1
+            x, P = np.append(z[d], [0.0, 0.0]), np.diag([*np.diag(self.R), 4.0, 4.0])
+            self.tracks.append({'x': x, 'P': P, 'seen': [True], 'firm': False, 'id': self.number})
+        self.tracks = [one for one in self.tracks if self._lives(one)]
+        return [self._estimate(scan.stamp_ns)]
+
+    def _lives(self, one: dict[str, Any]) -> bool:
+        if one['firm']:
+            return len(one['seen']) < 5 or any(one['seen'][-5:])
+        return len(one['seen']) - sum(one['seen']) <= self.window - self.hits
+
+    def _estimate(self, stamp_ns: int) -> Estimate:
+        n = len(self.tracks)
+        state = np.reshape([one['x'] for one in self.tracks], (n, 4))
+        extras = {
+            'track_id': np.array([one['id'] for one in self.tracks], int),
+            'track_state': np.array([one['firm'] for one in self.tracks], int),
+        }
+        return Estimate(
+            stamp_ns=stamp_ns,
+            frame_id='map',
+            xyz=np.zeros((n, 3), np.float32),
+            state_names=('px', 'py', 'vx', 'vy'),
+            state=state,
+            covariance=np.reshape([one['P'] for one in self.tracks], (n, 4, 4)),
+            extras=extras,
+        )
+
+
+Make = Callable[[float, float, tuple[int, int]], Any]
+
+
+def ours(**values: Any) -> Make:
+    """A tracker of this package; the noise that is tuned is that of its motion."""
+
+    def make(noise: float, std: float, life: tuple[int, int]) -> DiverTracker:
+        name = 'speed_noise' if 'model_set' not in values else 'acceleration_noise'
+        tuned = noise if name == 'speed_noise' else (noise,)
+        told = {name: tuned, 'fix_std': std, 'confirm_hits': life[0], 'confirm_window': life[1]}
+        return DiverTracker(DiverConfig(clutter_density=1e-5, **{**values, **told}))
+
+    return make
+
+
+TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
+    'plain CV Kalman, 40 lines': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
+    'CV Kalman, gnn': (ours(model_set='cv'), (0.1, 0.3, 1.0)),
+    'CV Kalman, jipda': (ours(model_set='cv', association='jipda'), (0.1, 0.3, 1.0)),
+    'heading_speed, gnn': (ours(**BOATS), (0.03, 0.1, 0.3)),
+    'heading_speed, jipda': (ours(**BOATS, association='jipda'), (0.03, 0.1, 0.3)),
+}
+
+
+def run(tracker: Any, items: list) -> dict[int, Estimate]:
+    final: dict[int, Estimate] = {}
+    for item in items:
+        final.update((one.stamp_ns, one) for one in tracker.process(item))
+    return final
+
+
+def half(final: dict[int, Estimate], middle_ns: int, second: bool) -> dict[int, Estimate]:
+    return {stamp: one for stamp, one in final.items() if (stamp >= middle_ns) == second}
+
+
+def sensor_table(sensor: str, offset: float, folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / sensor
+        convert_autoferry(
+            folder / 'scenario13_detections.json',
+            out,
+            sensors=(sensor,),
+            truth=folder / 'scenario13_groundTruth.json',
+            time_offset_ns=round(offset * 1e9),
+        )
+        items, truth = load(out)
+    stamps = sorted(item.stamp_ns for item in items)
+    middle = stamps[len(stamps) // 2]
+    later = f', stamps {offset:+g} s' if offset else ''
+    print(
+        f'\n### {sensor.capitalize()}{later}: {len(items)} scans, {sum(map(len, items))} fixes\n'
+    )
+    header('GOSPA first half', 'GOSPA second half', 'missed', 'false', 'tracks', 'RMSE m')
+    for label, (make, noises) in TRACKERS.items():
+        runs = [run(make(*one), items) for one in product(noises, STDS, LIVES)]
+        halves = [
+            [boat_scores(half(final, middle, second), truth) for final in runs]
+            for second in (False, True)
+        ]
+        best = [int(np.argmin([scores[0] for scores in one])) for one in halves]
+        # Chosen on one half, scored on the other.
+        scored = [halves[0][best[1]], halves[1][best[0]]]
+        row(label, [scored[0][0], scored[1][0], *np.mean([one[1:] for one in scored], axis=0)])
+
+
+def main() -> None:
+    folder = DATA / 'autoferry'
+    if not folder.is_dir():
+        raise SystemExit(f'no recordings at {DATA}: set SONAR_IMM_DATA')
+    for sensor, offsets in OFFSETS.items():
+        for offset in offsets:
+            sensor_table(sensor, offset, folder)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,167 @@
+"""What a fix does to its track, compiled: many fixes are few numbers each.
+
+All floats are float64, all arrays C-contiguous; T tracks of M models with n states. `warm` compiles
+or loads every kernel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...estimation import imm_kernels
+from ...estimation.adaptation_kernels import row_sum
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.jit import kernel
+
+Sums = tuple[float, float, float, float, float]
+"""Those of `fix_consistency.FixConsistency`."""
+
+
+@kernel
+def expected(x: FloatArray, H: FloatArray) -> FloatArray:
+    """What each model expects, (T, M, m): x (T, M, n), H (1, M, m, n)."""
+    T, M, n = x.shape
+    m = H.shape[2]
+    h = np.zeros((T, M, m))
+    for t in range(T):
+        for j in range(M):
+            for r in range(m):
+                for a in range(n):
+                    h[t, j, r] += H[0, j, r, a] * x[t, j, a]
+    return h
+
+
+@kernel
+def finite(x: FloatArray, P: FloatArray) -> BoolArray:
+    """Which tracks (T,) have finite numbers only: x (T, M, n), P (T, M, n, n)."""
+    T = len(x)
+    out = np.ones(T, dtype=np.bool_)
+    for t in range(T):
+        # A sum of finite numbers may overflow, so each is asked.
+        for value in x[t].flat:
+            out[t] = out[t] and math.isfinite(value)
+        for value in P[t].flat:
+            out[t] = out[t] and math.isfinite(value)
+    return out
+
+
+@kernel
+def take(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    h: FloatArray,
+    H: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    tracks: IntArray,
+    detection: IntArray,
+    nis: FloatArray,
+    nis_dof: np.ndarray,
+) -> int:
+    """Update `tracks` (t,), each with its `detection` (t,) of z (D, 2), R (D, 2, 2), in place: x
+    (T, M, n), P (T, M, n, n), mu (T, M); h (T, M, 2) expected. Adds to nis and nis_dof (T,); gives
+    how many covariances were repaired."""
+    M = x.shape[1]
+    innovation = np.empty((len(tracks), M, 2))
+    for k in range(len(tracks)):
+        for j in range(M):
+            for r in range(2):
+                innovation[k, j, r] = z[detection[k], r] - h[tracks[k], j, r]
+    x1, P1, mu1, _, nis1, ok, repaired = imm_kernels.update(
+        x[tracks], P[tracks], mu[tracks], innovation, H, R[detection]
+    )
+    for k in range(len(tracks)):
+        t = tracks[k]
+        x[t], P[t], mu[t] = x1[k], P1[k], mu1[k]
+        if ok[k]:
+            nis[t] += nis1[k]
+            nis_dof[t] += 2
+    return int(repaired.sum())
+
+
+@kernel
+def keep_score(
+    score: FloatArray,
+    fit: FloatArray,
+    chosen: IntArray,
+    named: BoolArray,
+    missed: float,
+    gain: float,
+    log_clutter: float,
+) -> None:
+    """Add to score (T,), in place: ln of P_D N(nu; 0, S) / clutter for a hit, ln of 1 - P_D, which
+    is `missed`, for a miss; gain: ln of P_D / (1 - P_D). Not for tracks that are `named` (T,)."""
+    for t in range(len(score)):
+        if not named[t]:
+            score[t] += missed
+        if chosen[t] >= 0:
+            score[t] += fit[t, chosen[t]] + gain
+            score[t] -= log_clutter
+
+
+@kernel
+def watch(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    H: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    tracks: IntArray,
+    detection: IntArray,
+    tentative: BoolArray,
+    white: FloatArray,
+    sums: Sums,
+    memory: float,
+) -> Sums:
+    """Whiten the innovations that the mixture of each of `tracks` (t,) sees in its `detection`
+    (t,), into white (T, 2), in place. Gives the sums with those of confirmed tracks, of which
+    about the last `memory` count; tentative (T,), the rest as in `take`."""
+    mean, covariance = imm_kernels.combine(x[tracks], P[tracks], mu[tracks], H[0])
+    one, other = np.empty((len(tracks), 2)), np.empty((len(tracks), 2))
+    count, pairs = 0, 0
+    for k in range(len(tracks)):
+        t, row = tracks[k], detection[k]
+        # The inverse of the Cholesky factor of 2 x 2, written out.
+        a = math.sqrt(covariance[k, 0, 0] + R[row, 0, 0])
+        b = (covariance[k, 1, 0] + R[row, 1, 0]) / a
+        c = math.sqrt(covariance[k, 1, 1] + R[row, 1, 1] - b * b)
+        first = (z[row, 0] - mean[k, 0]) / a
+        second = (z[row, 1] - mean[k, 1] - b * first) / c
+        if not tentative[t] and math.isfinite(first) and math.isfinite(second):
+            one[count, 0], one[count, 1] = first, second
+            count += 1
+            if math.isfinite(white[t, 0]) and math.isfinite(white[t, 1]):
+                other[pairs] = white[t]
+                # Those that have a partner come first.
+                one[count - 1], one[pairs] = one[pairs].copy(), one[count - 1].copy()
+                pairs += 1
+        white[t, 0], white[t, 1] = first, second
+    if not count:
+        return sums
+    now, before = one.ravel(), other.ravel()
+    square, cross = now[: 2 * count] ** 2, now[: 2 * pairs] * before[: 2 * pairs]
+    both = square[: 2 * pairs] + before[: 2 * pairs] ** 2
+    total = sums[0] + count
+    kept = memory / total if total > memory else 1.0
+    return (
+        total * kept,
+        (sums[1] + 0.5 * row_sum(square)) * kept,
+        (sums[2] + pairs) * kept,
+        (sums[3] + row_sum(cross)) * kept,
+        (sums[4] + 0.5 * row_sum(both)) * kept,
+    )
+
+
+def warm() -> None:
+    """Run the kernels once on tiny input: compiled or loaded from the cache."""
+    x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
+    H, z, R, first = P.copy(), np.zeros((1, 2)), np.eye(2)[None], np.zeros(1, np.int64)
+    take(x, P, mu, expected(x, H), H, z, R, first, first, np.zeros(1), np.zeros(1, np.uint16))
+    no, sums = np.zeros(1, np.bool_), (0.0, 0.0, 0.0, 0.0, 0.0)
+    watch(x, P, mu, H, z, R, first, first, no, np.full((1, 2), np.nan), sums, 1.0)
+    keep_score(np.zeros(1), z, first, no, 0.0, 0.0, 0.0)
+    finite(x, P)
