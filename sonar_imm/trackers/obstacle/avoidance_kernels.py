@@ -14,7 +14,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import semidefinite_root
-from .kernels import _sigma_point, _to_world, KAPPA, point
+from .kernels import KAPPA, moments, point, sigma_point, to_world
 
 SIZE = 5
 SLICES = 16
@@ -51,35 +51,25 @@ def relative(
     weight mu (T, K) is too small."""
     T, K, size = x.shape
     mean, covariance = np.zeros((T, K, SIZE)), np.zeros((T, K, SIZE, SIZE))
-    whole, images = np.zeros((size, size)), np.zeros((2 * size + 1, SIZE))
+    whole, images = np.zeros((size, size)), np.zeros((SIZE, 2 * size + 1))
     y, m, world = np.empty(size), np.empty(3), np.empty(3)
     for t in range(T):
         for j in range(K):
             if mu[t, j] < WEIGHT:
                 continue
             n = size if moves[j] else 4
-            weight, centre = 0.5 / (n + KAPPA), KAPPA / (n + KAPPA)
             L = whole[:n, :n]
             semidefinite_root(P[t, j, :n, :n], L)
             images[:] = 0.0
             for number in range(2 * n + 1):
-                _sigma_point(x[t, j, :n], L, number, y)
+                sigma_point(x[t, j, :n], L, number, y)
                 point(y[0], y[1], y[2] - p[2], R, cone, m)
-                _to_world(R, m, world)
-                images[number, 0], images[number, 1] = world[0], world[1]
-                images[number, 2] = y[2] - p[2]
+                to_world(R, m, world)
+                images[0, number], images[1, number] = world[0], world[1]
+                images[2, number] = y[2] - p[2]
                 for i in range(4, n):
-                    images[number, i - 1] = y[i]
-            for number in range(2 * n + 1):
-                share = centre if number == 0 else weight
-                for a in range(SIZE):
-                    mean[t, j, a] += share * images[number, a]
-            for number in range(2 * n + 1):
-                share = centre if number == 0 else weight
-                for a in range(SIZE):
-                    for b in range(SIZE):
-                        off = images[number, b] - mean[t, j, b]
-                        covariance[t, j, a, b] += share * (images[number, a] - mean[t, j, a]) * off
+                    images[i - 1, number] = y[i]
+            moments(images, 2 * n + 1, mean[t, j], covariance[t, j])
     return mean, covariance
 
 
@@ -171,7 +161,7 @@ def closed_form(g: FloatArray, L: FloatArray, safety: Safety) -> float:
     y = np.empty(SIZE)
     miss, drop, when = np.empty(2 * SIZE + 1), np.empty(2 * SIZE + 1), np.empty(2 * SIZE + 1)
     for number in range(2 * SIZE + 1):
-        _sigma_point(g, L, number, y)
+        sigma_point(g, L, number, y)
         w0, w1 = y[3] - V[0], y[4] - V[1]
         square = max(w0 * w0 + w1 * w1, LITTLE)
         miss[number] = (y[0] * w1 - y[1] * w0) / math.sqrt(square)

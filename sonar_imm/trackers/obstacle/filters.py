@@ -26,8 +26,8 @@ from ...estimation import kalman, unscented
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
 from ...estimation.covariance import symmetrise
-from . import avoidance_kernels
-from . import kernels as kernels
+from . import avoidance_kernels, behaviour_kernels, kernels
+from .behaviour_kernels import Motion, Step
 from .config import ObstacleConfig
 
 BAND = 0.9
@@ -143,10 +143,8 @@ class DepthSlices:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
         mixture = self._clamp_to_seafloor(mixture, before)
-        noise = np.array(self._noise) * dt
-        x, P, repaired = kernels.advance(
-            mixture.x, mixture.P, *before.pose, *after.pose, noise, self.cone
-        )
+        step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
+        x, P, repaired = behaviour_kernels.advance(*mixture, Motion.none(self.K), step)
         return Mixture(x, P, mixture.mu), int(repaired.sum())
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:

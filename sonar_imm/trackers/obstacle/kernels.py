@@ -59,13 +59,13 @@ def echo(m: FloatArray, cone: bool) -> tuple[float, float]:
 
 
 @kernel
-def _to_world(R: FloatArray, m: FloatArray, world: FloatArray) -> None:
+def to_world(R: FloatArray, m: FloatArray, world: FloatArray) -> None:
     for i in range(3):
         world[i] = R[i, 0] * m[0] + R[i, 1] * m[1] + R[i, 2] * m[2]
 
 
 @kernel
-def _sigma_point(x: FloatArray, L: FloatArray, number: int, y: FloatArray) -> None:
+def sigma_point(x: FloatArray, L: FloatArray, number: int, y: FloatArray) -> None:
     """Point `number` of 2n + 1 into y (n,): the centre, then plus and minus each column of L."""
     n = len(x)
     reach = math.sqrt(n + KAPPA)
@@ -78,66 +78,27 @@ def _sigma_point(x: FloatArray, L: FloatArray, number: int, y: FloatArray) -> No
 
 
 @kernel
-def advance(
-    x: FloatArray,
-    P: FloatArray,
-    p0: FloatArray,
-    R0: FloatArray,
-    p1: FloatArray,
-    R1: FloatArray,
-    noise: FloatArray,
-    cone: bool,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Predict what sonar pose (p1, R1) will see of what (p0, R0) saw, by the unscented transform.
-
-    noise (3,): variances the time between adds to horizontal position, azimuth and depth. Gives x,
-    P and where P (T, K) was repaired (`estimation.covariance`).
-    """
-    T, K, n = x.shape
-    x1, P1 = np.empty((T, K, n)), np.empty((T, K, n, n))
-    repaired = np.zeros((T, K), dtype=np.bool_)
-    L, images = np.zeros((n, n)), np.empty((2 * n + 1, n))
-    y, m, world = np.empty(n), np.empty(3), np.empty(3)
-    weight = 0.5 / (n + KAPPA)
-    centre = KAPPA / (n + KAPPA)
-    for t in range(T):
-        for j in range(K):
-            semidefinite_root(P[t, j], L)
-            for number in range(2 * n + 1):
-                _sigma_point(x[t, j], L, number, y)
-                point(y[0], y[1], y[2] - p0[2], R0, cone, m)
-                _to_world(R0, m, world)
-                world[0] += (p0[0] - p1[0]) * (1.0 + y[3])
-                world[1] += (p0[1] - p1[1]) * (1.0 + y[3])
-                world[2] += p0[2] - p1[2]
-                for i in range(3):
-                    m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
-                images[number, 0], images[number, 1] = echo(m, cone)
-                images[number, 2], images[number, 3] = y[2], y[3]
-                turns = (images[number, 1] - images[0, 1]) / (2.0 * math.pi)
-                images[number, 1] -= 2.0 * math.pi * np.round(turns)
-            for a in range(n):
-                total = centre * images[0, a]
-                for number in range(1, 2 * n + 1):
-                    total += weight * images[number, a]
-                x1[t, j, a] = total
-            for a in range(n):
-                for b in range(a + 1):
-                    total = 0.0
-                    for number in range(2 * n + 1):
-                        share = centre if number == 0 else weight
-                        total += (
-                            share
-                            * (images[number, a] - x1[t, j, a])
-                            * (images[number, b] - x1[t, j, b])
-                        )
-                    P1[t, j, a, b] = total
-                    P1[t, j, b, a] = total
-            P1[t, j, 0, 0] += noise[0]
-            P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
-            P1[t, j, 2, 2] += noise[2]
-            repaired[t, j] = lift(P1[t, j], L)
-    return x1, P1, repaired
+def moments(images: FloatArray, points: int, mean: FloatArray, covariance: FloatArray) -> None:
+    """Mean (n,) and covariance (n, n), into the latter two, of sigma points: the first `points`
+    columns of images (n, ..), the centre first. Leaves in images how far off the mean they are."""
+    n = len(mean)
+    # Of 2 s + 1 points on s states the others weigh 1 / (2 (s + kappa)).
+    weight = 0.5 / (0.5 * (points - 1) + KAPPA)
+    centre = KAPPA / (0.5 * (points - 1) + KAPPA)
+    for a in range(n):
+        total = centre * images[a, 0]
+        for number in range(1, points):
+            total += weight * images[a, number]
+        mean[a] = total
+        for number in range(points):
+            images[a, number] -= total
+    for a in range(n):
+        for b in range(a + 1):
+            total = centre * images[a, 0] * images[b, 0]
+            for number in range(1, points):
+                total += weight * images[a, number] * images[b, number]
+            covariance[a, b] = total
+            covariance[b, a] = total
 
 
 @kernel
@@ -168,9 +129,9 @@ def locate(
                 continue
             semidefinite_root(P[t, j], L)
             for number in range(2 * n + 1):
-                _sigma_point(x[t, j], L, number, y)
+                sigma_point(x[t, j], L, number, y)
                 point(y[0], y[1], y[2] - p[2], R, cone, m)
-                _to_world(R, m, world[j, number])
+                to_world(R, m, world[j, number])
                 share = mu[t, j] * (centre if number == 0 else weight)
                 for i in range(3):
                     mean[t, i] += share * world[j, number, i]
