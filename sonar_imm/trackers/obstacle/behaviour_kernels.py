@@ -17,7 +17,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import lift, semidefinite_root
-from .kernels import echo, moments, point, sigma_point, to_world
+from .kernels import along, echo, moments, point, to_world
 
 STATES = 6
 COMMON = 4
@@ -155,7 +155,7 @@ def advance(
     p0, R0, p1, R1, noise, cone = step
     x1, P1 = np.zeros((T, C, size)), np.zeros((T, C, size, size))
     repaired = np.zeros((T, C), dtype=np.bool_)
-    whole, images = np.zeros((size, size)), np.empty((size, 2 * size + 1))
+    L, images = np.zeros((size, size)), np.empty((size, 2 * size + 1))
     y, m, J = np.empty(size), np.empty(3), np.empty((2, 2))
     middle, world, scratch = np.empty(3), np.empty(3), np.empty((size, size))
     for t in range(T):
@@ -166,12 +166,14 @@ def advance(
             if mu[t, j] <= 0.0:
                 continue
             n = size if motion.prior[j] > 0.0 else COMMON
-            L = whole[:n, :n]
-            semidefinite_root(P[t, j, :n, :n], L)
+            centre, mean, spread, root = x[t, j], x1[t, j, :n], P1[t, j, :n, :n], L[:n, :n]
+            semidefinite_root(P[t, j, :n, :n], root)
             for number in range(2 * n + 1):
-                sigma_point(x[t, j, :n], L, number, y)
-                # L is triangular: d, delta and z differ from the centre's on its first columns.
-                if number == 0 or (number - 1) % n < PLACED:
+                column, reach = along(number, n)
+                for a in range(n):
+                    y[a] = centre[a] + reach * root[a, column]
+                # The root is triangular: on its later columns a point is where the centre is.
+                if column < PLACED:
                     point(y[0], y[1], y[2] - p0[2], R0, cone, m)
                     to_world(R0, m, world)
                     if number == 0:
@@ -193,7 +195,7 @@ def advance(
                 apart = images[1, number] - images[1, 0]
                 if abs(apart) > math.pi:
                     images[1, number] -= 2.0 * math.pi * np.round(apart / (2.0 * math.pi))
-            moments(images, 2 * n + 1, x1[t, j, :n], P1[t, j, :n, :n])
+            moments(images, 2 * n + 1, mean, spread)
             P1[t, j, 0, 0] += noise[0]
             P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
             P1[t, j, 2, 2] += noise[2]

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.trackers.obstacle import behaviour_kernels, kernels
+from sonar_imm.trackers.obstacle import avoidance_kernels, behaviour_kernels, kernels
 from sonar_imm.trackers.obstacle.behaviour_kernels import Motion, Step
 
 MODELS = {'plane': False, 'cone': True}
@@ -111,12 +111,14 @@ def test_places_equal_sampling():
     rng = np.random.default_rng(3)
     before, _ = poses(rng)
     x, P, mu = targets(rng, before, T=1, K=2)
-    mean, covariance = kernels.locate(x, P, mu, *before, False)
+    still = np.zeros(2, np.bool_)
+    near = avoidance_kernels.relative(x, P, mu, still, *before, False)
+    mean, covariance = kernels.matched(*near, mu, 3)
     which = rng.choice(2, 200_000, p=mu[0])
     draws = np.array([rng.multivariate_normal(x[0, k], P[0, k], 200_000) for k in (0, 1)])
     d, delta, z, _ = draws[which, np.arange(200_000)].T
     m = geometry.reconstruct(d, delta, z - before.position[2], before.R)
-    world = geometry.to_world(before, m)
+    world = geometry.apply(before.R, m)
     assert_allclose(mean[0], world.mean(axis=0), atol=0.1)
     assert_allclose(covariance[0], np.cov(world.T), rtol=0.05, atol=0.2)
 
