@@ -7,8 +7,8 @@ fixed, `all` has the default behaviours; both see the same measurements. Errors 
 vertical offset when the range first falls to 50, 30 and 20 m, of the track that is confirmed and
 nearest, at most 5 m off; `lost` counts the runs without one. P is the mean probability of each
 behaviour at 30 m, v the RMSE of the velocity of each axis there.
-`velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first,
-begins to move or stops.
+`velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
+while it is followed, begins to move or stops.
 `calibration` compares stated probabilities of a collision with what happened, at 60, 40 and 25 m
 and for as many runs of a fixed, a swaying and a moving obstacle each: `over the beam` draws the
 vertical offset evenly over what the beam shows at the first ping, which is what the tracker
@@ -126,6 +126,8 @@ def velocity(runs: int) -> dict[str, dict[str, float]]:
             final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             t = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
             seen = when or t[np.argmax(truth.in_beam)]
+            if when and nearest(truth, final, int(np.argmin(np.abs(t - when)))) is None:
+                continue
             for seconds, off in errors.items():
                 ping = int(np.argmin(np.abs(t - seen - seconds)))
                 found = nearest(truth, final, ping)
