@@ -1,14 +1,19 @@
 """Obstacles that stay, sway, move or lie on the sea floor: accuracy with and without behaviours.
 
-    python -m benchmarks.obstacle_sea --runs 25 --out docs/results/obstacle_sea.json
+    python -m benchmarks.obstacle_sea --runs 100 --out docs/results/obstacle_sea.json
 
 Each run is the whole tracker: gating, confirmation, track logic. `fixed` holds every obstacle for
 fixed, `all` has the default behaviours; both see the same measurements. Errors are those of the
 vertical offset when the range first falls to 50, 30 and 20 m, of the track that is confirmed and
 nearest, at most 5 m off; `lost` counts the runs without one. P is the mean probability of each
 behaviour at 30 m, v the RMSE of the velocity of each axis there.
-`calibration` compares stated probabilities of a collision with what happened: twice the runs for
-each of a fixed, a swaying and a moving obstacle, the vertical offset uniform within 5 m.
+`velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
+while it is followed, begins to move or stops.
+`calibration` compares stated probabilities of a collision with what happened, at 60, 40 and 25 m
+and for as many runs of a fixed, a swaying and a moving obstacle each: `over the beam` draws the
+vertical offset evenly over what the beam shows at the first ping, which is what the tracker
+believes of a new obstacle; `near the sonar` within 5 m. `guess` is the Brier score of who knows
+nothing but how often it happens.
 """
 
 from __future__ import annotations
@@ -32,18 +37,37 @@ from benchmarks.obstacle_accuracy import (
 )
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
+from sonar_imm.simulation.obstacle.scenario import SCENARIOS
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 
+CALM = {
+    name: value
+    for name, value in SCENARIOS['calm'][1].items()
+    if name not in ('vertical_offset', 'offset_spread')
+}
+FLOOR = {'altitude': 6.0}
+"""The sonar of the study is 0.3 m below the navigation reference, and the floor 5.7 m below it."""
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     'fixed': ('approach', {}),
     'fixed, roll 4 deg': ('rolling', {}),
     'swaying': ('swaying', {}),
     'swaying, roll 4 deg': ('swaying', {'roll_rms_deg': 4.0}),
+    'swaying, calm': ('swaying', CALM),
+    'smooth sway': ('swaying', {'obstacle_motion': 'swinging'}),
     'moving .3-1.5 m/s': ('mover', {}),
     'moving .1-.3 m/s': ('mover', {'obstacle_speed': [0.1, 0.3]}),
-    'on the sea floor': ('approach', {'placement': 'seabed', 'altitude': 6.0}),
+    'on the sea floor': ('approach', {**FLOOR, 'vertical_offset': 5.7, 'offset_spread': 0.5}),
+    'half a metre above the sea floor': ('approach', {**FLOOR, 'placement': 'seabed'}),
 }
+VELOCITY: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
+    'moves': ({}, 0.0, (5.0, 10.0, 20.0)),
+    'starts to move': ({'obstacle_starts': 20.0}, 20.0, (2.0, 5.0, 10.0)),
+    'stops': ({'obstacle_stops': 20.0}, 20.0, (2.0, 5.0, 10.0)),
+}
+"""What differs from a mover, when something happens, s, and how long after it is looked at, s."""
+DRAWN = {'over the beam': 11.5, 'near the sonar': 5.0}
+"""Greatest vertical offset of the obstacles of a calibration, m."""
 METHODS: dict[str, dict[str, Any]] = {
     'fixed': {'behaviours': ('fixed',)},
     'all': {'behaviours': BEHAVIOURS},
@@ -52,23 +76,67 @@ AT = 30.0
 BINS = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
 
 
+def nearest(truth: TrueObstacle, final: dict[int, Estimate], ping: int) -> dict[str, float] | None:
+    """The columns of the confirmed track nearest to an obstacle at a ping, None without one."""
+    estimate = final.get(int(truth.stamp_ns[ping]))
+    if estimate is None:
+        return None
+    points, confirmed = level(estimate)
+    distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
+    distance[~confirmed] = np.inf
+    if not len(distance) or distance.min() > NEAR:
+        return None
+    row = int(np.argmin(distance))
+    return {name: float(values[row]) for name, values in estimate.extras.items()}
+
+
+def first_at(
+    truth: TrueObstacle, final: dict[int, Estimate], at: float
+) -> tuple[int, dict[str, float]] | None:
+    """The ping at which the range first falls to `at` and the obstacle is followed."""
+    for ping in np.flatnonzero(truth.range <= at)[:6].tolist():
+        found = nearest(truth, final, ping)
+        if found is not None:
+            return ping, found
+    return None
+
+
+def off_velocity(truth: TrueObstacle, ping: int, found: dict[str, float]) -> list[float]:
+    return [found[name] - truth.velocity[ping, i] for i, name in enumerate(('vx', 'vy'))]
+
+
 def behaviour_at(truth: TrueObstacle, final: dict[int, Estimate]) -> list[float] | None:
     """Probability of each behaviour and the error of vx and vy when the range falls to `AT`."""
-    for ping in np.flatnonzero(truth.range <= AT)[:6]:
-        estimate = final.get(int(truth.stamp_ns[ping]))
-        if estimate is None:
-            continue
-        points, confirmed = level(estimate)
-        distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
-        distance[~confirmed] = np.inf
-        if len(distance) and distance.min() <= NEAR:
-            row = int(np.argmin(distance))
-            extras = estimate.extras
-            return [float(extras[f'prob_{name}'][row]) for name in BEHAVIOURS] + [
-                float(extras[name][row] - truth.velocity[ping, i])
-                for i, name in enumerate(('vx', 'vy'))
-            ]
-    return None
+    seen = first_at(truth, final, AT)
+    if seen is None:
+        return None
+    ping, found = seen
+    return [found[f'prob_{name}'] for name in BEHAVIOURS] + off_velocity(truth, ping, found)
+
+
+def velocity(runs: int) -> dict[str, dict[str, float]]:
+    """RMSE of the velocity of each axis after what happens, by the time since."""
+    table: dict[str, dict[str, float]] = {}
+    for name, (changes, when, after) in VELOCITY.items():
+        setting = scenario('mover', {**LEVER, **changes})
+        errors: dict[float, list[float]] = {seconds: [] for seconds in after}
+        for seed in range(runs):
+            scene = simulate(setting, seed)
+            truth = scene.truth[0]
+            final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
+            t = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
+            seen = when or t[np.argmax(truth.in_beam)]
+            if when and nearest(truth, final, int(np.argmin(np.abs(t - when)))) is None:
+                continue
+            for seconds, off in errors.items():
+                ping = int(np.argmin(np.abs(t - seen - seconds)))
+                found = nearest(truth, final, ping)
+                if found is not None:
+                    off += off_velocity(truth, ping, found)
+        table[name] = {
+            f'{s:.0f} s': float(np.sqrt(np.mean(np.square(e)))) for s, e in errors.items()
+        }
+    return table
 
 
 def case(name: str, runs: int) -> dict[str, dict[str, float]]:
@@ -112,24 +180,24 @@ def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bo
     return bool(np.any((level_distance <= radius) & (np.abs(offset) <= height)))
 
 
-def calibration(runs: int) -> dict[str, dict[str, float]]:
+def calibration(runs: int, reach: float) -> dict[str, dict[str, float]]:
     """Stated probabilities of a collision at 60, 40 and 25 m, by bin, beside what happened."""
     forecasts: list[tuple[str, float, float, float]] = []
     config = ObstacleConfig()
     for kind in ('approach', 'swaying', 'mover'):
         setting = scenario(
             kind,
-            {**LEVER, 'vertical_offset': 0.0, 'offset_spread': 5.0, 'last_range': -30.0},
+            {**LEVER, 'vertical_offset': 0.0, 'offset_spread': reach, 'last_range': -30.0},
         )
         for seed in range(runs):
             scene = simulate(setting, 1000 + seed)
             truth = scene.truth[0]
             final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             for at in (60.0, 40.0, 25.0):
-                stated = risk_at(truth, final, at)
-                if stated is not None:
-                    hit = happened(truth, stated[0], config.safety_radius, config.safety_height)
-                    forecasts.append((kind, at, stated[1], float(hit)))
+                seen = first_at(truth, final, at)
+                if seen is not None and np.isfinite(seen[1]['collision_probability']):
+                    hit = happened(truth, seen[0], config.safety_radius, config.safety_height)
+                    forecasts.append((kind, at, seen[1]['collision_probability'], float(hit)))
     table: dict[str, dict[str, float]] = {}
     p = np.array([one[2] for one in forecasts])
     hit = np.array([one[3] for one in forecasts])
@@ -142,28 +210,14 @@ def calibration(runs: int) -> dict[str, dict[str, float]]:
                 'happened': float(hit[rows].mean()),
             }
     for kind in ('approach', 'swaying', 'mover'):
-        table[f'Brier, {kind}'] = {}
+        for name in ('Brier', 'guess'):
+            table[f'{name}, {kind}'] = {}
         for at in (60.0, 40.0, 25.0):
             rows = np.array([one[0] == kind and one[1] == at for one in forecasts])
+            often = hit[rows].mean()
             table[f'Brier, {kind}'][f'{at:.0f} m'] = float(np.mean((p[rows] - hit[rows]) ** 2))
+            table[f'guess, {kind}'][f'{at:.0f} m'] = float(often * (1.0 - often))
     return table
-
-
-def risk_at(
-    truth: TrueObstacle, final: dict[int, Estimate], at: float
-) -> tuple[int, float] | None:
-    """The ping at which the range first falls to `at`, and the probability stated there."""
-    for ping in np.flatnonzero(truth.range <= at)[:6]:
-        estimate = final.get(int(truth.stamp_ns[ping]))
-        if estimate is None:
-            continue
-        points, confirmed = level(estimate)
-        distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
-        distance[~confirmed] = np.inf
-        if len(distance) and distance.min() <= NEAR:
-            risk = float(estimate.extras['collision_probability'][int(np.argmin(distance))])
-            return (int(ping), risk) if np.isfinite(risk) else None
-    return None
 
 
 def guarded(rows: list[list[list[float] | None]]) -> dict[str, float]:
@@ -186,19 +240,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument('--runs', type=int, default=25)
-    parser.add_argument(
-        '--cases', nargs='*', choices=[*CASES, 'calibration'], default=[*CASES, 'calibration']
-    )
+    parser.add_argument('--runs', type=int, default=100)
+    every = [*CASES, 'velocity', *(f'calibration, {name}' for name in DRAWN)]
+    parser.add_argument('--cases', nargs='*', choices=every, default=every)
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
     tables: dict[str, Any] = {}
     for name in options.cases:
-        if name == 'calibration':
-            tables[name] = calibration(2 * options.runs)
+        if name == 'velocity':
+            tables[name] = velocity(options.runs)
+            parts = [{row: values} for row, values in tables[name].items()]
+        elif name not in CASES:
+            tables[name] = calibration(options.runs, DRAWN[name.removeprefix('calibration, ')])
             parts = [
-                {row: values for row, values in tables[name].items() if row.startswith(word)}
-                for word in ('stated', 'Brier')
+                {row: values for row, values in tables[name].items() if row.startswith(words)}
+                for words in (('stated',), ('Brier', 'guess'))
             ]
         else:
             tables[name] = case(name, options.runs)
@@ -211,7 +267,7 @@ def main() -> None:
             parts = [errors, {both: told}]
         for part in parts:
             print(f'\n{markdown(part, 3)}', flush=True)
-    write_json(options.out, {'runs': options.runs, **tables})
+        write_json(options.out, {'runs': options.runs, **tables})
 
 
 if __name__ == '__main__':

@@ -107,12 +107,16 @@ def rotation_of_quaternion(q: ArrayLike) -> FloatArray:
     """The rotation (..., 3, 3) of quaternions (..., 4) x, y, z, w, which need not have unit
     length."""
     q = np.asarray(q, np.float64)
-    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    parts = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    # Of one quaternion plain floats: the same bits in a tenth of the time.
+    x, y, z, w = parts.tolist() if q.ndim == 1 else parts
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
         [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
         [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
     ]
+    if q.ndim == 1:
+        return np.array(rows)
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 

@@ -1,9 +1,9 @@
 """How runs of the obstacle tracker are judged: heights and 90 % bands against the truth.
 
-`series` lays estimates end to end and says which track is which obstacle. `scoring` says how large
-the errors are and whether the stated uncertainty holds, `deferred` what the paper's deferred
-estimate would have been. `summary`, `sections` and `figures` present it; `bench` measures the
-tracker.
+`series` lays estimates end to end and says which track is which obstacle. `scoring` says how
+large the errors are and whether the stated uncertainty holds, `motion` the same of velocities,
+behaviours and collisions, `deferred` what the paper's deferred estimate would have been.
+`summary`, `sections` and `figures` present it; `bench` measures the tracker.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ...trackers.obstacle.config import ObstacleConfig
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_measurements, read_truth, RunFolder
 from .deferred import deferred_estimates
+from .motion import motion_metrics
 from .scoring import score
 from .series import Matching, series_of, truth_of
 from .summary import lines, summary_sentence
@@ -51,6 +52,8 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     metrics, found = score(series, truth, cutoff=cutoff, gap=options.gap)
     metrics['truth_lag_s'] = options.lag
     config = ObstacleConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    if found is not None and truth is not None:
+        metrics |= motion_metrics(found, truth, config)
     received = list(read_measurements(run))
     deferred = deferred_estimates(series, received, config, _met_first(found, truth), options.gap)
     if deferred is not None:

@@ -19,6 +19,7 @@ STEP_NS = 500_000_000
 
 
 VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
+    'fixed obstacles alone': (0, {'behaviours': ('fixed',)}),
     'with 5 false echoes per ping': (5, {}),
     '5 slices instead of 9': (0, {'components': 5}),
     'two_way timing': (0, {'ping_timing': 'two_way', 'max_extrapolation': 0.2}),

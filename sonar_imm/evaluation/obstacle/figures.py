@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
@@ -193,3 +193,30 @@ def error_figure(found: Matching) -> go.Figure:
     figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
     figure.update_yaxes(title='offset error / sigma')
     return styled(figure, height=320)
+
+
+def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> go.Figure:
+    """How often what was stated with a probability came true, by bins of it; the area of a point
+    is the number of forecasts."""
+    stated = [one['stated'] for one in bins.values()]
+    came, n = [one['came_true'] for one in bins.values()], [one['n'] for one in bins.values()]
+    figure = go.Figure()
+    figure.add_scatter(
+        x=[0, 1],
+        y=[0, 1],
+        mode='lines',
+        name='as stated',
+        line={'color': INK, 'width': 1.5, 'dash': 'dot'},
+    )
+    figure.add_scatter(
+        x=stated,
+        y=came,
+        mode='lines+markers',
+        name='happened',
+        text=[f'{count} forecasts' for count in n],
+        line={'color': COLOURS[0]},
+        marker={'size': [6.0 + 18.0 * (count / max(n)) ** 0.5 for count in n]},
+    )
+    figure.update_xaxes(title='stated probability', range=[-0.03, 1.03])
+    figure.update_yaxes(title='share that happened', range=[-0.03, 1.03])
+    return styled(figure, height=360)

@@ -9,6 +9,7 @@ from attrs import frozen
 import numpy as np
 
 from ...measurements import Detections
+from ...trackers.obstacle.config import BEHAVIOURS
 from ..judging import Check
 from ..numbers import bounds_remark
 from ..page import Card, Part, Section, table
@@ -153,6 +154,7 @@ def _sections(material: Material) -> list[Section]:
                 ),
             )
         )
+    sections += _motion_sections(material.metrics)
     hits = series.pick(np.isfinite(series.nis))
     if len(hits):
         sections.append(
@@ -164,6 +166,35 @@ def _sections(material: Material) -> list[Section]:
                 nis_figure(
                     seconds(hits.stamp_ns, series.ping_ns), hits.nis, np.full(len(hits), 2.0)
                 ),
+            )
+        )
+    return sections
+
+
+def _motion_sections(metrics: Mapping[str, Any]) -> list[Section]:
+    sections = []
+    if behaviours := metrics.get('behaviours'):
+        names = list(BEHAVIOURS)
+        rows = [
+            (true, values['n'], *(values[name] for name in names))
+            for true, values in behaviours['confusion'].items()
+        ]
+        sections.append(
+            Section(
+                'What the obstacles do',
+                'Mean stated probability of each behaviour, by what the obstacle really does.',
+                html=table(('does', 'rows', *(f'P({name})' for name in names)), rows),
+            )
+        )
+    if collisions := metrics.get('collisions'):
+        sections.append(
+            Section(
+                'Calibration of the probability of a collision',
+                'How often a collision followed, by the stated probability. Forecasts of one '
+                'approach are not independent. '
+                f'Brier score {collisions["brier"]:.3f}; of always saying how often it happened, '
+                f'{collisions["brier_of_a_guess"]:.3f}.',
+                figures.calibration_figure(collisions['bins']),
             )
         )
     return sections

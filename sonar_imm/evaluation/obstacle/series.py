@@ -16,6 +16,7 @@ from ...estimates import Estimate
 from ...estimation.angles import wrap_angle
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.consistency import gospa
+from ...trackers.obstacle.config import BEHAVIOURS
 from .. import SECOND
 
 STATES = ('range', 'bearing', 'vertical_offset')
@@ -29,7 +30,9 @@ PASSED = 0.2
 class Series:
     """Rows of confirmed tracks, sorted by stamp: stamp_ns, track_id (n,); state (n, 3) in the
     order of `STATES`; covariance (n, 3, 3); low, high: the 90 % band of the offset (n,); above:
-    its probability (n,); nis (n,), NaN without a hit. ping_ns: all pings."""
+    its probability (n,); nis (n,), NaN without a hit; velocity (n, 2) m/s with velocity_covariance
+    (n, 2, 2); does (n, 4): the probability of each of `BEHAVIOURS`; risk (n,): the probability of
+    a collision; these are NaN where a run does not tell them. ping_ns: all pings."""
 
     ping_ns: IntArray
     stamp_ns: IntArray
@@ -40,6 +43,10 @@ class Series:
     high: FloatArray
     above: FloatArray
     nis: FloatArray
+    velocity: FloatArray
+    velocity_covariance: FloatArray
+    does: FloatArray
+    risk: FloatArray
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -54,18 +61,24 @@ class Series:
         return int(ids[np.argmax(counts)]) if len(ids) else None
 
 
-_ROWS = ('stamp_ns', 'track_id', 'state', 'covariance', 'low', 'high', 'above', 'nis')
+_ROWS = (
+    'stamp_ns', 'track_id', 'state', 'covariance', 'low', 'high', 'above', 'nis', 'velocity',
+    'velocity_covariance', 'does', 'risk',
+)  # fmt: skip
 
 
 @frozen(eq=False)
 class TruePath:
     """True states of one obstacle: stamp_ns (n,); seen (n, 3) in the order of `STATES`; in_beam
-    (n,)."""
+    (n,); velocity (n, 2) m/s and does (n,), which of `BEHAVIOURS`, both None where it is not
+    told."""
 
     track_id: int
     stamp_ns: IntArray
     seen: FloatArray
     in_beam: NDArray[np.bool_]
+    velocity: FloatArray | None = None
+    does: IntArray | None = None
 
     def at(self, stamp_ns: IntArray, gap: float) -> FloatArray:
         """(m, 3) at other stamps; NaN outside the path and in gaps over `gap` seconds."""
@@ -125,6 +138,14 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
     def extra(name: str) -> FloatArray:
         return stack([np.asarray(one.extras[name], float) for one in filled])
 
+    columns = [one.columns() for one in filled]
+
+    def told(name: str) -> FloatArray:
+        if all(name in each for each in columns):
+            return stack([np.asarray(each[name], float) for each in columns])
+        return np.full(sum(map(len, filled)), np.nan)
+
+    spread = [told(f'vel_cov_{axes}') for axes in ('x_x', 'x_y', 'x_y', 'y_y')]
     full = Series(
         ping_ns=np.array([one.stamp_ns for one in ordered], np.int64),
         stamp_ns=np.repeat(
@@ -137,18 +158,25 @@ def series_of(estimates: Iterable[Estimate]) -> Series:
         high=extra('vertical_offset_hi'),
         above=stack([one.probabilities[:, one.model_names.index('above')] for one in filled]),
         nis=extra('nis'),
+        velocity=np.stack([told('vx'), told('vy')], axis=-1),
+        velocity_covariance=np.stack(spread, axis=-1).reshape(-1, 2, 2),
+        does=np.stack([told(f'prob_{name}') for name in BEHAVIOURS], axis=-1),
+        risk=told('collision_probability'),
     )
     return full.pick(extra('track_state') > 0)
 
 
 def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ...]:
     """Truth by obstacle, shifted to `lag` seconds earlier. Raises ValueError for other tables."""
-    rows: dict[int, list[tuple[int, float, float, float, float]]] = {}
+    rows: dict[int, list[tuple[int, ...]]] = {}
     for table in tables:
         if missing := [name for name in STATES if name not in table.extras]:
             raise ValueError(f"the truth has no column '{missing[0]}'")
         columns = [np.asarray(table.extras[name], float) for name in STATES]
         columns.append(np.asarray(table.extras.get('in_beam', np.ones(len(table.xyz))), float))
+        unknown, told = np.full(len(table.xyz), np.nan), table.columns()
+        for name in ('vx', 'vy', *(f'prob_{name}' for name in BEHAVIOURS)):
+            columns.append(np.asarray(told.get(name, unknown), float))
         ids = np.asarray(table.extras.get('track_id', np.ones(len(table.xyz))), int)
         for number, values in zip(ids, zip(*columns)):
             rows.setdefault(int(number), []).append((table.stamp_ns, *map(float, values)))
@@ -159,8 +187,16 @@ def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ..
             continue
         stamps = np.array(sorted(by_stamp), np.int64)
         values = np.array([by_stamp[stamp] for stamp in stamps.tolist()])
+        velocity, does = values[:, 4:6], values[:, 6:]
         paths.append(
-            TruePath(number, stamps - round(lag * SECOND), values[:, :3], values[:, 3] > 0)
+            TruePath(
+                number,
+                stamps - round(lag * SECOND),
+                values[:, :3],
+                values[:, 3] > 0,
+                velocity if np.isfinite(velocity).all() else None,
+                np.argmax(does, axis=1) if np.isfinite(does).all() else None,
+            )
         )
     return tuple(paths)
 

@@ -40,6 +40,25 @@ def summary_sentence(metrics: Mapping[str, Any]) -> str:
     return ' '.join(sentences)
 
 
+def motion_lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Velocity, behaviours and forecasts of collisions, as far as they were scored."""
+    result = []
+    for name, values in metrics.get('velocity', {}).items():
+        result.append((f'velocity error, {name}, RMSE an axis', f'{values["rmse_m_s"]:.3f} m/s'))
+        result += chi2_line('NEES, velocity', values.get('nees', {}))
+    for name, values in metrics.get('behaviours', {}).get('confusion', {}).items():
+        result.append((f'P({name}) of what is', f'{values[name]:.3f} ({values["n"]} rows)'))
+    if collisions := metrics.get('collisions'):
+        result.append(
+            (
+                'Brier score of collisions',
+                f'{collisions["brier"]:.3f}, of a guess {collisions["brier_of_a_guess"]:.3f} '
+                f'({collisions["n"]} forecasts, {100 * collisions["happened"]:.0f} % happened)',
+            )
+        )
+    return result
+
+
 def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Title and value of the most important numbers."""
     consistency = metrics['consistency']
@@ -56,6 +75,7 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
         held = consistency['band_coverage']
         result.append(('truth inside the 90 % band', f'{100 * held:.0f} %'))
         result.append(('Brier score of P(above)', f'{metrics["above"]["brier"]:.3f}'))
+        result += motion_lines(metrics)
         result.append(('GOSPA', f'{metrics["gospa"]["mean_m"]:.2f} m'))
     if deferred := metrics.get('deferred'):
         result.append(

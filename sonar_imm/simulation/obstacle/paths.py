@@ -9,36 +9,64 @@ from ...estimation.arrays import FloatArray
 from .scenario import ObstacleScenario
 
 _SWAY_STEP = 0.1
+WAVES = 3
+"""Sinusoids that make up a swing, with periods of 0.75 to 1.3 times the stated one: narrow-band,
+as swell is. The study that docs/obstacle.md compares with has such swings."""
+FOR_EVER = 1e9
 _AHEAD = np.radians(12.0)
 """A mover comes from within this of the course on either side, so that a sonar can see it."""
 
 
+class Swing:
+    """A random narrow-band oscillation: `value` at any time (n,)."""
+
+    def __init__(self, rms: float, period: float, rng: np.random.Generator):
+        self.rate = 2.0 * np.pi / (period * rng.uniform(0.75, 1.3, WAVES))
+        self.phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
+        share = rng.uniform(0.6, 1.0, WAVES)
+        self.amplitude = rms * np.sqrt(2.0 / np.sum(share**2)) * share
+
+    def __call__(self, t: FloatArray) -> FloatArray:
+        return np.sin(np.multiply.outer(t, self.rate) + self.phase) @ self.amplitude
+
+
 @frozen(eq=False)
 class Path:
-    """place: (3,) NED at time `meets`; speed: (2,) m/s north and east; sway: (n, 2) displacements
-    every 0.1 s from the time 0."""
+    """place: (3,) NED at time `meets`; speed: (2,) m/s north and east, from the time `starts` to
+    `stops`; sway: (n, 2) displacements every 0.1 s from the time 0; swing: of north and east."""
 
     place: FloatArray
     meets: float = 0.0
     speed: FloatArray | None = None
     sway: FloatArray | None = None
+    swing: tuple[Swing, Swing] | None = None
+    starts: float = -FOR_EVER
+    stops: float = FOR_EVER
+
+    def moves(self, t: FloatArray) -> np.ndarray:
+        """Whether it moves at the times t (n,)."""
+        return (self.speed is not None) & (t >= self.starts) & (t < self.stops)
 
     def at(self, t: FloatArray) -> FloatArray:
         """(n, 3) NED at the times t (n,), s."""
         where = np.tile(self.place, (len(t), 1))
         if self.speed is not None:
-            where[:, :2] += (t - self.meets)[:, None] * self.speed
+            active = np.clip(t, self.starts, self.stops)
+            active = active - np.clip(self.meets, self.starts, self.stops)
+            where[:, :2] += active[:, None] * self.speed
         if self.sway is not None:
             clock = _SWAY_STEP * np.arange(len(self.sway))
             for axis in range(2):
                 where[:, axis] += np.interp(t, clock, self.sway[:, axis])
+        if self.swing is not None:
+            where[:, :2] += np.column_stack([one(t) for one in self.swing])
         return where
 
     def velocity(self, t: FloatArray) -> FloatArray:
         """(n, 3) m/s, NED, of what moves; 0 of what stays where it is on average."""
         steady = np.zeros((len(t), 3))
         if self.speed is not None:
-            steady[:, :2] = self.speed
+            steady[self.moves(t), :2] = self.speed
         return steady
 
 
@@ -56,10 +84,14 @@ def _path(
 ) -> Path:
     if config.obstacle_motion == 'swaying':
         return Path(place, sway=_sway(config, rng))
+    if config.obstacle_motion == 'swinging':
+        swing = (config.obstacle_sway, config.obstacle_swing_period)
+        return Path(place, swing=(Swing(*swing, rng), Swing(*swing, rng)))
     if config.obstacle_motion == 'moving':
         ahead = np.array([np.cos(course), np.sin(course)])
         meets = float(place[:2] @ ahead) / config.speed
-        return Path(place, meets=meets, speed=_speed(config, course, rng))
+        times = {'starts': config.obstacle_starts, 'stops': config.obstacle_stops}
+        return Path(place, meets=meets, speed=_speed(config, course, rng), **times)
     return Path(place)
 
 

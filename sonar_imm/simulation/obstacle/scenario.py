@@ -11,7 +11,7 @@ from ...parameters import parameter
 from ..scene import Scenario
 
 PLACEMENTS = ('offset', 'tether', 'seabed', 'surface')
-MOTIONS = ('fixed', 'swaying', 'moving')
+MOTIONS = ('fixed', 'swaying', 'swinging', 'moving')
 
 
 @frozen(kw_only=True)
@@ -170,17 +170,27 @@ class ObstacleScenario(Scenario):
         6.0, 'obstacles are passed at up to this on either side', unit='m', low=0.0, high=100.0
     )
     obstacle_motion: str = parameter(
-        'fixed', 'whether they stay, sway about their place, or move', choices=MOTIONS
+        'fixed',
+        'whether they stay, sway about their place at random, swing about it in smooth waves, or '
+        'move',
+        choices=MOTIONS,
     )
     obstacle_sway: float = parameter(
-        0.5, 'swaying: standard deviation along each axis', unit='m', low=0.0, high=100.0
+        0.5, 'swaying, swinging: standard deviation along each axis', unit='m', low=0.0, high=100.0
     )
     obstacle_sway_time: float = parameter(
         20.0, 'swaying: time over which the place is forgotten', unit='s', low=0.1, high=3600.0
     )
+    obstacle_swing_period: float = parameter(
+        15.0, 'swinging: period of the waves', unit='s', low=0.5, high=3600.0
+    )
     obstacle_speed: tuple[float, ...] = parameter(
         (0.3, 1.5), 'moving: least and greatest speed', unit='m/s', low=0.0, high=20.0
     )
+    obstacle_starts: float = parameter(
+        -1e9, 'moving: it stays until then, counted from the first ping', unit='s'
+    )
+    obstacle_stops: float = parameter(1e9, 'moving: it stays from then on', unit='s')
 
     def check(self) -> list[str]:
         problems = super().check()

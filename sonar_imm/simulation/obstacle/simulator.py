@@ -23,17 +23,15 @@ from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...measurements import Altitude, Detections, nanoseconds, Navigation
 from ..scene import Received, Scene, TruthTable
-from .paths import Path, paths
+from .paths import Path, paths, Swing
 from .scenario import ObstacleScenario, SCENARIOS
 
 __all__ = ['ObstacleScenario', 'SCENARIOS', 'TrueObstacle', 'scenario', 'simulate']
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
+DOES = ('fixed', 'swaying', 'moving', 'seabed')
 LEAD_IN = 1.0
 """Seconds of navigation before the first ping and after the last."""
-WAVES = 3
-"""Sinusoids that make up a swing, with periods of 0.75 to 1.3 times the stated one: narrow-band,
-as swell is. The study that docs/obstacle.md compares with has such swings."""
 _FINE = 0.02
 """Seconds to either side for numerical derivatives."""
 
@@ -43,8 +41,8 @@ class TrueObstacle:
     """True position of one obstacle relative to the sonar at each ping.
 
     stamp_ns (n,); position (n, 3) and velocity (n, 2) m/s, ENU, the latter of what moves and 0 of
-    what sways; range m, bearing rad (to port), vertical_offset m (below), in
-    the sonar's frame, each (n,); in_beam (n,) True where a ping can show it.
+    what sways; does (n,): which of `DOES`; range m, bearing rad (to port), vertical_offset m
+    (below), in the sonar's frame, each (n,); in_beam (n,) True where a ping can show it.
     """
 
     track_id: int
@@ -55,10 +53,11 @@ class TrueObstacle:
     vertical_offset: FloatArray
     in_beam: np.ndarray
     velocity: FloatArray
+    does: np.ndarray
 
     def tables(self, frame_id: str) -> Iterator[TruthTable]:
-        """Give one row per ping: ``x y z range bearing vertical_offset in_beam track_id
-        vx vy``."""
+        """Give one row per ping: ``x y z range bearing vertical_offset in_beam track_id vx vy``
+        and ``prob_<behaviour>``, 1 for what it does and 0 else."""
         columns = {
             **dict(zip('xyz', self.position.astype(np.float32).T)),
             'range': self.range,
@@ -69,6 +68,7 @@ class TrueObstacle:
             'vx': self.velocity[:, 0],
             'vy': self.velocity[:, 1],
         }
+        columns |= {f'prob_{name}': 1.0 * (self.does == k) for k, name in enumerate(DOES)}
         for k, stamp in enumerate(self.stamp_ns):
             row = {name: column[k : k + 1] for name, column in columns.items()}
             yield TruthTable(int(stamp), frame_id, row)
@@ -101,19 +101,6 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
 # -- the vehicle -------------------------------------------------------------------------------
 
 
-class _Swing:
-    """A random narrow-band oscillation: `value` at any time (n,)."""
-
-    def __init__(self, rms: float, period: float, rng: np.random.Generator):
-        self.rate = 2.0 * np.pi / (period * rng.uniform(0.75, 1.3, WAVES))
-        self.phase = rng.uniform(0.0, 2.0 * np.pi, WAVES)
-        share = rng.uniform(0.6, 1.0, WAVES)
-        self.amplitude = rms * np.sqrt(2.0 / np.sum(share**2)) * share
-
-    def __call__(self, t: FloatArray) -> FloatArray:
-        return np.sin(np.multiply.outer(t, self.rate) + self.phase) @ self.amplitude
-
-
 class _Vehicle:
     """Pose of the vehicle at any time, NED and FRD."""
 
@@ -122,11 +109,11 @@ class _Vehicle:
         self.course = (
             rng.uniform(-np.pi, np.pi) if config.random_course else np.radians(config.course_deg)
         )
-        self.roll = _Swing(np.radians(config.roll_rms_deg), config.roll_period, rng)
-        self.pitch = _Swing(np.radians(config.pitch_rms_deg), config.pitch_period, rng)
-        self.yaw = _Swing(np.radians(config.yaw_rms_deg), config.yaw_period, rng)
-        self.heave = _Swing(config.heave_rms, config.heave_period, rng)
-        self.sway = _Swing(config.sway_rms, config.sway_period, rng)
+        self.roll = Swing(np.radians(config.roll_rms_deg), config.roll_period, rng)
+        self.pitch = Swing(np.radians(config.pitch_rms_deg), config.pitch_period, rng)
+        self.yaw = Swing(np.radians(config.yaw_rms_deg), config.yaw_period, rng)
+        self.heave = Swing(config.heave_rms, config.heave_period, rng)
+        self.sway = Swing(config.sway_rms, config.sway_period, rng)
         self.lever = geometry.flip_body(config.sonar_lever)
         roll, pitch, yaw = np.radians(config.sonar_mount_rpy_deg)
         self.mount = geometry.rotation(roll, -pitch, -yaw)  # stated in FLU
@@ -362,7 +349,15 @@ def _truth(
         vertical_offset=place[:, 2] - sonar.position[:, 2],
         in_beam=_echoes(config, vehicle, times, path, 1.0)[1],
         velocity=geometry.flip_world(path.velocity(times))[:, :2],
+        does=_does(config, path, times),
     )
+
+
+def _does(config: ObstacleScenario, path: Path, times: FloatArray) -> np.ndarray:
+    still = 'seabed' if config.placement == 'seabed' else 'fixed'
+    if path.sway is not None or path.swing is not None:
+        still = 'swaying'
+    return np.where(path.moves(times), DOES.index('moving'), DOES.index(still))
 
 
 def _stamps(t: FloatArray) -> np.ndarray:

@@ -14,7 +14,8 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import semidefinite_root
-from .kernels import _sigma_point, _to_world, KAPPA, point
+from .behaviour_kernels import COMMON, PLACED
+from .kernels import along, moments, NEGLIGIBLE, normal, point, to_world
 
 SIZE = 5
 SLICES = 16
@@ -48,38 +49,37 @@ def relative(
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (T, K, 5) and covariance (T, K, 5, 5) of g, by the unscented transform, of components
     whose states are (d, delta, z, s) and, where `moves` (K,), the velocity; zeros where the
-    weight mu (T, K) is too small."""
+    weight mu (T, K) is negligible."""
     T, K, size = x.shape
     mean, covariance = np.zeros((T, K, SIZE)), np.zeros((T, K, SIZE, SIZE))
-    whole, images = np.zeros((size, size)), np.zeros((2 * size + 1, SIZE))
-    y, m, world = np.empty(size), np.empty(3), np.empty(3)
+    L, images = np.zeros((size, size)), np.zeros((SIZE, 2 * COMMON + 1))
+    y, m, world = np.empty(3), np.empty(3), np.empty(3)
     for t in range(T):
         for j in range(K):
-            if mu[t, j] < WEIGHT:
+            if mu[t, j] <= NEGLIGIBLE:
                 continue
-            n = size if moves[j] else 4
-            weight, centre = 0.5 / (n + KAPPA), KAPPA / (n + KAPPA)
-            L = whole[:n, :n]
-            semidefinite_root(P[t, j, :n, :n], L)
-            images[:] = 0.0
-            for number in range(2 * n + 1):
-                _sigma_point(x[t, j, :n], L, number, y)
-                point(y[0], y[1], y[2] - p[2], R, cone, m)
-                _to_world(R, m, world)
-                images[number, 0], images[number, 1] = world[0], world[1]
-                images[number, 2] = y[2] - p[2]
-                for i in range(4, n):
-                    images[number, i - 1] = y[i]
-            for number in range(2 * n + 1):
-                share = centre if number == 0 else weight
-                for a in range(SIZE):
-                    mean[t, j, a] += share * images[number, a]
-            for number in range(2 * n + 1):
-                share = centre if number == 0 else weight
-                for a in range(SIZE):
-                    for b in range(SIZE):
-                        off = images[number, b] - mean[t, j, b]
-                        covariance[t, j, a, b] += share * (images[number, a] - mean[t, j, a]) * off
+            n = size if moves[j] else COMMON
+            semidefinite_root(P[t, j, :n, :n], L[:n, :n])
+            images[3:] = 0.0
+            for number in range(2 * COMMON + 1):
+                column, reach = along(number, COMMON)
+                for a in range(3):
+                    y[a] = x[t, j, a] + reach * L[a, column]
+                for a in range(COMMON, n):
+                    images[a - 1, number] = x[t, j, a] + reach * L[a, column]
+                images[2, number] = y[2] - p[2]
+                if column < PLACED:
+                    point(y[0], y[1], images[2, number], R, cone, m)
+                    to_world(R, m, world)
+                    images[0, number], images[1, number] = world[0], world[1]
+                else:
+                    images[0, number], images[1, number] = images[0, 0], images[1, 0]
+            moments(images, 2 * COMMON + 1, mean[t, j], covariance[t, j])
+            # What of the velocity the place does not tell.
+            for a in range(COMMON, n):
+                for b in range(COMMON, n):
+                    for i in range(COMMON, n):
+                        covariance[t, j, a - 1, b - 1] += L[a, i] * L[b, i]
     return mean, covariance
 
 
@@ -130,16 +130,11 @@ def collides(
 
 
 @kernel
-def _normal(u: float) -> float:
-    return 0.5 * math.erfc(-u / math.sqrt(2.0))
-
-
-@kernel
 def _between(low: float, high: float, mean: float, std: float) -> float:
     """Probability of a Gaussian in an interval."""
     if std <= 1e-12:
         return 1.0 if low <= mean <= high else 0.0
-    return _normal((high - mean) / std) - _normal((low - mean) / std)
+    return normal((high - mean) / std) - normal((low - mean) / std)
 
 
 @kernel
@@ -168,44 +163,38 @@ def closed_form(g: FloatArray, L: FloatArray, safety: Safety) -> float:
     vehicle that keeps its depth: miss distance, vertical offset and the time of the closest
     approach as Gaussians by sigma points."""
     V, horizon = safety.velocity, safety.horizon
-    y = np.empty(SIZE)
-    miss, drop, when = np.empty(2 * SIZE + 1), np.empty(2 * SIZE + 1), np.empty(2 * SIZE + 1)
+    images, y = np.empty((3, 2 * SIZE + 1)), np.empty(SIZE)
+    mean, spread = np.empty(3), np.empty((3, 3))
     for number in range(2 * SIZE + 1):
-        _sigma_point(g, L, number, y)
+        column, reach = along(number, SIZE)
+        for a in range(SIZE):
+            y[a] = g[a] + reach * L[a, column]
         w0, w1 = y[3] - V[0], y[4] - V[1]
         square = max(w0 * w0 + w1 * w1, LITTLE)
-        miss[number] = (y[0] * w1 - y[1] * w0) / math.sqrt(square)
-        drop[number] = y[2]
-        when[number] = -(y[0] * w0 + y[1] * w1) / square
-    weight, centre = 0.5 / (SIZE + KAPPA), KAPPA / (SIZE + KAPPA)
-    b = z = t = 0.0
-    for number in range(2 * SIZE + 1):
-        share = centre if number == 0 else weight
-        b, z, t = b + share * miss[number], z + share * drop[number], t + share * when[number]
-    var_b = var_z = var_t = both = 0.0
-    for number in range(2 * SIZE + 1):
-        share = centre if number == 0 else weight
-        var_b += share * (miss[number] - b) ** 2
-        var_z += share * (drop[number] - z) ** 2
-        var_t += share * (when[number] - t) ** 2
-        both += share * (miss[number] - b) * (drop[number] - z)
-    std_z = math.sqrt(var_z)
+        images[0, number] = (y[0] * w1 - y[1] * w0) / math.sqrt(square)
+        images[1, number] = y[2]
+        images[2, number] = -(y[0] * w0 + y[1] * w1) / square
+    moments(images, 2 * SIZE + 1, mean, spread)
+    b, z, t = mean
+    var_b, var_z, var_t, both = spread[0, 0], spread[1, 1], spread[2, 2], spread[0, 1]
+    std_z, R = math.sqrt(var_z), safety.radius
     low, high = max(-safety.height, z - 6.0 * std_z), min(safety.height, z + 6.0 * std_z)
-    if not low <= high:
+    in_time = _between(0.0, horizon, t, math.sqrt(var_t))
+    if not low <= high or in_time < LITTLE:
         return 0.0
     slope = both / var_z if var_z > LITTLE else 0.0
     rest = math.sqrt(max(var_b - slope * both, 0.0))
-    total, width = 0.0, (high - low) / SLICES
     if std_z <= 1e-9:
-        total = _between(-safety.radius, safety.radius, b, rest)
-    else:
-        for k in range(SLICES):
-            start = low + k * width
-            given = b + slope * (start + 0.5 * width - z)
-            total += _between(start, start + width, z, std_z) * _between(
-                -safety.radius, safety.radius, given, rest
-            )
-    return total * _between(0.0, horizon, t, math.sqrt(var_t))
+        return _between(-R, R, b, rest) * in_time
+    total, width, before = 0.0, (high - low) / SLICES, normal((low - z) / std_z)
+    for k in range(SLICES):
+        end = low + (k + 1) * width
+        until = normal((end - z) / std_z)
+        if until - before > LITTLE:
+            given = b + slope * (end - 0.5 * width - z)
+            total += (until - before) * _between(-R, R, given, rest)
+        before = until
+    return total * in_time
 
 
 @kernel

@@ -17,11 +17,13 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import lift, semidefinite_root
-from .kernels import _sigma_point, _to_world, echo, KAPPA, point
+from .kernels import along, echo, moments, point, to_world
 
 STATES = 6
 COMMON = 4
 """The states d, delta, z, s that all behaviours have."""
+PLACED = 3
+"""The first of them say where the obstacle is."""
 
 
 class Motion(NamedTuple):
@@ -34,6 +36,11 @@ class Motion(NamedTuple):
     push: FloatArray
     noise: FloatArray
     prior: FloatArray
+
+    @classmethod
+    def none(cls, C: int) -> Motion:
+        """Of C components that all stay where they are."""
+        return cls(*np.zeros((5, C)))
 
 
 class Step(NamedTuple):
@@ -138,18 +145,19 @@ def slopes(m: FloatArray, R: FloatArray, cone: bool, J: FloatArray) -> None:
 def advance(
     x: FloatArray, P: FloatArray, mu: FloatArray, motion: Motion, step: Step
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Predict what the sonar will see of components that move: `kernels.advance` with e.
+    """Predict what the sonar will see, by the unscented transform.
 
-    Gives x, P and where P (T, C) was repaired. Dropped components are given the numbers of the
-    most probable one, so that all stay finite.
+    x (T, C, 4) of obstacles that are all fixed, or (T, C, 6). Gives x, P and where P (T, C) was
+    repaired (`estimation.covariance`). Dropped components are given the numbers of the most
+    probable one, so that all stay finite.
     """
     T, C, size = x.shape
     p0, R0, p1, R1, noise, cone = step
     x1, P1 = np.zeros((T, C, size)), np.zeros((T, C, size, size))
     repaired = np.zeros((T, C), dtype=np.bool_)
-    whole, images = np.zeros((size, size)), np.empty((2 * size + 1, size))
-    y, m, world, J = np.empty(size), np.empty(3), np.empty(3), np.empty((2, 2))
-    scratch = np.empty((size, size))
+    L, images = np.zeros((size, size)), np.empty((size, 2 * size + 1))
+    y, m, J = np.empty(size), np.empty(3), np.empty((2, 2))
+    middle, world, scratch = np.empty(3), np.empty(3), np.empty((size, size))
     for t in range(T):
         best = 0
         for j in range(C):
@@ -158,45 +166,36 @@ def advance(
             if mu[t, j] <= 0.0:
                 continue
             n = size if motion.prior[j] > 0.0 else COMMON
-            weight = 0.5 / (n + KAPPA)
-            centre = KAPPA / (n + KAPPA)
-            L = whole[:n, :n]
-            semidefinite_root(P[t, j, :n, :n], L)
+            centre, mean, spread, root = x[t, j], x1[t, j, :n], P1[t, j, :n, :n], L[:n, :n]
+            semidefinite_root(P[t, j, :n, :n], root)
             for number in range(2 * n + 1):
-                _sigma_point(x[t, j, :n], L, number, y)
-                point(y[0], y[1], y[2] - p0[2], R0, cone, m)
-                _to_world(R0, m, world)
+                column, reach = along(number, n)
+                for a in range(n):
+                    y[a] = centre[a] + reach * root[a, column]
+                # The root is triangular: on its later columns a point is where the centre is.
+                if column < PLACED:
+                    point(y[0], y[1], y[2] - p0[2], R0, cone, m)
+                    to_world(R0, m, world)
+                    if number == 0:
+                        middle[:] = world
+                else:
+                    world[:] = middle
                 for i in range(2):
                     world[i] += (p0[i] - p1[i]) * (1.0 + y[3])
                     if n > COMMON:
                         world[i] += motion.step[j] * y[COMMON + i]
-                        images[number, COMMON + i] = motion.keep[j] * y[COMMON + i]
+                        images[COMMON + i, number] = motion.keep[j] * y[COMMON + i]
                 world[2] += p0[2] - p1[2]
                 for i in range(3):
                     m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
-                images[number, 0], images[number, 1] = echo(m, cone)
-                images[number, 2], images[number, 3] = y[2], y[3]
+                images[0, number], images[1, number] = echo(m, cone)
+                images[2, number], images[3, number] = y[2], y[3]
                 if number == 0 and n > COMMON:
                     slopes(m, R1, cone, J)
-                turns = (images[number, 1] - images[0, 1]) / (2.0 * math.pi)
-                images[number, 1] -= 2.0 * math.pi * np.round(turns)
-            for a in range(n):
-                total = centre * images[0, a]
-                for number in range(1, 2 * n + 1):
-                    total += weight * images[number, a]
-                x1[t, j, a] = total
-            for a in range(n):
-                for b in range(a + 1):
-                    total = 0.0
-                    for number in range(2 * n + 1):
-                        share = centre if number == 0 else weight
-                        total += (
-                            share
-                            * (images[number, a] - x1[t, j, a])
-                            * (images[number, b] - x1[t, j, b])
-                        )
-                    P1[t, j, a, b] = total
-                    P1[t, j, b, a] = total
+                apart = images[1, number] - images[1, 0]
+                if abs(apart) > math.pi:
+                    images[1, number] -= 2.0 * math.pi * np.round(apart / (2.0 * math.pi))
+            moments(images, 2 * n + 1, mean, spread)
             P1[t, j, 0, 0] += noise[0]
             P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
             P1[t, j, 2, 2] += noise[2]

@@ -18,9 +18,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...estimation.arrays import FloatArray
-from ...estimation.covariance import symmetrise
-from . import avoidance_kernels, behaviour_kernels
+from ...estimation.arrays import BoolArray, FloatArray
+from . import behaviour_kernels, kernels
 from .behaviour_kernels import COMMON, Motion, Step
 from .config import BEHAVIOURS, ObstacleConfig
 from .filters import depth_slices, depth_span, DepthSlices, Filter, Landmark, Mixture, Sonar, View
@@ -54,6 +53,8 @@ class BehaviourSlices(DepthSlices):
         names = switching * self.slices + ['seabed'] * ('seabed' in self.behaviours)
         self.K = len(names)
         self._is = {name: np.array([one == name for one in names]) for name in BEHAVIOURS}
+        self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
+        self.moves = self._is['moving']
 
     def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
         B, M, last = len(z), self.M, self.slices * self.M
@@ -95,33 +96,8 @@ class BehaviourSlices(DepthSlices):
         x, P, repaired = behaviour_kernels.advance(*mixed, motion, step)
         return Mixture(x, P, mixed[2]), int(repaired.sum())
 
-    def view(self, mixture: Mixture, sonar: Sonar) -> View:
-        x, P, mu = mixture
-        common = Mixture(
-            np.ascontiguousarray(x[..., :COMMON]),
-            np.ascontiguousarray(P[..., :COMMON, :COMMON]),
-            mu,
-        )
-        behaviour, velocity, covariance = self.motion(mixture)
-        return (
-            super()
-            .view(common, sonar)
-            ._replace(behaviour=behaviour, velocity=velocity, velocity_covariance=covariance)
-        )
-
-    def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        return avoidance_kernels.relative(*mixture, self._is['moving'], *sonar.pose, self.cone)
-
-    def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
-        x, P, mu = mixture
-        probability = np.stack([mu @ self._is[name] for name in self.behaviours], axis=-1)
-        moving = self._is['moving']
-        v, weight = x[:, moving, COMMON:], mu[:, moving]
-        mean = np.einsum('tk,tki->ti', weight, v)
-        # What does not move has velocity 0, without spread.
-        square = np.einsum('tk,tkij->tij', weight, P[:, moving, COMMON:, COMMON:])
-        square += np.einsum('tk,tki,tkj->tij', weight, v, v)
-        return probability, mean, symmetrise(square - mean[:, :, None] * mean[:, None, :])
+    def behaviour(self, mu: FloatArray) -> FloatArray:
+        return np.asarray(mu @ self._of)
 
     def _stay(self, dt: float) -> float:
         """Probability that an obstacle does the same `dt` seconds later."""
@@ -165,17 +141,23 @@ def build_filter(config: ObstacleConfig) -> Filter:
 def moving_alike(filter_: Filter, mixture: Mixture, confirmed: np.ndarray) -> bool:
     """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
     is more probably the navigation that drifts: an error of its velocity moves all alike."""
-    if 'moving' not in filter_.behaviours or confirmed.sum() < ALIKE_AT_LEAST:
+    which = np.flatnonzero(confirmed)
+    which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]
+    if len(which) < ALIKE_AT_LEAST:
         return False
-    probability, velocity, covariance = filter_.motion(mixture)
-    moves = confirmed & (probability[:, filter_.behaviours.index('moving')] > 0.5)
-    v = velocity[moves]
-    if len(v) < ALIKE_AT_LEAST:
-        return False
+    v, covariance = _velocity(mixture.rows(which), filter_.moves)
     off = v - np.median(v, axis=0)
-    variance = np.trace(covariance[moves], axis1=-2, axis2=-1)
+    variance = np.trace(covariance, axis1=-2, axis2=-1)
     alike = np.einsum('ti,ti->t', off, off) <= 9.0 * variance + ALIKE**2
     return bool(alike.sum() >= ALIKE_AT_LEAST and alike.sum() > 0.5 * confirmed.sum())
+
+
+def _velocity(mixture: Mixture, moves: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, 2) and covariance (T, 2, 2) of the velocity; what does not move has 0, without
+    spread."""
+    x, P = mixture.x[..., COMMON:].copy(), mixture.P[..., COMMON:, COMMON:].copy()
+    x[:, ~moves], P[:, ~moves] = 0.0, 0.0
+    return kernels.matched(x, P, mixture.mu, 2)
 
 
 def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:

@@ -25,9 +25,8 @@ from ...acoustics.geometry import Pose
 from ...estimation import kalman, unscented
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
-from ...estimation.covariance import symmetrise
-from . import avoidance_kernels
-from . import kernels as kernels
+from . import avoidance_kernels, behaviour_kernels, kernels
+from .behaviour_kernels import Motion, Step
 from .config import ObstacleConfig
 
 BAND = 0.9
@@ -76,7 +75,8 @@ class View(NamedTuple):
     """A mixture in words a user knows, all (T, ...): range, azimuth and vertical offset with their
     covariance; the interval of the offset; probability that the obstacle is above; its place in
     the world with covariance; the probability of each behaviour (T, B) of the filter's; north and
-    east velocity (T, 2), m/s, with covariance."""
+    east velocity (T, 2), m/s, with covariance; near: mean (T, K, 5) and covariance (T, K, 5, 5) of
+    each component's place and velocity as `avoidance_kernels` has them."""
 
     state: FloatArray
     covariance: FloatArray
@@ -88,6 +88,7 @@ class View(NamedTuple):
     behaviour: FloatArray
     velocity: FloatArray
     velocity_covariance: FloatArray
+    near: tuple[FloatArray, FloatArray]
 
 
 class DepthSlices:
@@ -100,9 +101,11 @@ class DepthSlices:
         self.config = config
         self.seafloor = config.method == 'seafloor'
         self.K = 1 if self.seafloor else config.components
+        self.moves = np.zeros(self.K, np.bool_)
         self.cone = config.azimuth_model == 'cone'
         self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
+        self._beam = _beam(config)
         self._noise = (
             config.position_noise**2,
             np.radians(config.yaw_noise_deg) ** 2,
@@ -143,10 +146,8 @@ class DepthSlices:
         """The targets as the sonar will see them `dt` seconds later, and how many covariances had
         to be repaired."""
         mixture = self._clamp_to_seafloor(mixture, before)
-        noise = np.array(self._noise) * dt
-        x, P, repaired = kernels.advance(
-            mixture.x, mixture.P, *before.pose, *after.pose, noise, self.cone
-        )
+        step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
+        x, P, repaired = behaviour_kernels.advance(*mixture, Motion.none(self.K), step)
         return Mixture(x, P, mixture.mu), int(repaired.sum())
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
@@ -168,35 +169,25 @@ class DepthSlices:
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
         x, P, mu = mixture
-        offset = x[..., 2] - sonar.pose.position[2]
-        three = np.concatenate([x[..., :2], offset[..., None]], axis=-1)
-        mean = np.einsum('tk,tki->ti', mu, three)
-        spread = three - mean[:, None]
-        covariance = np.einsum('tk,tkij->tij', mu, P[..., :3, :3])
-        covariance += np.einsum('tk,tki,tkj->tij', mu, spread, spread)
-        std = np.sqrt(P[..., 2, 2])
-        low, high, above = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
-        place = kernels.locate(x, P, mu, *sonar.pose, self.cone)
-        still = self.motion(mixture)
-        return View(mean, symmetrise(covariance), low, high, above, *place, *still)
+        state, covariance = kernels.matched(x, P, mu, 3)
+        state[:, 2] -= sonar.pose.position[2]
+        offset, std = x[..., 2] - sonar.pose.position[2], np.sqrt(P[..., 2, 2])
+        band = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
+        near = avoidance_kernels.relative(*mixture, self.moves, *sonar.pose, self.cone)
+        together, spread = kernels.matched(*near, mu, avoidance_kernels.SIZE)
+        place = sonar.pose.position + together[:, :3], spread[:, :3, :3]
+        velocity = together[:, 3:], spread[:, 3:, 3:]
+        return View(state, covariance, *band, *place, self.behaviour(mu), *velocity, near)
 
-    def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Probability of each behaviour (T, B), north and east velocity (T, 2), m/s, and its
-        covariance (T, 2, 2)."""
-        return _still(len(mixture.mu))
-
-    def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        """Mean (T, K, 5) and covariance (T, K, 5, 5) of place and velocity as
-        `avoidance_kernels` has them."""
-        still = np.zeros(self.K, np.bool_)
-        return avoidance_kernels.relative(*mixture, still, *sonar.pose, self.cone)
+    def behaviour(self, mu: FloatArray) -> FloatArray:
+        """Probability of each behaviour, (T, B)."""
+        return np.ones((len(mu), 1))
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
         m = kernels.points(mixture.x, *sonar.pose, self.cone)
         spread = np.sqrt(mixture.P[..., 2, 2]) / mixture.x[..., 0]
-        inside = np.einsum('tk,tk->t', mixture.mu, _in_beam(m, spread, self.config))
-        return inside, _ahead(np.einsum('tk,tki->ti', mixture.mu, m))
+        return kernels.outlook(m, spread, mixture.mu, *self._beam)
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -224,10 +215,12 @@ class Landmark:
     n = 4
     K = 1
     behaviours: tuple[str, ...] = ('fixed',)
+    moves = np.zeros(1, np.bool_)
 
     def __init__(self, config: ObstacleConfig):
         self.config = config
         self.model = config.azimuth_model
+        self._beam = _beam(config)
         self._noise = (config.position_noise**2, config.depth_noise**2)
 
     def ready(self, sonar: Sonar) -> bool:
@@ -289,24 +282,18 @@ class Landmark:
         low, high, above = kernels.bands(
             np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)
         )
-        place = x[:, :3], P[:, :3, :3]
-        still = self.motion(mixture)
-        return View(seen.mean, seen.covariance, low, high, above, *place, *still)
-
-    def motion(self, mixture: Mixture) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return _still(len(mixture.mu))
-
-    def relative(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        T = len(mixture.mu)
-        mean, covariance = np.zeros((T, 1, 5)), np.zeros((T, 1, 5, 5))
-        mean[..., :3] = mixture.x[..., :3] - sonar.pose.position
-        covariance[..., :3, :3] = mixture.P[..., :3, :3]
-        return mean, covariance
+        place = mixture.x[..., :3] - sonar.pose.position
+        near = np.zeros((len(x), 1, 5)), np.zeros((len(x), 1, 5, 5))
+        near[0][..., :3], near[1][..., :3, :3] = place, mixture.P[..., :3, :3]
+        still = np.ones((len(x), 1)), np.zeros((len(x), 2)), np.zeros((len(x), 2, 2))
+        return View(
+            seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3], *still, near
+        )
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
-        m = geometry.to_body(sonar.pose, mixture.x[:, 0, :3])
-        spread = np.sqrt(mixture.P[:, 0, 2, 2]) / np.linalg.norm(m, axis=-1)
-        return _in_beam(m, spread, self.config), _ahead(m)
+        m = geometry.to_body(sonar.pose, mixture.x[..., :3])
+        spread = np.sqrt(mixture.P[..., 2, 2]) / np.linalg.norm(m, axis=-1)
+        return kernels.outlook(m, spread, mixture.mu, *self._beam)
 
     def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
         out = geometry.to_body(sonar.pose, points[..., :3])
@@ -316,11 +303,6 @@ class Landmark:
 
 
 Filter = DepthSlices | Landmark
-
-
-def _still(T: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Behaviour, velocity and its covariance of T obstacles that are fixed for certain."""
-    return np.ones((T, 1)), np.zeros((T, 2)), np.zeros((T, 2, 2))
 
 
 def depth_span(
@@ -381,20 +363,8 @@ def _two_way(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArra
     return np.stack([0.5 * (d_out + d_back), azimuth], axis=-1)
 
 
-def _in_beam(m: FloatArray, elevation_std: FloatArray, config: ObstacleConfig) -> FloatArray:
-    from scipy.special import ndtr
-
-    d = np.linalg.norm(m, axis=-1)
-    elevation = np.arcsin(np.clip(m[..., 2] / d, -1.0, 1.0))
-    half = np.radians(0.5 * config.vertical_fov_deg)
-    spread = np.maximum(elevation_std, 1e-6)
-    inside = ndtr((half - elevation) / spread) - ndtr((-half - elevation) / spread)
-    azimuth = np.arctan2(m[..., 1], m[..., 0])
-    return inside * (
-        (np.abs(azimuth) <= np.radians(0.5 * config.horizontal_fov_deg)) & (d <= config.max_range)
-    )
-
-
-def _ahead(m: FloatArray) -> np.ndarray:
-    """Ahead means within 78 degrees of the axis: beyond, range and azimuth fix nothing."""
-    return m[..., 0] > 0.2 * np.linalg.norm(m, axis=-1)
+def _beam(config: ObstacleConfig) -> tuple[float, float, float]:
+    """Half height and half width, rad, and reach of the beam, m."""
+    fov = config.vertical_fov_deg, config.horizontal_fov_deg
+    vertical, horizontal = np.radians(0.5 * np.array(fov))
+    return float(vertical), float(horizontal), config.max_range

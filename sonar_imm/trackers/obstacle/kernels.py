@@ -21,7 +21,6 @@ from ...estimation.jit import kernel
 from ...estimation.small_matrices import (
     careful_update,
     lift,
-    semidefinite_root,
     sound,
     whitened_square,
 )
@@ -29,6 +28,10 @@ from ...estimation.small_matrices import (
 KAPPA = 1.0
 NEGLIGIBLE = 1e-12
 """A component that weighs less plays no part in a quantile or a place."""
+AHEAD = 0.2
+"""Cosine to the axis of the sonar, 78 degrees: beyond, range and azimuth fix nothing."""
+NORMAL_95 = 1.645
+"""Where the search for a quantile begins, standard deviations off the mean."""
 
 
 @kernel
@@ -38,15 +41,25 @@ def point(d: float, delta: float, d_st: float, R: FloatArray, cone: bool, m: Flo
     cosine, sine = math.cos(delta), math.sin(delta)
     if cone:
         m_y, r = d * sine, d * cosine
-        reach = r * math.sqrt(a * a + c * c)
-        eta = math.asin(min(1.0, max(-1.0, (d_st - b * m_y) / reach))) - math.atan2(a, c)
-        m[0], m[1], m[2] = r * math.cos(eta), m_y, r * math.sin(eta)
+        m[0], m[2] = _level(a, c, d_st - b * m_y, r)
+        m[1] = m_y
     else:
-        k = a * cosine + b * sine
-        reach = d * math.sqrt(k * k + c * c)
-        eps = math.asin(min(1.0, max(-1.0, d_st / reach))) - math.atan2(k, c)
-        level = d * math.cos(eps)
-        m[0], m[1], m[2] = level * cosine, level * sine, d * math.sin(eps)
+        level, m[2] = _level(a * cosine + b * sine, c, d_st, d)
+        m[0], m[1] = level * cosine, level * sine
+
+
+@kernel
+def _level(k: float, c: float, drop: float, r: float) -> tuple[float, float]:
+    """The two components of length r at the elevation asin(drop / (r A)) - atan2(k, c), A =
+    hypot(k, c): the arcs are never computed, only their cosines and sines."""
+    A = math.sqrt(k * k + c * c)
+    sine = min(1.0, max(-1.0, drop / (r * A)))
+    cosine = math.sqrt((1.0 - sine) * (1.0 + sine))
+    if A > 0.0:
+        k, c = k / A, c / A
+    else:
+        k, c = 0.0, 1.0
+    return r * (cosine * c + sine * k), r * (sine * c - cosine * k)
 
 
 @kernel
@@ -59,85 +72,43 @@ def echo(m: FloatArray, cone: bool) -> tuple[float, float]:
 
 
 @kernel
-def _to_world(R: FloatArray, m: FloatArray, world: FloatArray) -> None:
+def to_world(R: FloatArray, m: FloatArray, world: FloatArray) -> None:
     for i in range(3):
         world[i] = R[i, 0] * m[0] + R[i, 1] * m[1] + R[i, 2] * m[2]
 
 
 @kernel
-def _sigma_point(x: FloatArray, L: FloatArray, number: int, y: FloatArray) -> None:
-    """Point `number` of 2n + 1 into y (n,): the centre, then plus and minus each column of L."""
-    n = len(x)
+def along(number: int, n: int) -> tuple[int, float]:
+    """Sigma point `number` of 2 n + 1 lies on this column of the root, and so far along it: the
+    centre, then the points ahead on each column, then those behind."""
+    if number == 0:
+        return 0, 0.0
     reach = math.sqrt(n + KAPPA)
-    for a in range(n):
-        y[a] = x[a]
-        if number > n:
-            y[a] -= reach * L[a, number - n - 1]
-        elif number > 0:
-            y[a] += reach * L[a, number - 1]
+    return (number - 1, reach) if number <= n else (number - n - 1, -reach)
 
 
 @kernel
-def advance(
-    x: FloatArray,
-    P: FloatArray,
-    p0: FloatArray,
-    R0: FloatArray,
-    p1: FloatArray,
-    R1: FloatArray,
-    noise: FloatArray,
-    cone: bool,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Predict what sonar pose (p1, R1) will see of what (p0, R0) saw, by the unscented transform.
-
-    noise (3,): variances the time between adds to horizontal position, azimuth and depth. Gives x,
-    P and where P (T, K) was repaired (`estimation.covariance`).
-    """
-    T, K, n = x.shape
-    x1, P1 = np.empty((T, K, n)), np.empty((T, K, n, n))
-    repaired = np.zeros((T, K), dtype=np.bool_)
-    L, images = np.zeros((n, n)), np.empty((2 * n + 1, n))
-    y, m, world = np.empty(n), np.empty(3), np.empty(3)
-    weight = 0.5 / (n + KAPPA)
-    centre = KAPPA / (n + KAPPA)
-    for t in range(T):
-        for j in range(K):
-            semidefinite_root(P[t, j], L)
-            for number in range(2 * n + 1):
-                _sigma_point(x[t, j], L, number, y)
-                point(y[0], y[1], y[2] - p0[2], R0, cone, m)
-                _to_world(R0, m, world)
-                world[0] += (p0[0] - p1[0]) * (1.0 + y[3])
-                world[1] += (p0[1] - p1[1]) * (1.0 + y[3])
-                world[2] += p0[2] - p1[2]
-                for i in range(3):
-                    m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
-                images[number, 0], images[number, 1] = echo(m, cone)
-                images[number, 2], images[number, 3] = y[2], y[3]
-                turns = (images[number, 1] - images[0, 1]) / (2.0 * math.pi)
-                images[number, 1] -= 2.0 * math.pi * np.round(turns)
-            for a in range(n):
-                total = centre * images[0, a]
-                for number in range(1, 2 * n + 1):
-                    total += weight * images[number, a]
-                x1[t, j, a] = total
-            for a in range(n):
-                for b in range(a + 1):
-                    total = 0.0
-                    for number in range(2 * n + 1):
-                        share = centre if number == 0 else weight
-                        total += (
-                            share
-                            * (images[number, a] - x1[t, j, a])
-                            * (images[number, b] - x1[t, j, b])
-                        )
-                    P1[t, j, a, b] = total
-                    P1[t, j, b, a] = total
-            P1[t, j, 0, 0] += noise[0]
-            P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
-            P1[t, j, 2, 2] += noise[2]
-            repaired[t, j] = lift(P1[t, j], L)
-    return x1, P1, repaired
+def moments(images: FloatArray, points: int, mean: FloatArray, covariance: FloatArray) -> None:
+    """Mean (n,) and covariance (n, n), into the latter two, of sigma points: the first `points`
+    columns of images (n, ..), the centre first. Leaves in images how far off the mean they are."""
+    n = len(mean)
+    # Of 2 s + 1 points on s states the others weigh 1 / (2 (s + kappa)).
+    weight = 0.5 / (0.5 * (points - 1) + KAPPA)
+    centre = KAPPA / (0.5 * (points - 1) + KAPPA)
+    for a in range(n):
+        total = centre * images[a, 0]
+        for number in range(1, points):
+            total += weight * images[a, number]
+        mean[a] = total
+        for number in range(points):
+            images[a, number] -= total
+    for a in range(n):
+        for b in range(a + 1):
+            total = centre * images[a, 0] * images[b, 0]
+            for number in range(1, points):
+                total += weight * images[a, number] * images[b, number]
+            covariance[a, b] = total
+            covariance[b, a] = total
 
 
 @kernel
@@ -152,44 +123,58 @@ def points(x: FloatArray, p: FloatArray, R: FloatArray, cone: bool) -> FloatArra
 
 
 @kernel
-def locate(
-    x: FloatArray, P: FloatArray, mu: FloatArray, p: FloatArray, R: FloatArray, cone: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Mean (T, 3) and covariance (T, 3, 3) of the targets' places in the world."""
-    T, K, n = x.shape
-    mean, covariance = np.zeros((T, 3)), np.zeros((T, 3, 3))
-    L, y, m = np.zeros((n, n)), np.empty(n), np.empty(3)
-    world = np.empty((K, 2 * n + 1, 3))
-    weight = 0.5 / (n + KAPPA)
-    centre = KAPPA / (n + KAPPA)
+def normal(u: float) -> float:
+    """The probability of a standard normal value below u."""
+    return 0.5 * math.erfc(-u / math.sqrt(2.0))
+
+
+@kernel
+def outlook(
+    m: FloatArray,
+    spread: FloatArray,
+    mu: FloatArray,
+    vertical: float,
+    horizontal: float,
+    reach: float,
+) -> tuple[FloatArray, BoolArray]:
+    """Of targets that lie at m (T, K, 3), seen from the sonar, with `spread` (T, K) rad in
+    elevation: the probability (T,) that a beam of these half widths and that reach holds them, and
+    whether they lie `AHEAD` (T,)."""
+    T, K, _ = m.shape
+    inside, ahead, mean = np.zeros(T), np.zeros(T, dtype=np.bool_), np.empty(3)
+    for t in range(T):
+        mean[:] = 0.0
+        for j in range(K):
+            for i in range(3):
+                mean[i] += mu[t, j] * m[t, j, i]
+            x, y, z = m[t, j]
+            d = math.sqrt(x * x + y * y + z * z)
+            if mu[t, j] > 0.0 and d <= reach and abs(math.atan2(y, x)) <= horizontal:
+                elevation, std = math.asin(z / d), max(spread[t, j], 1e-6)
+                high = normal((vertical - elevation) / std)
+                inside[t] += mu[t, j] * (high - normal((-vertical - elevation) / std))
+        d = math.sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2])
+        ahead[t] = mean[0] > AHEAD * d
+    return inside, ahead
+
+
+@kernel
+def matched(x: FloatArray, P: FloatArray, mu: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, n) and covariance (T, n, n) of the first n states of mixtures (T, K)."""
+    T, K, _ = x.shape
+    mean, covariance, off = np.zeros((T, n)), np.zeros((T, n, n)), np.empty(n)
     for t in range(T):
         for j in range(K):
-            if mu[t, j] <= NEGLIGIBLE:
-                continue
-            semidefinite_root(P[t, j], L)
-            for number in range(2 * n + 1):
-                _sigma_point(x[t, j], L, number, y)
-                point(y[0], y[1], y[2] - p[2], R, cone, m)
-                _to_world(R, m, world[j, number])
-                share = mu[t, j] * (centre if number == 0 else weight)
-                for i in range(3):
-                    mean[t, i] += share * world[j, number, i]
+            for a in range(n):
+                mean[t, a] += mu[t, j] * x[t, j, a]
         for j in range(K):
-            if mu[t, j] <= NEGLIGIBLE:
-                continue
-            for number in range(2 * n + 1):
-                share = mu[t, j] * (centre if number == 0 else weight)
-                for a in range(3):
-                    for b in range(a + 1):
-                        covariance[t, a, b] += (
-                            share
-                            * (world[j, number, a] - mean[t, a])
-                            * (world[j, number, b] - mean[t, b])
-                        )
-        for a in range(3):
+            for a in range(n):
+                off[a] = x[t, j, a] - mean[t, a]
+                for b in range(a + 1):
+                    covariance[t, a, b] += mu[t, j] * (P[t, j, a, b] + off[a] * off[b])
+        for a in range(n):
             for b in range(a):
                 covariance[t, b, a] = covariance[t, a, b]
-            mean[t, a] += p[a]
     return mean, covariance
 
 
@@ -310,21 +295,23 @@ def below(mean: FloatArray, std: FloatArray, mu: FloatArray, value: float) -> tu
     for j in range(len(mu)):
         if mu[j] > NEGLIGIBLE:
             u = (value - mean[j]) / std[j]
-            probability += 0.5 * mu[j] * math.erfc(-u / math.sqrt(2.0))
+            probability += mu[j] * normal(u)
             density += mu[j] * math.exp(-0.5 * u * u) / (std[j] * math.sqrt(2.0 * math.pi))
     return probability, density
 
 
 @kernel
-def quantile(mean: FloatArray, std: FloatArray, mu: FloatArray, probability: float) -> float:
-    """The value (K components) below which a mixture lies with `probability`: Newton's steps,
-    halving the bracket where they leave it."""
+def quantile(
+    mean: FloatArray, std: FloatArray, mu: FloatArray, probability: float, first: float
+) -> float:
+    """The value (K components) below which a mixture lies with `probability`: Newton's steps from
+    `first`, halving the bracket where they leave it."""
     low, high = np.inf, -np.inf
     for j in range(len(mu)):
         if mu[j] > NEGLIGIBLE:
             low = min(low, mean[j] - 9.0 * std[j])
             high = max(high, mean[j] + 9.0 * std[j])
-    value = 0.5 * (low + high)
+    value = min(max(first, low), high)
     for _ in range(100):
         reached, density = below(mean, std, mu, value)
         if reached < probability:
@@ -332,12 +319,11 @@ def quantile(mean: FloatArray, std: FloatArray, mu: FloatArray, probability: flo
         else:
             high = value
         step = (probability - reached) / density if density > 0.0 else np.inf
-        following = value + step
-        if not low < following < high:
-            following = 0.5 * (low + high)
-        if abs(following - value) <= 1e-9 * (1.0 + abs(value)):
-            return following
-        value = following
+        if abs(step) <= 1e-9 * (1.0 + abs(value)):
+            return value + step
+        value += step
+        if not low < value < high:
+            value = 0.5 * (low + high)
     return value
 
 
@@ -349,8 +335,14 @@ def bands(
     T = len(mean)
     low, high, negative = np.empty(T), np.empty(T), np.empty(T)
     for t in range(T):
-        low[t] = quantile(mean[t], std[t], mu[t], tail)
-        high[t] = quantile(mean[t], std[t], mu[t], 1.0 - tail)
+        # Where the quantiles of a Gaussian as wide as the mixture would be.
+        middle = square = 0.0
+        for j in range(len(mu[t])):
+            middle += mu[t, j] * mean[t, j]
+            square += mu[t, j] * (std[t, j] * std[t, j] + mean[t, j] * mean[t, j])
+        reach = NORMAL_95 * math.sqrt(max(square - middle * middle, 0.0))
+        low[t] = quantile(mean[t], std[t], mu[t], tail, middle - reach)
+        high[t] = quantile(mean[t], std[t], mu[t], 1.0 - tail, middle + reach)
         # Weights add up to one but for rounding: no probability may leave [0, 1] for that.
         negative[t] = min(below(mean[t], std[t], mu[t], 0.0)[0], 1.0)
     return low, high, negative

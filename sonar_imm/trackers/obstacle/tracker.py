@@ -104,6 +104,7 @@ class ObstacleTracker:
         self.config = config
         self.filter = build_filter(config)
         self.mount = Mount(config)
+        self._H = np.tile(np.eye(2), (1, self.filter.K, 1, 1))
         self.reset()
 
     def reset(self) -> None:
@@ -278,9 +279,8 @@ class ObstacleTracker:
         h, C = self.filter.expected(now.mixture, now.sonar)
         if not len(h) or not len(z):
             return np.full(len(h), -1), h
-        H = np.tile(np.eye(2), (1, h.shape[1], 1, 1))
         threshold = gate_threshold(self.config.gate_probability, 2)
-        fit = imm_kernels.gate(h, H, C, now.mixture.mu, z, R, threshold)
+        fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
         target, detection = np.nonzero(np.isfinite(fit))
         cost = association_cost(
             fit[target, detection], self.config.detection_probability, self.config.clutter_density
@@ -335,12 +335,11 @@ class ObstacleTracker:
 
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
-        near = self.filter.relative(ping.mixture, ping.sonar)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
             **behaviour_columns(view, self.filter.behaviours),
-            **closest_approach(*near, ping.mixture.mu, ping.sonar.course, self.config),
+            **closest_approach(*view.near, ping.mixture.mu, ping.sonar.course, self.config),
             'track_id': ping.life.track_id,
             'track_state': ping.life.status,
             'vertical_offset_lo': view.low,

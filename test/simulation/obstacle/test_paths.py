@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.simulation.obstacle.simulator import DOES, scenario, simulate
 
 
 def test_a_swaying_obstacle_stays_about_its_place():
@@ -34,6 +34,35 @@ def test_a_mover_moves_as_its_velocity_says_and_is_seen():
         assert 0.3 <= np.linalg.norm(truth.velocity[0]) <= 1.5
         seen.append(truth.in_beam.mean())
     assert np.mean(seen) > 0.5
+
+
+def test_a_swinging_obstacle_goes_in_smooth_waves():
+    moved = []
+    for seed in range(20):
+        scene = simulate(scenario('swaying', {'obstacle_motion': 'swinging'}), seed)
+        place = simulate(scenario('approach'), seed).truth[0].position
+        moved.append((scene.truth[0].position - place)[:, :2])
+    moved = np.array(moved)
+    assert moved.std() == pytest.approx(0.5, rel=0.1)
+    # A swing of 15 s has a turning point every 7.5 s; a random sway has one at every other ping.
+    turns = np.mean(np.diff(np.sign(np.diff(moved, axis=1)), axis=1) != 0)
+    assert turns == pytest.approx(0.5 / 7.5, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    'changes, moving',
+    [({'obstacle_starts': 20.0}, (False, True)), ({'obstacle_stops': 20.0}, (True, False))],
+)
+def test_a_mover_starts_and_stops(changes, moving):
+    truth = simulate(scenario('mover', changes), 3).truth[0]
+    t = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
+    step = np.linalg.norm(np.diff(truth.position, axis=0)[:, :2], axis=1) > 1e-6
+    assert np.array_equal(step, np.where(t[1:] <= 20.0, *moving))
+    assert np.array_equal(truth.does == DOES.index('moving'), np.where(t < 20.0, *moving))
+    table = list(truth.tables('odom'))[-1]
+    assert [table.columns[f'prob_{name}'][0] for name in ('fixed', 'moving')] == [
+        float(not moving[1]), float(moving[1])
+    ]  # fmt: skip
 
 
 def test_truth_tables_say_the_velocity():

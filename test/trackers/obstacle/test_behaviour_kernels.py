@@ -7,7 +7,6 @@ import pytest
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.trackers.obstacle import behaviour_kernels as behave
-from sonar_imm.trackers.obstacle import kernels
 from sonar_imm.trackers.obstacle.behaviours import BehaviourSlices
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar
@@ -162,7 +161,8 @@ def test_fixed_components_are_predicted_as_the_fixed_filter_does():
     noise = np.array([1e-3, 2e-7, 3e-4])
     x1, P1, _ = behave.advance(x, P, mu, motion(), behave.Step(*before, *after, noise, False))
     four = np.ascontiguousarray(x[..., :4]), np.ascontiguousarray(P[..., :4, :4])
-    plain, plain_P, _ = kernels.advance(*four, *before, *after, noise, False)
+    none, step = behave.Motion.none(x.shape[1]), behave.Step(*before, *after, noise, False)
+    plain, plain_P, _ = behave.advance(*four, mu, none, step)
     assert np.all(x1[:, 0, :4] == plain[:, 0]) and np.all(P1[:, 0, :4, :4] == plain_P[:, 0])
 
 

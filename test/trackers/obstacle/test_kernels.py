@@ -8,7 +8,8 @@ from scipy.special import ndtr
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.trackers.obstacle import kernels as kernels
+from sonar_imm.trackers.obstacle import avoidance_kernels, behaviour_kernels, kernels
+from sonar_imm.trackers.obstacle.behaviour_kernels import Motion, Step
 
 MODELS = {'plane': False, 'cone': True}
 
@@ -35,6 +36,12 @@ def targets(rng, before, T=3, K=4):
     return x, A @ np.swapaxes(A, -1, -2), mu
 
 
+def advanced(x, P, before, after, noise, cone=False):
+    """The prediction of obstacles that are all fixed."""
+    weights, step = np.ones(x.shape[:2]), Step(*before, *after, noise, cone)
+    return behaviour_kernels.advance(x, P, weights, Motion.none(x.shape[1]), step)
+
+
 def sigma_points(x, P):
     """Nine points (..., 9, 4) and their weights, by numpy."""
     columns = np.swapaxes(np.sqrt(5.0) * np.linalg.cholesky(P), -1, -2)
@@ -49,7 +56,7 @@ def test_prediction_equals_numpy(model):
     before, after = poses(rng)
     x, P, _ = targets(rng, before)
     noise = np.array([1e-3, 2e-7, 3e-4])
-    x1, P1, _ = kernels.advance(x, P, *before, *after, noise, MODELS[model])
+    x1, P1, _ = advanced(x, P, before, after, noise, MODELS[model])
     points, weights = sigma_points(x, P)
     d, delta, z, s = np.moveaxis(points, -1, 0)
     m = geometry.reconstruct(d, delta, z - before.position[2], before.R, model)
@@ -74,7 +81,7 @@ def test_prediction_of_a_known_target_is_exact():
     before, after = poses(rng)
     x, _, _ = targets(rng, before)
     x[..., 3] = 0.0
-    x1, P1, _ = kernels.advance(x, np.zeros((3, 4, 4, 4)), *before, *after, np.zeros(3), False)
+    x1, P1, _ = advanced(x, np.zeros((3, 4, 4, 4)), before, after, np.zeros(3))
     m = geometry.reconstruct(x[..., 0], x[..., 1], x[..., 2] - before.position[2], before.R)
     assert_allclose(
         x1[..., :2], np.stack(geometry.project(geometry.predict(m, before, after)), -1), rtol=1e-12
@@ -88,7 +95,7 @@ def test_a_turn_through_the_back_keeps_the_spread_of_the_azimuth():
     P = np.diag([0.01, 1e-4, 0.01, 1e-6])[None, None]
     still = np.zeros(3)
     turned = geometry.rotation(0.0, 0.0, -(np.pi - 3.0))
-    _, P1, _ = kernels.advance(x, P, still, np.eye(3), still, turned, np.zeros(3), False)
+    _, P1, _ = advanced(x, P, Pose(still, np.eye(3)), Pose(still, turned), np.zeros(3))
     assert_allclose(P1[0, 0, 1, 1], 1e-4, rtol=1e-3)
 
 
@@ -104,12 +111,14 @@ def test_places_equal_sampling():
     rng = np.random.default_rng(3)
     before, _ = poses(rng)
     x, P, mu = targets(rng, before, T=1, K=2)
-    mean, covariance = kernels.locate(x, P, mu, *before, False)
+    still = np.zeros(2, np.bool_)
+    near = avoidance_kernels.relative(x, P, mu, still, *before, False)
+    mean, covariance = kernels.matched(*near, mu, 3)
     which = rng.choice(2, 200_000, p=mu[0])
     draws = np.array([rng.multivariate_normal(x[0, k], P[0, k], 200_000) for k in (0, 1)])
     d, delta, z, _ = draws[which, np.arange(200_000)].T
     m = geometry.reconstruct(d, delta, z - before.position[2], before.R)
-    world = geometry.to_world(before, m)
+    world = geometry.apply(before.R, m)
     assert_allclose(mean[0], world.mean(axis=0), atol=0.1)
     assert_allclose(covariance[0], np.cov(world.T), rtol=0.05, atol=0.2)
 

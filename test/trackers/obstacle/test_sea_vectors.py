@@ -1,6 +1,7 @@
 """The whole tracker on recorded encounters, beside what an independent filter made of them."""
 
-from helpers.obstacle_sea import column, encounter, ENCOUNTERS, KINDS, track
+from helpers.obstacle_runs import SECOND
+from helpers.obstacle_sea import column, encounter, ENCOUNTERS, KINDS, oldest, track
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -74,3 +75,22 @@ def test_velocity_is_east_and_north():
         assert 0.005 < spread < 0.3
         error = last.extras[f'v{a}'][0] - data['true_v'][-1, i]
         assert abs(error) < 4.0 * spread
+
+
+def test_the_place_is_as_deep_as_the_offset_says():
+    """Also where a hypothesis lies deeper than the echo is far, as those of a near echo do."""
+    data = encounter('seabed_and_fixed', 1)
+    for estimate in track(data)[::5]:
+        row = oldest(estimate)
+        assert_allclose(
+            row['place_cov_z_z'], row['cov_vertical_offset_vertical_offset'], rtol=1e-9
+        )
+        k = int(np.argmin(np.abs(SECOND + data['t'] * SECOND - estimate.stamp_ns)))
+        sonar = data['odom_p'][k] + turned(data['odom_q'][k], data['sonar_lever_flu'])
+        assert_allclose(row['z'], sonar[2] - row['vertical_offset'], atol=1e-4)
+
+
+def turned(q, vector):
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(q).apply(vector)
