@@ -15,7 +15,8 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """So many fresh processes. What has not begun when the context is left by an error is not
     begun any more.
 
-    Raises OSError when one of them dies. They are started anew and not forked: a fork copies the threads of a library half.
+    Raises OSError when one of them dies. They are started anew and not forked: a fork copies the
+    threads of a library half.
     """
     pool = ProcessPoolExecutor(
         count,

@@ -171,6 +171,13 @@ class BathymetryConfig(SeaParameters):
     gate_false_alarm: float = parameter(
         1e-3, 'probability of taking noise for an echo', low=1e-9, high=0.5
     )
+    decorrelation: float = parameter(
+        0.0,
+        'share of the power of an echo that is not the same at all staves, as of a diffuse floor '
+        'under a wide aperture; acts as noise',
+        low=0.0,
+        high=0.95,
+    )
     multipath: bool = parameter(
         False, 'expect echoes by way of the surface, as noise from where they would come'
     )

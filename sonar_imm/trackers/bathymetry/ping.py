@@ -14,11 +14,11 @@ from typing import NamedTuple
 from attrs import evolve, frozen
 import numpy as np
 
+from ...acoustics import variances
 from ...acoustics.geometry import Pose
 from ...acoustics.rays import profile_of
-from ...acoustics.variances import mean_power
 from ...estimates import Estimate
-from ...estimation.arrays import FloatArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.mode_smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
@@ -42,24 +42,37 @@ class Ping:
 
 @frozen(eq=False)
 class Look:
-    """What a ping says before any terrain model is run along it."""
+    """What a ping says before any terrain model is run along it; loud (T,): bins 20 dB above the
+    noise."""
 
     ping: Ping
     swath: Swath
     models: TerrainModels
     likelihood: PingLikelihood
+    loud: BoolArray
 
     @property
     def config(self) -> BathymetryConfig:
         return self.ping.config
 
 
+class LoudBins(NamedTuple):
+    """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
+    of their power that differs from stave to stave, NaN without any."""
+
+    count: int
+    silent: int
+    decorrelation: float
+
+
 class Answer(NamedTuple):
-    """The estimate of one ping, what to count of it, and numbers for diagnostics."""
+    """The estimate of one ping, what to count of it, numbers for diagnostics, and what its loud
+    bins show."""
 
     estimate: Estimate
     counts: Counter[str]
     health: dict[str, float]
+    loud: LoudBins
 
 
 def track_ping(ping: Ping) -> Answer:
@@ -72,10 +85,10 @@ def look(ping: Ping) -> Look:
     """What is heard in each bin, and the models for it."""
     config = ping.config
     swath, floor_below = _swath(ping)
-    likelihood = ping_likelihood(ping.snapshot, config, swath, floor_below)
+    likelihood, loud = ping_likelihood(ping.snapshot, config, swath, floor_below)
     first = int(np.argmax(likelihood.heard)) if likelihood.heard.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
-    return Look(ping, swath, models, likelihood)
+    return Look(ping, swath, models, likelihood, loud)
 
 
 def run(seen: Look, favour: FloatArray | None = None) -> Track:
@@ -122,7 +135,13 @@ def answer_of(seen: Look, track: Track) -> Answer:
         else math.nan,
         'noise_variance': float(np.median(likelihood.noise)),
     }
-    return Answer(estimate_of(seen, track), counts, health)
+    loud = LoudBins(
+        int(seen.loud.sum()),
+        int((seen.loud & ~heard).sum()),
+        variances.decorrelation(snapshot.iq, seen.loud & heard),
+    )
+    health['decorrelation'] = loud.decorrelation
+    return Answer(estimate_of(seen, track), counts, health, loud)
 
 
 def floor_of(seen: Look, track: Track) -> Floor:
@@ -200,7 +219,7 @@ def _swath(ping: Ping) -> tuple[Swath, float]:
 def intensity(snapshot: Snapshot) -> FloatArray:
     """Mean power of a stave in each bin (T,), dB; -inf for silent bins."""
     with np.errstate(divide='ignore', invalid='ignore'):
-        return 10.0 * np.log10(mean_power(snapshot.iq))
+        return 10.0 * np.log10(variances.mean_power(snapshot.iq))
 
 
 def array_height(config: BathymetryConfig, poses: Pose) -> float:

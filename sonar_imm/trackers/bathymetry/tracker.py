@@ -23,7 +23,7 @@ particle filters for side scan bathymetry*, OCEANS 2013.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from typing import Any
 
 from attrs import evolve
@@ -33,12 +33,16 @@ from ...estimates import Estimate
 from ...measurements import Altitude, Navigation, Snapshot
 from .config import BathymetryConfig
 from .coupling import Alone, Coupling, Favoured
-from .ping import Answer, answer_of, look, Ping, run, track_ping
+from .ping import Answer, answer_of, look, LoudBins, Ping, run, track_ping
 from .pose_queue import PoseQueue
 
 __all__ = ['BathymetryConfig', 'BathymetryTracker']
 
 SPACING_TOLERANCE = 0.05
+PINGS_JUDGED, FEWEST_LOUD = 100, 200
+"""Warnings are drawn from the last pings, when they have so many loud bins."""
+SOME_DECORRELATION = 0.04
+"""Noise, slopes and rough floor make neighbouring staves differ by so much in any case."""
 
 
 class BathymetryTracker:
@@ -54,6 +58,7 @@ class BathymetryTracker:
         self._queue = PoseQueue(self.counts)
         self._coupling = Coupling()
         self._health: dict[str, float] = {}
+        self._loud: deque[LoudBins] = deque(maxlen=PINGS_JUDGED)
 
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config
@@ -87,6 +92,28 @@ class BathymetryTracker:
         waiting = {'pings_waiting': len(self._queue)} if self._moving else {}
         held = {'pings_held': len(self._coupling)} if len(self._coupling) else {}
         return {**self._health, **waiting, **held}
+
+    def warnings(self) -> list[str]:
+        """What of the last pings makes most echoes useless, or more sure than they are."""
+        loud = sum(one.count for one in self._loud)
+        if loud < FEWEST_LOUD:
+            return []
+        silent = sum(one.silent for one in self._loud) / loud
+        differ = sum(one.count * one.decorrelation for one in self._loud if one.count) / loud
+        told, sentences = self.config.decorrelation, []
+        if silent > 0.5:
+            sentences.append(
+                f'{silent:.0%} of the bins that stand 20 dB above the quiet ones were passed '
+                'over, since their staves do not agree: state noise_variance, so that power can '
+                'tell echo from noise, check element_spacing_wavelengths, or say shadow_gate: '
+                'false'
+            )
+        if differ > SOME_DECORRELATION + 2.0 * told:
+            sentences.append(
+                f'{differ:.0%} of the power of loud echoes differs from stave to stave, where '
+                f'decorrelation says {told:.0%}: estimates are surer than they should be, or lost'
+            )
+        return sentences
 
     def process(self, measurement: Any) -> list[Estimate]:
         return [made for ping in self.tasks(measurement) for made in self.take(self.work(ping))]
@@ -136,6 +163,7 @@ class BathymetryTracker:
         """The estimate of an answer, after what it says is counted."""
         self.counts.update(answer.counts)
         self._health = answer.health
+        self._loud.append(answer.loud)
         return answer.estimate
 
     @property
