@@ -46,7 +46,7 @@ def read_sonar_image(
     else:
         distance = _raw_ranges(message, sound_speed)
         bearing = -np.array(message.rx_angles, np.float64)  # receive angles count to starboard
-    amplitude = _samples(message.image, len(distance), len(bearing), image_order)
+    amplitude = image_samples(message.image, len(distance), len(bearing), image_order)
     return SonarImage(
         stamp_ns=stamp_ns(message),
         range=distance,
@@ -69,8 +69,8 @@ def _raw_ranges(message: Any, sound_speed: float) -> FloatArray:
     return (int(message.sample0) + np.arange(count)) * speed / (2.0 * rate)
 
 
-def _samples(image: Any, ranges: int, beams: int, order: str) -> FloatArray:
-    """The magnitudes (ranges, beams)."""
+def image_samples(image: Any, ranges: int, beams: int, order: str) -> FloatArray:
+    """The samples (ranges, beams) of an image. Raises `Rejection`."""
     if not 0 <= int(image.dtype) < len(DTYPES):
         raise Rejection('bad_field', f'the image has the unknown datatype {int(image.dtype)}')
     if int(image.beam_count) != beams:

@@ -137,6 +137,12 @@ def first_return(
         passed = values >= coherence_threshold(staves, 1, false_alarm, spacing)
     else:
         passed = ~silent_bins(values, staves, spacing=spacing, false_alarm=false_alarm)
+    return first_of(passed)
+
+
+def first_of(passed: BoolArray) -> int:
+    """The first of the bins `passed` (n,) of which, itself included, at least four in five are;
+    0 when there is none."""
     running = np.concatenate([[0], np.cumsum(passed)])
     together = running[GATE_BINS:] - running[:-GATE_BINS]
     begins = passed[: len(together)] & (together >= GATE_BINS - 1)

@@ -261,6 +261,80 @@ def images(
 
 
 @command.command(
+    'interferometer',
+    epilog=example(
+        'sonar-imm convert interferometer survey.bag swath.bag --amplitude /sss/amplitude --phase '
+        '/sss/phase --element-spacing 0.012',
+        'sonar-imm convert interferometer survey.bag swath.bag --iq /stave_0 --iq /stave_1',
+    ),
+)
+@click.argument('source', metavar='IN', type=BAG)
+@click.argument('out_bag', type=BAG_OUT)
+@click.option('--amplitude', default='', metavar='TOPIC', help='Topic with the amplitudes.')
+@click.option(
+    '--phase',
+    default='',
+    metavar='TOPIC',
+    help='Topic with the phases, of stave 1 against stave 0, or one of each stave.',
+)
+@click.option(
+    '--iq',
+    multiple=True,
+    metavar='TOPIC',
+    help='Topic with the complex samples of a stave, the uppermost first; once for each.',
+)
+@pairs_option(
+    '--field',
+    'fields',
+    metavar='WHAT=PATH',
+    help='Where something stands in the messages, e.g. phase=sidescan.phase.',
+)
+@click.option(
+    '--side', type=click.Choice(['port', 'starboard']), default=None, help='Of the array.'
+)
+@click.option(
+    '--phase-scale',
+    'radians_per_count',
+    type=float,
+    metavar='RAD',
+    help='Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
+    'full circle over their range.',
+)
+@click.option(
+    '--element-spacing',
+    type=click.FloatRange(min=1e-5, max=10.0),
+    metavar='METRES',
+    help='Distance between staves, to be stated in the snapshots.',
+)
+@click.option(
+    '--sound-speed',
+    type=click.FloatRange(min=1300.0, max=1700.0),
+    default=1500.0,
+    show_default=True,
+    help='Speed of sound in m/s, where a message states none.',
+)
+@click.option(
+    '--order',
+    type=click.Choice(['range_major', 'beam_major']),
+    default='range_major',
+    show_default=True,
+    help='Order of the samples in an image with several channels.',
+)
+@storage_option
+@json_option
+def interferometer(
+    source: Path, out_bag: Path, side: str | None, as_json: bool, **values: Any
+) -> None:
+    """Bag with images of amplitude and phase, or of each stave, to /snapshot.
+
+    Takes RawSonarImage of marine_acoustic_msgs and messages like it: their fields are found by
+    name. --field names others: amplitude, phase, iq, sample_rate, sample0, frequency, sound_speed.
+    Navigation and altitudes are copied.
+    """
+    _convert('interferometer', source, out_bag, as_json, side=side or '', **values)
+
+
+@command.command(
     'segy',
     epilog=example(
         'sonar-imm convert segy line.seg line.bag',

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from attrs import frozen
 import click
 
 from ..trackers import System, SYSTEMS
@@ -27,9 +29,10 @@ from .common import (
         'sonar-imm track dive.bag out',
         'sonar-imm track dive.bag out --set model_set=cv_cv',
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
+        'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3',
     )
 )
-@click.argument('bag', type=BAG)
+@click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=BAG)
 @click.argument('out_dir', type=click.Path(path_type=Path))
 @system_option
 @click.option(
@@ -47,11 +50,19 @@ from .common import (
     help='Messages in the order of arrival, or sorted by their stamps.',
 )
 @click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
+@click.option(
+    '--jobs',
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help='Processes: for several bags, or for the pings of one where no ping needs another '
+    '(bathymetry). The estimates do not depend on it.',
+)
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
 def command(
-    bag: Path,
+    bags: tuple[Path, ...],
     out_dir: Path,
     system: str | None,
     params: Path | None,
@@ -59,6 +70,7 @@ def command(
     topics: dict[str, str],
     order: str,
     smooth: bool,
+    jobs: int,
     overwrite: bool,
     strict: bool,
     as_json: bool,
@@ -67,26 +79,125 @@ def command(
 
     OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
     same bytes in bag and CSV. Without --params the file `parameters.yaml` in the folder of BAG is
-    used, if there is one. --set changes single parameters.
+    used, if there is one. --set changes single parameters. Of several bags each gets a folder of
+    its name in OUT_DIR; one that fails is named and does not stop the others.
     """
-    from ..evaluation.tracking import InputOptions
-    from ..recordings.own_parameters import own_parameters
-
-    if params is None and (params := own_parameters(bag)) and not as_json:
-        say(f'using the parameters of the recording, {params}')
-    chosen = choose_system(bag, system, topics)
-    config, node = load_config(chosen, params, overrides)
-    options = InputOptions(
-        topics=inputs_by_topic(topics),
+    plan = Plan(
+        system=system,
+        params=params,
+        overrides=overrides,
+        topics=topics,
         order=order,
-        frame_id=node.frame_id,
-        world_frame=node.world_frame_convention,
         smooth=smooth,
+        jobs=jobs if len(bags) == 1 else 1,
+        overwrite=overwrite,
+        strict=strict,
     )
-    run = track_recording(
-        bag, out_dir, chosen, config, options, overwrite=overwrite, strict=strict, quiet=as_json
-    )
-    print_json(run) if as_json else _print(run, out_dir)
+    if len(bags) == 1:
+        say_parameters(bags[0], plan, quiet=as_json)
+        run = plan.track(bags[0], out_dir, quiet=as_json)
+        print_json(run) if as_json else _print(run, out_dir)
+        return
+    runs, failures = {}, []
+    for bag, folder, outcome in _of_each(plan, bags, out_dir, jobs):
+        if isinstance(outcome, str):
+            failures.append(outcome)
+            click.echo(f'{bag}: {outcome}', err=True)
+            continue
+        runs[str(bag)] = outcome
+        if not as_json:
+            say_parameters(bag, plan)
+            _print(outcome, folder)
+    if as_json:
+        print_json(runs)
+    if failures:
+        raise click.exceptions.Exit(1)
+
+
+@frozen(kw_only=True)
+class Plan:
+    """What the options of the command ask for, for any bag."""
+
+    system: str | None
+    params: Path | None
+    overrides: dict[str, str]
+    topics: dict[str, str]
+    order: str
+    smooth: bool
+    jobs: int
+    overwrite: bool
+    strict: bool
+
+    def parameters_of(self, bag: Path) -> Path | None:
+        """The parameter file for `bag`: the one that was named, else the bag's own."""
+        from ..recordings.own_parameters import own_parameters
+
+        return self.params if self.params is not None else own_parameters(bag)
+
+    def track(self, bag: Path, out_dir: Path, *, quiet: bool) -> dict[str, Any]:
+        """Track one bag; gives the content of run.json. Raises `BagError` and `ConfigError`."""
+        from ..evaluation.tracking import InputOptions
+
+        chosen = choose_system(bag, self.system, self.topics)
+        config, node = load_config(chosen, self.parameters_of(bag), self.overrides)
+        options = InputOptions(
+            topics=inputs_by_topic(self.topics),
+            order=self.order,
+            frame_id=node.frame_id,
+            world_frame=node.world_frame_convention,
+            smooth=self.smooth,
+            jobs=self.jobs,
+        )
+        return track_recording(
+            bag,
+            out_dir,
+            chosen,
+            config,
+            options,
+            overwrite=self.overwrite,
+            strict=self.strict,
+            quiet=quiet,
+        )
+
+
+def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
+    """Say where the parameters of `bag` come from, when that was not asked for."""
+    if plan.params is None and (own := plan.parameters_of(bag)):
+        say(f'using the parameters of the recording, {own}', quiet=quiet)
+
+
+Outcome = dict[str, Any] | str
+"""The content of run.json, or the sentence why there is none."""
+
+
+def _of_each(
+    plan: Plan, bags: Sequence[Path], out_dir: Path, jobs: int
+) -> Iterator[tuple[Path, Path, Outcome]]:
+    """Every bag with its folder and outcome, in the order of `bags`."""
+    from ..evaluation.jobs import processes
+
+    folders = [out_dir / bag.name.removesuffix('.bag').removesuffix('.mcap') for bag in bags]
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise click.UsageError(f'two bags would be tracked into {folder}')
+    if jobs == 1:
+        for bag, folder in zip(bags, folders):
+            yield bag, folder, _outcome(plan, bag, folder)
+        return
+    with processes(min(jobs, len(bags))) as pool:
+        coming = [pool.submit(_outcome, plan, bag, folder) for bag, folder in zip(bags, folders)]
+        for bag, folder, one in zip(bags, folders, coming):
+            yield bag, folder, one.result()
+
+
+def _outcome(plan: Plan, bag: Path, folder: Path) -> Outcome:
+    from ..parameters import ConfigError
+    from ..recordings.reader import BagError
+
+    try:
+        return plan.track(bag, folder, quiet=True)
+    except (BagError, ConfigError) as error:
+        return str(error)
 
 
 def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:

@@ -16,7 +16,6 @@ from importlib import import_module
 import math
 import os
 from pathlib import Path
-import signal
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -30,6 +29,7 @@ from ..recordings.reader import BagReader
 from ..recordings.scenes import write_scene
 from ..recordings.sources import BagError
 from ..trackers import SYSTEMS
+from .jobs import ignore_interrupt
 from .judging import judge
 from .numbers import flatten
 from .run_folder import RunFolder
@@ -148,13 +148,8 @@ def run_on_processes(sweep: Sweep, seeds: Sequence[int], workers: int) -> Iterat
         ) as cluster,
         Client(cluster) as client,
     ):
-        client.register_worker_callbacks(_ignore_interrupt)
+        client.register_worker_callbacks(ignore_interrupt)
         yield from _distributed(client, sweep, seeds, within)
-
-
-def _ignore_interrupt() -> None:
-    """Ctrl-C reaches all processes of a terminal; the first one ends the others."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def run_on_cluster(

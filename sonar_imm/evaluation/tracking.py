@@ -8,7 +8,9 @@ so that memory does not grow with the recording.
 from __future__ import annotations
 
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 import time
 from typing import Any
 
@@ -22,9 +24,12 @@ from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
 from ..trackers import System
 from . import SECOND
+from .jobs import processes
 from .run_folder import fingerprint, RUN, run_record, RunFolder
 
 TO_THE_END = 2**62
+AHEAD = 4
+"""Tasks of each process that may wait or be done: what bounds the memory of a shared run."""
 
 
 @frozen(kw_only=True)
@@ -32,7 +37,8 @@ class InputOptions:
     """How to treat a recording.
 
     topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
-    later input too, which takes memory in proportion to the recording.
+    later input too, which takes memory in proportion to the recording. jobs: processes that share
+    the work where a tracker can share it; the estimates do not depend on it.
     """
 
     topics: Mapping[str, str] | None = None
@@ -40,6 +46,7 @@ class InputOptions:
     world_frame: str = 'enu'
     frame_id: str = ''
     smooth: bool = False
+    jobs: int = 1
 
 
 @define
@@ -130,18 +137,47 @@ class OfflineRun:
         """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
         revisions = Revisions(self._window_ns)
         self.tracker.warm()
-        for measurement in self._measurements(advance):
-            begin = time.perf_counter()
-            made = self.tracker.process(measurement)
-            self.durations.append(time.perf_counter() - begin)
+        share = self.options.jobs > 1 and hasattr(self.tracker, 'tasks')
+        for made in self._shared_out(advance) if share else self._one_by_one(advance):
             final = revisions.add(made)
             if not self.options.smooth:
                 yield from final
-        last = revisions.finish()
+        last = revisions.add(getattr(self.tracker, 'finish', list)()) + revisions.finish()
         if not self.options.smooth:
             yield from last
         elif last:
             yield from self.tracker.smoothed()
+
+    def _one_by_one(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
+        """What the tracker makes of each measurement."""
+        for measurement in self._measurements(advance):
+            begin = time.perf_counter()
+            made = self.tracker.process(measurement)
+            self.durations.append(time.perf_counter() - begin)
+            yield made
+
+    def _shared_out(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
+        """The same from a `SharingTracker`, whose tasks `jobs` processes do."""
+        ahead = AHEAD * self.options.jobs
+        waiting: deque[Future[tuple[Any, float]]] = deque()
+        with processes(self.options.jobs) as pool:
+            try:
+                for measurement in self._measurements(advance):
+                    for task in self.tracker.tasks(measurement):
+                        waiting.append(pool.submit(_timed, self.tracker.work, task))
+                    while waiting and (len(waiting) > ahead or waiting[0].done()):
+                        yield self._taken(waiting.popleft())
+                while waiting:
+                    yield self._taken(waiting.popleft())
+            finally:
+                for one in waiting:
+                    one.cancel()
+
+    def _taken(self, done: Future[tuple[Any, float]]) -> list[Estimate]:
+        found, seconds = done.result()
+        self.durations.append(seconds)
+        made: list[Estimate] = self.tracker.take(found)
+        return made
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
         guard = FrameGuard(self.options.frame_id)
@@ -199,6 +235,12 @@ class OfflineRun:
             'tracker_p50_ms': float(np.median(spent)),
             'tracker_p99_ms': float(np.percentile(spent, 99.0)),
         }
+
+
+def _timed(work: Callable[[Any], Any], task: Any) -> tuple[Any, float]:
+    """What a task gives, and the seconds it took."""
+    begin = time.perf_counter()
+    return work(task), time.perf_counter() - begin
 
 
 def write_run(

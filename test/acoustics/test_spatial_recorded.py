@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics import coherence, spatial, variances
+from sonar_imm.acoustics import coherence, loudness, spatial, variances
 
 ROOT = Path(__file__).resolve().parents[2]
 PING = Path(os.environ.get('SONAR_IMM_DATA', ROOT / '../shared/data')) / 'crimac_ek80/ping.npz'
@@ -60,10 +60,17 @@ def test_the_floor_lies_straight_below(ping):
     assert abs(np.degrees(np.arcsin(phase))) < 1.5
 
 
-def test_the_gate_hears_the_floor_and_not_the_water(ping):
+def test_power_hears_the_floor_that_coherence_takes_for_noise(ping):
     ranges, iq, spacing = ping
     silent = coherence.silent_bins(coherence.coherence(iq, spacing)[0], 2, spacing=spacing)
-    assert not silent[strongest(ranges, iq, 10.0, 13.9)]
-    assert silent[(ranges > 7.0) & (ranges < 10.0)].all()
-    # Two staves need a mean of five bins, which the sphere, one bin long, does not pass.
-    assert silent[strongest(ranges, iq, 4.0, 8.0)]
+    power, water = variances.mean_power(iq), (ranges > 7.0) & (ranges < 10.0)
+    ratio = power / power[water].mean()
+    level = loudness.loud_level(2, coherence.GATE_BINS, 1e-3)
+    usable = np.ones(len(ranges), bool)
+    heard = loudness.loud_bins(ratio, level, bins=coherence.GATE_BINS, usable=usable)
+    floor = (ratio > loudness.VERY_LOUD) & (ranges > 12.0)
+    assert floor.sum() > 150 and silent[floor].mean() > 0.85  # 20 to 78 dB above the noise
+    assert heard[floor].mean() > 0.98
+    assert silent[water].all() and heard[water].mean() < 0.005
+    # A diffuse floor: a quarter of its power differs between the halves.
+    assert 0.1 < variances.decorrelation(iq, floor) < 0.35

@@ -15,6 +15,7 @@ from .arrivals import convert_arrivals
 from .autoferry import convert_autoferry
 from .fixes import convert_fixes
 from .images import convert_images
+from .interferometer import convert_interferometer
 from .segy import convert_segy
 from .snapshots import convert_snapshots
 from .traces import convert_traces
@@ -25,6 +26,7 @@ __all__ = [
     'convert_autoferry',
     'convert_fixes',
     'convert_images',
+    'convert_interferometer',
     'convert_segy',
     'convert_snapshots',
     'convert_traces',
@@ -41,6 +43,7 @@ KINDS: dict[str, Callable[..., ConversionReport]] = {
     'autoferry': convert_autoferry,
     'snapshots': convert_snapshots,
     'images': convert_images,
+    'interferometer': convert_interferometer,
     'segy': convert_segy,
     'traces': convert_traces,
 }

@@ -21,6 +21,7 @@ from ..messages import ros_message
 from ..reader import BagReader
 from ..sources import BagError
 from ..writer import BagWriter
+from .companions import companion_topics, copied
 
 FURTHER = {entry.name: entry for entry in inputs_of('obstacle') if entry.name != 'detections'}
 
@@ -65,20 +66,11 @@ def _topics(bag: BagReader) -> dict[str, str]:
     if not images:
         raise BagError(f'{bag.path} has no topic with {" or ".join(IMAGE_TYPES)}')
     chosen = {images[0]: 'detections'}
-    for name, entry in FURTHER.items():
-        fitting = [topic.name for topic in bag.topics if topic.type_name in entry.readers]
-        if fitting:
-            chosen[fitting[0]] = name
-    return chosen
+    return chosen | companion_topics(bag, FURTHER)
 
 
 def _converted(name: str, item: Any, config: DetectorConfig) -> Any:
     if name == 'detections':
         image = read_sonar_image(item.message, **config.reading())
         return write_detections(detect(image, config), ros_message)
-    entry = FURTHER[name]
-    # A frame that calls itself NED is turned into ENU; others stay as they are, and whoever tracks
-    # the new bag states their convention.
-    ned = str(item.message.header.frame_id).endswith('_ned')
-    measurement = entry.readers[item.type_name](item.message, world_frame='ned' if ned else 'enu')
-    return entry.write(measurement, ros_message)
+    return copied(FURTHER[name], item)

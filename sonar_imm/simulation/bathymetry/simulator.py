@@ -68,6 +68,9 @@ class BathymetryScenario(ShipScenario):
     state_noise: bool = parameter(True, 'the snapshot says its noise variance')
     state_signal: bool = parameter(False, 'the snapshot says its signal variance')
     law: str = parameter('laplace', 'how the power of echoes varies', choices=LAWS)
+    decorrelation: float = parameter(
+        0.0, 'share of the power of an echo that differs from stave to stave', low=0.0, high=1.0
+    )
 
     slope: float = parameter(0.0, 'rise of the floor per metre of slant range', low=-1.0, high=1.0)
     undulation_height: float = parameter(0.0, 'amplitude of an undulation', unit='m', low=0.0)
@@ -360,11 +363,17 @@ def _speed_at_array(config: BathymetryScenario) -> float:
 
 
 def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator) -> ComplexArray:
-    """Plane waves (n, P) of unit power from direction sines (n,)."""
+    """Plane waves (n, P) of unit power from direction sines (n,), less what differs from stave to
+    stave."""
     vectors = array.steering(
         sine, config.staves, config.spacing_wavelengths, conjugate=config.conjugate
     )
-    return vectors * _circular(rng, len(sine), 1)
+    share = config.decorrelation
+    wave = vectors * _circular(rng, len(sine), 1)
+    if not share > 0.0:
+        return wave
+    own = _circular(rng, len(sine), config.staves)
+    return math.sqrt(1.0 - share) * wave + math.sqrt(share) * own
 
 
 def _fading(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:

@@ -171,6 +171,13 @@ class BathymetryConfig(SeaParameters):
     gate_false_alarm: float = parameter(
         1e-3, 'probability of taking noise for an echo', low=1e-9, high=0.5
     )
+    decorrelation: float = parameter(
+        0.0,
+        'share of the power of an echo that is not the same at all staves, as of a diffuse floor '
+        'under a wide aperture; acts as noise',
+        low=0.0,
+        high=0.95,
+    )
     multipath: bool = parameter(
         False, 'expect echoes by way of the surface, as noise from where they would come'
     )
@@ -211,6 +218,13 @@ class BathymetryConfig(SeaParameters):
         'which finds nothing rough without, else none',
         choices=('auto', 'none', 'modes', 'states'),
     )
+    ping_coupling: float = parameter(
+        0.0,
+        'how strongly the labels of neighbouring pings lean on each other, 0 for not at all; 0.35 '
+        'suits most; needs smoothing; estimates come one ping late; heights are never coupled',
+        low=0.0,
+        high=5.0,
+    )
     seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
 
     def check(self) -> list[str]:
@@ -226,6 +240,11 @@ class BathymetryConfig(SeaParameters):
             )
         if self.smoothing == 'states' and not self.runs_on_grid:
             problems.append('smoothing of the states needs engine grid; particles smooth modes')
+        if self.ping_coupling > 0.0 and self.smoothing_used == 'none':
+            problems.append(
+                'ping_coupling needs what a whole ping says of each bin: smoothing states (engine '
+                'grid) or modes'
+            )
         if self.model_set == 'angle_two_rw' and abs(self.initial_mean) > 0.5 * math.pi:
             problems.append(
                 f'initial_mean is an angle for angle_two_rw, between -pi/2 and pi/2, not '

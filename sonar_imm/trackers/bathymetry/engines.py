@@ -38,7 +38,9 @@ def run_particles(
     n, k = models.F.shape[1], models.G.shape[2]
     x, w = models.draw(count, start), np.full((M, count), 1.0 / count)
     particles = Particles(x, w, models.initial.copy())
-    motion = Motion(models.F, models.G, models.scale, models.transition, models.coast)
+    motion = Motion(
+        models.F, models.G, models.scale, models.transition, models.coast, models.favour
+    )
     track = _empty(T, M, n)
     block = max(1, min(_BLOCK // (M * k * count), T))
     size = M * k * count
@@ -65,7 +67,7 @@ def run_grid(
     shape = models.density(cells)
     p = models.initial[:, None] * (shape / shape.sum())
     sigma = models.scale / (cells[1] - cells[0])
-    motion = GridMotion(cells, models.transition, sigma, models.coast)
+    motion = GridMotion(cells, models.transition, sigma, models.coast, models.favour)
     window = np.empty((T, 2), np.int64)
     kept = filter_ping(p, motion, ping, window, track, smooth)
     if smooth:

@@ -19,12 +19,13 @@ from .kernels import drift, Geometry, PingLikelihood, sines_of, Track
 class GridMotion(NamedTuple):
     """How the models move on the grid: cells (G,), the states it is made of; transition (M, M) of
     the models; sigma (T, M) of their walks, in cells; `coast` is the model that all follow through
-    bins where nothing is heard."""
+    bins where nothing is heard; favour (T, M): see `models.TerrainModels`, (0, M) for none."""
 
     cells: FloatArray
     transition: FloatArray
     sigma: FloatArray
     coast: int
+    favour: FloatArray
 
 
 class Drift(NamedTuple):
@@ -122,6 +123,8 @@ def filter_ping(
         heard, reach = ping.heard[t], 0
         if heard:
             grid.mix(p, low, high, motion.transition, mixed)
+            if motion.favour.shape[0] > 0:
+                _favour(mixed, low, high, motion.favour[t])
         else:
             for j in range(M):
                 for g in range(low, high):
@@ -213,6 +216,8 @@ def smooth_ping(
                     back[j, g] = beta[j, g]
         low, high = new_low, new_high
         if heard:
+            if motion.favour.shape[0] > 0:
+                _favour(back, low, high, motion.favour[t + 1])
             grid.mix(back, low, high, motion.transition.T, beta)
         else:
             for j in range(M):
@@ -231,6 +236,14 @@ def smooth_ping(
         track.mean[t, 0], track.covariance[t, 0, 0] = grid.combine(
             p, low, high, cells, track.probability[t]
         )
+
+
+@kernel
+def _favour(p: FloatArray, low: int, high: int, favour: FloatArray) -> None:
+    """Multiply each model's row of p (M, G) on [low, high) by its factor."""
+    for j in range(p.shape[0]):
+        for g in range(low, high):
+            p[j, g] *= favour[j]
 
 
 @kernel

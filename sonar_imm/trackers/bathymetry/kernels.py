@@ -72,13 +72,15 @@ class PingLikelihood(NamedTuple):
 
 class Motion(NamedTuple):
     """How the models move: F (M, n, n), G (M, n, k) times scale (T, M); transition (M, M) of the
-    models; `coast` is the model that moves all particles through bins where nothing is heard."""
+    models; `coast` is the model that moves all particles through bins where nothing is heard;
+    favour (T, M): see `models.TerrainModels`, (0, M) for none."""
 
     F: FloatArray
     G: FloatArray
     scale: FloatArray
     transition: FloatArray
     coast: int
+    favour: FloatArray
 
 
 class Particles(NamedTuple):
@@ -161,6 +163,17 @@ def drift(state: FloatArray, t: int, geometry: Geometry, out: FloatArray) -> Non
 
 
 @kernel
+def favoured(c: FloatArray, favour: FloatArray) -> None:
+    """Predicted probabilities c (M,) times what favours each model, as probabilities again."""
+    total = 0.0
+    for j in range(c.shape[0]):
+        c[j] *= favour[j]
+        total += c[j]
+    for j in range(c.shape[0]):
+        c[j] /= total
+
+
+@kernel
 def filter_block(
     first: int,
     particles: Particles,
@@ -189,6 +202,8 @@ def filter_block(
         t = first + b
         if heard[t]:
             imm.mix(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
+            if motion.favour.shape[0] > 0:
+                favoured(c, motion.favour[t])
         for j in range(M):
             model = j if heard[t] else motion.coast
             for a in range(n):

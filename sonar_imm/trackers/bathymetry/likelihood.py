@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import coherence, interference, laplace, likelihood_kernels, variances
+from ...acoustics import coherence, interference, laplace, likelihood_kernels, loudness, variances
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...measurements import Snapshot
 from .config import BathymetryConfig
@@ -38,40 +38,61 @@ def spacing_of(
     return -spacing if config.conjugate else spacing
 
 
+class Heard(NamedTuple):
+    """The likelihood of a ping, and which bins (T,) stand 20 dB above the noise, or, where that is
+    not known, above the quietest tenth of the bins."""
+
+    likelihood: PingLikelihood
+    loud: BoolArray
+
+
 def ping_likelihood(
     snapshot: Snapshot, config: BathymetryConfig, swath: Swath, floor_below: float
-) -> PingLikelihood:
+) -> Heard:
     """The likelihood of every bin of a snapshot under `config`. floor_below: how far below the
     array the floor is said to be, m."""
     ranges, spacing = swath.ranges, swath.geometry.spacing
     iq = np.where(snapshot.usable[:, None], snapshot.iq, 0.0)
     first = 0
     if config.sonar_height_std > 0.0:
-        gamma = coherence.coherence(iq, abs(spacing))[0]
-        first = coherence.first_return(
-            gamma, snapshot.staves, spacing=abs(spacing), false_alarm=config.gate_false_alarm
-        )
+        first = _first_return(snapshot, iq, abs(spacing), config)
         floor_below = float(ranges[first])
-    noise = _noise(snapshot, ranges, config, floor_below)
+    noise, known = _noise(snapshot, ranges, config, floor_below)
     make = _beside_surface if config.multipath else _in_white_noise
     parts = make(snapshot, iq, swath, floor_below, noise, config)
     P = snapshot.staves
     laplacian = config.likelihood == 'laplace'
     constant = laplace.log_constant if laplacian else laplace.gaussian_log_constant
-    heard = _heard(snapshot.usable, parts.coherence, P, abs(spacing), config)
+    heard = _heard(snapshot.usable, parts, known, P, abs(spacing), config)
     heard[:first] = False
-    return PingLikelihood(
+    likelihood = PingLikelihood(
         ranges=ranges,
         heard=heard,
         form=np.ascontiguousarray(parts.form),
         base=np.ascontiguousarray(parts.base),
         spread=np.ascontiguousarray(parts.spread),
         signal=np.ascontiguousarray(parts.signal),
-        noise=np.ascontiguousarray(noise),
+        noise=np.ascontiguousarray(parts.noise),
         constant=np.ascontiguousarray(constant(P, parts.log_determinant)),
         table=likelihood_kernels.likelihood_table(P, config.likelihood),
         geometry=_drifting(swath.geometry, heard, config),
     )
+    quiet = 1.0 if known.all() else float(np.quantile(parts.loudness, 0.1))
+    return Heard(likelihood, parts.loudness > loudness.VERY_LOUD * quiet)
+
+
+def _first_return(
+    snapshot: Snapshot, iq: ComplexArray, spacing: float, config: BathymetryConfig
+) -> int:
+    """The first bin with an echo of the floor. Few staves need a stated noise to tell it from one
+    bin."""
+    P, false_alarm = snapshot.staves, config.gate_false_alarm
+    noise = _stated_noise(snapshot, config)
+    if P < coherence.FEWEST_STAVES_ALONE and np.isfinite(noise).all():
+        ratio = variances.mean_power(iq) / noise
+        return coherence.first_of(_loud(ratio, P, false_alarm, snapshot.usable))
+    gamma = coherence.coherence(iq, spacing)[0]
+    return coherence.first_return(gamma, P, spacing=spacing, false_alarm=false_alarm)
 
 
 def _drifting(geometry: Geometry, heard: BoolArray, config: BathymetryConfig) -> Geometry:
@@ -83,12 +104,17 @@ def _drifting(geometry: Geometry, heard: BoolArray, config: BathymetryConfig) ->
 
 
 class _Parts(NamedTuple):
+    """What the likelihood is made of, see `PingLikelihood`; noise (T,) with what of the echo is
+    not the same at all staves; loudness (T,): power of a bin in powers of all that is no floor."""
+
     form: ComplexArray
     base: FloatArray
     spread: ComplexArray
     signal: FloatArray
+    noise: FloatArray
     log_determinant: FloatArray
     coherence: FloatArray
+    loudness: FloatArray
 
 
 def _in_white_noise(
@@ -101,14 +127,17 @@ def _in_white_noise(
 ) -> _Parts:
     T, P = iq.shape
     spacing = swath.geometry.spacing
-    signal = _signal(snapshot, noise, np.ones(T))
+    above_noise = variances.mean_power(iq) / noise
+    signal, noise = _split(_signal(snapshot, noise, np.ones(T)), noise, config)
     return _Parts(
         form=laplace.form_coefficients(iq, signal, noise),
         base=np.zeros(T),
         spread=np.empty((T, 0), np.complex128),
         signal=signal,
+        noise=noise,
         log_determinant=P * np.log(noise) + np.log1p(P * signal / noise),
         coherence=coherence.coherence(iq, abs(spacing))[0] if config.shadow_gate else np.ones(T),
+        loudness=above_noise,
     )
 
 
@@ -126,6 +155,7 @@ def _beside_surface(
     spacing = swath.geometry.spacing
     sines = swath.surface_sines(floor_below, config.sonar_depth)
     signal = _signal(snapshot, noise, 1.0 + level * np.isfinite(sines).sum(axis=1))
+    signal, noise = _split(signal, noise, config)
     step = 2.0 * math.pi * spacing
     R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
     form = interference.interference_form(iq, R)
@@ -134,41 +164,81 @@ def _beside_surface(
         base=form.base,
         spread=form.spread,
         signal=signal,
+        noise=noise,
         log_determinant=form.log_determinant,
         coherence=interference.coherence_beside(form, abs(spacing)),
+        loudness=form.base / P,
     )
 
 
 def _heard(
-    usable: BoolArray, gamma: FloatArray, staves: int, spacing: float, config: BathymetryConfig
+    usable: BoolArray,
+    parts: _Parts,
+    known: BoolArray,
+    staves: int,
+    spacing: float,
+    config: BathymetryConfig,
 ) -> BoolArray:
+    """Bins (T,) with an echo. Many staves tell it by coherence, and by power where a whole stretch
+    cannot be noise; few staves by power alone, where the noise is `known` (T,), since noise is
+    coherent at two of them too often."""
     if not config.shadow_gate:
         return np.array(usable)
     false_alarm = config.gate_false_alarm
-    silent = coherence.silent_bins(gamma, staves, spacing=spacing, false_alarm=false_alarm)
-    return usable & ~silent
+    silent = coherence.silent_bins(
+        parts.coherence, staves, spacing=spacing, false_alarm=false_alarm
+    )
+    if staves < coherence.FEWEST_STAVES_ALONE:
+        return np.where(
+            known, _loud(parts.loudness, staves, false_alarm, usable), usable & ~silent
+        )
+    return usable & ~(silent & ~loudness.diffuse_bins(parts.loudness, silent, usable & known))
+
+
+def _loud(ratio: FloatArray, staves: int, false_alarm: float, usable: BoolArray) -> BoolArray:
+    bins = coherence.GATE_BINS
+    level = loudness.loud_level(staves, bins, false_alarm)
+    return loudness.loud_bins(ratio, level, bins=bins, usable=usable)
+
+
+def _split(
+    signal: FloatArray, noise: FloatArray, config: BathymetryConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Signal and noise (T,) when a share of the echo is not the same at all staves, and so acts as
+    noise."""
+    share = config.decorrelation
+    return (signal * (1.0 - share), noise + share * signal) if share > 0.0 else (signal, noise)
 
 
 def _noise(
     snapshot: Snapshot, ranges: FloatArray, config: BathymetryConfig, floor_below: float
-) -> FloatArray:
-    """Noise variance (T,) at a stave: from the snapshot, the config, the water column, or from
-    what is not coherent."""
-    given = snapshot.noise_variance
-    if given is not None and np.isfinite(given).all():
-        return np.array(given)
-    level = config.noise_variance
-    if not level > 0.0:
-        quiet = (ranges < WATER_COLUMN * floor_below) & snapshot.usable
-        if quiet.sum() >= FEWEST_QUIET_BINS:
-            level = variances.noise_variance(snapshot.iq, quiet)
-        else:
-            level = variances.blind_noise_variance(snapshot.iq)
+) -> tuple[FloatArray, BoolArray]:
+    """Noise variance (T,) at a stave, and where it is known (T,): from the snapshot, the config or
+    the water column; else it is taken blindly from what is not coherent."""
+    stated = _stated_noise(snapshot, config)
+    missing = np.isnan(stated)
+    if not missing.any():
+        return stated, ~missing
+    quiet = (ranges < WATER_COLUMN * floor_below) & snapshot.usable
+    measured = bool(quiet.sum() >= FEWEST_QUIET_BINS)
+    if measured:
+        level = variances.noise_variance(snapshot.iq, quiet)
+    else:
+        level = variances.blind_noise_variance(snapshot.iq)
     if not level > 0.0:
         # Too few bins to tell noise from echo: suppose the 20 dB of a usual swath.
         level = 0.01 * float(np.mean(variances.mean_power(snapshot.iq[snapshot.usable])))
-    noise = np.full(len(snapshot), level)
-    return noise if given is None else np.where(np.isfinite(given), given, noise)
+        measured = False
+    return np.where(missing, level, stated), ~missing | measured
+
+
+def _stated_noise(snapshot: Snapshot, config: BathymetryConfig) -> FloatArray:
+    """Noise variance (T,) that the snapshot or the config states; NaN where neither does."""
+    level = config.noise_variance if config.noise_variance > 0.0 else math.nan
+    given = snapshot.noise_variance
+    if given is None:
+        return np.full(len(snapshot), level)
+    return np.where(np.isfinite(given), given, level)
 
 
 def _signal(snapshot: Snapshot, noise: FloatArray, echoes: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 
-from attrs import frozen
+from attrs import field, frozen
 import numpy as np
 from scipy.special import ndtr, ndtri
 
@@ -85,8 +85,8 @@ class TerrainModels:
     F (M, n, n), G (M, n, k); scale (T, M): noise of each model at each bin; transition (M, M);
     initial (M,) probabilities before the first bin; mean (n,) and std (n,) of the state then;
     coast: the model that crosses bins where nothing is heard. rough (M,): models that mean rough
-    floor, none but in a bank. start: the law of the first state
-    where it is no normal one.
+    floor. start: the law of the first state where it is no normal one. favour (T, M): factors on
+    the predicted probability of each model in each bin, from elsewhere; (0, M) for none.
     """
 
     names: tuple[str, ...]
@@ -101,6 +101,7 @@ class TerrainModels:
     coast: int
     rough: BoolArray
     start: UnknownHeight | None = None
+    favour: FloatArray = field(factory=lambda: np.empty((0, 0)))
 
     def draw(self, particles: int, rng: np.random.Generator) -> FloatArray:
         """Particles (M, n, N) of the state before the first bin.
@@ -179,7 +180,7 @@ def _states(config: BathymetryConfig) -> tuple[str, ...]:
 
 def _rough(config: BathymetryConfig, models: int) -> BoolArray:
     if not config.in_bank:
-        return np.zeros(models, bool)
+        return np.arange(models) == (0 if config.model_set == 'height_rw_ncs' else 1)
     return np.array(config.sigmas or DEFAULT_SIGMAS['height_bank']) >= config.rough_sigma
 
 

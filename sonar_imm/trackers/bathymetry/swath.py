@@ -103,6 +103,14 @@ class Swath:
         assert self.looks is not None
         return sounding.beam_angle(sounding.direction(self.looks, np.sin(angle)), self.side)
 
+    def distance(self, floor: Floor) -> FloatArray:
+        """Horizontal distance (T,) of the floor from the array, m; NaN where it is not known."""
+        if self.looks is None:
+            aside = np.abs(floor.xyz[:, 1])
+        else:
+            aside = np.linalg.norm(floor.xyz[:, :2] - self.looks.position[:, :2], axis=1)
+        return np.where(np.isfinite(floor.angle), aside, np.nan)
+
     def uncertainties(self, floor: Floor, budget: ErrorBudget) -> tuple[FloatArray, FloatArray]:
         """Vertical and horizontal variance (T,) of the soundings, m^2."""
         assert self.looks is not None

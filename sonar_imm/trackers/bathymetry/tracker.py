@@ -10,7 +10,8 @@ few terrain models (`models`). So the filter runs *along the ping*: range is its
 
 Nothing is carried from one ping to the next: a floor that was taken over wrongly would do more
 harm than a floor that is taken over rightly does good. Late, shuffled or repeated pings therefore
-need no care; the random numbers of a ping come from its own stamp.
+need no care; the random numbers of a ping come from its own stamp. Only the labels may lean on
+those of the neighbours (`coupling`).
 
 On a ship that moves each bin has a pose of its own, and a ping waits until the navigation has
 covered its last bin (`pose_queue`). The state is then the height of the floor in the world, so
@@ -22,32 +23,26 @@ particle filters for side scan bathymetry*, OCEANS 2013.
 
 from __future__ import annotations
 
-from collections import Counter
-import math
+from collections import Counter, deque
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 
-from ...acoustics.geometry import Pose
-from ...acoustics.rays import profile_of
-from ...acoustics.variances import mean_power
 from ...estimates import Estimate
-from ...estimation.arrays import FloatArray
-from ...estimation.mode_smoothing import smooth_modes
 from ...measurements import Altitude, Navigation, Snapshot
-from ...soundings import SIDES
 from .config import BathymetryConfig
-from .engines import run_grid, run_particles
-from .kernels import PingLikelihood, Track
-from .likelihood import ping_likelihood, spacing_of
-from .models import build_models, grid_cells, TerrainModels
-from .pose_queue import PosedPing, PoseQueue, sound_speed_of
-from .swath import level_swath, ship_swath, Swath
+from .coupling import Alone, Coupling, Favoured
+from .ping import Answer, answer_of, look, LoudBins, Ping, run, track_ping
+from .pose_queue import PoseQueue
 
 __all__ = ['BathymetryConfig', 'BathymetryTracker']
 
 SPACING_TOLERANCE = 0.05
+PINGS_JUDGED, FEWEST_LOUD = 100, 200
+"""Warnings are drawn from the last pings, when they have so many loud bins."""
+SOME_DECORRELATION = 0.04
+"""Noise, slopes and rough floor make neighbouring staves differ by so much in any case."""
 
 
 class BathymetryTracker:
@@ -61,7 +56,9 @@ class BathymetryTracker:
     def reset(self) -> None:
         self.counts: Counter[str] = Counter()
         self._queue = PoseQueue(self.counts)
+        self._coupling = Coupling()
         self._health: dict[str, float] = {}
+        self._loud: deque[LoudBins] = deque(maxlen=PINGS_JUDGED)
 
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config
@@ -85,17 +82,49 @@ class BathymetryTracker:
             gap = evolve(self.config, max_gap=60.0)
             tracker._queue.add_ping(snapshot)
             for posed in tracker._queue.ready(gap):
-                tracker._ping(posed.snapshot, posed)
-        tracker._ping(snapshot, None)
+                track_ping(Ping(tracker.config, posed.snapshot, posed))
+        track_ping(Ping(tracker.config, snapshot, None))
 
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins heard, mean effective sample size of the
         particles of a model (NaN for the grid), mean log likelihood of a bin, noise variance; and
         how many pings wait for navigation."""
         waiting = {'pings_waiting': len(self._queue)} if self._moving else {}
-        return {**self._health, **waiting}
+        held = {'pings_held': len(self._coupling)} if len(self._coupling) else {}
+        return {**self._health, **waiting, **held}
+
+    def warnings(self) -> list[str]:
+        """What of the last pings makes most echoes useless, or more sure than they are."""
+        loud = sum(one.count for one in self._loud)
+        if loud < FEWEST_LOUD:
+            return []
+        silent = sum(one.silent for one in self._loud) / loud
+        differ = sum(one.count * one.decorrelation for one in self._loud if one.count) / loud
+        told, sentences = self.config.decorrelation, []
+        if silent > 0.5:
+            sentences.append(
+                f'{silent:.0%} of the bins that stand 20 dB above the quiet ones were passed '
+                'over, since their staves do not agree: state noise_variance, so that power can '
+                'tell echo from noise, check element_spacing_wavelengths, or say shadow_gate: '
+                'false'
+            )
+        if differ > SOME_DECORRELATION + 2.0 * told:
+            sentences.append(
+                f'{differ:.0%} of the power of loud echoes differs from stave to stave, where '
+                f'decorrelation says {told:.0%}: estimates are surer than they should be, or lost'
+            )
+        return sentences
 
     def process(self, measurement: Any) -> list[Estimate]:
+        return [made for ping in self.tasks(measurement) for made in self.take(self.work(ping))]
+
+    def finish(self) -> list[Estimate]:
+        """The estimates of pings that waited for the next one, when there will be none."""
+        return [self._counted(_again(one)) for one in self._coupling.finish()]
+
+    def tasks(self, measurement: Any) -> list[Ping]:
+        """The pings that a measurement makes ready to be estimated, in the order in which they
+        came."""
         if isinstance(measurement, Navigation):
             self._queue.add_pose(measurement)
         elif isinstance(measurement, Altitude):
@@ -107,12 +136,35 @@ class BathymetryTracker:
             self.counts['other_spacing'] += 1
             return []
         elif not self._moving:
-            return [self._ping(measurement, None)]
+            return [Ping(self.config, measurement, None)]
         else:
             self._queue.add_ping(measurement)
         if not self._moving:
             return []
-        return [self._ping(posed.snapshot, posed) for posed in self._queue.ready(self.config)]
+        ready = self._queue.ready(self.config)
+        return [Ping(self.config, posed.snapshot, posed) for posed in ready]
+
+    @staticmethod
+    def work(task: Ping) -> Answer | Alone:
+        """What a ping says by itself: its answer, or what its neighbours need of it."""
+        if not task.config.ping_coupling > 0.0:
+            return track_ping(task)
+        seen = look(task)
+        return Alone.of(seen, run(seen))
+
+    def take(self, found: Answer | Alone) -> list[Estimate]:
+        """The estimates that follow from what `work` found, pings in the order of `tasks`."""
+        if isinstance(found, Alone):
+            return [self._counted(_again(one)) for one in self._coupling.add(found)]
+        left = self.finish() if len(self._coupling) else []
+        return [*left, self._counted(found)]
+
+    def _counted(self, answer: Answer) -> Estimate:
+        """The estimate of an answer, after what it says is counted."""
+        self.counts.update(answer.counts)
+        self._health = answer.health
+        self._loud.append(answer.loud)
+        return answer.estimate
 
     @property
     def _moving(self) -> bool:
@@ -125,130 +177,8 @@ class BathymetryTracker:
         told, said = self.config.element_spacing_wavelengths, snapshot.spacing_wavelengths
         return told > 0.0 and said is not None and abs(said / told - 1.0) > SPACING_TOLERANCE
 
-    def _ping(self, snapshot: Snapshot, posed: PosedPing | None) -> Estimate:
-        swath, floor_below = self._swath(snapshot, posed)
-        ping = ping_likelihood(snapshot, self.config, swath, floor_below)
-        first = int(np.argmax(ping.heard)) if ping.heard.any() else 0
-        models = build_models(self.config, ping.ranges, ping.geometry, first, floor_below)
-        track = self._track(models, ping, snapshot.stamp_ns, swath.side)
-        self._count(snapshot, ping, track)
-        return self._estimate(snapshot, models, ping, swath, track, posed)
 
-    def _swath(self, snapshot: Snapshot, posed: PosedPing | None) -> tuple[Swath, float]:
-        """The swath of a ping, and how far below the array the floor is said to be."""
-        config = self.config
-        ranges = np.array(snapshot.ranges(config.sound_speed))
-        side = snapshot.side or config.side
-        speed = sound_speed_of(snapshot, config)
-        if posed is None:
-            spacing = spacing_of(snapshot, config)
-            return level_swath(config, ranges, speed, side, spacing), config.sonar_height
-        at_array = None
-        if config.sound_speed_profile:
-            depth = config.water_level - array_height(config, posed.poses)
-            at_array = float(profile_of(config.sound_speed_profile).at(depth))
-        spacing = spacing_of(snapshot, config, at_array)
-        swath = ship_swath(config, ranges, speed, side, spacing, posed.poses)
-        if posed.altitude is None:
-            return swath, config.sonar_height
-        above = array_height(config, posed.poses) - float(posed.poses.position[:, 2].mean())
-        return swath, max(posed.altitude + above, 0.01)
-
-    def _track(
-        self, models: TerrainModels, ping: PingLikelihood, stamp_ns: int, side: str
-    ) -> Track:
-        config = self.config
-        if config.runs_on_grid:
-            cells = grid_cells(config, models)
-            track = run_grid(models, ping, cells, smooth=config.smoothing_used == 'states')
-        else:
-            entropy = config.seed, stamp_ns, int(side == 'port')
-            track = run_particles(
-                models,
-                ping,
-                config.particles_per_model,
-                entropy,
-                resample=config.variant == 'paper',
-            )
-        if config.smoothing_used == 'modes':
-            smoothed = smooth_modes(track.probability, models.transition, ping.heard)
-            track = track._replace(probability=smoothed)
-        return track
-
-    def _count(self, snapshot: Snapshot, ping: PingLikelihood, track: Track) -> None:
-        self.counts['used'] += 1
-        self.counts['bins'] += len(snapshot)
-        self.counts['bins_unusable'] += int((~snapshot.usable).sum())
-        self.counts['bins_silent'] += int((snapshot.usable & ~ping.heard).sum())
-        self.counts['bins_unexplained'] += int(np.isneginf(track.log_likelihood).sum())
-        self._health = {
-            'bins': len(snapshot),
-            'heard_share': float(ping.heard.mean()),
-            'effective_sample_size': float(track.sample_size.mean()),
-            'log_likelihood_mean': float(track.log_likelihood[ping.heard].mean())
-            if ping.heard.any()
-            else math.nan,
-            'noise_variance': float(np.median(ping.noise)),
-        }
-
-    def _estimate(
-        self,
-        snapshot: Snapshot,
-        models: TerrainModels,
-        ping: PingLikelihood,
-        swath: Swath,
-        track: Track,
-        posed: PosedPing | None,
-    ) -> Estimate:
-        config, covariance = self.config, track.covariance
-        floor = swath.floor(track.mean[:, 0], track.covariance[:, 0, 0])
-        of_heights = models.state_names[0] == 'height'
-        other = ('angle', floor.angle) if of_heights else ('height', floor.height)
-        label = track.probability.argmax(axis=1)
-        extras = {
-            'range': ping.ranges,
-            other[0]: other[1],
-            'valid': ping.heard.astype(np.uint8),
-            'log_likelihood': track.log_likelihood,
-            'label': label.astype(np.uint8),
-            'label_probability': track.probability[np.arange(len(label)), label],
-        }
-        if config.in_bank:
-            extras['rough'] = track.probability[:, models.rough].sum(axis=1)
-        if posed is not None:
-            vertical, horizontal = swath.uncertainties(floor, config.budget())
-            extras |= {
-                'vertical_uncertainty': vertical,
-                'horizontal_uncertainty': horizontal,
-                'intensity': intensity(snapshot),
-                'beam_angle': swath.beam_angle(floor.angle),
-            }
-        elif of_heights and config.sonar_height_std > 0.0:
-            # Heights are counted from where the sonar is believed to be: its error is theirs.
-            covariance = covariance.copy()
-            covariance[:, 0, 0] += config.sonar_height_std**2
-        if posed is not None or snapshot.side:
-            extras['side'] = np.full(len(label), SIDES.index(swath.side), np.uint8)
-        return Estimate(
-            stamp_ns=snapshot.stamp_ns,
-            frame_id=snapshot.frame_id if posed is None else posed.frame_id,
-            xyz=floor.xyz.astype(np.float32),
-            state_names=models.state_names,
-            state=track.mean,
-            covariance=covariance,
-            model_names=models.names,
-            probabilities=track.probability,
-            extras=extras,
-        )
-
-
-def intensity(snapshot: Snapshot) -> FloatArray:
-    """Mean power of a stave in each bin (T,), dB; -inf for silent bins."""
-    with np.errstate(divide='ignore', invalid='ignore'):
-        return 10.0 * np.log10(mean_power(snapshot.iq))
-
-
-def array_height(config: BathymetryConfig, poses: Pose) -> float:
-    """z of the array in the world, m, mean over the ping."""
-    lever = poses.R @ np.array(config.sonar_lever)
-    return float((poses.position + lever)[:, 2].mean())
+def _again(one: Favoured) -> Answer:
+    """The answer of a ping, given what its neighbours favour."""
+    seen, favour = one.alone.seen, one.favour
+    return answer_of(seen, one.alone.track if favour is None else run(seen, favour))

@@ -1,0 +1,201 @@
+"""Labels that lean on those of neighbouring pings."""
+
+import itertools
+import math
+
+from attrs import evolve
+from helpers.bathymetry_cases import floor
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Snapshot
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.bathymetry.coupling import Alone, favour_of, NEIGHBOURS_NS
+from sonar_imm.trackers.bathymetry.ping import look, Ping, run
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+
+RANGES = 20.0 + 0.05 * np.arange(60)
+EXACT = BathymetryConfig(engine='grid', smoothing='states', grid_extent=4.0)
+COUPLED = evolve(EXACT, ping_coupling=0.35)
+MODES = BathymetryConfig(particles_per_model=50, smoothing='modes', ping_coupling=0.35)
+
+
+def ping(number, *, side='', seed=None, height=0.0, period_ns=10**8):
+    made = floor(height, ranges=RANGES, seed=number if seed is None else seed)
+    return evolve_snapshot(made, stamp_ns=10**12 + number * period_ns, side=side)
+
+
+def evolve_snapshot(snapshot, **values):
+    return Snapshot(
+        range=snapshot.range,
+        iq=snapshot.iq,
+        noise_variance=snapshot.noise_variance,
+        **values,
+    )
+
+
+def enumerated(initial, transition, favour, steps):
+    """Filtered and smoothed probabilities of a chain that no measurement tells about, over all its
+    sequences."""
+    M = len(initial)
+
+    def marginals(upto):
+        weight = np.zeros((upto, M))
+        for path in itertools.product(range(M), repeat=upto):
+            chance, before = 1.0, None
+            for t, j in enumerate(path):
+                come = initial @ transition[:, j] if before is None else transition[before, j]
+                chance *= come * favour[t, j]
+                before = j
+            for t, j in enumerate(path):
+                weight[t, j] += chance
+        return weight / weight.sum(axis=1, keepdims=True)
+
+    return np.array([marginals(t + 1)[t] for t in range(steps)]), marginals(steps)
+
+
+@pytest.mark.parametrize('engine', ['grid', 'particles'])
+def test_favours_act_as_a_prior_of_each_bin(engine):
+    """Equal walks: measurements say nothing of the model, and only chain and favours are left."""
+    transition = (0.9, 0.1, 0.3, 0.7)
+    config = BathymetryConfig(
+        sigmas=(0.05, 0.05),
+        transition_matrix=transition,
+        initial_probabilities=(0.2, 0.8),
+        engine=engine,
+        particles_per_model=20_000,
+        smoothing='none',
+        shadow_gate=False,
+        grid_extent=4.0,
+    )
+    T = 6
+    snapshot = floor(0.0, ranges=RANGES[:T])
+    favour = np.random.default_rng(1).uniform(0.2, 1.8, size=(T, 2))
+    filtered, smoothed = enumerated(
+        np.array([0.2, 0.8]), np.reshape(transition, (2, 2)), favour, T
+    )
+    exact = engine == 'grid'
+    seen = look(Ping(config, snapshot, None))
+    found = run(seen, favour).probability
+    assert found == pytest.approx(filtered, abs=1e-9 if exact else 0.02)
+    whole = evolve(config, smoothing='states' if exact else 'modes')
+    found = run(look(Ping(whole, snapshot, None)), favour).probability
+    assert found == pytest.approx(smoothed, abs=1e-9 if exact else 0.02)
+    assert np.abs(run(seen).probability - filtered).max() > 0.05
+
+
+def alone(config, snapshot, rough):
+    """A ping by itself that is as rough (T,) as told."""
+    seen = look(Ping(config, snapshot, None))
+    made = Alone.of(seen, run(seen))
+    probability = np.column_stack([1.0 - rough, rough])
+    return Alone.of(seen, made.track._replace(probability=probability))
+
+
+def test_the_field_is_that_of_the_two_neighbours():
+    J, T = 0.35, len(RANGES)
+    of = [alone(COUPLED, ping(k, seed=1), p * np.ones(T)) for k, p in enumerate((0.9, 0.5, 0.2))]
+    field = sum(
+        math.log((p + (1 - p) * math.exp(-J)) / ((1 - p) + p * math.exp(-J))) for p in (0.9, 0.2)
+    )
+    favour = favour_of(of[1], [of[0], of[2]], J)
+    assert favour[:, 1] == pytest.approx(2.0 / (1.0 + math.exp(-field)))
+    assert favour[:, 0] == pytest.approx(2.0 / (1.0 + math.exp(field)))
+    undecided = alone(COUPLED, ping(3, seed=1), np.full(T, 0.5))
+    assert favour_of(of[1], [undecided], J) == pytest.approx(np.ones((T, 2)))
+
+
+def test_neighbours_are_compared_at_the_same_place_across_the_track():
+    """The neighbour's bins are twice as far apart: rough from 21 m on, whatever the bin."""
+    wide = floor(0.0, ranges=20.0 + 0.1 * np.arange(30), seed=1)
+    rough = alone(COUPLED, wide, (wide.range >= 21.0).astype(float))
+    favour = favour_of(alone(COUPLED, ping(1), np.full(60, 0.5)), [rough], 0.35)
+    inner, outer = (RANGES > 20.2) & (RANGES < 20.8), (RANGES > 21.2) & (RANGES < 22.8)
+    assert (favour[inner, 1] < 1.0).all() and (favour[outer, 1] > 1.0).all()
+    # Where the neighbour ends it has no opinion.
+    short = alone(COUPLED, floor(0.0, ranges=RANGES[:20], seed=1), np.ones(20))
+    favour = favour_of(alone(COUPLED, ping(1), np.full(60, 0.5)), [short], 0.35)
+    assert favour[30:] == pytest.approx(np.ones((30, 2))) and favour[5, 1] > 1.1
+
+
+@pytest.mark.parametrize('config', [COUPLED, MODES], ids=['states', 'modes'])
+def test_estimates_come_one_ping_late_and_none_is_lost(config):
+    tracker, pings = BathymetryTracker(config), [ping(k) for k in range(4)]
+    made = [tracker.process(one) for one in pings]
+    assert [len(one) for one in made] == [0, 1, 1, 1]
+    assert tracker.health()['pings_held'] == 1
+    last = tracker.finish()
+    assert tracker.finish() == [] and 'pings_held' not in tracker.health()
+    stamps = [one.stamp_ns for one in [*sum(made, []), *last]]
+    assert stamps == [one.stamp_ns for one in pings] and tracker.counts['used'] == 4
+
+
+def same(a, b):
+    return all(np.array_equal(v, b.columns()[k], equal_nan=True) for k, v in a.columns().items())
+
+
+def test_an_estimate_depends_on_its_neighbours_alone():
+    def third(*seeds):
+        tracker = BathymetryTracker(COUPLED)
+        made = [one for k, seed in enumerate(seeds) for one in tracker.process(ping(k, seed=seed))]
+        return [*made, *tracker.finish()][2]
+
+    assert same(third(1, 2, 3, 4, 5), third(9, 2, 3, 4, 9))
+    assert not same(third(1, 2, 3, 4, 5), third(1, 2, 3, 9, 5))
+
+
+def test_pings_far_apart_and_other_sides_are_no_neighbours():
+    by_itself = BathymetryTracker(EXACT)
+    tracker = BathymetryTracker(COUPLED)
+    pings = [
+        ping(0, side='port'),
+        ping(0, side='starboard', seed=7),
+        ping(1, side='port', period_ns=NEIGHBOURS_NS + 1),
+        ping(1, side='starboard', seed=8, period_ns=NEIGHBOURS_NS + 1),
+    ]
+    found = [one for p in pings for one in tracker.process(p)] + tracker.finish()
+    assert len(found) == 4
+    for p, one in zip(pings, found):
+        assert same(by_itself.process(p)[0], one)
+
+
+def test_a_clock_set_back_begins_anew():
+    tracker = BathymetryTracker(COUPLED)
+    made = [one for k in (5, 6, 1, 2) for one in tracker.process(ping(k))]
+    assert [one.stamp_ns for one in [*made, *tracker.finish()]] == [
+        ping(k).stamp_ns for k in (5, 6, 1, 2)
+    ]
+
+
+def test_switched_off_the_held_ping_comes_out_first():
+    tracker = BathymetryTracker(COUPLED)
+    assert tracker.process(ping(0)) == []
+    tracker.reconfigure(EXACT)
+    assert [one.stamp_ns for one in tracker.process(ping(1))] == [
+        ping(0).stamp_ns,
+        ping(1).stamp_ns,
+    ]
+
+
+def test_it_needs_smoothing():
+    with pytest.raises(ConfigError, match='ping_coupling needs'):
+        BathymetryConfig.from_mapping({'ping_coupling': 0.3})
+    assert BathymetryConfig().ping_coupling == 0.0
+
+
+def test_a_bin_in_doubt_goes_with_its_neighbours():
+    """A patch that two pings see clearly and the one between hardly."""
+    T = len(RANGES)
+    patch = (np.arange(T) >= 20) & (np.arange(T) < 40)
+    rng = np.random.default_rng(3)
+
+    def seen(number, std):
+        return ping(number, height=patch * std * rng.normal(size=T))
+
+    pings = [seen(0, 0.5), seen(1, 0.045), seen(2, 0.5)]
+    plain = BathymetryTracker(EXACT).process(pings[1])[0]
+    tracker = BathymetryTracker(evolve(COUPLED, ping_coupling=1.0))
+    coupled = [one for p in pings for one in tracker.process(p)][1]
+    gain = (coupled.probabilities - plain.probabilities)[:, 1]
+    assert gain[patch].mean() > 0.05 and gain[patch].min() > -1e-9
+    assert gain[~patch].max() < gain[patch].max()
