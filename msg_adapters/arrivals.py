@@ -38,7 +38,8 @@ COLUMNS = (
     'var_depth',
 )
 
-MAX_PAIRS = 10_000
+MAX_PAIRS = 1000
+"""Most rows of a ping: time grows with their number, and none of a network has as many."""
 FARTHEST = 1e8
 """Most metres from the origin, the limit that `Fix` has too."""
 DEEPEST = 12_000.0

@@ -4,6 +4,7 @@ bin or reflector."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from attrs import field, frozen
 import numpy as np
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 class Estimate:
     """Everything known at one stamp.
 
-    xyz: (rows, 3) float32, for display only.
+    xyz: (rows, 3) where it is. As published float32, which at a northing of 9e6 m is half a metre
+    coarse: there for display only.
     state: (rows, n) in the order of `state_names`; covariance: (rows, n, n).
     probabilities: (rows, models) in the order of `model_names`, each row sums to one.
     extras: further columns, each (rows,), dtypes as published.
@@ -22,7 +24,7 @@ class Estimate:
 
     stamp_ns: int
     frame_id: str
-    xyz: NDArray[np.float32]
+    xyz: NDArray[np.floating[Any]]
     state_names: tuple[str, ...]
     state: NDArray[np.float64]
     covariance: NDArray[np.float64]

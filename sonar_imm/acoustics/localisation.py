@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
-from ..estimation.arrays import FloatArray
+from ..estimation.arrays import FloatArray, IndexArray
 from .arrival_fit import ArrivalFit, BoolArray, Minima, minimise
 from .multistatic import emission_time
 
@@ -109,11 +109,17 @@ AMBIGUITY_COST = 9.21
 """Chi-square above the best within which another minimum is an alternative: likelihood ratio of
 100 to 1."""
 
+MOST_CONDITION = 1e14
+"""Most that one direction can be better known than the other: beyond, an inverse has no digits."""
+
 DISTINCT = 4.0
 """Squared Mahalanobis distance beyond which two minima are two positions."""
 
 SEEDS = 4
 """Minima from which the search goes on when a row is left out."""
+
+MOST_SUSPECTS = 32
+"""Rows of which one is left out, those that fit worst: to try every one of n rows costs n^2."""
 
 ASIDE = 2.0
 QUADRATIC = (0.3, 3.5)
@@ -268,8 +274,8 @@ def _search(fit: ArrivalFit, limits: Limits) -> tuple[BoolArray, Minima]:
         dof = _dof(fit, kept)
         if dof < 2 or not len(minima.cost) or _p_value(minima.cost[0], dof) >= limits.min_p_value:
             break
-        suspects = np.flatnonzero(kept)
         seeds = minima.position[:SEEDS]
+        suspects = _suspects(fit, seeds, kept)
         all_but_one = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
         trials = minimise(
             fit, np.tile(seeds, (len(suspects), 1)), np.repeat(all_but_one, len(seeds), axis=0)
@@ -282,6 +288,18 @@ def _search(fit: ArrivalFit, limits: Limits) -> tuple[BoolArray, Minima]:
     return kept, minima
 
 
+def _suspects(fit: ArrivalFit, seeds: FloatArray, kept: BoolArray) -> IndexArray:
+    """The rows kept (m,), in their order, that may be the one to leave out: all, or the
+    `MOST_SUSPECTS` that are furthest from what some of the seeds (k, 2) would cause."""
+    rows = np.flatnonzero(kept)
+    if len(rows) <= MOST_SUSPECTS:
+        return rows
+    weight = fit.weight * kept
+    residual, _ = fit.residuals(seeds, weight)
+    misfit = (weight * np.square(residual)).max(axis=0)[rows]
+    return rows[np.sort(np.argsort(-misfit, kind='stable')[:MOST_SUSPECTS])]
+
+
 def _candidates(fit: ArrivalFit, minima: Minima) -> list[Candidate]:
     """The minima in range that match the best one or nearly so, apart from each other."""
     near = np.linalg.norm(minima.position - fit.centre, axis=-1) <= fit.max_range
@@ -290,11 +308,25 @@ def _candidates(fit: ArrivalFit, minima: Minima) -> list[Candidate]:
     for index in np.flatnonzero(near & level):
         position = minima.position[index]
         if all(other.distance2(position) > DISTINCT for other in found):
-            # That the target is in range is the weakest of priors, and keeps the inverse finite.
-            information = minima.information[index] + np.eye(2) / fit.max_range**2
             cost = float(minima.cost[index])
-            found.append(Candidate(position, np.linalg.inv(information), cost))
+            found.append(Candidate(position, _covariance(fit, minima.information[index]), cost))
     return found
+
+
+def _covariance(fit: ArrivalFit, information: FloatArray) -> FloatArray:
+    """The covariance (2, 2) of a fix with this information (2, 2).
+
+    That the target is in range is the weakest of priors, and keeps the inverse finite. On the
+    line of a line array accurate times leave one direction unknown: what is known of the other
+    is then no more than numbers can hold beside it.
+    """
+    least = 1.0 / fit.max_range**2
+    known, axes = np.linalg.eigh(information)
+    if known[1] > MOST_CONDITION * max(known[0] + least, least):
+        known = np.maximum(known, 0.0) + least
+        known[1] = min(known[1], MOST_CONDITION * known[0])
+        return np.asarray((axes / known) @ axes.T)
+    return np.asarray(np.linalg.inv(information + least * np.eye(2)))
 
 
 def _doubt(

@@ -6,26 +6,34 @@ as in a locked-down container, the kernel still works and is compiled anew in ea
 
 Compiled code contains the kernels it calls and the constants it names, wherever they are defined.
 numba itself compiles anew only when the kernel's own file changes. Here a cached kernel is valid
-only while every source file that its own file imports, directly or not, is unchanged; what is no
-longer valid is overwritten.
+only while every source file that its own file imports, directly or not, is unchanged.
+
+numba keeps an index file beside files of code with running numbers. Processes that compile at the
+same time take the same number for different code, and one then runs the other's. Here each file
+has the name of what it holds, and says it inside.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+import contextlib
 from functools import cache
 import hashlib
 import inspect
 from pathlib import Path
 import re
+import time
 from typing import Any, cast, TypeVar
 
 import numba
 from numba import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 F = TypeVar('F', bound=Callable[..., Any])
+
+KEPT_SECONDS = 7 * 86400.0
+"""How long code is kept that was compiled of sources as they no longer are."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)
@@ -55,8 +63,62 @@ class _KernelCacheImpl(CompileResultCacheImpl):
         self._locator.get_source_stamp = lambda: (own_stamp(), digest, checked)
 
 
+class _FilePerKey(IndexDataCacheFile):
+    """One file for each source stamp and key, instead of an index."""
+
+    def load(self, key: Any) -> Any:
+        try:
+            stamp, held, data = self._load_data(self._name_of(key))
+        except OSError:
+            return None
+        return data if (stamp, held) == (self._source_stamp, key) else None
+
+    def save(self, key: Any, data: Any) -> None:
+        self._save_data(self._name_of(key), (self._source_stamp, key, data))
+        self._tidy()
+
+    def flush(self) -> None:
+        for path in self._files():
+            path.unlink(missing_ok=True)
+
+    def _name_of(self, key: Any) -> str:
+        return f'{self._stem}{_short_digest(key)}.nbc'
+
+    @property
+    def _stem(self) -> str:
+        """How the names of files of this state of the sources begin."""
+        return self._data_name(0).removesuffix('0.nbc') + _short_digest(self._source_stamp) + '.'
+
+    def _files(self) -> Iterator[Path]:
+        """The files of this kernel, of any state of the sources."""
+        base = self._data_name(0).removesuffix('0.nbc')
+        for path in Path(self._cache_path).iterdir():
+            if path.name.startswith(base) and path.suffix == '.nbc':
+                yield path
+
+    def _tidy(self) -> None:
+        """Remove what was compiled of other sources long ago."""
+        oldest = time.time() - KEPT_SECONDS
+        for path in self._files():
+            with contextlib.suppress(OSError):
+                if not path.name.startswith(self._stem) and path.stat().st_mtime < oldest:
+                    path.unlink()
+
+
 class _KernelCache(FunctionCache):
     _impl_class = _KernelCacheImpl
+
+    def __init__(self, function: Callable[..., Any]):
+        super().__init__(function)
+        self._cache_file = _FilePerKey(
+            cache_path=self._cache_path,
+            filename_base=self._impl.filename_base,
+            source_stamp=self._impl.locator.get_source_stamp(),
+        )
+
+
+def _short_digest(value: Any) -> str:
+    return hashlib.sha256(repr((numba.__version__, value)).encode()).hexdigest()[:16]
 
 
 @cache

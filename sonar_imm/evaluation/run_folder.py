@@ -52,6 +52,16 @@ BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
 )
 
 
+_KINDS = {
+    'system': str,
+    'bag': str,
+    'world_frame': str,
+    **dict.fromkeys(('topics', 'parameters', 'counts', 'refused', 'versions'), dict),
+}
+"""What of run.json is read again; what is not required may be missing."""
+_NAMES = {str: 'a text', dict: 'a mapping'}
+
+
 class RunFolder:
     """The folder of one run."""
 
@@ -117,10 +127,7 @@ class RunFolder:
             )
         try:
             run = json.loads(path.read_text(encoding='utf-8'))
-            if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
-                raise ValueError('keys are missing')
-            if run['system'] not in SYSTEMS:
-                raise ValueError(f"there is no system '{run['system']}'")
+            _check_run(run)
         except (ValueError, AttributeError, TypeError) as error:
             raise BagError(f'{path} cannot be understood: {error}') from None
         return run
@@ -128,6 +135,24 @@ class RunFolder:
     def read_estimates(self) -> list[Estimate]:
         """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
         return _read_estimates(self.path / BAG)
+
+
+def _check_run(run: Any) -> None:
+    """Raise ValueError or TypeError for a run.json whose entries are not what they must be."""
+    if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
+        raise ValueError('keys are missing')
+    for name, kind in _KINDS.items():
+        if not isinstance(run.get(name, kind()), kind):
+            raise ValueError(f"'{name}' is not {_NAMES[kind]}")
+    if run['system'] not in SYSTEMS:
+        raise ValueError(f"there is no system '{run['system']}'")
+    if run.get('world_frame', 'enu') not in ('enu', 'ned'):
+        raise ValueError("'world_frame' is neither enu nor ned")
+    if not all(isinstance(name, str) for name in run['topics'].values()):
+        raise ValueError("'topics' does not give the name of an input for each topic")
+    for reason, entry in run.get('refused', {}).items():
+        if not (isinstance(entry, dict) and {'count', 'example'} <= entry.keys()):
+            raise ValueError(f"'refused' has no count and example for '{reason}'")
 
 
 class CsvTable:

@@ -32,6 +32,7 @@ from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import InvalidQoSProfileException
+from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
@@ -47,6 +48,7 @@ from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
+from .stopping import START_PATIENCE, stopper
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 _PATIENCE = 3.0
@@ -312,36 +314,43 @@ class TrackerNode(Node):
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
-    """Spin a node until SIGINT or SIGTERM. Gives the exit code: 0 done, 2 unusable parameters.
+    """Spin a node until SIGINT, SIGTERM or SIGHUP. Gives the exit code: 0 done, 2 unusable
+    parameters.
 
     The order of things matters: the textbook version fails on every tenth signal, because the
     context can vanish inside any call, the constructor included.
     """
+    first = stopper.listen()
     node = None
     try:
         _init(args)
+        stopper.on_stop(rclpy.try_shutdown, START_PATIENCE)
         executor = SingleThreadedExecutor()
         node = make_node()
+        stopper.on_stop(rclpy.try_shutdown)
         rclpy.spin(node, executor)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
     except ConfigError as error:
         print(f'{Path(sys.argv[0]).stem}: {error}', file=sys.stderr)
         return 2
-    except RuntimeError:  # RCLError, when the context vanished in the middle of a call
+    except Exception:  # of many kinds, when the context vanished in the middle of a call
         if rclpy.ok():
             raise
     finally:
-        with contextlib.suppress(KeyboardInterrupt):
+        with contextlib.suppress(*([Exception] if stopper.asked else [])):
             if node is not None:
                 node.destroy_node()
         rclpy.try_shutdown()
+        stopper.release() if first else stopper.ignore()
     return 0
 
 
 def _init(args: list[str] | None) -> None:
     try:
-        rclpy.init(args=args)
+        # Where signals cannot be taken here, they remain with whoever has them.
+        mine = SignalHandlerOptions.NO if stopper.listening else None
+        rclpy.init(args=args, signal_handler_options=mine)
     except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
         raise ConfigError(' '.join(str(error).split())) from None
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 if __name__ == '__main__':
     from ..threads import one_blas_thread
+    from .stopping import stopper
 
+    stopper.listen()
     one_blas_thread()  # before numpy is imported
 
 from collections import Counter

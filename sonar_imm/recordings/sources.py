@@ -84,13 +84,27 @@ class RosbagsSource:
         place = _FolderPath(path) if path.is_dir() else path
         self._reader = AnyReader([place], default_typestore=typestore())
         self._reader.open()
-        if not all(isinstance(link.msgcount, int) for link in self._reader.connections):
+        if trouble := self._trouble():
             self._reader.close()
-            raise BagError('metadata.yaml has a message count that is no number')
+            raise BagError(f'metadata.yaml has {trouble}')
         # rosbags ignores its default types as soon as the bag defines a single one
         _add_known_types(
             self._reader.typestore, [link.msgtype for link in self._reader.connections]
         )
+
+    def _trouble(self) -> str:
+        """What of the metadata is of a wrong kind, empty when nothing is; rosbags does not ask."""
+        links = self._reader.connections
+        if not all(isinstance(link.msgcount, int) for link in links):
+            return 'a message count that is no number'
+        if not all(isinstance(one, str) for link in links for one in (link.topic, link.msgtype)):
+            return 'a topic whose name or type is no text'
+        for reader in self._reader.readers:
+            storage = getattr(reader, 'storage', None)
+            if not isinstance(getattr(storage, 'files', []), list):
+                storage.files = []  # rosbags could not close it
+                return 'a list of files that is none'
+        return ''
 
     @property
     def custom_data(self) -> dict[str, str]:

@@ -482,3 +482,19 @@ def test_filterpy_agrees_where_it_is_right():
         mean, covariance = imm_kernels.combine(*state, np.tile(np.eye(3), (3, 1, 1)))
         np.testing.assert_allclose(mean[0], theirs.x[:, 0], atol=1e-8)
         np.testing.assert_allclose(covariance[0], theirs.P, atol=1e-8)
+
+
+@pytest.mark.parametrize('targets, detections', [(0, 3), (2, 0)])
+def test_a_gate_without_targets_or_detections_takes_no_memory(targets, detections):
+    """What it needs else is the size of a measurement squared, here 80 GB for each model."""
+    m = 100_000
+    fit = imm_kernels.gate(
+        np.zeros((targets, 2, m)),
+        np.zeros((1, 2, m, 1)),
+        np.ones((targets, 2, 1, 1)),
+        np.full((targets, 2), 0.5),
+        np.zeros((detections, m)),
+        np.zeros((detections, 1, 1)),
+        9.0,
+    )
+    assert fit.shape == (targets, detections)

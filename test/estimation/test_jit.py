@@ -43,7 +43,7 @@ def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
         'print(sum(combine.stats.cache_hits.values()))'
     )
     assert [run(code, ROOT, tmp_path) for _ in range(2)] == [['0'], ['1']]
-    assert list(tmp_path.rglob('*.nbi'))
+    assert list(tmp_path.rglob('*.nbc'))
 
 
 @pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
@@ -74,6 +74,73 @@ print(out[0], mixed[1, 0, 0], hits)
     edit(constant, 'LEAST_CHANCE = 1e-290', 'LEAST_CHANCE = 1e-3')
     assert run(code, root, cache) == ['1.5', '3.0', '0']
     assert run(code, root, cache) == ['1.5', '3.0', '2']
+
+
+def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
+    """Of numba's own cache the second of two signatures, compiled in two processes at once, or
+    code of another state of the sources, could be read as the first."""
+
+    def doubled(x):
+        return x + x
+
+    def compiled(digest='one'):
+        monkeypatch.setattr(jit, 'digest_of', lambda path: digest)
+        return jit.kernel(doubled)
+
+    def files(function):
+        folder = Path(function.stats.cache_path)
+        return {path: path.read_bytes() for path in folder.glob('*doubled*.nbc')}
+
+    one, other = compiled(), compiled()
+    one._cache.flush()
+    assert one(2.0) == 4.0
+    first = files(one)
+    assert other(2) == 4 and compiled('two')(2.0) == 4.0
+    both = files(one)
+    assert len(first) == 1 and len(both) == 3 and first.items() <= both.items()
+    loaded = compiled()
+    assert loaded(3.0) == 6.0 and type(loaded(3)) is int
+    assert sum(loaded.stats.cache_hits.values()) == 2
+
+
+def test_a_file_that_holds_something_else_is_not_used():
+    @jit.kernel
+    def halved(x):
+        return 0.5 * x
+
+    @jit.kernel
+    def thirded(x):
+        return x / 3.0
+
+    for function in (halved, thirded):
+        function._cache.flush()
+        function(1.0)
+    folder = Path(halved.stats.cache_path)
+    (mine,), (foreign,) = folder.glob('*halved*.nbc'), folder.glob('*thirded*.nbc')
+    shutil.copy(foreign, mine)
+    cache_file = halved._cache._cache_file
+    key = halved._cache._index_key(halved.signatures[0], halved.targetctx.codegen())
+    assert cache_file.load(key) is None
+    thirded._cache.flush()
+    halved._cache.flush()
+    assert not list(folder.glob('*halved*.nbc'))
+
+
+def test_code_of_old_sources_is_removed_after_a_while(monkeypatch):
+    def tripled(x):
+        return 3.0 * x
+
+    kernels = []
+    for digest in ('one', 'two', 'three'):
+        monkeypatch.setattr(jit, 'digest_of', lambda path, digest=digest: digest)
+        kernels.append(jit.kernel(tripled))
+        kernels[-1](1.0)
+        folder = Path(kernels[-1].stats.cache_path)
+        for path in folder.glob('*tripled*.nbc'):
+            if digest == 'one':
+                os.utime(path, (0, 0))
+    assert len(list(folder.glob('*tripled*.nbc'))) == 2
+    kernels[-1]._cache.flush()
 
 
 def edit(path, old, new):

@@ -88,6 +88,31 @@ def test_a_broken_run_json_is_one_sentence(folder, text):
         folder.read_run()
 
 
+GOOD_RUN = {
+    'system': 'diver',
+    'bag': '',
+    'topics': {'/fix': 'fix'},
+    'parameters': {},
+    'counts': {'used': 1},
+    'refused': {'nan': {'count': 1, 'example': 'it is not a number'}},
+    'versions': {},
+    'world_frame': 'enu',
+}
+
+
+@pytest.mark.parametrize('name', GOOD_RUN)
+@pytest.mark.parametrize('value', [None, 5, True, [], ['a'], {'a': []}])
+def test_entries_of_a_wrong_kind_are_one_sentence(folder, name, value):
+    folder.write_json('run.json', GOOD_RUN)
+    assert folder.read_run() == GOOD_RUN
+    folder.write_json('run.json', {**GOOD_RUN, name: value})
+    if isinstance(value, dict) and name in ('parameters', 'counts', 'versions'):
+        folder.read_run()  # what is in them is judged where it is used
+        return
+    with pytest.raises(BagError, match='cannot be understood'):
+        folder.read_run()
+
+
 def test_an_unfinished_run_is_told(tmp_path):
     with pytest.raises(BagError, match='no finished run'):
         RunFolder(tmp_path).read_run()

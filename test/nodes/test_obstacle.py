@@ -11,7 +11,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from msg_adapters.detections import write_detections
 from msg_adapters.estimates import read_estimate
 from msg_adapters.navigation import write_navigation, write_range
-from msg_adapters.obstacles import band, write_markers
+from msg_adapters.obstacles import band, write_markers, write_poses
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.nodes.messages import make, message_class
@@ -212,3 +212,32 @@ def test_a_laser_scan_is_heard_when_it_is_asked_for(make_bench):
     publisher.publish(scan)
     bench.spin_until(lambda: node._meter.received['detections'] == 1)
     assert not node._meter.refused and node.tracker.health()['pings_waiting'] == 1
+
+
+def test_places_far_from_the_origin_keep_their_centimetres():
+    """float32 is half a metre coarse at a northing of 9e6."""
+    estimate = an_estimate([1], [1])
+    place = np.array([[500_000.37, 9_000_000.21, -30.0]])
+    far = evolve(estimate, xyz=place)
+    pose = write_poses(far, [0], make).poses[0].position
+    ball = write_markers(far, [0], make).markers[1].pose.position
+    for point in (pose, ball):
+        assert (point.x, point.y) == (500_000.37, 9_000_000.21)
+
+
+def test_places_of_the_tracker_are_not_rounded_either():
+    config = scenario('late', {'last_range': 60.0})
+    near = [one.measurement for one in simulate(config, 3).measurements]
+    shift = np.array([500_000.0, 9_000_000.0, 0.0])
+    far = [
+        evolve(one, position=one.position + shift) if isinstance(one, Navigation) else one
+        for one in near
+    ]
+    trackers = ObstacleTracker(ObstacleConfig()), ObstacleTracker(ObstacleConfig())
+    runs = [
+        [estimate for one in scene for estimate in tracker.process(one)]
+        for tracker, scene in zip(trackers, (near, far))
+    ]
+    assert any(len(estimate) for estimate in runs[0])
+    for one, other in zip(*runs, strict=True):
+        np.testing.assert_allclose(other.xyz - shift, one.xyz, atol=1e-4)

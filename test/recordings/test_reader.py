@@ -6,6 +6,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+import yaml
 
 from sonar_imm.recordings.messages import ros_message, typestore
 from sonar_imm.recordings.reader import BagError, BagReader
@@ -309,10 +310,23 @@ class TestTypes:
         assert [item.topic for item in items] == ['/custom', '/text'] and not problems
 
 
-def test_a_message_count_that_is_no_number_is_told(write_fixes):
+@pytest.mark.parametrize(
+    'place, value, told',
+    [
+        (('topics_with_message_count', 0, 'message_count'), 'many', 'count that is no number'),
+        (('topics_with_message_count', 0, 'topic_metadata', 'name'), [5], 'is no text'),
+        (('topics_with_message_count', 0, 'topic_metadata', 'name'), 5, 'is no text'),
+        (('files',), 'none', 'a list of files that is none'),
+    ],
+)
+def test_metadata_of_a_wrong_kind_are_told_and_the_files_are_read(write_fixes, place, value, told):
     path = write_fixes(3)
-    metadata = path / 'metadata.yaml'
-    metadata.write_text(metadata.read_text().replace('message_count: 3', 'message_count: many'))
+    metadata = yaml.safe_load((path / 'metadata.yaml').read_text())
+    inside = metadata['rosbag2_bagfile_information']
+    for key in place[:-1]:
+        inside = inside[key]
+    inside[place[-1]] = value
+    (path / 'metadata.yaml').write_text(yaml.safe_dump(metadata))
     items, problems = read(path)
     assert len(items) == 3
-    assert 'a message count that is no number' in problems[0]
+    assert told in problems[0]

@@ -14,7 +14,7 @@ from ...estimation.arrays import FloatArray, IndexArray
 from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
 from .model_set import heights_of
-from .sensing import locate, Positions, systematic_variance, toa_variance
+from .sensing import locate, Positions, spread, systematic_variance, toa_variance
 
 
 class Birth(NamedTuple):
@@ -36,6 +36,9 @@ it."""
 
 MAX_COMBINATIONS = 200
 """Combinations of echoes tried for one position."""
+
+MOST_FOUND = 10
+"""Positions found by combining the echoes of one ping; those of others are found in later ones."""
 
 
 def births_from_fixes(
@@ -61,7 +64,9 @@ def births_from_ping(
     """
     rows = np.flatnonzero(free & np.isfinite(ping.toa))
     births: list[Birth] = []
-    while len(rows):
+    for _ in range(MOST_FOUND):
+        if not len(rows):
+            break
         pairs = [rows] if ping.passive else _by_pair(ping, rows)
         if ping.passive or max(len(one) for one in pairs) == 1:
             return births + _fix(ping, rows, config, factor)[0]
@@ -82,6 +87,7 @@ def _fix(
     ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: float
 ) -> tuple[list[Birth], np.ndarray]:
     """The fix of `rows` and its alternatives, and the rows it used."""
+    rows = spread(rows)
     fix = locate(ping, rows, config, config.covariance_scale * factor)
     if fix is None:
         return [], rows[:0]

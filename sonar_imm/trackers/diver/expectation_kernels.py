@@ -42,6 +42,26 @@ def fit_numbers(
 
 
 @kernel
+def expect_residuals(
+    x: FloatArray, mu: FloatArray, height: float, numbers: Numbers
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (C,), value less the one expected of the mixture of the models x (M, n), mu (M,),
+    and those of each model (M, C)."""
+    M, n = x.shape
+    C = len(numbers.value)
+    residual, nu, g = np.zeros(C), np.empty((M, C)), np.empty(n)
+    for j in range(M):
+        for c in range(C):
+            nu[j, c] = numbers.value[c] - observe(
+                numbers.kind[c], x[j], numbers.columns[c], height, numbers.tx[c], numbers.rx[c], g
+            )
+            if numbers.kind[c] == BEARING:
+                nu[j, c] -= 2.0 * math.pi * math.floor(nu[j, c] / (2.0 * math.pi) + 0.5)
+            residual[c] += mu[j] * nu[j, c]
+    return residual, nu
+
+
+@kernel
 def expect_numbers(
     x: FloatArray, P: FloatArray, mu: FloatArray, height: float, numbers: Numbers
 ) -> tuple[FloatArray, FloatArray]:
@@ -49,11 +69,13 @@ def expect_numbers(
     without the variances of the numbers, of the mixture of the models."""
     M, n = x.shape
     C = len(numbers.value)
-    residual, covariance = np.zeros(C), np.zeros((C, C))
-    nu, G, GP = np.empty((M, C)), np.empty((C, n)), np.empty(n)
+    covariance, G, GP = np.zeros((C, C)), np.empty((C, n)), np.empty(n)
+    residual, nu = expect_residuals(x, mu, height, numbers)
     for j in range(M):
+        if mu[j] == 0.0:
+            continue
         for c in range(C):
-            nu[j, c] = numbers.value[c] - observe(
+            observe(
                 numbers.kind[c],
                 x[j],
                 numbers.columns[c],
@@ -62,11 +84,6 @@ def expect_numbers(
                 numbers.rx[c],
                 G[c],
             )
-            if numbers.kind[c] == BEARING:
-                nu[j, c] -= 2.0 * math.pi * math.floor(nu[j, c] / (2.0 * math.pi) + 0.5)
-            residual[c] += mu[j] * nu[j, c]
-        if mu[j] == 0.0:
-            continue
         for c in range(C):
             for a in range(n):
                 GP[a] = 0.0

@@ -21,12 +21,12 @@ from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.student_t import DEGREES
 from ...measurements import Arrivals
 from .config import DiverConfig
-from .expectation_kernels import expect_numbers
+from .expectation_kernels import expect_numbers, expect_residuals, fit_numbers
 from .instruments import Layout
 from .model_set import heights_of, ModelSet
 from .ping_kernels import MOST_EXPLANATIONS, Numbers, subset_ping
 from .robust_kernels import student_t_maxima, student_t_ping
-from .sensing import bearing_variance, toa_variance
+from .sensing import bearing_variance, MOST_NUMBERS, spread, toa_variance
 
 MOST_SUBSETS = 6
 """Most transmitter-receiver pairs heard whose subsets are all tried."""
@@ -62,13 +62,21 @@ class Ping(NamedTuple):
 
     def only(self, keep: BoolArray) -> Ping:
         """The numbers `keep` (C,), without those whose parent is not kept."""
-        parent = self.numbers.parent
-        keep = keep & ((parent < 0) | keep[np.maximum(parent, 0)])
+        keep = self.kept(keep)
         place = np.cumsum(keep) - 1
         left = Numbers(*(np.ascontiguousarray(column[keep]) for column in self.numbers))
         left = left._replace(parent=np.where(left.parent >= 0, place[left.parent], -1))
         pairs = len(np.unique(left.node[left.kind <= ONE_WAY]))
         return Ping(left, self.row[keep], self.passive, pairs)
+
+    def kept(self, keep: BoolArray) -> BoolArray:
+        """`keep` (C,) without those whose parent is not kept."""
+        parent = self.numbers.parent
+        return np.asarray(keep & ((parent < 0) | keep[np.maximum(parent, 0)]))
+
+    def compared(self, keep: BoolArray) -> Ping:
+        """As `only`, but at most `MOST_NUMBERS`, evenly chosen."""
+        return self.only(np.isin(np.arange(len(keep)), spread(np.flatnonzero(keep))))
 
     @property
     def nodes(self) -> IntArray:
@@ -106,7 +114,7 @@ def ping_numbers(
     if not ping.passive:
         usable = usable[np.isfinite(ping.tx[usable]).all(axis=1)]
     if ping.passive:
-        usable = usable[np.argsort(ping.rx_id[usable], kind='stable')]
+        usable = spread(usable[np.argsort(ping.rx_id[usable], kind='stable')])
     speed = config.sound_speed
     first = ping.toa[usable].min(initial=np.inf) if ping.passive else 0.0
     variance = toa_variance(ping, config, factor)[usable] * speed**2
@@ -174,7 +182,23 @@ def update_by_ping(
     layout: Layout,
 ) -> PingUpdate | None:
     """One diver, x (M, n + q), P (M, n + q, n + q), mu (M,), updated by all of a ping; None where
-    no model can be."""
+    no model can be.
+
+    Of more than `MOST_NUMBERS` those are used that are nearest to what is expected; the others
+    are good where they fit what became of the diver.
+    """
+    if len(ping.row) > MOST_NUMBERS:
+        _, nis = fit_numbers(x, P, mu, config.target_z, ping.numbers)
+        keep = np.zeros(len(nis), bool)
+        keep[np.argsort(nis, kind='stable')[:MOST_NUMBERS]] = True
+        keep = ping.kept(keep)
+        after = update_by_ping(x, P, mu, ping.only(keep), config, layout)
+        if after is None:
+            return None
+        _, nis = fit_numbers(after.x, after.P, after.mu, config.target_z, ping.numbers)
+        good = 1.0 / (1.0 + nis / GOOD_RESIDUAL**2)
+        good[keep] = after.good
+        return after._replace(good=good)
     n, numbers, mask = x.shape[-1], ping.numbers, layout.mask
     if ping.passive:
         x, P, mask = _with_emission(x, P, mu, ping, mask, config.target_z)
@@ -297,7 +321,7 @@ def _with_emission(
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P
-    residual, _ = expect_numbers(wide, covariance, mu, height, ping.numbers)
+    residual, _ = expect_residuals(wide, mu, height, ping.numbers)
     wide[:, n] = np.median(residual[ping.echo]) if ping.echo.any() else 0.0
     covariance[:, n, n] = EMISSION_STD**2
     return wide, covariance, np.append(mask, True)

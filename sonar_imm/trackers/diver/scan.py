@@ -225,12 +225,12 @@ class Scan:
         self.instruments = self.instruments.heard(ping, self.config)
         self.layout = self.instruments.layout(self.config, self.models.n)
         self.x, self.P = self.layout.widened(self.x, self.P)
-        rows = np.arange(len(ping))
+        rows, taken = np.arange(len(ping)), np.zeros(len(ping), bool)
         numbers = ping_numbers(ping, rows, self.config, factor, self.models, self.layout)
-        taken = np.zeros(len(ping), bool)
         if len(self.x) and numbers.pairs > int(ping.passive):
             good = (self._take_tag if ping.passive else self._take_echoes)(numbers, factor)
             taken[numbers.row[good & numbers.echo]] = True
+            taken |= ping.passive and taken.any()  # all are one track's, also those not used
         return taken
 
     def _take_echoes(self, ping: Ping, factor: float) -> BoolArray:
@@ -276,7 +276,7 @@ class Scan:
             owner = self._owners(tracks, fit, near & ~taken, pairs)
             found = np.zeros(len(taken), bool)
             for track in tracks:
-                mine = ~taken & ~found & ((owner < 0) | (owner == track))
+                mine = ping.kept(~taken & ~found & ((owner < 0) | (owner == track)))
                 index = np.flatnonzero(mine)
                 good = self._accept(track, ping.only(mine), factor)
                 found[index[good]] = True
@@ -368,14 +368,14 @@ class Scan:
         good = np.asarray(after.good > TAKEN)
         height = self.config.target_z
         if (good & ping.echo).sum() > int(ping.passive):
-            own = ping.only(good)
+            own = ping.compared(good)
             residual, covariance, dof = residuals(*before, own, height)
             S = covariance + np.diag(own.numbers.variance)
             self.nis[track] += float(residual @ np.linalg.solve(S, residual))
             self.nis_dof[track] += np.uint16(dof)
         self.x[track], self.P[track], self.mu[track] = after.x, after.P, after.mu
         if self.config.estimate_covariance_scale and (good & ping.echo).any():
-            self._learn_from_ping(track, ping.only(good & ping.echo), factor)
+            self._learn_from_ping(track, ping.compared(good & ping.echo), factor)
         return good
 
     def _learn_from_ping(self, track: int, ping: Ping, factor: float) -> None:

@@ -14,6 +14,21 @@ from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from .config import DiverConfig
 from .model_set import heights_of
 
+LEAST_VAR_TOA = 1e-13
+"""Least variance of an arrival time, s^2: half a millimetre of path. Below it a joint covariance
+with the unknown emission of a tag has no inverse."""
+
+MOST_NUMBERS = 128
+"""Numbers of one ping that are used at once: time and memory grow with them, by the third power
+where their joint covariance is needed."""
+
+
+def spread(rows: IndexArray) -> IndexArray:
+    """At most `MOST_NUMBERS` of the rows (n,), evenly chosen, in their order."""
+    if len(rows) <= MOST_NUMBERS:
+        return rows
+    return rows[np.linspace(0.0, len(rows) - 1.0, MOST_NUMBERS).round().astype(np.intp)]
+
 
 @frozen(eq=False)
 class Positions:
@@ -117,9 +132,10 @@ def systematic_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:
 
 
 def toa_variance(ping: Arrivals, config: DiverConfig, factor: float) -> FloatArray:
-    """Variance (n,) of the arrival times, s^2: the sender's where given."""
+    """Variance (n,) of the arrival times, s^2: the sender's, not below `LEAST_VAR_TOA`."""
     known = np.isfinite(ping.var_toa) & (ping.var_toa > 0.0)
-    return np.asarray(np.where(known, ping.var_toa, config.toa_std**2) * factor)
+    stated = np.where(known, np.maximum(ping.var_toa, LEAST_VAR_TOA), config.toa_std**2)
+    return np.asarray(stated * factor)
 
 
 def bearing_variance(ping: Arrivals, config: DiverConfig) -> FloatArray:

@@ -352,7 +352,7 @@ class ObstacleTracker:
         return Estimate(
             stamp_ns=ping.stamp_ns,
             frame_id=self._stream.frame_id,
-            xyz=place.astype(np.float32),
+            xyz=place,
             state_names=STATES,
             state=view.state * side,
             covariance=view.covariance * np.outer(side, side),
