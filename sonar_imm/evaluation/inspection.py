@@ -96,8 +96,7 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
         (system, entry)
         for system in SYSTEMS
         for entry in inputs_of(system)
-        if item.type_name in entry.readers
-        and (not entry.companion or item.topic.split('/')[-1] == entry.name)
+        if entry.may_be(item.topic, item.type_name)
     ]
 
 

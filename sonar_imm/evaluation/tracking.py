@@ -175,7 +175,7 @@ class OfflineRun:
         pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         health = self.tracker.health()
-        for name in ('covariance_repairs', 'pings_moving_alike'):
+        for name in ('covariance_repairs', 'pings_moving_alike', 'waiting_for_vessel'):
             if count := health.get(name):
                 counts[name] = int(count)
         refused = sum(entry.count for entry in self.refused.values())
@@ -184,6 +184,11 @@ class OfflineRun:
     def warnings(self) -> list[str]:
         """What of the input cannot be true, as the tracker says it at the end."""
         return list(getattr(self.tracker, 'warnings', list)())
+
+    def origin(self) -> dict[str, Any]:
+        """Where the frame of the tracks lies on Earth, as plain values; nothing when not known."""
+        origin = getattr(self.tracker, 'origin', None)
+        return {} if origin is None else {'origin': asdict(origin)}
 
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""
@@ -222,6 +227,7 @@ def write_run(
         refused=offline.refusals(),
         warnings=offline.warnings(),
         problems=list(offline.bag.problems),
+        **offline.origin(),
         parameters=offline.tracker.config.as_dict(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )

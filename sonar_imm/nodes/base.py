@@ -24,6 +24,7 @@ import time
 import traceback
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
@@ -78,7 +79,11 @@ class TrackerNode(Node):
         self._endpoints = Endpoints(self)
         with _explained_overrides(self):
             self._advertise()
-            hears = {topic.name: self._listen(topic) for topic in self._topics}
+            hears = {
+                name: self._listen(topic, name)
+                for topic in self._topics
+                for name in topic.instances(self.tracker.config.as_dict())
+            }
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)
         self._jumps = self.get_clock().create_jump_callback(
@@ -145,17 +150,20 @@ class TrackerNode(Node):
         )
         self.advertise_displays()
 
-    def _listen(self, topic: InputTopic) -> str:
-        """Subscribe to one input and give the resolved name of its topic."""
+    def _listen(self, topic: InputTopic, name: str) -> str:
+        """Subscribe to one input on the topic `name`, and give the resolved name of that."""
         spec = type_spec(topic)
         type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
         reader = topic.reader(
-            type_name, self._node_config.world_frame_convention, self.tracker.config.as_dict()
+            type_name,
+            self._node_config.world_frame_convention,
+            self.tracker.config.as_dict(),
+            name,
         )
         subscription = self._endpoints.subscribe(
             message_class(type_name),
-            topic.name,
-            functools.partial(self._receive, topic, reader),
+            name,
+            functools.partial(self._receive, evolve(topic, name=name), reader),
             input_qos(self._node_config.queue_depth),
         )
         return subscription.topic_name

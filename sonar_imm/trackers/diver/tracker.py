@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from attrs import evolve
 import numpy as np
 
+from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
 from ...estimation import imm_kernels, jipda_kernels
 from ...estimation.adaptation import AdaptiveChain
@@ -34,6 +35,7 @@ from .fix_consistency import FixConsistency
 from .fix_scans import each_name_once, shows_all, take_fixes
 from .instruments import Instruments
 from .models import build_models
+from .placing import Placer
 from .pings import begin_from_ping, FAR, ping_numbers
 from .scan import Scan
 from .sensing import position_groups
@@ -65,10 +67,16 @@ class DiverTracker:
             survivor=lambda state: self._nobody(state.life.none_left()),
         )
         self.counts = self._stream.counts
+        self._placer = Placer(self.config, self.counts)
+
+    @property
+    def origin(self) -> Origin | None:
+        """Where the frame of the tracks lies on Earth, None when that is not known."""
+        return self._placer.origin
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
-        self.config = config
+        self.config = self._placer.config = config
 
     def warm(self) -> None:
         imm_kernels.warm()
@@ -109,20 +117,25 @@ class DiverTracker:
             'covariance_repairs': now.repairs,
             'fixes_mean_nis': now.fixes.mean_nis,
             'fixes_lag_1': now.fixes.lag_1,
+            'waiting_for_vessel': len(self._placer),
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
 
     def warnings(self) -> list[str]:
-        """What of the input cannot be true, in sentences for the user."""
-        return self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
+        """What of the input cannot be true or used, in sentences for the user."""
+        lasting = self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
+        return self._placer.warnings() + lasting
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
 
     def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
         """The stamps and states that are new or changed, oldest first."""
-        return self._stream.revise(measurement)
+        revised: dict[int, DiverState] = {}
+        for one in self._placer.place(measurement):
+            revised.update(self._stream.revise(one))
+        return [(stamp_ns, revised[stamp_ns]) for stamp_ns in sorted(revised)]
 
     def _nobody(self, life: Tracks) -> DiverState:
         """The state without a track; `life` has none, but the next identity."""
@@ -266,5 +279,13 @@ class DiverTracker:
                 'nis_dof': state.nis_dof,
                 'existence': state.existence,
                 'target_id': state.target_id.astype(np.int32),
+                **self._on_earth(mean, depth),
             },
         )
+
+    def _on_earth(self, mean: FloatArray, height: FloatArray) -> dict[str, FloatArray]:
+        """Columns with latitude and longitude, degrees, where the origin is known."""
+        if self.origin is None:
+            return {}
+        place = self.origin.geodetic(np.column_stack([mean[:, :2], height]))
+        return {'latitude': place[:, 0], 'longitude': place[:, 1]}
