@@ -1,8 +1,8 @@
 """Positions in latitude and longitude: sensor_msgs/NavSatFix and the messages of geographic_msgs.
 
-A NavSatFix whose status says that there is no fix is refused (``no_fix``). Of its covariance, east,
-north, up, the type decides: unknown is unknown, whatever the numbers; diagonal means only the
-diagonal. geographic_msgs is read by field names: GeoPointStamped, GeoPoseStamped and
+A NavSatFix whose status says that there is no fix is refused (``no_fix``). The type of its
+covariance (east, north, up) decides: unknown is unknown, whatever the numbers; diagonal means only
+the diagonal. geographic_msgs is read by field names: GeoPointStamped, GeoPoseStamped and
 GeoPoseWithCovarianceStamped.
 """
 
@@ -51,8 +51,8 @@ def write_geodetic(fix: GeodeticFix, make: Make) -> Any:
 def write_geo(estimate: Estimate, row: int, origin: Origin, make: Make) -> Any:
     """Write where one diver is as a NavSatFix, frame ``diver_<track_id>``.
 
-    The covariance is east, north, up at the diver. Where depth is not estimated the altitude is NaN
-    and its variance large.
+    The covariance is east, north, up at the diver. Where depth is not estimated the altitude is
+    NaN and its variance large.
     """
     names = [name for name in ('px', 'py', 'pz') if name in estimate.state_names]
     index = [estimate.state_names.index(name) for name in names]

@@ -7,9 +7,9 @@ Read by field names, so that the packages of the drivers need not be installed:
 - seatrac_interfaces/ModemRec: range, azimuth and elevation in the axes of the beacon, clockwise
   and up, tenths of a metre and a degree; without those its position east and north, by the compass
   of the beacon. ``src_id`` says whose it is;
-- acomms_msgs/UsblData (EvoLogics): east, north, up where the device knows its attitude, else x y z;
-  ``accuracy`` is taken as the standard deviation on each axis, ``remote_address`` says whose it is.
-  The stamp is that of reception: the age of the measurement by the clock of the device,
+- acomms_msgs/UsblData (EvoLogics): east, north, up where the device knows its attitude, else x y
+  z; ``accuracy`` is taken as the standard deviation on each axis, ``remote_address`` says whose it
+  is. The stamp is that of reception: the age of the measurement by the clock of the device,
   ``current_time - measurement_time``, is taken off;
 - stonefish_ros2/BeaconInfo: ``relative_position`` in the axes of the simulated transceiver,
   forward, starboard, down; ``beacon_id`` says whose it is.
@@ -100,9 +100,7 @@ def read_usbl_data(message: Any, *, relative_axes: str = 'flu', **_: Any) -> Rel
     if not xyz.any():
         raise Rejection('no_position', 'the USBL message has no position')
     offset, covariance, levelled = _turned(xyz, covariance, relative_axes)
-    return _fix(
-        message, offset, covariance=covariance, levelled=levelled, target_id=own, age=age
-    )
+    return _fix(message, offset, covariance=covariance, levelled=levelled, target_id=own, age=age)
 
 
 def read_beacon(message: Any, **_: Any) -> RelativeFix:

@@ -29,9 +29,7 @@ def read_heading(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselH
     if hasattr(message, 'orientation_covariance'):
         given = np.array(message.orientation_covariance, np.float64).ravel()
         if given.size != 9:
-            raise Rejection(
-                'bad_shape', f'the covariance has {given.size} numbers, 9 are needed'
-            )
+            raise Rejection('bad_shape', f'the covariance has {given.size} numbers, 9 are needed')
         if given[0] == -1.0:
             raise Rejection('no_orientation', 'the IMU says that it has no orientation')
         usable = np.isfinite(given).all() and (np.diag(given.reshape(3, 3)) > 0.0).all()
@@ -65,6 +63,4 @@ def _turned(heading: VesselHeading) -> VesselHeading:
     covariance = heading.covariance
     if covariance is not None:
         covariance = swap_axes(swap_axes(covariance).T)
-    return evolve(
-        heading, orientation=flip_quaternion(heading.orientation), covariance=covariance
-    )
+    return evolve(heading, orientation=flip_quaternion(heading.orientation), covariance=covariance)

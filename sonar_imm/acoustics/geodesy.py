@@ -28,9 +28,7 @@ class Origin:
         from pymap3d import geodetic2enu  # only needed for latitudes
 
         return np.array(
-            geodetic2enu(
-                latitude, longitude, height, self.latitude, self.longitude, self.height
-            ),
+            geodetic2enu(latitude, longitude, height, self.latitude, self.longitude, self.height),
             np.float64,
         )
 
@@ -45,10 +43,14 @@ class Origin:
     def turn(self, latitude: float, longitude: float) -> FloatArray:
         """(3, 3) that turns vectors in east, north, up of a place into those of the origin.
 
-        Ten kilometres from the origin the axes differ by .1 to .3 degrees.
+        About the vertical only: ten kilometres away the meridians converge by .1 to .3 degrees. The
+        vertical tilts by as little, and a height that is not known must not be spread over east and
+        north by it.
         """
         here, there = _to_earth(self.latitude, self.longitude), _to_earth(latitude, longitude)
-        return np.asarray(here.T @ there)
+        east, north = (here.T @ there)[:2, 0]
+        c, s = np.array([east, north]) / np.hypot(east, north)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _to_earth(latitude: float, longitude: float) -> FloatArray:

@@ -1,14 +1,14 @@
-"""Where a target is that a transceiver on a vessel has located: its place in the world, and how sure.
+"""Where a target is that a transceiver on a vessel has located, and how sure that is.
 
     place = vessel + R (lever + R_mount offset)
 
-Errors of the vessel's position and of the lever add up; an error of the attitude, a small rotation
-vector theta in axes of the world, moves the target by ``theta x arm``, and an error of the angles
-that the transceiver measures does the same with the offset alone. To second order a random rotation
-with covariance S also shortens what it turns, by ``(tr S I - S) v / 2`` on average, which is
-undone, and spreads it along itself, ``cov_ij = tr(M_i S M_j S) / 2`` with ``M_i = (e_i v' + v
-e_i') / 2 - v_i I``. Without that a sonar good to .1 m and 2 degrees would claim .1 m in range where
-its arc bends by more.
+Errors of the vessel's position and of the lever add up. An error of the attitude, a small
+rotation vector theta in axes of the world, moves the target by ``theta x arm``, and an error of
+the angles that the transceiver measures does the same with the offset alone. To second order a
+random rotation with covariance S also shortens what it turns, by ``(tr S I - S) v / 2`` on
+average, which is undone, and spreads it along itself, ``cov_ij = tr(M_i S M_j S) / 2`` with
+``M_i = (e_i v' + v e_i') / 2 - v_i I``. Without that a sonar good to .1 m and 2 degrees would
+claim .1 m in range where its arc bends by more.
 """
 
 from __future__ import annotations
@@ -85,7 +85,9 @@ def place(
     return Placed(vessel.position + lever + seen + lengthened, covariance)
 
 
-def _polar(offset: FloatArray, range_std: float, angle_std: float) -> tuple[FloatArray, FloatArray]:
+def _polar(
+    offset: FloatArray, range_std: float, angle_std: float
+) -> tuple[FloatArray, FloatArray]:
     """Covariance (3, 3) of an offset to first order, and that of the rotation that its angles may
     be wrong by."""
     distance = float(np.linalg.norm(offset))

@@ -16,7 +16,7 @@ from attrs import asdict, define, frozen
 import numpy as np
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, Rejection
+from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
@@ -120,6 +120,7 @@ class OfflineRun:
         self.messages = 0
         self.durations = array('d')
         self._window_ns = window_ns(config)
+        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
 
     @property
     def total(self) -> int:
@@ -159,10 +160,11 @@ class OfflineRun:
                 if isinstance(heard.measurement, Rejection):
                     raise heard.measurement
                 guard.check(heard.measurement)
+                measurement = self._repeats.fresh(heard.measurement)
             except Rejection as rejection:
                 self._refuse(heard.topic, rejection)
                 continue
-            yield heard.measurement
+            yield measurement
 
     def _refuse(self, topic: str, rejection: Rejection) -> None:
         entry = self.refused.setdefault(
@@ -178,6 +180,8 @@ class OfflineRun:
         for name in ('covariance_repairs', 'pings_moving_alike', 'waiting_for_vessel'):
             if count := health.get(name):
                 counts[name] = int(count)
+        if self._repeats.rows:
+            counts['repeated_rows'] = self._repeats.rows
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 

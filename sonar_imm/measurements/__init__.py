@@ -14,6 +14,7 @@ from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .frames import frame_role, FrameGuard
 from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
 from .positions import GeodeticFix, RelativeFix, VesselFix, VesselHeading, VesselPose
+from .repeats import RepeatGuard
 
 __all__ = [
     'Altitude',
@@ -38,6 +39,7 @@ __all__ = [
     'Pressure',
     'Rejection',
     'RelativeFix',
+    'RepeatGuard',
     'scan_of',
     'Snapshot',
     'SonarImage',
@@ -54,6 +56,8 @@ Measurement = (
     | Arrivals
     | GeodeticFix
     | RelativeFix
+    | VesselPose
+    | VesselFix
     | VesselHeading
     | Snapshot
     | Trace

@@ -79,7 +79,8 @@ class Fixes:
 
     position: (n, 3) x, y, z in `frame_id`, metres; covariance: (n, 2, 2) of x and y in m^2, a row
     of NaN where the sender does not know it, None when no row has one; target_id: (n,) whose
-    position it is, `NOBODY` where that is not known, None when no row says so; sensor: as of `Fix`.
+    position it is, `NOBODY` where that is not known, None when no row says so; sensor: as of
+    `Fix`.
     """
 
     stamp_ns: int
@@ -109,9 +110,7 @@ class Fixes:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key(
-            'fixes' + self.sensor, self.position, self.covariance, self.target_id
-        )
+        return content_key('fixes' + self.sensor, self.position, self.covariance, self.target_id)
 
 
 def scan_of(measurement: Fix | Fixes) -> Fixes:
@@ -225,7 +224,11 @@ class Arrivals:
         order = np.lexsort(columns) if len(self) else np.arange(0)
         if (np.diff(order) == 1).all():
             return self
-        return evolve(self, **{name: getattr(self, name)[order] for name in ARRIVAL_COLUMNS})
+        return self.only(order)
+
+    def only(self, rows: NDArray) -> Arrivals:
+        """The same ping with some of its rows: an index or a mask."""
+        return evolve(self, **{name: getattr(self, name)[rows] for name in ARRIVAL_COLUMNS})
 
     @property
     def passive(self) -> bool:

@@ -40,7 +40,7 @@ from msg_adapters.inputs import inputs_of, InputTopic
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, Rejection
+from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
@@ -70,6 +70,7 @@ class TrackerNode(Node):
         )
         self.tracker = SYSTEMS[system].build(self._settings[config_type])
         self._guard = FrameGuard(self._node_config.frame_id)
+        self._repeats = RepeatGuard(getattr(self.tracker.config, 'repeat_time', 0.0))
         self._warm()
 
         self._enabled = True
@@ -212,6 +213,10 @@ class TrackerNode(Node):
     def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         measurement = reader(message)
         self._guard.check(measurement)
+        rows = self._repeats.rows
+        measurement = self._repeats.fresh(measurement)
+        if self._repeats.rows > rows:
+            self._doubt(topic, 'repeated_rows')
         if (doubt := topic.doubt(message)) is not None:
             self._doubt(topic, doubt)
         self._publish(self.tracker.process(measurement))
@@ -277,6 +282,7 @@ class TrackerNode(Node):
     def _start_afresh(self) -> None:
         self.tracker.reset()
         self._guard.reset()
+        self._repeats.reset()
         self.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:

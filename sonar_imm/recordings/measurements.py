@@ -16,6 +16,7 @@ from .sources import BagError, TopicInfo
 DOUBTS = {
     'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
     'no_frame': 'have no frame_id',
+    'flagged_invalid': 'have rows flagged as invalid, which are left out',
     'unusable_rows': 'have rows that cannot be used, which are left out',
 }
 

@@ -11,7 +11,7 @@ import numpy as np
 from msg_adapters.fixes import check_size, write_fix
 from msg_adapters.scans import write_scan
 
-from ...measurements import Fix, Fixes, NOBODY
+from ...measurements import Fix, Fixes, NOBODY, RepeatGuard
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame
@@ -28,6 +28,7 @@ def convert_fixes(
     truth_options: CsvOptions | None = None,
     frame_id: str = 'map',
     origin: tuple[float, ...] | None = None,
+    repeat_time: float = 5.0,
     storage: str = 'mcap',
 ) -> ConversionReport:
     """Convert a CSV of position fixes to the topic ``/fix``, or ``/fixes`` with identities.
@@ -38,13 +39,20 @@ def convert_fixes(
     covariance. Latitudes become metres around `origin`
     (latitude, longitude[, height]), the first good row when None. `truth` is a CSV as in
     `convert_truth`, for the same bag and the same origin.
+
+    Rows that ``valid`` says are not, and repeated polls (the same position of the same diver again
+    within `repeat_time` seconds, see `RepeatGuard`), are left out and counted.
     """
     table = CsvTable(path, options)
     table.require('stamp')
     frame = LocalFrame(table, origin)
     report = ConversionReport(Path(out))
 
+    repeats: dict[str, RepeatGuard] = {}
+
     def parse(row: Row) -> tuple[Fix, str]:
+        row.require_valid()
+        name = row.text('id')
         fix = Fix(
             stamp_ns=row.stamp_ns(),
             position=frame.position(row),
@@ -52,7 +60,8 @@ def convert_fixes(
             frame_id=frame_id,
         )
         check_size(fix)
-        return fix, row.text('id')
+        repeats.setdefault(name, RepeatGuard(repeat_time)).fresh(fix)
+        return fix, name
 
     rows = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
     if _names_divers(table, rows, report):

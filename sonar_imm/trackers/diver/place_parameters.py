@@ -65,7 +65,8 @@ class PlaceParameters(Config):
     relative_axes: str = parameter(
         'flu',
         'axes of relative fixes whose message does not say: flu (forward, port, up of the '
-        'transceiver), frd (forward, starboard, down), enu or ned (of the world, by its own compass)',
+        'transceiver), frd (forward, starboard, down), enu or ned (of the world, by its own '
+        'compass)',
         choices=RELATIVE_AXES,
     )
     relative_range_std: float = parameter(

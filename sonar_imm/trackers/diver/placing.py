@@ -83,7 +83,7 @@ class _Samples:
 
 
 class Placer:
-    """Gives what the tracker can use of each measurement. counts: where to count what it cannot."""
+    """Gives what the tracker can use of each measurement; counts what it cannot in `counts`."""
 
     def __init__(self, config: DiverConfig, counts: Counter[str]):
         self.config = config

@@ -20,7 +20,8 @@ class Positions:
     """D fixes of one stamp, of which each target causes at most one: z (D, 2), R (D, 2, 2);
     clutter: density of false ones; factor: what the stated covariances were multiplied by to give
     R. target_id: (D,) whose they are, None when that is not known of any; whole: whether they are
-    all that there was to see, so that a diver without one was missed."""
+    all that there was to see, so that a diver without one was missed; sensor: which has seen
+    them."""
 
     z: FloatArray
     R: FloatArray
@@ -28,44 +29,73 @@ class Positions:
     factor: float = 1.0
     target_id: IntArray | None = None
     whole: bool = True
+    sensor: str = ''
 
 
 def position_groups(
     items: Sequence[Measurement], config: DiverConfig, factor: float
 ) -> list[Positions]:
-    """The fixes of one stamp: all single ones together, then scan by scan those that say whose
-    they are, of each diver the first, and those that do not. factor: on their covariances."""
+    """The fixes of one stamp: all single ones of a sensor together, then scan by scan those that
+    say whose they are, of each diver the first, and those that do not. factor: on their
+    covariances."""
     groups = []
-    single = [scan_of(item) for item in items if isinstance(item, Fix)]
-    if single:
-        position = np.concatenate([scan.position for scan in single])
-        R = np.concatenate([_covariances(scan, config) for scan in single])
-        groups.append(_group(position, R * factor, config, factor, whole=config.fixes_are_scans))
+    fixes = [item for item in items if isinstance(item, Fix)]
+    for sensor in sorted({fix.sensor for fix in fixes}):
+        own = [fix for fix in fixes if fix.sensor == sensor]
+        named = [scan_of(fix) for fix in own if fix.target_id != NOBODY]
+        for scan in named:
+            groups.append(_group(scan, [0], config, factor, whole=False))
+        nameless = [scan_of(fix) for fix in own if fix.target_id == NOBODY]
+        if nameless:
+            groups.append(_together(nameless, config, factor))
     for scan in (item for item in items if isinstance(item, Fixes)):
-        R = _covariances(scan, config) * factor
         said = np.empty(0, np.intp)
         if scan.target_id is not None:
             said = np.flatnonzero(scan.target_id != NOBODY)
-            names, first = np.unique(scan.target_id[said], return_index=True)
-            rows = said[first]
-            if len(rows):
-                groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
+            _, first = np.unique(scan.target_id[said], return_index=True)
+            if len(said):
+                groups.append(_group(scan, said[first], config, factor, whole=False))
         if len(said) < len(scan) or not len(scan):
             rows = np.setdiff1d(np.arange(len(scan)), said)
-            groups.append(_group(scan.position[rows], R[rows], config, factor))
+            groups.append(_group(scan, rows, config, factor, named=False))
     return groups
 
 
 def _group(
-    position: FloatArray,
-    R: FloatArray,
+    scan: Fixes,
+    rows: Sequence[int] | IntArray,
     config: DiverConfig,
     factor: float,
-    target_id: IntArray | None = None,
+    *,
     whole: bool = True,
+    named: bool = True,
 ) -> Positions:
-    z = np.ascontiguousarray(position[:, :2])
-    return Positions(z, R, config.clutter_density, factor, target_id, whole)
+    """The rows of a scan, with their names unless they have none."""
+    config = config.of_sensor(scan.sensor)
+    return Positions(
+        np.ascontiguousarray(scan.position[rows, :2]),
+        _covariances(scan, config)[rows] * factor,
+        config.clutter_density,
+        factor,
+        scan.target_id[rows] if named and scan.target_id is not None else None,
+        whole,
+        scan.sensor,
+    )
+
+
+def _together(scans: Sequence[Fixes], config: DiverConfig, factor: float) -> Positions:
+    """Scans of one fix of one sensor as one group."""
+    config = config.of_sensor(scans[0].sensor)
+    R = np.concatenate([_covariances(scan, config) for scan in scans])
+    return Positions(
+        np.ascontiguousarray(np.concatenate([scan.position for scan in scans])[:, :2]),
+        R * factor,
+        config.clutter_density,
+        factor,
+        None,
+        config.fixes_are_scans,
+        scans[0].sensor,
+    )
 
 
 def _covariances(scan: Fixes, config: DiverConfig) -> FloatArray:

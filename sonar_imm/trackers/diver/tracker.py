@@ -35,8 +35,9 @@ from .fix_consistency import FixConsistency
 from .fix_scans import each_name_once, shows_all, take_fixes
 from .instruments import Instruments
 from .models import build_models
-from .placing import Placer
+from .names import hear_named, is_named, merged, names_said, pings_of, remembered
 from .pings import begin_from_ping, FAR, ping_numbers
+from .placing import Placer
 from .scan import Scan
 from .sensing import position_groups
 from .state import DiverState
@@ -168,12 +169,19 @@ class DiverTracker:
         scan = self._predict(before, stamp_ns)
         births: list[Birth] = []
         fix_factor = float(self.config.covariance_scale * factor[0])
-        for group in position_groups(items, self.config, fix_factor):
+        groups = position_groups(items, self.config, fix_factor)
+        for group in groups:
             births += take_fixes(scan, group)
-        for ping in (item.in_order() for item in items if isinstance(item, Arrivals)):
+        pings = pings_of(items)
+        for ping in pings:
+            if is_named(ping):
+                births += hear_named(scan, ping, self.config, float(factor[1]))
+                continue
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
-        now = self._prune(scan.learn(), items)
+        said = names_said(groups, pings)
+        now = self._prune(remembered(scan.learn(), before, said, self.config.max_coast), items)
+        now = merged(now, before, groups, self.config, self.models.E[:, :2])
         return self._spawn(now, births)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
