@@ -43,9 +43,9 @@ class Origin:
     def turn(self, latitude: float, longitude: float) -> FloatArray:
         """(3, 3) that turns vectors in east, north, up of a place into those of the origin.
 
-        About the vertical only: ten kilometres away the meridians converge by .1 to .3 degrees. The
-        vertical tilts by as little, and a height that is not known must not be spread over east and
-        north by it.
+        About the vertical only: ten kilometres away the meridians converge by .1 to .3 degrees.
+        The vertical tilts by as little, and a height that is not known must not be spread over
+        east and north by it.
         """
         here, there = _to_earth(self.latitude, self.longitude), _to_earth(latitude, longitude)
         east, north = (here.T @ there)[:2, 0]
