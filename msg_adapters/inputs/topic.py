@@ -65,6 +65,12 @@ class InputTopic:
         names = dict.fromkeys(name for key in self.named_by for name in settings.get(key, ()))
         return (self.name, *(f'{name}/{self.name}' for name in names))
 
+    def instance(self, topic: str, settings: Mapping[str, Any]) -> str:
+        """The relative name under which a node hears what was recorded on `topic`."""
+        parts = topic.split('/')
+        names = [name for key in self.named_by for name in settings.get(key, ()) if name in parts]
+        return f'{names[0]}/{self.name}' if names else self.name
+
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any], topic: str = ''
     ) -> Callable[[Any], Any]:

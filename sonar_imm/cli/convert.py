@@ -81,14 +81,6 @@ def _say_all(label: str, lines: Iterable[str]) -> None:
 )
 @click.argument('source', metavar='IN', type=FILE)
 @click.argument('out_bag', type=BAG_OUT)
-@click.option(
-    '--repeat-time',
-    type=click.FloatRange(min=0.0),
-    default=5.0,
-    show_default=True,
-    metavar='SECONDS',
-    help='The same position again within this time is a repeated poll and left out; 0: keep it.',
-)
 @csv_options()
 @truth_option
 @place_options
@@ -99,7 +91,7 @@ def fixes(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
 
     Columns: stamp, x and y [m] or latitude and longitude [deg]; optional var_x, cov_xy, var_y
     [m^2] or std_x, std_y or std [m], id and valid. Usual names are recognised. Rows flagged as
-    invalid and repeated polls are left out and counted.
+    invalid are left out and counted; repeated polls are counted, and left out by `track`.
     """
     _convert(
         'fixes',

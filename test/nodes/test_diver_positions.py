@@ -21,7 +21,7 @@ SECOND = 10**9
 
 
 def start(make_bench, *parameters):
-    bench = make_bench([one for value in parameters for one in ('-p', value)])
+    bench = make_bench(*(one for value in parameters for one in ('-p', value)))
     node = bench.add(DiverNode(context=bench.context))
     return bench, node
 

@@ -252,7 +252,7 @@ def test_the_real_truth_alone(real_data, tmp_path):
     assert np.median(speed) == pytest.approx(0.48, abs=0.05)
 
 
-def test_flagged_and_repeated_rows_are_left_out_and_counted(tmp_path):
+def test_flagged_rows_are_left_out_and_repeated_ones_are_counted(tmp_path):
     source = tmp_path / 'log.csv'
     lines = ['time,x,y,diver,position_valid']
     for k in range(1, 21):
@@ -261,10 +261,9 @@ def test_flagged_and_repeated_rows_are_left_out_and_counted(tmp_path):
         lines.append(f'{k},0,{place},bob,1')
     source.write_text('\n'.join(lines) + '\n')
     report = convert_fixes(source, tmp_path / 'bag')
-    assert report.reasons == {'repeated': 17, 'flagged invalid': 4}
-    assert report.bad_rows == 21 and report.messages == {'/fixes': 10 + 1}
-    kept = convert_fixes(source, tmp_path / 'all', repeat_time=0.0)
-    assert kept.reasons == {'flagged invalid': 4} and kept.messages == {'/fixes': 20}
+    assert report.reasons == {'flagged invalid': 4} and report.bad_rows == 4
+    assert report.messages == {'/fixes': 20}
+    assert report.notes['repeated'].startswith('16 rows hold a position that came before')
 
 
 def test_a_flag_that_is_neither_is_said(tmp_path):
