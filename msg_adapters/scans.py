@@ -1,10 +1,11 @@
 """Scans of fixes: one message with all positions that were found at a stamp, also without any.
 
 Our own message is a table with one row per fix. Columns: ``x``, ``y`` f8 [m]; ``cov_x_x``,
-``cov_x_y``, ``cov_y_y`` f4 [m^2]; optional ``z`` f8 [m], ``cov_z_z`` f4 and ``id`` i4, whose
-position it is. The columns are there in an empty scan too: a table of something else that
-happens to be empty is no scan. As in `fixes`, a negative variance or NaN means unknown, and all
-zeros that the covariance was not filled in. A negative ``id`` is nobody's.
+``cov_x_y``, ``cov_y_y`` f4 [m^2]; optional ``z`` f8 [m], ``cov_z_z`` f4, ``id`` i4, whose
+position it is, and ``valid`` u1, 0 for a fix that its sender flags as invalid. The columns are
+there in an empty scan too: a table of something else that happens to be empty is no scan. As in
+`fixes`, a negative variance or NaN means unknown, and all zeros that the covariance was not filled
+in. A negative ``id`` is nobody's.
 
 Rows that cannot be used are left out, so that ``message.height * message.width - len(scan)``
 counts them (see `doubt_scan`).
@@ -27,7 +28,7 @@ from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 REQUIRED = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')
-COLUMNS = (*REQUIRED, 'z', 'id')
+COLUMNS = (*REQUIRED, 'z', 'id', 'valid')
 MAX_FIXES = 10_000
 
 
@@ -37,6 +38,10 @@ def read_scan(message: Any, *, world_frame: str = 'enu') -> Fixes:
     columns = decode_table(message, COLUMNS, most_rows=MAX_FIXES)
     require_columns(columns, REQUIRED, 'fixes')
     values = {name: scalar_column(columns, name) for name in columns}
+    if 'valid' in values and not (said := values['valid'] != 0).all():
+        if not said.any():
+            raise Rejection('flagged_invalid', f'all {len(said)} fixes are flagged as invalid')
+        values = {name: column[said] for name, column in values.items()}
     rows = len(values['x'])
     z = values.get('z', np.zeros(rows))
     position = np.column_stack([values['x'], values['y'], np.where(np.isfinite(z), z, 0.0)])
@@ -60,13 +65,20 @@ def read_poses(message: Any, *, world_frame: str = 'enu') -> Fixes:
 
 
 def doubt_scan(message: Any) -> str | None:
-    """Give ``'unusable_rows'`` for a scan of which some rows are left out."""
+    """Give ``'unusable_rows'`` for a scan of which some rows are left out, ``'flagged_invalid'``
+    where its sender flags some."""
     try:
         scan = read_poses(message) if hasattr(message, 'poses') else read_scan(message)
     except Rejection:
         return None
     rows = len(message.poses) if hasattr(message, 'poses') else message.height * message.width
-    return 'unusable_rows' if len(scan) < rows else None
+    if len(scan) == rows:
+        return None
+    if not hasattr(message, 'poses'):
+        valid = decode_table(message, ('valid',), most_rows=MAX_FIXES).get('valid')
+        if valid is not None and not np.all(valid):
+            return 'flagged_invalid'
+    return 'unusable_rows'
 
 
 def write_scan(scan: Fixes, make: Make) -> Any:

@@ -2,25 +2,72 @@
 
 from __future__ import annotations
 
-from sonar_imm.measurements import Arrivals, Fix, Fixes
+from typing import Any
+
+from sonar_imm.measurements import (
+    Arrivals,
+    Fix,
+    Fixes,
+    GeodeticFix,
+    RelativeFix,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
 
 from ..arrivals import read_arrivals, write_arrivals
 from ..fixes import doubt_fix, read_fix, write_fix
+from ..geodetic import (
+    doubt_geodetic,
+    is_geodetic,
+    read_geodetic,
+    read_vessel_fix,
+    write_geodetic,
+)
+from ..headers import Make
+from ..navigation import write_navigation
+from ..relative import read_beacon, read_modem, read_relative, read_usbl_data, write_relative
 from ..scans import doubt_scan, read_poses, read_scan, write_scan
+from ..vessel import read_heading, read_vessel_pose, write_heading
 from .topic import InputTopic
+
+GEODETIC = (
+    'sensor_msgs/msg/NavSatFix',
+    'geographic_msgs/msg/GeoPointStamped',
+    'geographic_msgs/msg/GeoPoseStamped',
+    'geographic_msgs/msg/GeoPoseWithCovarianceStamped',
+)
+RELATIVE = (
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'geometry_msgs/msg/PointStamped',
+    'geometry_msgs/msg/Vector3Stamped',
+)
+
+
+def _doubt(message: Any) -> str | None:
+    return doubt_geodetic(message) if is_geodetic(message) else doubt_fix(message)
+
+
+def _write(fix: Fix | GeodeticFix, make: Make) -> Any:
+    return write_geodetic(fix, make) if isinstance(fix, GeodeticFix) else write_fix(fix, make)
+
 
 TOPICS = (
     InputTopic(
         'fix',
-        'position fixes in a local metric frame',
+        'position fixes in a local metric frame, or in latitude and longitude',
         measurement=Fix,
+        also=(GeodeticFix,),
         readers={
             'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
             'geometry_msgs/msg/PointStamped': read_fix,
+            **dict.fromkeys(GEODETIC, read_geodetic),
         },
-        write=write_fix,
-        doubt=doubt_fix,
+        write=_write,
+        doubt=_doubt,
         scans=True,
+        second=frozenset(GEODETIC),
+        named_by=('tags', 'sensors'),
     ),
     InputTopic(
         'fixes',
@@ -32,6 +79,23 @@ TOPICS = (
         },
         write=write_scan,
         doubt=doubt_scan,
+        named_by=('sensors',),
+    ),
+    InputTopic(
+        'relative',
+        'position fixes relative to a transceiver on a vessel',
+        measurement=RelativeFix,
+        readers={
+            **dict.fromkeys(RELATIVE, read_relative),
+            'seatrac_interfaces/msg/ModemRec': read_modem,
+            'acomms_msgs/msg/UsblData': read_usbl_data,
+            'stonefish_ros2/msg/BeaconInfo': read_beacon,
+        },
+        write=write_relative,
+        scans=True,
+        settings=('relative_axes',),
+        by_name=frozenset(RELATIVE),
+        named_by=('tags', 'sensors'),
     ),
     InputTopic(
         'arrivals',
@@ -39,5 +103,36 @@ TOPICS = (
         measurement=Arrivals,
         readers={'sensor_msgs/msg/PointCloud2': read_arrivals},
         write=write_arrivals,
+    ),
+    InputTopic(
+        'nav',
+        'pose of the vessel that carries the transceiver of relative fixes',
+        measurement=VesselPose,
+        readers={'nav_msgs/msg/Odometry': read_vessel_pose},
+        write=write_navigation,
+        companion=True,
+        beside=('relative',),
+    ),
+    InputTopic(
+        'nav_fix',
+        'where the vessel is, in latitude and longitude, where there is no nav',
+        measurement=VesselFix,
+        readers=dict.fromkeys(GEODETIC, read_vessel_fix),
+        write=write_geodetic,
+        doubt=doubt_geodetic,
+        companion=True,
+        beside=('relative',),
+    ),
+    InputTopic(
+        'heading',
+        'how the vessel lies, beside nav_fix',
+        measurement=VesselHeading,
+        readers={
+            'sensor_msgs/msg/Imu': read_heading,
+            'geometry_msgs/msg/QuaternionStamped': read_heading,
+        },
+        write=write_heading,
+        companion=True,
+        beside=('relative',),
     ),
 )

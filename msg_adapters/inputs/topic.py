@@ -8,6 +8,8 @@ from typing import Any
 
 from attrs import field, frozen
 
+from ..labels import Labels
+
 Reader = Callable[..., Any]
 
 
@@ -24,6 +26,15 @@ class InputTopic:
     settings: parameters of the tracker that its readers take as keywords too: what messages do not
     say themselves.
     companion: describes another input; found by its topic name, never enough alone.
+    beside: the inputs that a companion is of use to; without them it is left out. Empty: any.
+    also: further classes that its readers give and `write` takes.
+    by_name: types that mean this input only on a topic of its name, because they mean other things
+    elsewhere.
+    second: types that are this input by their topic's name only where no other input is there,
+    because the instrument may be another's.
+    named_by: parameters of the tracker that list names, of tags or of sensors: below each name
+    there is an input of its own (``<name>/fix``), and a measurement is labelled by the name in its
+    topic or its frame.
     """
 
     name: str
@@ -36,10 +47,38 @@ class InputTopic:
     one_topic: bool = field(default=False, kw_only=True)
     settings: tuple[str, ...] = field(default=(), kw_only=True)
     companion: bool = field(default=False, kw_only=True)
+    beside: tuple[str, ...] = field(default=(), kw_only=True)
+    also: tuple[type, ...] = field(default=(), kw_only=True)
+    by_name: frozenset[str] = field(default=frozenset(), kw_only=True)
+    second: frozenset[str] = field(default=frozenset(), kw_only=True)
+    named_by: tuple[str, ...] = field(default=(), kw_only=True)
+
+    def may_be(self, topic: str, type_name: str) -> bool:
+        """Whether a topic of that name and type could be this input, if a user says so."""
+        if type_name not in self.readers:
+            return False
+        own = topic.split('/')[-1] == self.name
+        return own or not (self.companion or type_name in self.by_name)
+
+    def instances(self, settings: Mapping[str, Any]) -> tuple[str, ...]:
+        """The relative names of its topics: its own, and one for each tag or sensor named."""
+        names = dict.fromkeys(name for key in self.named_by for name in settings.get(key, ()))
+        return (self.name, *(f'{name}/{self.name}' for name in names))
+
+    def instance(self, topic: str, settings: Mapping[str, Any]) -> str:
+        """The relative name under which a node hears what was recorded on `topic`."""
+        parts = topic.split('/')
+        names = [name for key in self.named_by for name in settings.get(key, ()) if name in parts]
+        return f'{names[0]}/{self.name}' if names else self.name
 
     def reader(
-        self, type_name: str, world_frame: str, settings: Mapping[str, Any]
+        self, type_name: str, world_frame: str, settings: Mapping[str, Any], topic: str = ''
     ) -> Callable[[Any], Any]:
-        """Give the reader of a message type with its settings; `settings` may hold more."""
+        """Give the reader of a message type with its settings; `settings` may hold more.
+
+        topic: the name of the topic, by which measurements may be labelled.
+        """
         told = {name: settings[name] for name in self.settings if name in settings}
-        return partial(self.readers[type_name], world_frame=world_frame, **told)
+        read = partial(self.readers[type_name], world_frame=world_frame, **told)
+        label = Labels.of(topic, settings, self.named_by)
+        return read if label is None else lambda message: label(read(message))

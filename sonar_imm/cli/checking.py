@@ -84,7 +84,9 @@ def check_recording(
         bag, folder / 'offline', SYSTEMS[system], config, options, overwrite=True, quiet=quiet
     )
     with progress('playing to the node', run['messages'], quiet=quiet) as advance:
-        live = run_lockstep(bag, system, params_file=params, progress=advance)
+        live = run_lockstep(
+            bag, system, params_file=params, settings=config.as_dict(), progress=advance
+        )
     _keep(live, config, system, folder / 'live')
     judgement = evaluate_run(folder / 'offline')
     checks = [_answered(live, run), _equal(folder), _ended(live)]

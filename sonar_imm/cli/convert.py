@@ -52,6 +52,7 @@ def _convert(kind: str, source: Path, out_bag: Path, as_json: bool, **options: A
                 'messages': report.messages,
                 'rows': report.rows,
                 'bad_rows': report.bad_rows,
+                'reasons': dict(report.reasons),
                 'problems': report.problems,
                 'notes': report.notes,
             }
@@ -62,7 +63,8 @@ def _convert(kind: str, source: Path, out_bag: Path, as_json: bool, **options: A
     _say_all('note', (f'{key}: {value}' for key, value in report.notes.items()))
     _say_all('left out', report.problems)
     if report.bad_rows:
-        say(f'  {report.bad_rows} rows left out')
+        why = ', '.join(f'{count} {reason}' for reason, count in report.reasons.most_common())
+        say(f'  {report.bad_rows} rows left out' + (f', of them {why}' if why else ''))
 
 
 def _say_all(label: str, lines: Iterable[str]) -> None:
@@ -88,7 +90,8 @@ def fixes(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
 
     Columns: stamp, x and y [m] or latitude and longitude [deg]; optional var_x, cov_xy, var_y
-    [m^2] or std_x, std_y or std [m], and id. Usual names are recognised.
+    [m^2] or std_x, std_y or std [m], id and valid. Usual names are recognised. Rows flagged as
+    invalid are left out and counted; repeated polls are counted, and left out by `track`.
     """
     _convert(
         'fixes',

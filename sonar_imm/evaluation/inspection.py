@@ -92,13 +92,14 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     """The tracker inputs that a message could be for. Truth is no input."""
     if _is_truth(item.topic):
         return []
-    return [
-        (system, entry)
-        for system in SYSTEMS
-        for entry in inputs_of(system)
-        if item.type_name in entry.readers
-        and (not entry.companion or item.topic.split('/')[-1] == entry.name)
-    ]
+    own = item.topic.split('/')[-1]
+    found = []
+    for system in SYSTEMS:
+        fitting = [one for one in inputs_of(system) if one.may_be(item.topic, item.type_name)]
+        named = [one for one in fitting if one.name.split('/')[-1] == own]
+        # A topic of several sides is named by its namespace too, see `InputTopic.name`.
+        found += [(system, entry) for entry in named or fitting]
+    return found
 
 
 def _is_truth(topic: str) -> bool:

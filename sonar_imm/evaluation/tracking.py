@@ -18,7 +18,7 @@ from attrs import asdict, define, frozen
 import numpy as np
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, Rejection
+from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..parameters import Config
 from ..recordings.measurements import fitting_topics, measurements_of
 from ..recordings.reader import BagReader
@@ -127,6 +127,7 @@ class OfflineRun:
         self.messages = 0
         self.durations = array('d')
         self._window_ns = window_ns(config)
+        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
 
     @property
     def total(self) -> int:
@@ -195,10 +196,11 @@ class OfflineRun:
                 if isinstance(heard.measurement, Rejection):
                     raise heard.measurement
                 guard.check(heard.measurement)
+                measurement = self._repeats.fresh(heard.measurement)
             except Rejection as rejection:
                 self._refuse(heard.topic, rejection)
                 continue
-            yield heard.measurement
+            yield measurement
 
     def _refuse(self, topic: str, rejection: Rejection) -> None:
         entry = self.refused.setdefault(
@@ -211,15 +213,22 @@ class OfflineRun:
         pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         health = self.tracker.health()
-        for name in ('covariance_repairs', 'pings_moving_alike'):
+        for name in ('covariance_repairs', 'pings_moving_alike', 'waiting_for_vessel'):
             if count := health.get(name):
                 counts[name] = int(count)
+        if self._repeats.rows:
+            counts['repeated_rows'] = self._repeats.rows
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
     def warnings(self) -> list[str]:
         """What of the input cannot be true, as the tracker says it at the end."""
         return list(getattr(self.tracker, 'warnings', list)())
+
+    def origin(self) -> dict[str, Any]:
+        """Where the frame of the tracks lies on Earth, as plain values; nothing when not known."""
+        origin = getattr(self.tracker, 'origin', None)
+        return {} if origin is None else {'origin': asdict(origin)}
 
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""
@@ -264,6 +273,7 @@ def write_run(
         refused=offline.refusals(),
         warnings=offline.warnings(),
         problems=list(offline.bag.problems),
+        **offline.origin(),
         parameters=offline.tracker.config.as_dict(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )

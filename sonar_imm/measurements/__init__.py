@@ -13,6 +13,8 @@ from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .frames import frame_role, FrameGuard
 from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
+from .positions import GeodeticFix, RelativeFix, VesselFix, VesselHeading, VesselPose
+from .repeats import RepeatGuard
 
 __all__ = [
     'Altitude',
@@ -27,6 +29,7 @@ __all__ = [
     'Fixes',
     'frame_role',
     'FrameGuard',
+    'GeodeticFix',
     'IMAGE_ORDERS',
     'MAX_BINS',
     'Measurement',
@@ -35,17 +38,27 @@ __all__ = [
     'NOBODY',
     'Pressure',
     'Rejection',
+    'RelativeFix',
+    'RepeatGuard',
     'scan_of',
     'Snapshot',
     'SonarImage',
     'Trace',
     'usable_fixes',
+    'VesselFix',
+    'VesselHeading',
+    'VesselPose',
 ]
 
 Measurement = (
     Fix
     | Fixes
     | Arrivals
+    | GeodeticFix
+    | RelativeFix
+    | VesselPose
+    | VesselFix
+    | VesselHeading
     | Snapshot
     | Trace
     | CrossSpectra

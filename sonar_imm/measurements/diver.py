@@ -18,17 +18,25 @@ def _ids(value: Any) -> NDArray[np.uint16]:
     return array
 
 
+NOBODY = -1
+"""The `target_id` of a fix that does not say whose it is."""
+
+
 @frozen(eq=False, kw_only=True)
 class Fix:
     """A position found elsewhere: multistatic fusion, USBL, GPS.
 
     position: (3,) x, y, z in `frame_id`, metres (ENU by default; z may be 0).
     covariance: (2, 2) of x and y in m^2, or None when the sender does not know it.
+    target_id: whose position it is, `NOBODY` when that is not known; sensor: which of several
+    sensors it is from, by a name of the parameter `sensors`.
     """
 
     stamp_ns: int
     position: FloatArray = field(converter=floats(3))
     covariance: FloatArray | None = None
+    target_id: int = NOBODY
+    sensor: str = ''
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
@@ -49,11 +57,12 @@ class Fix:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key('fix', self.position, self.covariance)
+        return content_key('fix' + self.sensor, self.position, self.covariance, _said(self))
 
 
-NOBODY = -1
-"""The `Fixes.target_id` of a fix that does not say whose it is."""
+def _said(fix: Fix) -> NDArray | None:
+    """The name of a fix as an array, None when it has none."""
+    return None if fix.target_id == NOBODY else np.array([fix.target_id], np.int32)
 
 
 def _names(value: Any) -> NDArray[np.int32] | None:
@@ -70,13 +79,15 @@ class Fixes:
 
     position: (n, 3) x, y, z in `frame_id`, metres; covariance: (n, 2, 2) of x and y in m^2, a row
     of NaN where the sender does not know it, None when no row has one; target_id: (n,) whose
-    position it is, `NOBODY` where that is not known, None when no row says so.
+    position it is, `NOBODY` where that is not known, None when no row says so; sensor: as of
+    `Fix`.
     """
 
     stamp_ns: int
     position: FloatArray = field(converter=floats(None, 3))
     covariance: FloatArray | None = None
     target_id: NDArray[np.int32] | None = field(default=None, converter=_names)
+    sensor: str = ''
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
@@ -99,7 +110,7 @@ class Fixes:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key('fixes', self.position, self.covariance, self.target_id)
+        return content_key('fixes' + self.sensor, self.position, self.covariance, self.target_id)
 
 
 def scan_of(measurement: Fix | Fixes) -> Fixes:
@@ -110,6 +121,8 @@ def scan_of(measurement: Fix | Fixes) -> Fixes:
         stamp_ns=measurement.stamp_ns,
         position=measurement.position[None],
         covariance=None if measurement.covariance is None else measurement.covariance[None],
+        target_id=None if measurement.target_id == NOBODY else [measurement.target_id],
+        sensor=measurement.sensor,
         frame_id=measurement.frame_id,
     )
 
@@ -211,7 +224,11 @@ class Arrivals:
         order = np.lexsort(columns) if len(self) else np.arange(0)
         if (np.diff(order) == 1).all():
             return self
-        return evolve(self, **{name: getattr(self, name)[order] for name in ARRIVAL_COLUMNS})
+        return self.only(order)
+
+    def only(self, rows: NDArray) -> Arrivals:
+        """The same ping with some of its rows: an index or a mask."""
+        return evolve(self, **{name: getattr(self, name)[rows] for name in ARRIVAL_COLUMNS})
 
     @property
     def passive(self) -> bool:

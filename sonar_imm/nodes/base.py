@@ -24,6 +24,7 @@ import time
 import traceback
 from typing import Any
 
+from attrs import evolve
 import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
@@ -40,7 +41,7 @@ from msg_adapters.inputs import inputs_of, InputTopic
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, Rejection
+from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
@@ -71,6 +72,7 @@ class TrackerNode(Node):
         )
         self.tracker = SYSTEMS[system].build(self._settings[config_type])
         self._guard = FrameGuard(self._node_config.frame_id)
+        self._repeats = RepeatGuard(getattr(self.tracker.config, 'repeat_time', 0.0))
         self._warm()
 
         self._enabled = True
@@ -80,7 +82,11 @@ class TrackerNode(Node):
         self._endpoints = Endpoints(self)
         with _explained_overrides(self):
             self._advertise()
-            hears = {topic.name: self._listen(topic) for topic in self._topics}
+            hears = {
+                name: self._listen(topic, name)
+                for topic in self._topics
+                for name in topic.instances(self.tracker.config.as_dict())
+            }
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)
         self._jumps = self.get_clock().create_jump_callback(
@@ -147,17 +153,20 @@ class TrackerNode(Node):
         )
         self.advertise_displays()
 
-    def _listen(self, topic: InputTopic) -> str:
-        """Subscribe to one input and give the resolved name of its topic."""
+    def _listen(self, topic: InputTopic, name: str) -> str:
+        """Subscribe to one input on the topic `name`, and give the resolved name of that."""
         spec = type_spec(topic)
         type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
         reader = topic.reader(
-            type_name, self._node_config.world_frame_convention, self.tracker.config.as_dict()
+            type_name,
+            self._node_config.world_frame_convention,
+            self.tracker.config.as_dict(),
+            name,
         )
         subscription = self._endpoints.subscribe(
             message_class(type_name),
-            topic.name,
-            functools.partial(self._receive, topic, reader),
+            name,
+            functools.partial(self._receive, evolve(topic, name=name), reader),
             input_qos(self._node_config.queue_depth),
         )
         return subscription.topic_name
@@ -206,6 +215,10 @@ class TrackerNode(Node):
     def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         measurement = reader(message)
         self._guard.check(measurement)
+        rows = self._repeats.rows
+        measurement = self._repeats.fresh(measurement)
+        if self._repeats.rows > rows:
+            self._doubt(topic, 'repeated_rows')
         if (doubt := topic.doubt(message)) is not None:
             self._doubt(topic, doubt)
         self._publish(self.tracker.process(measurement))
@@ -271,6 +284,7 @@ class TrackerNode(Node):
     def _start_afresh(self) -> None:
         self.tracker.reset()
         self._guard.reset()
+        self._repeats.reset()
         self.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:

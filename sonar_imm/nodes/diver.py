@@ -1,9 +1,11 @@
 """The diver node: ``ros2 run sonar_imm diver_node``, or ``python -m sonar_imm.nodes.diver``.
 
-Hears ``fix`` and ``arrivals``. Besides ``~/estimate`` it publishes, for the newest state only:
+Hears ``fix``, ``fixes``, ``relative``, ``arrivals``, and for ``relative`` the vessel's ``nav`` or
+``nav_fix`` and ``heading``. Besides ``~/estimate`` it publishes, for the newest state only:
 
 - ``~/odometry``: one message a confirmed diver (coasting ones too), told apart by
   ``child_frame_id`` = ``diver_<track_id>``;
+- ``~/geo``: the same as NavSatFix, when it is known where the frame of the tracks lies on Earth;
 - ``~/model_probabilities``: those of the diver that has been tracked longest (the smallest
   ``track_id`` among the confirmed). One diver, because a plotting tool draws one curve a name:
   several divers in turn on one topic would be a zigzag between them. Those of all divers are
@@ -25,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from msg_adapters.estimates import write_model_probabilities, write_odometry
+from msg_adapters.geodetic import write_geo
 
 from ..estimates import Estimate
 from .base import run, TrackerNode
@@ -42,6 +45,7 @@ class DiverNode(TrackerNode):
 
     def advertise_displays(self) -> None:
         self._odometry = self.advertise('nav_msgs/msg/Odometry', '~/odometry')
+        self._geo = self.advertise('sensor_msgs/msg/NavSatFix', '~/geo')
         self._probabilities = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
 
     def show(self, newest: Estimate) -> None:
@@ -51,6 +55,10 @@ class DiverNode(TrackerNode):
         if self._odometry.get_subscription_count():
             for row in confirmed:
                 self._odometry.publish(write_odometry(newest, row, make))
+        origin = self.tracker.origin
+        if origin is not None and self._geo.get_subscription_count():
+            for row in confirmed:
+                self._geo.publish(write_geo(newest, row, origin, make))
         if self._probabilities.get_subscription_count():
             oldest = confirmed[np.argmin(newest.extras['track_id'][confirmed])]
             self._probabilities.publish(write_model_probabilities(newest, oldest, make))

@@ -16,8 +16,9 @@ import socket
 import subprocess
 import sys
 import tempfile
+from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from msg_adapters.inputs import InputTopic
@@ -64,18 +65,24 @@ def run_lockstep(
     system: str,
     *,
     params_file: Path | str | None = None,
+    settings: Mapping[str, Any] | None = None,
     topics: Mapping[str, str] | None = None,
     progress: Callable[[int], None] = lambda count: None,
 ) -> LockstepResult:
     """Start the node of `system` as a process and play the bag at `path` to it in lock-step.
 
-    topics: recorded topic names to input names, as in `fitting_topics`; by default those that fit.
-    Node and player meet in a ROS domain of their own on this machine. Raises `BagError` for the
-    bag and `LinkError` when the node ends, does not answer or refuses its parameters.
+    settings: parameters of the tracker, where `params_file` names tags or sensors, which have
+    topics of their own. topics: recorded topic names to input names, as in `fitting_topics`; by
+    default those that fit. Node and player meet in a ROS domain of their own on this machine.
+    Raises `BagError` for the bag and `LinkError` when the node ends, does not answer or refuses
+    its parameters.
     """
     with contextlib.ExitStack() as stack:
         bag = stack.enter_context(BagReader(path))
-        inputs = fitting_topics(bag, system, topics)
+        inputs = {
+            name: evolve(entry, name=entry.instance(name, settings or {}))
+            for name, entry in fitting_topics(bag, system, topics).items()
+        }
         domain = stack.enter_context(reserved_domain_id())
         stack.enter_context(
             _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
@@ -226,7 +233,7 @@ def _arguments(
         parameters[f'qos_overrides./{entry.name}.subscription.reliability'] = 'reliable'
         if len(entry.readers) == 1:
             continue
-        known = parameters.setdefault(f'{entry.name}_type', types[topic])
+        known = parameters.setdefault(f'{entry.name.split("/")[-1]}_type', types[topic])
         if known != types[topic]:
             raise LinkError(
                 f"the input '{entry.name}' would come as {known} and as "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +27,8 @@ class ConversionReport:
     """What a conversion did.
 
     messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
-    each of the first bad rows and for the file as a whole; notes: facts worth telling, such as the
+    each of the first bad rows and for the file as a whole; reasons: bad rows by a word, of those
+    that have one; notes: facts worth telling, such as the
     origin of local coordinates, also kept in the bag.
     """
 
@@ -36,10 +38,13 @@ class ConversionReport:
     messages: dict[str, int] = Factory(dict)
     problems: list[str] = Factory(list)
     notes: dict[str, str] = Factory(dict)
+    reasons: Counter[str] = Factory(Counter)
 
     def bad_row(self, path: Path, where: str, why: object) -> None:
         """Count a bad row and name it while there are few."""
         self.bad_rows += 1
+        if reason := getattr(why, 'reason', ''):
+            self.reasons[reason.replace('_', ' ')] += 1
         if self.bad_rows <= MOST_NAMED:
             self.problems.append(f'{path.name}, {where}: {why}')
         elif self.bad_rows == MOST_NAMED + 1:

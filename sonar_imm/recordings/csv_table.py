@@ -63,6 +63,8 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'vx': ('vx', 'v_east', 've', 'vel_x', 'velocity_x'),
     'vy': ('vy', 'v_north', 'vn', 'vel_y', 'velocity_y'),
     'id': ('id', 'track_id', 'target', 'target_id', 'tag', 'diver', 'name'),
+    'valid': ('valid', 'position_valid', 'is_valid', 'fix_valid', 'validity'),
+    'tag': ('tag', 'tag_id', 'transmitter', 'transmitter_id', 'tx', 'tx_id'),
     'ping': ('ping', 'ping_id', 'ping_number'),
     'receiver': (
         'receiver',
@@ -94,8 +96,17 @@ _UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
 _TIME = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
 
 
+_YES = ('1', '1.0', 'true', 't', 'yes', 'y', 'valid', 'ok')
+_NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
+
+
 class BadRow(ValueError):
-    """A row that cannot be used; the text says why."""
+    """A row that cannot be used; the text says why, `reason` is a code where rows are counted by
+    reason."""
+
+    def __init__(self, why: str, reason: str = ''):
+        super().__init__(why)
+        self.reason = reason
 
 
 @frozen(kw_only=True)
@@ -160,6 +171,15 @@ class Row:
         if math.isinf(value):
             raise BadRow(f'{self.table.header(name)} is infinite')
         return value
+
+    def require_valid(self) -> None:
+        """Raise `BadRow` for a row whose column ``valid`` says that it is not."""
+        said = self.text('valid').lower()
+        if said in ('', *_YES):
+            return
+        if said in _NO:
+            raise BadRow('the row is flagged as invalid', 'flagged invalid')
+        raise BadRow(f"{self.table.header('valid')} is '{said[:40]}', neither true nor false")
 
     def seconds_ns(self, name: str) -> int:
         """A duration or a time as integer nanoseconds, exactly as written."""

@@ -16,6 +16,7 @@ from .sources import BagError, TopicInfo
 DOUBTS = {
     'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
     'no_frame': 'have no frame_id',
+    'flagged_invalid': 'have rows flagged as invalid, which are left out',
     'unusable_rows': 'have rows that cannot be used, which are left out',
 }
 
@@ -49,6 +50,7 @@ def fitting_topics(
         and f'/{topic.name}'.endswith(f'/{entry.name}')
         and 'truth' not in topic.name.split('/')[:-1]
     }
+    fitting = _of_use(bag, fitting)
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
     for entry in inputs_of(system):
@@ -79,7 +81,7 @@ def measurements_of(
     """
     chosen = fitting_topics(bag, system, topics)
     readers = {
-        (name, type_name): entry.reader(type_name, world_frame, settings or {})
+        (name, type_name): entry.reader(type_name, world_frame, settings or {}, name)
         for name, entry in chosen.items()
         for type_name in entry.readers
     }
@@ -99,6 +101,31 @@ def measurements_of(
         yield Heard(item.topic, measurement, item.log_ns)
     for (topic, code), count in doubts.items():
         bag.add_problem(f'topic {topic}: {count} messages {DOUBTS.get(code, code)}')
+
+
+def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, InputTopic]:
+    """Without companions of what is not there, and without what may be another instrument's."""
+    types = {topic.name: topic.type_name for topic in bag.topics}
+    second = {name for name, entry in fitting.items() if types[name] in entry.second}
+    sure = {
+        name: entry
+        for name, entry in fitting.items()
+        if name not in second and not entry.companion
+    }
+    kept = dict(fitting)
+    for name in sorted(second if sure else ()):
+        sentence = (
+            f'topic {name} ({types[name]}) is left out, because {", ".join(sure)} says where '
+            f'divers are; choose it with --topic {kept.pop(name).name}={name}'
+        )
+        if sentence not in bag.problems:
+            bag.add_problem(sentence)
+    inputs = {entry.name for entry in kept.values()}
+    return {
+        name: entry
+        for name, entry in kept.items()
+        if not entry.beside or inputs & set(entry.beside)
+    }
 
 
 def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
@@ -135,7 +162,7 @@ def _nothing_fits(bag: BagReader, system: str) -> str:
         f'{topic.name} as {entry.name}'
         for topic in bag.topics
         for entry in inputs_of(system)
-        if _can_read(topic, entry) and not entry.companion and 'truth' not in topic.name.split('/')
+        if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
     ]
     hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''
     return (

@@ -22,7 +22,8 @@ def write_scene(
     inputs: dict[type, InputTopic] = {}
     for system in SYSTEMS:
         for entry in inputs_of(system):
-            inputs.setdefault(entry.measurement, entry)
+            for measurement in (entry.measurement, *entry.also):
+                inputs.setdefault(measurement, entry)
     records: list[Record] = []
     for one in scene.measurements:
         entry = inputs[type(one.measurement)]

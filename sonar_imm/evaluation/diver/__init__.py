@@ -7,6 +7,7 @@ result; `bench` measures the speed.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 import functools
 from pathlib import Path
@@ -15,6 +16,8 @@ from typing import Any, TYPE_CHECKING
 from ...estimates import Estimate
 from ...measurements import Fix, Fixes
 from ...recordings.sources import BagError
+from ...trackers.diver.config import DiverConfig
+from ...trackers.diver.placing import Placer
 from ..judging import Check, Judgement, JudgeOptions, Limit
 from ..run_folder import read_measurements, read_truth, RunFolder
 from .scoring import fix_series, score
@@ -38,7 +41,9 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     run = folder.read_run()
     series = _series(folder.read_estimates(), folder.path)
     truth = _truth(run, options)
-    fixes = [one for one in read_measurements(run) if isinstance(one, (Fix, Fixes))]
+    placer = Placer(DiverConfig.from_mapping(run['parameters'], ignore_unknown=True), Counter())
+    placed = (one for measurement in read_measurements(run) for one in placer.place(measurement))
+    fixes = [one for one in placed if isinstance(one, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics = score(series, truth, fixes=raw, cutoff=cutoff)

@@ -5,7 +5,8 @@ Two kinds of file are understood:
 - *Synchronised one-way arrivals* of an acoustic tag: ``ping``, ``receiver`` and the absolute time
   of ``arrival``. The time of emission is unknown. So a ping is stamped with its earliest arrival,
   ``toa`` counts from there, and the transmitter is NaN. The emission lies before the stamp by the
-  travel time to the nearest receiver.
+  travel time to the nearest receiver. ``tag``, where there is such a column, says which tag was
+  heard, so that each has its own track (``tx_id``; 0 is nobody's).
 - *Travel times* from known transmitters: ``stamp`` (the transmission), ``transmitter``,
   ``receiver`` and ``toa``. Rows with the same ``ping``, or with the same stamp where there is no
   such column, are one ping.
@@ -53,6 +54,7 @@ class _Arrival(NamedTuple):
     var_elevation: float
     depth: float
     var_depth: float
+    tag: str = ''
 
 
 def convert_arrivals(
@@ -85,15 +87,18 @@ def convert_arrivals(
         else _read_places(transmitters, report, receiver_options, origin, 'transmitter')[0]
     )
     default = math.nan if toa_std is None else toa_std**2
-    pings: dict[object, list[_Arrival]] = {}
+    pings: dict[tuple[object, str], list[_Arrival]] = {}
     table = CsvTable(path, options)
     passive = _is_passive(table)
     rows = report.read_rows(table, lambda row: _parse(row, passive, places, senders, default))
     for _, arrival in rows:
-        key = arrival.ping if table.has('ping') else arrival.time_ns
+        key = (arrival.ping if table.has('ping') else arrival.time_ns, arrival.tag)
         pings.setdefault(key, []).append(arrival)
+    tags = _tag_numbers([arrival.tag for ping in pings.values() for arrival in ping], report)
     numbers = number_names(list(places))
-    sender_numbers = numbers if senders is places else number_names(list(senders))
+    sender_numbers = tags
+    if not passive:
+        sender_numbers = numbers if senders is places else number_names(list(senders))
     records: list[Record] = []
     for label, ping in pings.items():
         try:
@@ -104,7 +109,7 @@ def convert_arrivals(
                 (measurement.stamp_ns, '/arrivals', write_arrivals(measurement, ros_message))
             )
         except Rejection as error:
-            report.bad_row(table.path, f'ping {label}', error)
+            report.bad_row(table.path, f'ping {label[0]}', error)
     if truth is not None and records:
         records += truth_records(truth, report, truth_options, frame_id, origin)
     if any(name != str(number) for name, number in numbers.items()):
@@ -112,6 +117,14 @@ def convert_arrivals(
     if passive:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
     return write_bag(out, records, report, source=Path(path).name, storage=storage)
+
+
+def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:
+    """The number of each tag, as ``tx_id`` has it: its own, or its order from 1."""
+    numbers = number_names([name for name in names if name])
+    if any(str(number) != name for name, number in numbers.items()):
+        report.notes['tag'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
+    return numbers
 
 
 def _is_passive(table: CsvTable) -> bool:
@@ -150,7 +163,13 @@ def _parse(row: Row, passive: bool, places: Places, senders: Places, default: fl
         _variance(row, 'elevation'),
         row.optional('depth'),
         _variance(row, 'depth'),
+        row.text('tag') if passive and _names_tags(row.table) else '',
     )
+
+
+def _names_tags(table: CsvTable) -> bool:
+    """Whether a column says which tag was heard, and not which receiver has heard it."""
+    return table.has('tag') and table.index['tag'] != table.index.get('receiver')
 
 
 def _variance(row: Row, what: str) -> float:
@@ -180,7 +199,10 @@ def _one_ping(
         stamp_ns=stamp,
         frame_id=frame_id,
         toa=toa,
-        tx_id=[0 if passive else sender_numbers[arrival.transmitter] for arrival in ping],
+        tx_id=[
+            sender_numbers.get(arrival.tag, 0) if passive else sender_numbers[arrival.transmitter]
+            for arrival in ping
+        ],
         rx_id=[numbers[arrival.receiver] for arrival in ping],
         tx=np.array([_NOWHERE if passive else senders[arrival.transmitter] for arrival in ping]),
         rx=np.array([places[arrival.receiver] for arrival in ping]),

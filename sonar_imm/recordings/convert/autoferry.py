@@ -43,7 +43,8 @@ def convert_autoferry(
     frame_id: str = 'map',
     storage: str = 'mcap',
 ) -> ConversionReport:
-    """Convert the detections of a scenario (JSON) to the topic ``/fixes``, east-north-up.
+    """Convert the detections of a scenario (JSON) to the topic ``/fixes``, east-north-up; of two
+    sensors to ``/radar/fixes`` and ``/lidar/fixes``, so that each may have numbers of its own.
 
     truth: the scenario's ground truth (JSON) for ``/truth/estimate``, velocity by central
     differences; sensors: of radar, lidar; std: standard deviation [m] on each axis to state in the
@@ -54,6 +55,7 @@ def convert_autoferry(
     if unknown := [name for name in sensors if name not in SENSORS]:
         raise BagError(f"there is no sensor '{unknown[0]}'; there are {' and '.join(SENSORS)}")
     numbers = {SENSORS[name] for name in sensors}
+    names = {number: name for name, number in SENSORS.items()}
     report = ConversionReport(
         Path(out), notes={'sensors': ', '.join(sorted(sensors)), 'targets': 'boats, not divers'}
     )
@@ -71,7 +73,8 @@ def convert_autoferry(
                 covariance=None if covariance is None else np.tile(covariance, (len(found), 1, 1)),
                 frame_id=frame_id,
             )
-            records.append((scan.stamp_ns, '/fixes', write_scan(scan, ros_message)))
+            topic = f'/{names[record["sensorID"]]}/fixes' if len(numbers) > 1 else '/fixes'
+            records.append((scan.stamp_ns, topic, write_scan(scan, ros_message)))
         except (KeyError, TypeError, ValueError) as error:  # covers BadRow and Rejection
             report.bad_row(Path(path), f'record {index}', _why(error))
     if truth is not None:

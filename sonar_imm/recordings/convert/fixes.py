@@ -11,12 +11,15 @@ import numpy as np
 from msg_adapters.fixes import check_size, write_fix
 from msg_adapters.scans import write_scan
 
-from ...measurements import Fix, Fixes, NOBODY
+from ...measurements import Fix, Fixes, NOBODY, Rejection, RepeatGuard
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame
 from ..messages import ros_message
 from .truth import number_names, truth_records
+
+REPEAT_TIME = 5.0
+"""Seconds within which the same position is a repeated poll: the default of the tracker."""
 
 
 def convert_fixes(
@@ -38,13 +41,22 @@ def convert_fixes(
     covariance. Latitudes become metres around `origin`
     (latitude, longitude[, height]), the first good row when None. `truth` is a CSV as in
     `convert_truth`, for the same bag and the same origin.
+
+    Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
+    the same diver again a moment later, see `RepeatGuard`) stay, and are counted: the tracker
+    leaves them out.
     """
     table = CsvTable(path, options)
     table.require('stamp')
     frame = LocalFrame(table, origin)
     report = ConversionReport(Path(out))
 
+    repeats: dict[str, RepeatGuard] = {}
+    repeated: list[int] = []
+
     def parse(row: Row) -> tuple[Fix, str]:
+        row.require_valid()
+        name = row.text('id')
         fix = Fix(
             stamp_ns=row.stamp_ns(),
             position=frame.position(row),
@@ -52,7 +64,11 @@ def convert_fixes(
             frame_id=frame_id,
         )
         check_size(fix)
-        return fix, row.text('id')
+        try:
+            repeats.setdefault(name, RepeatGuard(REPEAT_TIME)).fresh(fix)
+        except Rejection:
+            repeated.append(row.line)
+        return fix, name
 
     rows = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
     if _names_divers(table, rows, report):
@@ -62,6 +78,11 @@ def convert_fixes(
     if truth is not None and records:
         records += truth_records(truth, report, truth_options, frame_id, frame.origin)
     report.notes.update(frame.notes())
+    if repeated:
+        report.notes['repeated'] = (
+            f'{len(repeated)} rows hold a position that came before, the first in line '
+            f'{repeated[0]}; the tracker leaves them out (repeat_time)'
+        )
     return write_bag(out, records, report, source=Path(path).name, storage=storage)
 
 

@@ -10,10 +10,19 @@ import numpy as np
 
 from ...parameters import parameter
 from ..scene import Scenario
+from .afloat import GEODETIC, told_of_places, USBL
 from .crossing import CROSSING, told_of_scans
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
-SENSORS = ('polar', 'positions', 'multistatic_fixes', 'arrivals', 'scans')
+SENSORS = (
+    'polar',
+    'positions',
+    'multistatic_fixes',
+    'arrivals',
+    'scans',
+    'geodetic',
+    'usbl',
+)
 
 TRANSMITTER = np.array([0.0, 0.0, 0.0])
 RECEIVERS = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
@@ -50,9 +59,11 @@ class DiverScenario(Scenario):
         15.0, 'distance between the starts of several divers', unit='m', low=0.0
     )
     sensor: str = parameter('polar', 'what sees the divers', choices=SENSORS)
-    range_std: float = parameter(0.1, 'range error of the polar sonar', unit='m', low=1e-6)
+    range_std: float = parameter(
+        0.1, 'range error of the polar sonar and of usbl', unit='m', low=1e-6
+    )
     bearing_std_deg: float = parameter(
-        2.0, 'bearing error of the polar sonar', unit='deg', low=1e-6
+        2.0, 'bearing error of the polar sonar and of usbl', unit='deg', low=1e-6
     )
     toa_std: float = parameter(
         2e-4, 'arrival-time error of the multistatic sonar', unit='s', low=1e-9
@@ -92,7 +103,10 @@ class DiverScenario(Scenario):
         0.0, 'the sound speed differs by this from the one given', unit='m/s', low=0.0
     )
     fix_std: float = parameter(
-        1.0, 'white error on each axis of the sensors `positions` and `scans`', unit='m', low=1e-6
+        1.0,
+        'white error on each axis of the sensors `positions`, `scans` and `geodetic`',
+        unit='m',
+        low=1e-6,
     )
     fix_bias_std: float = parameter(
         0.0, 'lasting error on each axis of the sensor `positions`', unit='m', low=0.0
@@ -120,6 +134,8 @@ class DiverScenario(Scenario):
         return problems
 
     def told(self) -> dict[str, Any]:
+        if self.sensor in ('geodetic', 'usbl'):
+            return told_of_places(self)
         return told_of_scans(self) if self.sensor == 'scans' else super().told()
 
 
@@ -211,6 +227,8 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         },
     ),
     'crossing': CROSSING,
+    'usbl': USBL,
+    'geodetic': GEODETIC,
 }
 """Name: (what it is, what differs from the defaults of `DiverScenario`)."""
 

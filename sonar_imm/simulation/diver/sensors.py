@@ -10,6 +10,7 @@ from ...acoustics.polar import unbiased_polar_to_cartesian
 from ...estimation.arrays import FloatArray
 from ...estimation.gauss_markov import gauss_markov
 from ...measurements import Arrivals, Fix
+from .afloat import sense_from_vessel, sense_geodetic
 from .crossing import sense_scan
 from .scenarios import DiverScenario, RECEIVERS, TRANSMITTER
 
@@ -200,5 +201,7 @@ SENSE = {
     'positions': _sense_positions,
     'arrivals': _sense_arrivals,
     'multistatic_fixes': _sense_multistatic_fixes,
+    'geodetic': sense_geodetic,
+    'usbl': sense_from_vessel,
     'scans': lambda config, errors, *rest: sense_scan(config, *rest),
 }

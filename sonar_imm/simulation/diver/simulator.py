@@ -12,6 +12,7 @@ import numpy as np
 
 from ...estimation.arrays import FloatArray
 from ..scene import Received, Scene, TrueTrack
+from .afloat import namespace_of
 from .crossing import crossing_paths
 from .scenarios import (
     DiverScenario,
@@ -59,7 +60,8 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
         present = np.array([track.position[k] for track in truth])
         delay = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
         for measurement in SENSE[config.sensor](config, errors.at(k), int(stamp), present, rng):
-            received.append(Received(int(stamp) + round(delay * 1e9), measurement))
+            when = int(stamp) + round(delay * 1e9)
+            received.append(Received(when, measurement, namespace_of(measurement)))
     received.sort(key=lambda one: one.received_ns)
     return Scene(tuple(received), truth)
 

@@ -7,6 +7,7 @@ from attrs import frozen
 from ...parameters import inherited, parameter
 from ..model_checks import chain_problems
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+from .place_parameters import PlaceParameters
 from .scan_parameters import ScanParameters
 from .sea_parameters import SeaParameters
 
@@ -27,7 +28,12 @@ ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
 
 @frozen(kw_only=True)
 class DiverConfig(
-    SeaParameters, ScanParameters, DetectionParameters, TrackLifeParameters, StreamParameters
+    SeaParameters,
+    ScanParameters,
+    PlaceParameters,
+    DetectionParameters,
+    TrackLifeParameters,
+    StreamParameters,
 ):
     """Everything the diver tracker can be told. The defaults are the `heading_speed` set of the
     docs."""

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...estimation.arrays import BoolArray
-from ...measurements import Fixes, Measurement, NOBODY
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
 from . import soft
 from .births import Birth, births_from_fixes
 from .config import DiverConfig
+from .names import is_named
 from .scan import Scan
 from .sensing import Positions
 
@@ -19,6 +20,19 @@ def take_fixes(scan: Scan, group: Positions) -> list[Birth]:
     """Update the tracks by fixes; gives where they put new divers."""
     if group.target_id is not None:
         return births_from_fixes(group, ~_take_named(scan, group))
+    told, named, existence = scan.config, scan.named, scan.existence
+    scan.config = told.of_sensor(group.sensor)
+    if told.named_tracks == 'share':
+        scan.named = np.zeros(len(named), bool)
+    births = _take_nameless(scan, group)
+    # The life of a named track hangs on its own fixes.
+    scan.existence = np.where(named, existence, scan.existence)
+    scan.config, scan.named = told, named
+    return births
+
+
+def _take_nameless(scan: Scan, group: Positions) -> list[Birth]:
+    """Update the tracks by fixes that do not say whose they are."""
     if scan.config.association == 'gnn':
         return births_from_fixes(group, ~scan.associate_and_update(group))
     claimed = soft.take_softly(scan, group)
@@ -39,6 +53,10 @@ def shows_all(item: Measurement, config: DiverConfig) -> bool:
     """Whether a diver of whom `item` says nothing was missed by it."""
     if isinstance(item, Fixes):
         return item.target_id is None or not len(item) or bool((item.target_id == NOBODY).any())
+    if isinstance(item, Fix) and item.target_id != NOBODY:
+        return False
+    if isinstance(item, Arrivals) and is_named(item):
+        return False
     return config.fixes_are_scans
 
 

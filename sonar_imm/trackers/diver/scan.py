@@ -278,7 +278,7 @@ class Scan:
             for track in tracks:
                 mine = ping.kept(~taken & ~found & ((owner < 0) | (owner == track)))
                 index = np.flatnonzero(mine)
-                good = self._accept(track, ping.only(mine), factor)
+                good = self.accept(track, ping.only(mine), factor)
                 found[index[good]] = True
                 echoes = index[good & ping.echo[index]]
                 hits[track] = len(echoes)
@@ -319,7 +319,7 @@ class Scan:
             chosen = self._best_for_tag(ping, np.flatnonzero(turn))
             if chosen is not None:
                 track, after = chosen
-                good = self._accept(track, ping, factor, after)
+                good = self.accept(track, ping, factor, after)
                 self.score[track] += float(good.sum())
                 if 2 * good.sum() >= len(good):
                     return np.ones(len(good), bool)
@@ -356,7 +356,7 @@ class Scan:
     def _each(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
         return (self._one(track) for track in range(len(self.x)))
 
-    def _accept(
+    def accept(
         self, track: int, ping: Ping, factor: float, after: PingUpdate | None = None
     ) -> BoolArray:
         """Update one track by numbers it may have; True (C,) for those that are its own."""

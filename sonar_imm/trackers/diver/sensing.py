@@ -10,13 +10,15 @@ import numpy as np
 
 from ...acoustics.localisation import Localisation, localise
 from ...estimation.arrays import FloatArray, IndexArray, IntArray
-from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of
 from .config import DiverConfig
 from .model_set import heights_of
 
 LEAST_VAR_TOA = 1e-13
 """Least variance of an arrival time, s^2: half a millimetre of path. Below it a joint covariance
 with the unknown emission of a tag has no inverse."""
+
+_ALL = slice(None)
 
 MOST_NUMBERS = 128
 """Numbers of one ping that are used at once: time and memory grow with them, by the third power
@@ -35,7 +37,8 @@ class Positions:
     """D fixes of one stamp, of which each target causes at most one: z (D, 2), R (D, 2, 2);
     clutter: density of false ones; factor: what the stated covariances were multiplied by to give
     R. target_id: (D,) whose they are, None when that is not known of any; whole: whether they are
-    all that there was to see, so that a diver without one was missed."""
+    all that there was to see, so that a diver without one was missed; sensor: which has seen
+    them."""
 
     z: FloatArray
     R: FloatArray
@@ -43,46 +46,75 @@ class Positions:
     factor: float = 1.0
     target_id: IntArray | None = None
     whole: bool = True
+    sensor: str = ''
 
 
 def position_groups(
     items: Sequence[Measurement], config: DiverConfig, factor: float
 ) -> list[Positions]:
-    """The fixes of one stamp: all single ones together, then scan by scan those that say whose
-    they are, of each diver the first, and those that do not. factor: on their covariances."""
+    """The fixes of one stamp: all single ones of a sensor together, then scan by scan those that
+    say whose they are, of each diver the first, and those that do not. factor: on their
+    covariances."""
     groups = []
-    single = [item for item in items if isinstance(item, Fix)]
-    if single:
-        unknown = np.eye(2) * config.fix_std**2
-        position = np.array([fix.position for fix in single])
-        R = np.array([unknown if fix.covariance is None else fix.covariance for fix in single])
-        groups.append(_group(position, R * factor, config, factor, whole=config.fixes_are_scans))
+    fixes = [item for item in items if isinstance(item, Fix)]
+    for sensor in sorted({fix.sensor for fix in fixes}):
+        own = [fix for fix in fixes if fix.sensor == sensor]
+        for fix in own:
+            if fix.target_id != NOBODY:
+                groups.append(_group(scan_of(fix), _ALL, config, factor, whole=False))
+        nameless = [fix for fix in own if fix.target_id == NOBODY]
+        if nameless:
+            groups.append(_together(nameless, config, factor))
     for scan in (item for item in items if isinstance(item, Fixes)):
-        R = _covariances(scan, config) * factor
         if scan.target_id is None:
-            groups.append(_group(scan.position, R, config, factor))
+            groups.append(_group(scan, _ALL, config, factor, named=False))
             continue
         said = np.flatnonzero(scan.target_id != NOBODY)
-        names, first = np.unique(scan.target_id[said], return_index=True)
-        rows = said[first]
-        if len(rows):
-            groups.append(_group(scan.position[rows], R[rows], config, factor, names, False))
+        _, first = np.unique(scan.target_id[said], return_index=True)
+        if len(said):
+            groups.append(_group(scan, said[first], config, factor, whole=False))
         if len(said) < len(scan) or not len(scan):
             rows = np.flatnonzero(scan.target_id == NOBODY)
-            groups.append(_group(scan.position[rows], R[rows], config, factor))
+            groups.append(_group(scan, rows, config, factor, named=False))
     return groups
 
 
 def _group(
-    position: FloatArray,
-    R: FloatArray,
+    scan: Fixes,
+    rows: slice | IndexArray,
     config: DiverConfig,
     factor: float,
-    target_id: IntArray | None = None,
+    *,
     whole: bool = True,
+    named: bool = True,
 ) -> Positions:
-    z = np.ascontiguousarray(position[:, :2])
-    return Positions(z, R, config.clutter_density, factor, target_id, whole)
+    """The rows of a scan, with their names unless they have none."""
+    config = config.of_sensor(scan.sensor)
+    return Positions(
+        np.ascontiguousarray(scan.position[rows, :2]),
+        _covariances(scan, config)[rows] * factor,
+        config.clutter_density,
+        factor,
+        scan.target_id[rows] if named and scan.target_id is not None else None,
+        whole,
+        scan.sensor,
+    )
+
+
+def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
+    """Single fixes of one sensor as one group."""
+    config = config.of_sensor(fixes[0].sensor)
+    unknown = np.eye(2) * config.fix_std**2
+    R = np.array([unknown if fix.covariance is None else fix.covariance for fix in fixes])
+    return Positions(
+        np.array([fix.position[:2] for fix in fixes]),
+        R * factor,
+        config.clutter_density,
+        factor,
+        None,
+        config.fixes_are_scans,
+        fixes[0].sensor,
+    )
 
 
 def _covariances(scan: Fixes, config: DiverConfig) -> FloatArray:

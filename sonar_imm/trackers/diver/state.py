@@ -43,7 +43,8 @@ class DiverState:
     the stated covariances; existence (T,): probability that there is a diver, NaN where hits are
     counted instead; evidence (T,): sum of the probabilities of its detections; target_id (T,):
     whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older track it is
-    near, 0 for none, and for how many scans (`soft`); broken: tracks ended so far because their
+    near, 0 for none, and for how many scans (`soft`, `names`); said: names and when each was said
+    last, ns; broken: tracks ended so far because their
     numbers were not finite; repairs: covariances repaired so far (`estimation.covariance`).
     """
 
@@ -67,6 +68,7 @@ class DiverState:
     broken: int = 0
     repairs: int = 0
     instruments: Instruments = Instruments()
+    said: tuple[tuple[int, int], ...] = ()
 
     def factor(self) -> FloatArray:
         """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""

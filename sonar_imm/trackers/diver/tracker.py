@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from attrs import evolve
 import numpy as np
 
+from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
 from ...estimation import (
     adaptation_kernels,
@@ -40,7 +41,9 @@ from .fix_consistency import FixConsistency
 from .fix_scans import each_name_once, shows_all, take_fixes
 from .instruments import Layout
 from .models import build_models
+from .names import hear_named, is_named, merged, names_said, pings_of, remembered
 from .pings import begin_from_ping, FAR, ping_numbers
+from .placing import Placer
 from .scan import Scan
 from .sensing import position_groups
 from .state import DiverState
@@ -71,10 +74,16 @@ class DiverTracker:
             survivor=lambda state: self._nobody(state.life.none_left()),
         )
         self.counts = self._stream.counts
+        self._placer = Placer(self.config, self.counts)
+
+    @property
+    def origin(self) -> Origin | None:
+        """Where the frame of the tracks lies on Earth, None when that is not known."""
+        return self._placer.origin
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
-        self.config = config
+        self.config = self._placer.config = config
 
     def warm(self) -> None:
         imm_kernels.warm()
@@ -118,20 +127,25 @@ class DiverTracker:
             'covariance_repairs': now.repairs,
             'fixes_mean_nis': now.fixes.mean_nis,
             'fixes_lag_1': now.fixes.lag_1,
+            'waiting_for_vessel': len(self._placer),
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
 
     def warnings(self) -> list[str]:
-        """What of the input cannot be true, in sentences for the user."""
-        return self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
+        """What of the input cannot be true or used, in sentences for the user."""
+        lasting = self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
+        return self._placer.warnings() + lasting
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
 
     def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
         """The stamps and states that are new or changed, oldest first."""
-        return self._stream.revise(measurement)
+        revised: dict[int, DiverState] = {}
+        for one in self._placer.place(measurement):
+            revised.update(self._stream.revise(one))
+        return [(stamp_ns, revised[stamp_ns]) for stamp_ns in sorted(revised)]
 
     def _nobody(self, life: Tracks) -> DiverState:
         """The state without a track; `life` has none, but the next identity."""
@@ -164,12 +178,19 @@ class DiverTracker:
         scan = self._predict(before, stamp_ns)
         births: list[Birth] = []
         fix_factor = float(self.config.covariance_scale * factor[0])
-        for group in position_groups(items, self.config, fix_factor):
+        groups = position_groups(items, self.config, fix_factor)
+        for group in groups:
             births += take_fixes(scan, group)
-        for ping in (item.in_order() for item in items if isinstance(item, Arrivals)):
+        pings = pings_of(items)
+        for ping in pings:
+            if is_named(ping):
+                births += hear_named(scan, ping, self.config, float(factor[1]))
+                continue
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
-        now = self._prune(scan.learn(), items)
+        said = names_said(groups, pings)
+        now = self._prune(remembered(scan.learn(), before, said, self.config.max_coast), items)
+        now = merged(now, before, groups, self.config, self.models.E[:, :2])
         return self._spawn(now, births, scan.layout)
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
@@ -292,5 +313,13 @@ class DiverTracker:
                 'nis_dof': state.nis_dof,
                 'existence': state.existence,
                 'target_id': state.target_id.astype(np.int32),
+                **self._on_earth(mean, depth),
             },
         )
+
+    def _on_earth(self, mean: FloatArray, height: FloatArray) -> dict[str, FloatArray]:
+        """Columns with latitude and longitude, degrees, where the origin is known."""
+        if self.origin is None:
+            return {}
+        place = self.origin.geodetic(np.column_stack([mean[:, :2], height]))
+        return {'latitude': place[:, 0], 'longitude': place[:, 1]}

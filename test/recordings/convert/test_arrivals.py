@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from msg_adapters.arrivals import read_arrivals
 from sonar_imm.recordings.convert import convert_arrivals
 from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.reader import BagReader
@@ -136,3 +137,22 @@ def test_the_real_arrivals_lead_back_to_the_fixes(real_data, tmp_path):
 
     solved = least_squares(residuals, [80.0, -80.0, 0.0], loss='soft_l1', f_scale=1e-3).x
     assert np.hypot(*(solved[:2] - fixes[5, 1:3])) < 1.0  # the fixes are another robust solution
+
+
+def test_a_tag_that_is_named_keeps_its_number(tmp_path):
+    (tmp_path / 'rx.csv').write_text('receiver,x,y\n1,0,0\n2,50,0\n3,0,50\n')
+    rows = [
+        f'{ping},{tag},{receiver},{100 + ping + 0.01 * receiver}'
+        for ping in (1, 2)
+        for tag in ('amy', 'bob')
+        for receiver in (1, 2, 3)
+    ]
+    text = '\n'.join(['ping,tag,receiver,arrival', *rows]) + '\n'
+    (tmp_path / 'toa.csv').write_text(text)
+    report = convert_arrivals(tmp_path / 'toa.csv', tmp_path / 'bag', tmp_path / 'rx.csv')
+    assert report.messages == {'/arrivals': 4}
+    assert report.notes['tag'] == 'amy is 1, bob is 2'
+    with BagReader(tmp_path / 'bag') as bag:
+        pings = [read_arrivals(one.message) for one in bag.messages()]
+    assert sorted(ping.tx_id[0] for ping in pings) == [1, 1, 2, 2]
+    assert all(ping.passive and len(set(ping.tx_id.tolist())) == 1 for ping in pings)

@@ -68,6 +68,15 @@ def test_sensors_are_chosen(convert):
         convert(records, sensors=('sonar',))
 
 
+def test_two_sensors_have_a_topic_each_with_their_empty_scans(convert):
+    records = [record(1.0, [[1.0], [2.0]]), record(1.5, [], sensor=1), record(2.0, [], sensor=2)]
+    report = convert(records, sensors=('radar', 'lidar'), time_offset_ns=-500_000_000)
+    assert report.messages == {'/radar/fixes': 2, '/lidar/fixes': 1}
+    scans = fixes_of(report.path)
+    assert [one.stamp_ns for one in scans] == [500_000_000, 1_000_000_000, 1_500_000_000]
+    assert [len(one) for one in scans] == [1, 0, 0]
+
+
 def test_late_stamps_are_moved_and_truth_is_not(convert):
     truth = [[{'targetID': 1, 'position': [0.0, 0.0, 0.0], 'time': 3.0}]]
     report = convert([record(3.0, [1.0, 2.0])], truth, time_offset_ns=-1_500_000_000)

@@ -250,3 +250,25 @@ def test_the_real_truth_alone(real_data, tmp_path):
         for estimate in truth_of(report.path)
     ]
     assert np.median(speed) == pytest.approx(0.48, abs=0.05)
+
+
+def test_flagged_rows_are_left_out_and_repeated_ones_are_counted(tmp_path):
+    source = tmp_path / 'log.csv'
+    lines = ['time,x,y,diver,position_valid']
+    for k in range(1, 21):
+        place = k - k % 2  # every position is polled twice
+        lines.append(f'{k},{place},0,amy,{"false" if k > 16 else "1"}')
+        lines.append(f'{k},0,{place},bob,1')
+    source.write_text('\n'.join(lines) + '\n')
+    report = convert_fixes(source, tmp_path / 'bag')
+    assert report.reasons == {'flagged invalid': 4} and report.bad_rows == 4
+    assert report.messages == {'/fixes': 20}
+    assert report.notes['repeated'].startswith('16 rows hold a position that came before')
+
+
+def test_a_flag_that_is_neither_is_said(tmp_path):
+    source = tmp_path / 'log.csv'
+    source.write_text('time,x,y,valid\n1,1,1,\n2,2,2,perhaps\n')
+    report = convert_fixes(source, tmp_path / 'bag')
+    assert report.messages == {'/fix': 1}
+    assert "valid is 'perhaps', neither true nor false" in report.problems[0]

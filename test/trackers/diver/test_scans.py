@@ -168,8 +168,8 @@ def test_named_fixes_make_a_track_each_though_they_cross_and_come_in_turn():
 
 
 @pytest.mark.parametrize('association', ASSOCIATIONS)
-def test_a_named_track_is_not_missed_by_scans_and_takes_no_other_fix(association):
-    tracker = DiverTracker(DiverConfig(association=association))
+def test_a_named_track_alone_is_not_missed_by_scans_and_takes_no_other_fix(association):
+    tracker = DiverTracker(DiverConfig(association=association, named_tracks='alone'))
     for second in range(1, 6):
         tracker.process(scan(second, (0.0, 0.0), ids=[9]))
     for second in range(6, 25):

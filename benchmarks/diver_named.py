@@ -1,0 +1,140 @@
+"""Divers that are heard by name and seen without one: one track or two?
+
+    python -m benchmarks.diver_named --runs 8 --out docs/results/diver_named.json
+
+Two divers swim legs at .75 m/s for 120 s (`simulate diver`). A sonar sees them without names: a
+scan per second, .5 m on each axis, P_D .9, two false fixes in a square of 120 m. Transponders are
+heard in turn from the 20th second on, each every four seconds, good to 2 m. In `apart` they are
+30 m apart and both have a transponder; in `buddies` they swim the same way 2 m apart, and only the
+first has one. GOSPA (10 m, 2) counts confirmed tracks. `named_tracks: alone` is what a named track
+that takes only its own fixes does. The scenes and the tracker were not tuned on this; the scans
+before two tracks are one follow from P_D (`names.patience`).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.diver_crossing import true_paths
+from benchmarks.tables import markdown, write_json
+from sonar_imm.evaluation.diver.scoring import score
+from sonar_imm.evaluation.diver.series import series_of
+from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.simulation.diver.simulator import scenario, simulate
+from sonar_imm.simulation.scene import Scene, TrueTrack
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SCENES = ('apart', 'buddies')
+HALF, FALSE, SCAN_STD, NAMED_STD, P_DETECTION = 60.0, 2.0, 0.5, 2.0, 0.9
+HEARD_FROM, EVERY = 20, 4
+
+
+def truth_of(scene: str, seed: int) -> tuple[TrueTrack, ...]:
+    """The paths of the two divers."""
+    told = {'duration': 120.0, 'speed': 0.75, 'start': [-20.0, 0.0], 'turn_deg': 60.0}
+    told |= {'divers': 2, 'spacing': 30.0} if scene == 'apart' else {}
+    made = simulate(scenario('table1', told), seed).truth
+    first = made[0]
+    if scene == 'apart':
+        return made
+    aside = first.position + [0.0, 2.0, *([0.0] * (first.position.shape[1] - 2))]
+    return first, TrueTrack(2, first.stamp_ns, aside, first.velocity)
+
+
+def measured(scene: str, truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | Fixes]:
+    """Scans without names and fixes with names, in order."""
+    rng = np.random.default_rng([seed, 7])
+    measurements: list[Fix | Fixes] = []
+    for k, stamp in enumerate(truth[0].stamp_ns.tolist()):
+        there = np.array([one.position[k, :2] for one in truth])
+        there = there[rng.uniform(size=len(there)) < P_DETECTION]
+        seen = there + rng.normal(scale=SCAN_STD, size=there.shape)
+        false = rng.uniform(-HALF, HALF, (rng.poisson(FALSE), 2))
+        both = np.concatenate([seen, false])
+        measurements.append(
+            Fixes(
+                stamp_ns=stamp,
+                position=np.column_stack([both, np.zeros(len(both))]),
+                covariance=np.tile(np.eye(2) * SCAN_STD**2, (len(both), 1, 1)),
+                frame_id='map',
+            )
+        )
+        speaks = (k - HEARD_FROM) % EVERY // 2
+        if k < HEARD_FROM or (k - HEARD_FROM) % 2 or (scene == 'buddies' and speaks):
+            continue
+        place = truth[speaks].position[k, :2] + rng.normal(scale=NAMED_STD, size=2)
+        measurements.append(
+            Fix(
+                stamp_ns=stamp + 300_000_000,
+                position=[*place, 0.0],
+                covariance=np.eye(2) * NAMED_STD**2,
+                target_id=truth[speaks].track_id,
+                frame_id='map',
+            )
+        )
+    return measurements
+
+
+def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
+    """The scores of one run."""
+    truth = truth_of(scene, seed)
+    config = DiverConfig(
+        association=association,
+        named_tracks=mode,
+        detection_probability=P_DETECTION,
+        clutter_density=FALSE / (2.0 * HALF) ** 2,
+    )
+    tracker = DiverTracker(config)
+    made = [tracker.process(one)[-1] for one in measured(scene, truth, seed)]
+    paths = {one.track_id: one for one in truth}
+    error = []
+    for estimate in made[-120:]:
+        for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
+            own = paths[int(estimate.extras['target_id'][row])]
+            if estimate.stamp_ns <= own.stamp_ns[-1]:
+                at = [
+                    np.interp(estimate.stamp_ns, own.stamp_ns, own.position[:, axis])
+                    for axis in (0, 1)
+                ]
+                error.append(float(np.hypot(*(estimate.state[row, :2] - at))))
+    found = score(series_of(made), true_paths(Scene((), truth)), cutoff=10.0)
+    hours = found['span_s'] / 3600.0
+    return {
+        'gospa_m': found['gospa']['rms_m'],
+        'rmse_m': found['position']['rmse_m'],
+        'named_rmse_m': float(np.sqrt(np.mean(np.square(error)))),
+        'tracks': float(found['tracks_confirmed']),
+        'switches_per_hour': found['tracks']['identity_switches'] / hours,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--runs', type=int, default=8)
+    parser.add_argument('--out', type=Path)
+    options = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    for scene in SCENES:
+        for association in ('gnn', 'jipda'):
+            for mode in ('alone', 'share'):
+                runs = [run(scene, association, mode, seed) for seed in range(options.runs)]
+                mean = {name: float(np.mean([one[name] for one in runs])) for name in runs[0]}
+                rows.append({'scene': scene, 'association': association, 'named': mode} | mean)
+                print(rows[-1], flush=True)
+    table = {
+        f'{row["scene"]}, {row["association"]}, {row["named"]}': {
+            name: value for name, value in row.items() if isinstance(value, float)
+        }
+        for row in rows
+    }
+    print(markdown(table, 2))
+    if options.out:
+        write_json(options.out, {'runs': options.runs, 'rows': rows})
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,60 @@
+"""Latitude and longitude, and metres east, north, up of an origin.
+
+The ellipsoid of WGS 84 and its conversions are those of pymap3d: plain numpy, exact in closed form
+from latitude and longitude to metres and to a nanometre back, kept by others and tested against
+other libraries. What is added here is the turn of covariances: east and north are not the same
+directions at the origin and at a place far from it.
+"""
+
+from __future__ import annotations
+
+from attrs import frozen
+import numpy as np
+
+from ..estimation.arrays import FloatArray
+
+
+@frozen
+class Origin:
+    """The origin of local metres: latitude and longitude in degrees, height above the ellipsoid in
+    metres."""
+
+    latitude: float
+    longitude: float
+    height: float = 0.0
+
+    def local(self, latitude: float, longitude: float, height: float = 0.0) -> FloatArray:
+        """East, north, up (3,) in metres of a place in degrees and metres."""
+        from pymap3d import geodetic2enu  # only needed for latitudes
+
+        return np.array(
+            geodetic2enu(latitude, longitude, height, self.latitude, self.longitude, self.height),
+            np.float64,
+        )
+
+    def geodetic(self, enu: FloatArray) -> FloatArray:
+        """Latitude, longitude in degrees and height in metres (..., 3) of places (..., 3)."""
+        from pymap3d import enu2geodetic
+
+        east, north, up = np.moveaxis(np.asarray(enu, np.float64), -1, 0)
+        there = enu2geodetic(east, north, up, self.latitude, self.longitude, self.height)
+        return np.stack([np.asarray(one, np.float64) for one in there], axis=-1)
+
+    def turn(self, latitude: float, longitude: float) -> FloatArray:
+        """(3, 3) that turns vectors in east, north, up of a place into those of the origin.
+
+        About the vertical only: ten kilometres away the meridians converge by .1 to .3 degrees.
+        The vertical tilts by as little, and a height that is not known must not be spread over
+        east and north by it.
+        """
+        here, there = _to_earth(self.latitude, self.longitude), _to_earth(latitude, longitude)
+        east, north = (here.T @ there)[:2, 0]
+        c, s = np.array([east, north]) / np.hypot(east, north)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _to_earth(latitude: float, longitude: float) -> FloatArray:
+    """(3, 3) that turns east, north, up at a place into axes fixed to the Earth."""
+    phi, lam = np.radians(latitude), np.radians(longitude)
+    sp, cp, sl, cl = np.sin(phi), np.cos(phi), np.sin(lam), np.cos(lam)
+    return np.array([[-sl, -sp * cl, cp * cl], [cl, -sp * sl, cp * sl], [0.0, cp, sp]])

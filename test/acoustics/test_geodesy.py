@@ -1,0 +1,71 @@
+"""Latitude and longitude against the closed form of the ellipsoid, written out here."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.geodesy import Origin
+
+A, F = 6378137.0, 1.0 / 298.257223563
+E2 = F * (2.0 - F)
+
+
+def earth(latitude, longitude, height):
+    """Earth-centred metres: the textbook formula."""
+    phi, lam = math.radians(latitude), math.radians(longitude)
+    N = A / math.sqrt(1.0 - E2 * math.sin(phi) ** 2)
+    return np.array(
+        [
+            (N + height) * math.cos(phi) * math.cos(lam),
+            (N + height) * math.cos(phi) * math.sin(lam),
+            (N * (1.0 - E2) + height) * math.sin(phi),
+        ]
+    )
+
+
+def numeric_axes(latitude, longitude, height=0.0, step=1e-4):
+    """East, north, up (3, 3) as columns, by differences of the formula above."""
+    there = earth(latitude, longitude, height)
+    columns = [
+        earth(latitude, longitude + step, height) - earth(latitude, longitude - step, height),
+        earth(latitude + step, longitude, height) - earth(latitude - step, longitude, height),
+        earth(latitude, longitude, height + 1.0) - there,
+    ]
+    return np.array([column / np.linalg.norm(column) for column in columns]).T
+
+
+PLACES = [(59.1, 10.2, 0.0), (-33.9, 151.2, 20.0), (0.001, -179.9999, -5.0), (78.2, 15.6, 3.0)]
+
+
+@pytest.mark.parametrize('place', PLACES)
+def test_metres_are_those_of_the_ellipsoid_and_come_back(place):
+    origin = Origin(*place)
+    rng = np.random.default_rng(3)
+    for scale in (10.0, 3e3, 3e4):
+        east, north, up = rng.normal(scale=scale, size=3) * [1.0, 1.0, 0.001]
+        there = earth(*place) + numeric_axes(*place) @ [east, north, up]
+        latitude, longitude, height = origin.geodetic(np.array([east, north, up]))
+        assert earth(latitude, longitude, height) == pytest.approx(there, abs=2e-3)
+        back = origin.local(latitude, longitude, height)
+        assert back == pytest.approx([east, north, up], abs=1e-6)
+
+
+def test_many_places_at_once():
+    origin = Origin(59.1, 10.2)
+    enu = np.arange(12.0).reshape(4, 3) * 100.0
+    assert origin.geodetic(enu)[2] == pytest.approx(origin.geodetic(enu[2]))
+    assert origin.geodetic(np.empty((0, 3))).shape == (0, 3)
+
+
+def test_axes_turn_with_the_place():
+    origin = Origin(59.1, 10.2)
+    assert origin.turn(59.1, 10.2) == pytest.approx(np.eye(3))
+    turn = origin.turn(59.15, 10.5)
+    expected = numeric_axes(59.1, 10.2).T @ numeric_axes(59.15, 10.5)
+    # Up to the tilt of the vertical, a height of 20 km over the radius of the Earth.
+    assert turn == pytest.approx(expected, abs=20.0 / 6371.0)
+    assert turn[:2, :2] == pytest.approx(expected[:2, :2], abs=1e-5)
+    assert turn @ turn.T == pytest.approx(np.eye(3), abs=1e-12)
+    # The meridians converge: what is east there points a little north here.
+    assert math.degrees(math.atan2(turn[1, 0], turn[0, 0])) == pytest.approx(0.257, abs=0.005)

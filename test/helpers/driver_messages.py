@@ -1,0 +1,89 @@
+"""Messages of packages that are not installed, by their fields, as a bag brings them along."""
+
+from functools import cache
+
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+DEFINITIONS = {
+    'geographic_msgs/msg/GeoPoint': 'float64 latitude\nfloat64 longitude\nfloat64 altitude\n',
+    'geographic_msgs/msg/GeoPose': (
+        'geographic_msgs/GeoPoint position\ngeometry_msgs/Quaternion orientation\n'
+    ),
+    'geographic_msgs/msg/GeoPoseWithCovariance': (
+        'geographic_msgs/GeoPose pose\nfloat64[36] covariance\n'
+    ),
+    'geographic_msgs/msg/GeoPointStamped': (
+        'std_msgs/Header header\ngeographic_msgs/GeoPoint position\n'
+    ),
+    'geographic_msgs/msg/GeoPoseStamped': (
+        'std_msgs/Header header\ngeographic_msgs/GeoPose pose\n'
+    ),
+    'geographic_msgs/msg/GeoPoseWithCovarianceStamped': (
+        'std_msgs/Header header\ngeographic_msgs/GeoPoseWithCovariance pose\n'
+    ),
+    'seatrac_interfaces/msg/ModemRec': (
+        'std_msgs/Header header\nuint8 msg_id\nbool position_flt_error\nuint8 src_id\n'
+        'int16 attitude_yaw\nint16 depth_local\nuint16 vos\nbool includes_range\n'
+        'uint16 range_dist\nbool includes_usbl\nint16 usbl_azimuth\nint16 usbl_elevation\n'
+        'int16 usbl_fit_error\nbool includes_position\nint16 position_easting\n'
+        'int16 position_northing\nint16 position_depth\n'
+    ),
+    'acomms_msgs/msg/UsblData': (
+        'std_msgs/Header header\nfloat64 current_time\nfloat64 measurement_time\n'
+        'int32 remote_address\ngeometry_msgs/Vector3 xyz\ngeometry_msgs/Vector3 enu\n'
+        'geometry_msgs/Quaternion orientation\nfloat64 propagation_time\nfloat64 rssi\n'
+        'int32 integrity\nfloat64 accuracy\n'
+    ),
+    'stonefish_ros2/msg/BeaconInfo': (
+        'std_msgs/Header header\nuint8 beacon_id\nfloat32 range\nfloat32 azimuth\n'
+        'float32 elevation\ngeometry_msgs/Point relative_position\n'
+        'geometry_msgs/Quaternion local_orientation\nfloat32 local_depth\n'
+    ),
+}
+
+
+@cache
+def driver_types():
+    """A store that knows the types of Jazzy and these."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    found = {}
+    for name, text in DEFINITIONS.items():
+        found.update(get_types_from_msg(text, name))
+    store.register(found)
+    return store
+
+
+def driver_message(name, **values):
+    """A message with the fields `values`, by dotted names (``position.latitude``); others zero."""
+    message = _zero(name)
+    for path, value in values.items():
+        *way, last = path.split('__')
+        target = message
+        for step in way:
+            target = getattr(target, step)
+        object.__setattr__(target, last, value)
+    return message
+
+
+def _zero(name):
+    store = driver_types()
+    made = []
+    for _, (node, detail) in store.fielddefs[name][1]:
+        if node.name == 'NAME':
+            made.append(_zero(detail))
+        elif node.name == 'ARRAY':
+            import numpy as np
+
+            made.append(np.zeros(detail[1]))
+        else:
+            kind = detail[0]
+            made.append(
+                ''
+                if kind == 'string'
+                else 0.0
+                if 'float' in kind
+                else False
+                if kind == 'bool'
+                else 0
+            )
+    return store.types[name](*made)

@@ -1,0 +1,225 @@
+"""Recordings of drivers whose packages are not installed, of vessels, tags and sensors."""
+
+import json
+
+from helpers.driver_messages import driver_message, driver_types
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from msg_adapters.fixes import write_fix
+from msg_adapters.geodetic import write_geodetic
+from msg_adapters.navigation import write_navigation
+from msg_adapters.scans import write_scan
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.evaluation.inspection import inspect
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.evaluation.tracking import InputOptions, OfflineRun, write_run
+from sonar_imm.measurements import Fix, Fixes, GeodeticFix, VesselPose
+from sonar_imm.recordings.measurements import fitting_topics
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.diver.config import DiverConfig
+
+START, SECOND = 1_700_000_000, 10**9
+ORIGIN = Origin(59.0, 10.0)
+
+
+def write_bag(path, records):
+    """A bag as its recorder writes it: with the definitions of its types."""
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        links = {}
+        for stamp_ns, topic, message in sorted(records, key=lambda one: one[0]):
+            name = message.__msgtype__
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, name, typestore=driver_types())
+            raw = driver_types().serialize_cdr(message, name)
+            writer.write(links[topic], stamp_ns, raw)
+    return path
+
+
+def tracked(bag, folder, topics=None, **parameters):
+    """run.json and the last estimate."""
+    config = DiverConfig(**parameters)
+    with BagReader(bag) as reader:
+        offline = OfflineRun(reader, SYSTEMS['diver'], config, InputOptions(topics=topics))
+        run_folder = RunFolder(folder)
+        run_folder.prepare(overwrite=True)
+        write_run(run_folder, offline)
+    run = json.loads((folder / 'run.json').read_text())
+    return run, run_folder.read_estimates()
+
+
+def vessel(seconds):
+    """The vessel drives east at 1 m/s, bow north."""
+    stamp = round((START + seconds) * SECOND)
+    pose = VesselPose(
+        stamp_ns=stamp,
+        position=(seconds, 0.0, 0.0),
+        orientation=(0.0, 0.0, np.sin(np.pi / 4), np.cos(np.pi / 4)),
+        frame_id='odom',
+    )
+    return stamp, '/nav', write_navigation(pose, ros_message)
+
+
+def beacon(kind, seconds):
+    """A diver at rest 20 m north and 10 m east of where the vessel began, 5 m deep."""
+    ahead, starboard = 20.0, 10.0 - seconds
+    distance = np.sqrt(ahead**2 + starboard**2 + 25.0)
+    stamp = {'header__stamp__sec': START + seconds, 'header__frame_id': 'usbl'}
+    if kind == 'stonefish_ros2/msg/BeaconInfo':
+        at = {
+            f'relative_position__{axis}': value
+            for axis, value in zip('xyz', (ahead, starboard, 5.0))
+        }
+        return driver_message(kind, beacon_id=6, **stamp, **at)
+    if kind == 'acomms_msgs/msg/UsblData':
+        stamp['header__stamp__sec'] += 2
+        enu = {f'enu__{axis}': value for axis, value in zip('xyz', (starboard, ahead, -5.0))}
+        return driver_message(kind, remote_address=6, current_time=2.0, **stamp, **enu)
+    return driver_message(
+        kind,
+        src_id=6,
+        includes_range=True,
+        includes_usbl=True,
+        range_dist=round(10 * distance),
+        usbl_azimuth=round(10 * np.degrees(np.arctan2(starboard, ahead))),
+        usbl_elevation=round(-10 * np.degrees(np.arcsin(5.0 / distance))),
+        **stamp,
+    )
+
+
+@pytest.mark.parametrize(
+    'kind',
+    [
+        'seatrac_interfaces/msg/ModemRec',
+        'acomms_msgs/msg/UsblData',
+        'stonefish_ros2/msg/BeaconInfo',
+    ],
+)
+def test_a_driver_without_its_package_is_tracked_from_the_vessel(tmp_path, kind):
+    records = [vessel(k - 0.4) for k in range(1, 22)]
+    records += [((START + k) * SECOND, '/usbl/relative', beacon(kind, k)) for k in range(2, 20)]
+    bag = write_bag(tmp_path / 'bag', records)
+    run, estimates = tracked(bag, tmp_path / 'run')
+    assert run['topics'] == {'/nav': 'nav', '/usbl/relative': 'relative'}
+    last = estimates[-1]
+    assert last.frame_id == 'odom' and last.extras['target_id'].tolist() == [6]
+    assert last.stamp_ns == (START + 19) * SECOND
+    assert last.state[0, :2] == pytest.approx([10.0, 20.0], abs=0.3)
+    with BagReader(bag) as reader:
+        found = {one['name']: one['suits'] for one in inspect(reader)['topics']}
+    assert found['/usbl/relative'] == ['diver relative'] and 'diver nav' in found['/nav']
+
+
+def test_a_driver_on_any_topic_is_suggested(tmp_path):
+    kind = 'seatrac_interfaces/msg/ModemRec'
+    records = [((START + k) * SECOND, '/modem_rec', beacon(kind, k)) for k in range(2, 5)]
+    with BagReader(write_bag(tmp_path / 'bag', records)) as reader:
+        found = inspect(reader)
+    assert found['topics'][0]['suits'] == ['diver relative']
+    assert found['systems']['diver'] == {'relative': ['/modem_rec']}
+
+
+def geo(k, topic='/fix', status=0, x=None, frame_id='gps'):
+    place = ORIGIN.geodetic(np.array([0.7 * k if x is None else x, 5.0, 0.0]))
+    fix = GeodeticFix(
+        stamp_ns=(START + k) * SECOND,
+        latitude=place[0],
+        longitude=place[1],
+        covariance=0.04 * np.eye(3),
+        frame_id=frame_id,
+    )
+    message = write_geodetic(fix, ros_message)
+    message.status.status = status
+    return fix.stamp_ns, topic, message
+
+
+def test_navsatfix_is_tracked_and_what_says_nothing_is_named_and_counted(tmp_path):
+    records = [geo(k, status=-1 if k % 5 == 0 else 0) for k in range(1, 30)]
+    polls = [geo(k, x=0.7 * 7) for k in (8,)]
+    records = [one for one in records if one[0] != polls[0][0]] + polls
+    run, estimates = tracked(
+        write_bag(tmp_path / 'bag', records),
+        tmp_path / 'run',
+        origin_latitude=59.0,
+        origin_longitude=10.0,
+    )
+    assert {reason: one['count'] for reason, one in run['refused'].items()} == {
+        'no_fix': 5,
+        'repeated': 1,
+    }
+    assert run['counts']['refused'] == 6
+    assert run['origin'] == {'latitude': 59.0, 'longitude': 10.0, 'height': 0.0}
+    last = estimates[-1]
+    assert last.state[0, :2] == pytest.approx([0.7 * 29, 5.0], abs=0.1)
+    assert last.extras['latitude'] == pytest.approx([ORIGIN.geodetic(last.state[0, [0, 1, 2]])[0]])
+
+
+def test_the_gps_of_a_vessel_is_not_taken_for_a_diver(tmp_path):
+    def fix(k):
+        position = (0.5 * k, 0.1, 0.0)
+        one = Fix(
+            stamp_ns=(START + k) * SECOND,
+            position=position,
+            covariance=0.04 * np.eye(2),
+            frame_id='map',
+        )
+        return one.stamp_ns, '/usbl/fix', write_fix(one, ros_message)
+
+    records = [fix(k) for k in range(1, 10)] + [geo(k, '/gps/fix') for k in range(1, 10)]
+    bag = write_bag(tmp_path / 'bag', records)
+    run, estimates = tracked(bag, tmp_path / 'run')
+    assert run['topics'] == {'/usbl/fix': 'fix'} and len(estimates[-1]) == 1
+    assert run['problems'] == [
+        'topic /gps/fix (sensor_msgs/msg/NavSatFix) is left out, because /usbl/fix says where '
+        'divers are; choose it with --topic fix=/gps/fix'
+    ]
+
+
+def test_navigation_without_relative_fixes_is_left_alone(tmp_path):
+    records = [vessel(k) for k in range(1, 5)] + [geo(k) for k in range(1, 5)]
+    with BagReader(write_bag(tmp_path / 'bag', records)) as reader:
+        assert list(fitting_topics(reader, 'diver')) == ['/fix']
+
+
+def test_tags_by_topic_and_frame_have_their_own_tracks(tmp_path):
+    records = [geo(k, '/amy/fix', x=0.3 * k) for k in range(1, 20)]
+    records += [geo(k, '/divers/fix', x=5.0 - 0.3 * k, frame_id='bob') for k in range(1, 20)]
+    _, estimates = tracked(
+        write_bag(tmp_path / 'bag', records), tmp_path / 'run', tags=('amy', 'bob')
+    )
+    last = estimates[-1]
+    by_name = dict(zip(last.extras['target_id'].tolist(), last.state[:, 0]))
+    assert by_name[1] - by_name[2] == pytest.approx(0.6 * 19 - 5.0, abs=0.2)
+
+
+def test_sensors_by_topic_have_their_own_numbers(tmp_path):
+    def scan(k, sensor):
+        one = Fixes(stamp_ns=(START + k) * SECOND, position=[[0.4 * k, 0.0, 0.0]], frame_id='map')
+        return one.stamp_ns, f'/{sensor}/fixes', write_scan(one, ros_message)
+
+    spread = {}
+    for sensor in ('radar', 'lidar'):
+        bag = write_bag(tmp_path / sensor, [scan(k, sensor) for k in range(1, 15)])
+        _, estimates = tracked(
+            bag,
+            tmp_path / f'run_{sensor}',
+            sensors=('radar', 'lidar'),
+            sensor_fix_std=(5.0, 0.5),
+        )
+        spread[sensor] = estimates[-1].covariance[0, 0, 0]
+    assert spread['radar'] > 4.0 * spread['lidar']
+
+
+def test_metres_and_latitudes_without_an_origin_are_said(tmp_path):
+    records = [vessel(k - 0.4) for k in range(1, 8)]
+    records += [
+        ((START + k) * SECOND, '/relative', beacon('stonefish_ros2/msg/BeaconInfo', k))
+        for k in range(2, 6)
+    ]
+    records += [geo(k, '/nav_fix') for k in range(1, 8)]
+    run, _ = tracked(write_bag(tmp_path / 'bag', records), tmp_path / 'run')
+    assert run['counts']['no_origin'] == 7
+    assert 'origin_latitude' in run['warnings'][0]

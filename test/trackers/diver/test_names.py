@@ -1,0 +1,230 @@
+"""Names: of fixes, of tags' pings, of divers that are also seen without one."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Arrivals, Fix, Fixes, NOBODY
+from sonar_imm.trackers.diver.names import patience
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SECOND = 10**9
+BOTH = ('gnn', 'jipda')
+RX = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+
+
+def named(second, place, name, std=1.0):
+    return Fix(
+        stamp_ns=round(second * SECOND),
+        position=[*place, 0.0],
+        covariance=std**2 * np.eye(2),
+        target_id=name,
+        frame_id='map',
+    )
+
+
+def scan(second, *places, std=0.5, **values):
+    n = len(places)
+    return Fixes(
+        stamp_ns=round(second * SECOND),
+        position=np.reshape([[*place, 0.0] for place in places], (n, 3)),
+        covariance=np.tile(std**2 * np.eye(2), (n, 1, 1)),
+        frame_id='map',
+        **values,
+    )
+
+
+def test_single_fixes_with_a_name_go_to_their_own_track():
+    tracker = DiverTracker(DiverConfig())
+    for second in range(1, 40):
+        name = 7 if second % 2 else 3
+        (estimate,) = tracker.process(named(second, (0.1 * name, 0.0), name))
+    assert sorted(estimate.extras['target_id'].tolist()) == [3, 7]
+    assert (estimate.extras['track_state'] > 0).all()
+
+
+def test_scans_needed_before_two_tracks_are_one_follow_from_p_d():
+    for p_detection in (0.5, 0.7, 0.9):
+        scans = patience(p_detection)
+        apart = (1.0 - p_detection**2) ** np.array([scans, scans - 1])
+        assert apart[0] <= 1e-3 < apart[1]
+
+
+@pytest.mark.parametrize('association', BOTH)
+def test_a_diver_heard_by_name_and_seen_without_is_one_track(association):
+    """The sonar sees the diver first; its track goes on, with the name."""
+    tracker = DiverTracker(DiverConfig(association=association, clutter_density=1e-4))
+    rng = np.random.default_rng(3)
+    first = None
+    for second in range(1, 60):
+        place = np.array([0.5 * second, 0.0])
+        estimates = tracker.process(scan(second, place + 0.5 * rng.normal(size=2)))
+        if second == 19:
+            (first,) = estimates[-1].extras['track_id'].tolist()
+        if second >= 20 and second % 4 == 0:
+            tracker.process(named(second + 0.4, place + 0.2, 5))
+    (estimate,) = estimates
+    assert estimate.extras['target_id'].tolist() == [5]
+    assert estimate.extras['track_id'].tolist() == [first]
+    assert estimate.covariance[0, 0, 0] < 0.25  # the scans count, not the transponder alone
+
+
+@pytest.mark.parametrize('association', BOTH)
+def test_two_divers_that_swim_together_stay_two(association):
+    tracker = DiverTracker(DiverConfig(association=association, clutter_density=1e-4))
+    rng = np.random.default_rng(4)
+    for second in range(1, 80):
+        place = np.array([0.5 * second, 0.0])
+        both = [place + 0.4 * rng.normal(size=2), place + [0.0, 3.0] + 0.4 * rng.normal(size=2)]
+        seen = [one for one in both if rng.uniform() < 0.9]
+        (estimate,) = tracker.process(scan(second, *seen))
+        if second >= 10 and second % 4 == 0:
+            tracker.process(named(second + 0.4, place + 0.5 * rng.normal(size=2), 5))
+    confirmed = estimate.extras['track_state'] > 0
+    assert sorted(estimate.extras['target_id'][confirmed].tolist()) == [NOBODY, 5]
+
+
+@pytest.mark.parametrize('association', BOTH)
+def test_a_name_that_is_said_no_more_is_forgotten_and_the_track_goes_on(association):
+    tracker = DiverTracker(DiverConfig(association=association, max_coast=20.0))
+    for second in range(1, 60):
+        if second < 10:
+            tracker.process(named(second - 0.5, (0.3 * second, 0.0), 5))
+        (estimate,) = tracker.process(scan(second, (0.3 * second, 0.1 * (second % 2))))
+        if second == 25:
+            assert 5 in estimate.extras['target_id'].tolist()
+    assert estimate.extras['target_id'].tolist() == [NOBODY]
+    assert estimate.extras['track_id'].tolist() == [1]
+
+
+@pytest.mark.parametrize('association', BOTH)
+def test_order_inside_the_window_changes_no_bit_with_names(association):
+    rng = np.random.default_rng(8)
+    measurements = []
+    for second in range(1, 30):
+        place = np.array([0.5 * second, 0.0])
+        measurements.append(scan(second, place + 0.3 * rng.normal(size=2), (20.0, 20.0)))
+        if second % 3 == 0:
+            measurements.append(named(second + 0.4, place + rng.normal(size=2), 5))
+    config = DiverConfig(association=association)
+
+    def final(order):
+        tracker, last = DiverTracker(config), {}
+        for index in order:
+            made = tracker.process(measurements[index])
+            last.update((one.stamp_ns, one) for one in made)
+        return [last[stamp].state.tobytes() for stamp in sorted(last)]
+
+    straight = np.arange(len(measurements))
+    shuffled = straight.copy()
+    for k in range(1, len(shuffled) - 1, 3):
+        shuffled[[k, k + 1]] = shuffled[[k + 1, k]]
+    assert final(straight) == final(shuffled)
+
+
+# -- tags ----------------------------------------------------------------------------------------
+
+
+def ping(second, places, rng=None):
+    """A message with a tag's arrivals for each number in `places`."""
+    tx_id, rx_id, toa, rx = [], [], [], []
+    for number, place in places.items():
+        leg = np.linalg.norm(RX - [*place, 0.0], axis=1) / 1500.0
+        noise = 0.0 if rng is None else 1e-4 * rng.normal(size=4)
+        toa += (leg - leg.min() + 0.01 + noise).tolist()
+        tx_id += [number] * 4
+        rx_id += range(4)
+        rx += RX.tolist()
+    n = len(toa)
+    return Arrivals(
+        stamp_ns=round(second * SECOND),
+        tx_id=tx_id,
+        rx_id=rx_id,
+        tx=np.full((n, 3), np.nan),
+        rx=rx,
+        toa=toa,
+        var_toa=np.full(n, 1e-8),
+        bearing=np.full(n, np.nan),
+        var_bearing=np.full(n, np.nan),
+        frame_id='map',
+    )
+
+
+@pytest.mark.parametrize('together', [True, False])
+def test_the_number_of_a_tag_leads_its_pings_to_their_own_track(together):
+    """Two tags cross; each keeps its track and its number."""
+    tracker = DiverTracker(DiverConfig())
+    rng = np.random.default_rng(1)
+    for k in range(1, 41):
+        places = {4: (-20.0 + k, 30.0), 9: (20.0 - k, 30.5)}
+        if together:
+            (estimate,) = tracker.process(ping(k, places, rng))
+        else:
+            name = (4, 9)[k % 2]
+            (estimate,) = tracker.process(ping(k, {name: places[name]}, rng))
+    by_name = dict(zip(estimate.extras['target_id'].tolist(), estimate.state))
+    assert sorted(by_name) == [4, 9]
+    assert by_name[4][0] == pytest.approx(20.0, abs=1.5)
+    assert by_name[9][0] == pytest.approx(-20.0, abs=1.5)
+    assert tracker._stream.state.life.next_id == 3  # none was lost and found again
+
+
+def test_a_tag_without_a_number_is_as_before():
+    tracker = DiverTracker(DiverConfig())
+    for k in range(1, 10):
+        (estimate,) = tracker.process(ping(k, {0: (5.0 + k, 30.0)}))
+    assert estimate.extras['target_id'].tolist() == [NOBODY]
+    assert len(estimate) == 1
+
+
+# -- sensors -------------------------------------------------------------------------------------
+
+
+def test_sensors_have_numbers_of_their_own():
+    config = DiverConfig(
+        sensors=('radar', 'lidar'),
+        sensor_fix_std=(4.0, 0.5),
+        sensor_detection_probability=(0.5, 0.95),
+        sensor_clutter_density=(1e-3, 1e-7),
+    )
+    radar = config.of_sensor('radar')
+    assert (radar.fix_std, radar.detection_probability, radar.clutter_density) == (4.0, 0.5, 1e-3)
+    assert config.of_sensor('') is config
+    spread = {}
+    for sensor in ('radar', 'lidar', ''):
+        tracker = DiverTracker(config)
+        for k in range(1, 10):
+            fix = Fix(stamp_ns=k * SECOND, position=(0.1 * k, 0, 0), sensor=sensor, frame_id='m')
+            (estimate,) = tracker.process(fix)
+        spread[sensor] = estimate.covariance[0, 0, 0]
+    assert spread['lidar'] < spread[''] < spread['radar']
+
+
+def test_the_detection_probability_of_a_sensor_decides_how_soon_existence_fades():
+    config = DiverConfig(
+        association='jipda',
+        sensors=('weak', 'strong'),
+        sensor_detection_probability=(0.2, 0.95),
+    )
+    existence = {}
+    for sensor in config.sensors:
+        tracker = DiverTracker(config)
+        for k in range(1, 10):
+            tracker.process(scan(k, (0.1 * k, 0.0), sensor=sensor))
+        (estimate,) = tracker.process(scan(10, sensor=sensor))
+        existence[sensor] = estimate.extras['existence'].tolist()
+    assert existence['weak'][0] > 0.9
+    assert not existence['strong'] or existence['strong'][0] < existence['weak'][0]
+
+
+@pytest.mark.parametrize(
+    'values, words',
+    [
+        ({'sensors': ('a',), 'sensor_fix_std': (1.0, 2.0)}, 'one value for each of the 1 sensors'),
+        ({'sensor_fix_std': (1.0,)}, 'one value for each of the 0 sensors'),
+        ({'tags': ('a/b',)}, "'a/b' cannot be part of a topic"),
+        ({'transceiver_lever': (1.0,)}, 'needs three values'),
+    ],
+)
+def test_lists_that_do_not_fit_are_named(values, words):
+    with pytest.raises(ValueError, match=words.replace('(', r'\(')):
+        DiverConfig(**values)

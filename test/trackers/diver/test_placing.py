@@ -1,0 +1,258 @@
+"""Latitude and longitude, and positions relative to a vessel, as the tracker places them."""
+
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.acoustics.geometry import rotation
+from sonar_imm.measurements import (
+    Fix,
+    GeodeticFix,
+    RelativeFix,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
+from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+
+SECOND = 10**9
+ORIGIN = Origin(59.0, 10.0)
+
+
+def geodetic(second, enu, cls=GeodeticFix, origin=ORIGIN, **values):
+    latitude, longitude, height = origin.geodetic(np.array(enu, float))
+    return cls(
+        stamp_ns=round(second * SECOND),
+        latitude=latitude,
+        longitude=longitude,
+        **{'height': height, 'covariance': 0.04 * np.eye(3), **values},
+    )
+
+
+def pose(second, position, yaw, frame_id='odom', **values):
+    return VesselPose(
+        stamp_ns=round(second * SECOND),
+        position=position,
+        orientation=(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)),
+        frame_id=frame_id,
+        **values,
+    )
+
+
+def relative(second, offset, **values):
+    return RelativeFix(stamp_ns=round(second * SECOND), offset=offset, **values)
+
+
+def run(tracker, measurements):
+    made = [one for measurement in measurements for one in tracker.process(measurement)]
+    final = {one.stamp_ns: one for one in made}
+    return [final[stamp] for stamp in sorted(final)]
+
+
+# -- latitude and longitude ----------------------------------------------------------------------
+
+
+def test_positions_on_earth_give_the_track_of_the_same_positions_in_metres():
+    config = DiverConfig(origin_latitude=59.0, origin_longitude=10.0)
+    path = [(1000.0 + 0.7 * k, 500.0 - 0.3 * k, 0.0) for k in range(30)]
+    on_earth = run(DiverTracker(config), [geodetic(k + 1, p) for k, p in enumerate(path)])
+    metres = run(
+        DiverTracker(config),
+        [
+            Fix(stamp_ns=(k + 1) * SECOND, position=p, covariance=0.04 * np.eye(2), frame_id='map')
+            for k, p in enumerate(path)
+        ],
+    )
+    assert on_earth[-1].frame_id == 'map'
+    assert on_earth[-1].state == pytest.approx(metres[-1].state, abs=1e-6)
+    assert on_earth[-1].covariance == pytest.approx(metres[-1].covariance, rel=1e-3)
+    latitude, longitude, _ = ORIGIN.geodetic(np.array([*metres[-1].state[0, :2], 0.0]))
+    assert on_earth[-1].extras['latitude'] == pytest.approx([latitude], abs=1e-11)
+    assert on_earth[-1].extras['longitude'] == pytest.approx([longitude], abs=1e-11)
+
+
+def test_the_first_position_is_the_origin_unless_one_is_stated_and_reset_forgets_it():
+    tracker = DiverTracker(DiverConfig())
+    assert tracker.origin is None
+    estimates = run(tracker, [geodetic(k, (300.0, 40.0, 0.0)) for k in range(1, 5)])
+    assert tracker.origin.geodetic(np.zeros(3)) == pytest.approx(
+        ORIGIN.geodetic(np.array([300.0, 40.0, 0.0])) * [1.0, 1.0, 0.0],
+        abs=1e-6,
+    )
+    assert estimates[-1].state[0, :2] == pytest.approx([0.0, 0.0], abs=1e-6)
+    tracker.reset()
+    assert tracker.origin is None
+
+
+def test_metres_without_an_origin_and_latitudes_do_not_mix():
+    def fix(second):
+        return Fix(stamp_ns=second * SECOND, position=(5.0, 0.0, 0.0), frame_id='map')
+
+    first = DiverTracker(DiverConfig())
+    assert run(first, [fix(1), geodetic(2, (0, 0, 0)), fix(3)])[-1].stamp_ns == 3 * SECOND
+    assert first.counts['no_origin'] == 1 and first.origin is None
+    assert 'latitude' not in run(first, [fix(4)])[-1].extras
+    second = DiverTracker(DiverConfig())
+    run(second, [geodetic(1, (0, 0, 0)), fix(2), pose(3, (0, 0, 0), 0.0)])
+    assert second.counts['no_origin'] == 2
+    assert 'origin_latitude' in second.warnings()[0]
+    stated = DiverTracker(DiverConfig(origin_latitude=59.0, origin_longitude=10.0))
+    both = run(stated, [geodetic(1, (5.0, 0.2, 0.0)), fix(2)])
+    assert not stated.counts['no_origin'] and len(both[-1]) == 1
+
+
+def test_an_unknown_height_is_that_of_the_origin():
+    config = DiverConfig(origin_latitude=59.0, origin_longitude=10.0, origin_height=40.0)
+    known, unknown = (
+        run(DiverTracker(config), [geodetic(1, (2e4, 0.0, 0.0), **height)])[0].state
+        for height in ({'height': 40.0}, {'height': np.nan})
+    )
+    assert known.tolist() == unknown.tolist()
+
+
+# -- relative to a vessel ------------------------------------------------------------------------
+
+
+def test_a_relative_fix_is_composed_with_the_pose_between_two_messages():
+    config = DiverConfig(
+        transceiver_lever=(2.0, 0.0, -1.0), transceiver_mount_rpy_deg=(0.0, 0.0, 90.0)
+    )
+    tracker = DiverTracker(config)
+    assert run(tracker, [pose(1, (10.0, 0.0, 0.0), 0.0), relative(1.5, (30.0, 0.0, -5.0))]) == []
+    assert tracker.health()['waiting_for_vessel'] == 1
+    (estimate,) = tracker.process(pose(2, (12.0, 2.0, 0.0), 0.4))
+    R = rotation(0.0, 0.0, 0.2)
+    arm = R @ (np.array([2.0, 0.0, -1.0]) + rotation(0, 0, np.pi / 2) @ [30.0, 0.0, -5.0])
+    assert estimate.stamp_ns == 1.5 * SECOND and estimate.frame_id == 'odom'
+    # The mean is a little longer, because what errors turn is shorter on average.
+    assert estimate.state[0, :2] == pytest.approx([11.0 + arm[0], 1.0 + arm[1]], abs=0.06)
+    assert tracker.health()['waiting_for_vessel'] == 0
+
+
+def test_what_the_vessel_states_of_itself_counts_and_else_the_parameters():
+    def covariance(config=None, **values):
+        tracker = DiverTracker(config or DiverConfig())
+        near = [pose(s, (0, 0, 0), 0.0, **values) for s in (1, 2)]
+        (estimate,) = run(tracker, [*near, relative(1.5, (100.0, 0.0, 0.0))])
+        return estimate.covariance[0, :2, :2]
+
+    stated = np.diag([9.0, 16.0, 1.0, 1e-8, 1e-8, np.radians(3.0) ** 2])
+    angle, bent = np.radians(2.0), 1.1
+    P = covariance(pose_covariance=stated)
+    assert P[0, 0] == pytest.approx(9.0 + 0.25, rel=0.05)
+    across = 16.0 + 100.0**2 * (angle**2 + np.radians(3.0) ** 2)
+    assert across < P[1, 1] < across * bent
+    P = covariance(DiverConfig(vessel_position_std=2.0, vessel_heading_std_deg=0.0))
+    assert P[1, 1] == pytest.approx(4.0 + (100.0 * angle) ** 2, rel=0.02)
+    zero_attitude = np.diag([9.0, 16.0, 1.0, 0.0, 0.0, 0.0])
+    P = covariance(DiverConfig(vessel_heading_std_deg=3.0), pose_covariance=zero_attitude)
+    assert across < P[1, 1] < across * bent
+
+
+def test_a_gap_in_the_poses_and_a_stamp_before_them_are_counted():
+    tracker = DiverTracker(DiverConfig())
+    made = run(
+        tracker,
+        [
+            pose(5, (0, 0, 0), 0.0),
+            relative(4, (10.0, 0.0, 0.0)),
+            relative(7, (10.0, 0.0, 0.0)),
+            pose(9, (0, 0, 0), 0.0),
+        ],
+    )
+    assert not made and tracker.counts['vessel_pose_gap'] == 2
+
+
+def test_waiting_is_bounded_and_said():
+    tracker = DiverTracker(DiverConfig())
+    for k in range(1, 251):
+        assert tracker.process(relative(k, (10.0, 0.0, 0.0))) == []
+    assert tracker.health()['waiting_for_vessel'] == 200
+    assert tracker.counts['vessel_pose_missing'] == 50
+    assert 'wait for the pose of the vessel' in tracker.warnings()[0]
+
+
+def test_extrapolation_is_as_far_as_allowed():
+    tracker = DiverTracker(DiverConfig(vessel_max_extrapolation=0.6))
+    poses = [pose(1, (0, 0, 0), 0.0), pose(2, (2.0, 0, 0), 0.0)]
+    (estimate,) = run(tracker, [*poses, relative(2.5, (10.0, 0.0, 0.0))])
+    assert estimate.state[0, 0] == pytest.approx(13.0, abs=0.05)
+    assert run(tracker, [relative(2.7, (10.0, 0.0, 0.0))]) == []
+
+
+def test_a_clock_that_was_set_back_forgets_the_vessel():
+    tracker = DiverTracker(DiverConfig())
+    run(tracker, [pose(k, (0, 0, 0), 0.0) for k in range(10_000, 10_010)])
+    run(tracker, [relative(10_020, (10.0, 0.0, 0.0))])
+    run(tracker, [pose(k, (50.0, 0, 0), 0.0) for k in range(1, 12)])
+    assert tracker.health()['waiting_for_vessel'] == 0
+    made = run(tracker, [relative(10.5, (10.0, 0.0, 0.0))])
+    assert made and made[-1].state[0, 0] == pytest.approx(60.0, abs=0.1)
+
+
+def test_a_position_and_a_heading_make_a_pose():
+    config = DiverConfig(origin_latitude=59.0, origin_longitude=10.0)
+    tracker = DiverTracker(config)
+    made = run(
+        tracker,
+        [
+            geodetic(1.0, (100.0, 0.0, 0.0), VesselFix),
+            VesselHeading(stamp_ns=1 * SECOND, orientation=(0, 0, 0, 1.0)),
+            relative(1.5, (0.0, 20.0, 0.0)),
+            geodetic(2.0, (102.0, 0.0, 0.0), VesselFix),
+            VesselHeading(
+                stamp_ns=2 * SECOND, orientation=(0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4))
+            ),
+        ],
+    )
+    half = np.pi / 4
+    expected = [101.0 - 20.0 * np.sin(half), 20.0 * np.cos(half)]
+    assert made[-1].state[0, :2] == pytest.approx(expected, abs=0.05)
+    assert made[-1].frame_id == 'map' and 'latitude' in made[-1].extras
+
+
+def test_a_transceiver_on_a_pier_needs_no_pose():
+    config = DiverConfig(
+        vessel='fixed', transceiver_lever=(5.0, 0, 0), transceiver_mount_rpy_deg=(0.0, 0.0, 90.0)
+    )
+    (estimate,) = run(DiverTracker(config), [relative(1, (10.0, 0.0, 0.0))])
+    assert estimate.state[0, :2] == pytest.approx([5.0, 10.0], abs=0.05)
+
+
+def test_levelled_positions_do_not_turn_with_the_vessel():
+    poses = [pose(s, (0, 0, 0), 1.0) for s in (1, 2)]
+    (estimate,) = run(
+        DiverTracker(DiverConfig()), [*poses, relative(1.5, (30.0, 0.0, 0.0), levelled=True)]
+    )
+    assert estimate.state[0, :2] == pytest.approx([30.0, 0.0], abs=0.05)
+
+
+def test_the_tracker_is_consistent_with_all_errors_drawn():
+    """A diver that rests is seen by a transceiver on a vessel that circles it: NEES."""
+    rng = np.random.default_rng(5)
+    config = DiverConfig(
+        relative_range_std=0.5, vessel_position_std=0.5, vessel_heading_std_deg=1.0
+    )
+    nees = []
+    for _ in range(12):
+        tracker = DiverTracker(config)
+        last = None
+        for k in range(1, 41):
+            angle = 0.05 * k
+            where = np.array([60.0 * np.cos(angle), 60.0 * np.sin(angle), 0.0])
+            yaw = angle + np.pi / 2
+            seen = rotation(0, 0, yaw).T @ (-where)
+            distance = np.linalg.norm(seen)
+            turn = rotation(0.0, *np.radians(2.0) * rng.normal(size=2))
+            offset = turn @ seen * (1.0 + 0.5 * rng.normal() / distance)
+            noisy = pose(
+                k,
+                where + 0.5 * rng.normal(size=3) * [1, 1, 0],
+                yaw + np.radians(rng.normal()),
+                frame_id='map',
+            )
+            made = run(tracker, [noisy, relative(k, offset, frame_id='usbl')])
+            last = made[-1] if made else last
+        error, P = last.state[0, :2], last.covariance[0, :2, :2]
+        nees.append(error @ np.linalg.solve(P, error))
+    assert 0.5 < np.mean(nees) < 4.0  # 2 is due, for 24 numbers
