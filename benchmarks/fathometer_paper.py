@@ -4,8 +4,8 @@
 
 ``vectors``: the 300 records of test/vectors/fathometer/mvdr_traces.npz, with their noise as it is,
 an eighth too low (by so much it fades between where it is measured and where it is needed), and
-their envelopes (modulus of the analytic signal) with the noise of the real part, 1.1 and 1.25 times
-that. ``array``: drifts of the paper as cross-spectra through the tracker, 32 hydrophones, by its
+their envelopes (modulus of the analytic signal) with the noise of the real part, and 1.1 and 1.25
+times that. ``array``: drifts of the paper as cross-spectra through the tracker, 32 phones, by its
 configurations: the default, the paper's (`PAPER`), and both with the output of the array changed.
 P is the share of records whose number of reflectors is right; OSPA of second order, cutoff 2 m.
 """
