@@ -2,10 +2,10 @@
 
     python -m benchmarks.fathometer_acceptance --out docs/results/fathometer_acceptance.json
 
-Each set of vectors is written as a bag and tracked by the command with that many seeds; every number
-is the mean over the seeds, with the worst beside it, and the limit. Not here, because they are no
-recordings: the exact filter, signed likelihoods, depths in the sediment, and the processors on
-``pressure.npz``; their limits are in the tests of the same names.
+Each set of vectors is written as a bag and tracked by the command with that many seeds; every
+number is the mean over the seeds, with the worst beside it, and the limit. Not here, because they
+are no recordings: the exact filter, signed likelihoods, depths in the sediment, and the processors
+on ``pressure.npz``; their limits are in the tests of the same names.
 """
 
 from __future__ import annotations
