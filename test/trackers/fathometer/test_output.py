@@ -1,4 +1,4 @@
-"""What is made of both beams: coherence, correlation, or what the paper prints; real or envelope."""
+"""What is made of both beams: coherence, correlation, what the paper prints; real or envelope."""
 
 import numpy as np
 import pytest
