@@ -8,6 +8,11 @@ the paper, 32 hydrophones, seven to nine layers, MVDR. ``strong`` and ``signed``
 negative; a tenth as many records for each run. P is the share of records whose number of
 reflectors is right; OSPA of second order with a cutoff of 2 m; wrong signs per record. The first
 five records are not scored.
+
+``ghosts``: what a response without any noise holds besides the layers, in units of one record's
+noise: the matrices are the exact ones, the layers are fitted with either pulse and taken off, and
+the largest peaks further than 0.4 m from any layer are listed, each with the nearest place
+z_i + z_j - z_k. MVDR is no linear function of the matrices, so that echoes that interfere beat.
 """
 
 from __future__ import annotations
@@ -23,12 +28,15 @@ import numpy as np
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra
+from sonar_imm.simulation.fathometer.field import expected_csdm
 from sonar_imm.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm.simulation.fathometer.simulator import (
     cross_spectra,
     FathometerScenario,
     scenario,
 )
+from sonar_imm.trackers.fathometer.array_response import array_response
+from sonar_imm.trackers.fathometer.response import lattice_of_array, pulse_of
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 DEPTHS = np.array([52.0, 55.2, 58.5, 61.7, 66.0, 69.3])
@@ -110,6 +118,50 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
     }
 
 
+def ghosts() -> dict[str, list[dict[str, float]]]:
+    """The largest peaks beside the layers of ``strong``, by pulse."""
+    config, floor, rng = layers(0, 1, SIGNS['strong'])
+    floor = evolve(floor, depth=DEPTHS[None], array_depth=np.array([config.array_depth]))
+    first = np.ceil(config.frequency_min * config.snapshot_seconds)
+    last = np.floor(config.frequency_max * config.snapshot_seconds)
+    frequency = np.arange(first, last + 1.0) / config.snapshot_seconds
+    exact = CrossSpectra(
+        stamp_ns=1, frequency=frequency, csdm=expected_csdm(config, floor, 0, frequency)
+    )
+    told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
+    tracked = FathometerConfig(
+        **{**told, 'depth_min': config.depth_min, 'depth_max': config.depth_max},
+        pulse='processor',
+        noise_depth_min=0.0,
+        noise_depth_max=0.0,
+    )
+    lattice = lattice_of_array(config.array_depth, tracked)
+    response = array_response(exact, lattice, tracked, config.array_depth)
+    drawn = cross_spectra(config, floor, 0, config.array_depth, rng)
+    sigma = float(array_response(drawn, lattice, tracked, config.array_depth).sigma[0])
+    z, b = response.depth, response.amplitude / sigma
+    at = np.abs(z[:, None] - DEPTHS).argmin(axis=0)
+    triples = (DEPTHS[:, None, None] + DEPTHS[:, None] - DEPTHS).ravel()
+    found = {}
+    assert response.pulse is not None
+    for name, pulse in (('band', pulse_of(tracked)), ('processor', response.pulse)):
+        a = np.linalg.solve(pulse(z[at][:, None] - z[at]), b[at])
+        left = b - pulse(z[:, None] - z[at]) @ a
+        left[np.abs(z[:, None] - DEPTHS).min(axis=1) <= 0.4] = 0.0
+        size = np.abs(left)
+        peaks = 1 + np.flatnonzero((size[1:-1] > size[:-2]) & (size[1:-1] >= size[2:]))
+        largest = peaks[np.argsort(-size[peaks])][:8]
+        found[name] = [
+            {
+                'depth': float(z[k]),
+                'sigmas': float(left[k]),
+                'nearest z_i + z_j - z_k': float(triples[np.abs(triples - z[k]).argmin()]),
+            }
+            for k in largest
+        ]
+    return found
+
+
 def _score(found: Any, depth: np.ndarray, amplitude: np.ndarray) -> list[float]:
     z = found.state[np.isfinite(found.state[:, 0])]
     order = int(found.model_names[int(found.probabilities[0].argmax())].split('_')[1])
@@ -132,8 +184,13 @@ def main() -> None:
     parser.add_argument('--records', type=int, default=300)
     parser.add_argument('--particles', type=int, default=5000)
     parser.add_argument('--scenes', nargs='*', default=['strong', 'signed', 'drift'])
+    parser.add_argument('--ghosts', action='store_true', help='only these')
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
+    if options.ghosts:
+        for name, rows in ghosts().items():
+            print(f'\n{markdown({f"{name} {k + 1}": row for k, row in enumerate(rows)}, 2)}')
+        return
     made: dict[str, list[dict[str, float]]] = {}
     for name in options.scenes:
         records = options.records if name == 'drift' else max(10, options.records // 10)

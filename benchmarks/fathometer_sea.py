@@ -47,6 +47,11 @@ ROWS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         {'snapshot_seconds': 1.4, **MIRROR},
     ),
     '20 s, pressure': ('pressure', {'record_seconds': 20.0, 'records': 20}, {}),
+    '20 s, pressure, pulse of the processor': (
+        'pressure',
+        {'record_seconds': 20.0, 'records': 20},
+        {'pulse': 'processor'},
+    ),
     '20 s, cross-spectra': ('csdm', {'record_seconds': 20.0, 'records': 20}, MIRROR),
     '20 s, pressure, conventional': (
         'pressure',

@@ -171,7 +171,8 @@ def echo_spectrum(csdm: ComplexArray, frequency: ArrayLike, power: FloatArray) -
     is stronger. `frequency` (F,) Hz. The response itself stays unweighted: weights make it ring.
     """
     M = csdm.shape[-1]
-    f = np.maximum(np.asarray(frequency, np.float64), 1e-3)
+    f = np.asarray(frequency, np.float64)
+    f = np.maximum(f, np.min(f, where=f > 0.0, initial=np.inf))
     W = np.einsum('fmm->f', csdm).real.astype(np.float64) / (M * f * power)
     half = min(_RUNNING // 2, len(W) - 1)
     padded = np.pad(W, half, 'reflect')

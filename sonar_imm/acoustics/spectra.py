@@ -52,8 +52,8 @@ def window_overlap(name: str, share: FloatArray | float) -> FloatArray:
 def effective_snapshots(window: str, overlap: float, count: int) -> float:
     """How many independent snapshots say as much as `count` that overlap: Hann and half an
     overlap leave 0.95 of them."""
-    k = np.arange(1, max(1, min(count, int(1.0 / (1.0 - overlap)) + 2)))
-    common = np.square(window_overlap(window, k * (1.0 - overlap)))
+    k = np.arange(1.0, max(1, min(count, int(1.0 / (1.0 - overlap)) + 2)))
+    common = np.square(window_overlap(window, np.asarray(k * (1.0 - overlap), np.float64)))
     return count / (1.0 + 2.0 * float(np.sum((1.0 - k / count) * common)))
 
 

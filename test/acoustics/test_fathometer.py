@@ -16,8 +16,10 @@ from sonar_imm.acoustics.ambient import (
 from sonar_imm.acoustics.fathometer import (
     chirp_z,
     coherence,
+    coherence_and_power,
     conventional,
     depth_response,
+    echo_spectrum,
     mvdr,
     noise_sigma,
     steering,
@@ -227,3 +229,25 @@ def test_sampled_cross_spectra_scatter_as_wishart():
         assert np.mean(np.abs(drawn[:, 0, 9] - R[0, 0, 9]) ** 2) == pytest.approx(
             R[0, 0, 0].real * R[0, 9, 9].real / snapshots, rel=0.1
         )
+
+
+def test_the_spectrum_of_an_echo_is_smooth_finite_and_of_mean_one(band):
+    frequency, R = band
+    w = steering(frequency, HEIGHTS, C)
+    _, power = coherence_and_power(R, w, 'mvdr')
+    W = echo_spectrum(R, frequency, power)
+    assert W.mean() == pytest.approx(1.0) and (W > 0.0).all()
+    # MVDR is sharper than a plain sum where waves are long.
+    assert W[:50].mean() > 2.0 * W[-200:].mean()
+    few = echo_spectrum(R[:3], frequency[:3], power[:3])
+    assert few.shape == (3,) and np.isfinite(few).all()
+    # A row at 0 Hz counts as its neighbour.
+    direct = echo_spectrum(R[:40], np.append(0.0, frequency[1:40]), power[:40])
+    assert direct == pytest.approx(echo_spectrum(R[:40], frequency[:40], power[:40]), rel=0.1)
+
+
+def test_power_and_coherence_make_the_correlation(band):
+    frequency, R = band
+    w = steering(frequency, HEIGHTS, C)
+    gamma, power = coherence_and_power(R, w, 'mvdr')
+    assert gamma * power == pytest.approx(1j * mvdr(R, w, 1e-2)[0])

@@ -24,6 +24,22 @@ def test_what_is_written_is_read(write_fixes, storage):
         assert [item.message.pose.pose.position.x for item in bag.messages()] == list(range(7))
 
 
+def test_a_compressed_bag_is_smaller_and_says_the_same(write_fixes):
+    plain, packed = (
+        write_fixes(200, name='plain'),
+        write_fixes(200, name='packed', compressed=True),
+    )
+
+    def content(path):
+        with BagReader(path) as bag:
+            assert not bag.problems
+            return [(one.topic, one.log_ns, bytes(one.raw)) for one in bag.messages()]
+
+    assert content(plain) == content(packed) and len(content(plain)) == 200
+    sizes = [(path / f'{path.name}.mcap').stat().st_size for path in (plain, packed)]
+    assert sizes[1] < 0.6 * sizes[0]
+
+
 def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
     path = write_fixes(1)
     text = (path / 'metadata.yaml').read_text()

@@ -15,6 +15,7 @@ def test_the_shipped_recordings_pass(tmp_path, capsys):
     assert [outcome['bag'].rsplit('/', 1)[-1] for outcome in outcomes] == [
         'fathometer_array',
         'fathometer_drift',
+        'fathometer_pressure',
     ]
     for outcome in outcomes:
         assert outcome['good'] and len(outcome['checks']) == 4

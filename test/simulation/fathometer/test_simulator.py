@@ -78,3 +78,37 @@ def test_traces_hold_the_pulse_of_each_layer_and_noise_as_stated():
 def test_scenes_that_cannot_be(name, overrides, word):
     with pytest.raises(ConfigError, match=word):
         scenario(name, overrides)
+
+
+def test_pressure_in_whole_numbers_has_the_steps_it_was_told():
+    changes = {'records': 1, 'record_seconds': 1.0, 'block_seconds': 0.3}
+    coarse = simulate(scenario('pressure', {**changes, 'steps_per_sigma': 2.5}), 1)
+    fine = simulate(scenario('pressure', {**changes, 'steps_per_sigma': 0.0}), 1)
+    a = np.concatenate([one.measurement.pressure for one in coarse.measurements])
+    b = np.concatenate([one.measurement.pressure for one in fine.measurements])
+    (scale,) = {one.measurement.scale for one in coarse.measurements}
+    assert [len(one.measurement) for one in coarse.measurements] == [1800, 1800, 1800, 600]
+    assert scale == pytest.approx(b.std() / 2.5, rel=1e-3)
+    assert np.abs(a - b).max() <= 0.5001 * scale
+    assert np.abs(a / scale - np.round(a / scale)).max() < 1e-4
+    assert {one.measurement.scale for one in fine.measurements} == {0.0}
+
+
+def test_what_a_tracker_is_told_of_pressure_leaves_its_snapshots_to_it():
+    told = scenario('pressure').told()
+    assert 'snapshot_seconds' not in told
+    assert (told['depth_min'], told['depth_max']) == (42.0, 74.0)
+    assert scenario('small').told()['window'] == 'rectangular'
+
+
+def test_whitened_spectra_are_even():
+    changes = {'records': 1, 'snapshots': 400, 'ship_noise': 0.0}
+    red, even = (
+        simulate(scenario('small', {**changes, 'whitened': white}), 1).measurements[-1].measurement
+        for white in (False, True)
+    )
+    ratio = [
+        np.einsum('fmm->f', one.csdm).real[10] / (np.einsum('fmm->f', one.csdm).real[-10])
+        for one in (red, even)
+    ]
+    assert ratio[0] > 20.0 and 0.5 < ratio[1] < 2.0

@@ -60,6 +60,26 @@ def test_without_the_state_they_are_lost(scene):
     assert all((one.extras['heave_std'] == 0.0).all() for one in found.values())
 
 
+def test_without_a_spread_at_the_start_the_first_error_stays(scene, monkeypatch):
+    """The depths of the layers are then what the first record, told half a metre wrong, says."""
+    from sonar_imm.estimation import set_filter
+
+    whole = set_filter.shift_tables
+
+    def sure(shift, log_sum, share):
+        tables = whole(shift, log_sum, share)
+        return tables._replace(start=np.where(shift.places < 0.0, 0.0, 1.0))
+
+    def common_error():
+        options = {'heave': 'independent', 'array_depth_std': 0.5, 'depth_std': 0.05}
+        _, found = run(scene.traces(range(40)), particles=1500, **options)
+        return rms(errors(found, scene, after=20)[0])
+
+    right = common_error()
+    monkeypatch.setattr(set_filter, 'shift_tables', sure)
+    assert common_error() > 1.5 * right
+
+
 def test_an_error_that_lasts_is_followed_with_a_memory(scene):
     """The same layers, the errors of an autoregression put in place of the independent ones."""
     rng = np.random.default_rng(2)

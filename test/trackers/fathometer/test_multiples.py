@@ -72,6 +72,20 @@ def test_one_wrong_record_does_not_decide():
     assert after(depth, config)[1] > 0.9
 
 
+def test_all_ways_share_one_prior():
+    """More reflectors above are more ways by which one may lie there by chance."""
+    config = FathometerConfig()
+    few, many = np.array([[9.0, 18.05]]), np.array([[5.1, 7.7, 9.0, 18.05]])
+
+    def odds(depth):
+        p = after(depth, config)[-1]
+        return p / (1.0 - p)
+
+    ways = [len(ways_above(d[0], np.ones(d.shape[1]), d.shape[1] - 1).sign) for d in (few, many)]
+    assert ways == [1, 10]
+    assert odds(few) / odds(many) == pytest.approx(10.0, rel=0.05)
+
+
 def test_the_sign_counts_where_there_are_two():
     depth = np.tile([9.0, 18.05], (1, 1))
     both, one = FathometerConfig(polarity='both'), FathometerConfig()

@@ -1,0 +1,198 @@
+"""What the fathometer has to show on the vectors, through ``track``, with the runs stated.
+
+    python -m benchmarks.fathometer_acceptance --out docs/results/fathometer_acceptance.json
+
+Each set of vectors is written as a bag and tracked by the command with that many seeds; every
+number is the mean over the seeds, with the worst beside it, and the limit. Not here, because they
+are no recordings: the exact filter, signed likelihoods, depths in the sediment, and the processors
+on ``pressure.npz``; their limits are in the tests of the same names.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import io
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.tables import write_json
+from msg_adapters.array_records import write_trace
+from sonar_imm.cli import main as command
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.consistency import ospa
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.measurements import Trace
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.writer import BagWriter
+from sonar_imm.simulation.fathometer.scenario import PRESENT
+
+FOLDER = Path(__file__).parents[1] / 'test' / 'vectors'
+Truth = Mapping[str, np.ndarray]
+Score = Callable[[Sequence[Estimate], Truth], dict[str, float]]
+SECOND = 10**9
+
+
+def write_bag(truth: Truth, out: Path) -> None:
+    """One trace per record, a second apart, as the vectors have them."""
+    depth = truth['depth'].astype(float)
+    sigma = np.broadcast_to(np.ravel(truth['sigma']).astype(float), len(truth['amplitude']))
+    reference = truth.get('array_depth', truth.get('reference_depth'))
+    reference = np.broadcast_to(np.ravel(reference), len(sigma)) if reference is not None else None
+    with BagWriter(out) as bag:
+        for k, amplitude in enumerate(truth['amplitude'].astype(float)):
+            trace = Trace(
+                stamp_ns=(k + 1) * SECOND,
+                frame_id='array',
+                depth=depth,
+                amplitude=amplitude,
+                sigma=np.full(len(depth), sigma[k]),
+                reference_depth=None if reference is None else float(reference[k]),
+            )
+            bag.write('/trace', write_trace(trace, ros_message), trace.stamp_ns)
+
+
+def depths_at(truth: Truth, estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """True depths and signs of a record."""
+    record = estimate.stamp_ns // SECOND - 1
+    strength = truth['reflector_amplitude']
+    if strength.ndim == 1:
+        return truth['reflector_depth'][record], np.sign(strength)
+    there = strength[record] > PRESENT * np.nanmax(strength, axis=0)
+    return truth['reflector_depth'][record, there], np.ones(there.sum())
+
+
+def sets(found: Sequence[Estimate], truth: Truth, after: int) -> dict[str, float]:
+    """P, OSPA and wrong signs of the records later than `after`."""
+    right, distance, wrong = [], [], 0
+    for estimate in found:
+        if estimate.stamp_ns <= after * SECOND:
+            continue
+        depth, sign = depths_at(truth, estimate)
+        z = estimate.state[np.isfinite(estimate.state[:, 0])]
+        order = int(estimate.model_names[int(estimate.probabilities[0].argmax())].split('_')[1])
+        right.append(order == len(depth))
+        distance.append(ospa(z[:, :1], depth[:, None], cutoff=2.0, order=2.0))
+        near = np.abs(z[:, :1] - depth) < 0.3
+        wrong += int((near & (np.sign(z[:, 1:2]) != sign)).sum())
+    return {
+        'P': float(np.mean(right)),
+        'OSPA, m': float(np.mean(distance)),
+        'wrong signs': float(wrong),
+    }
+
+
+def heave(found: Sequence[Estimate], truth: Truth) -> dict[str, float]:
+    common, relative = [], []
+    for estimate in found:
+        depth, _ = depths_at(truth, estimate)
+        if estimate.stamp_ns > 20 * SECOND and len(estimate) == len(depth):
+            error = estimate.state[:, 0] - depth
+            common.append(error.mean())
+            relative += list(error - error.mean())
+    values = sets(found, truth, 20)
+    del values['wrong signs']
+    return values | {
+        'common, m': float(np.sqrt(np.mean(np.square(common)))),
+        'relative, m': float(np.sqrt(np.mean(np.square(relative)))),
+    }
+
+
+def multiples(found: Sequence[Estimate], truth: Truth) -> dict[str, float]:
+    is_multiple, flags = truth['is_multiple'].astype(bool), ([], [])
+    for estimate in found:
+        if estimate.stamp_ns > 10 * SECOND:
+            depth, _ = depths_at(truth, estimate)
+            away = np.abs(estimate.state[:, :1] - depth)
+            near, which = away.min(axis=1) < 0.3, is_multiple[away.argmin(axis=1)]
+            marked = estimate.extras['multiple_probability'] > 0.5
+            for kind, into in zip((which, ~which), flags):
+                into.extend(marked[near & kind])
+    return {'flagged': float(np.mean(flags[0])), 'primaries': float(np.mean(flags[1]))}
+
+
+CASES: dict[str, tuple[str, tuple[str, ...], Score, dict[str, float]]] = {
+    'negative': (
+        'fathometer_sea/negative.npz',
+        ('polarity=both',),
+        lambda found, truth: sets(found, truth, 5),
+        {'P': 0.95, 'OSPA, m': -0.03, 'wrong signs': -0.0},
+    ),
+    'negative, positive only': (
+        'fathometer_sea/negative.npz',
+        (),
+        lambda found, truth: {'P': sets(found, truth, 5)['P']},
+        {'P': -0.05},
+    ),
+    'heave': (
+        'fathometer_sea/heave.npz',
+        ('heave=independent', 'array_depth_std=0.5'),
+        heave,
+        {'P': 0.95, 'OSPA, m': -0.18, 'common, m': -0.20, 'relative, m': -0.02},
+    ),
+    'multiples': (
+        'fathometer_sea/multiples.npz',
+        ('polarity=both',),
+        multiples,
+        {'flagged': 0.85, 'primaries': -0.05},
+    ),
+    'mvdr_traces': (
+        'fathometer/mvdr_traces.npz',
+        (),
+        lambda found, truth: {k: v for k, v in sets(found, truth, 0).items() if k[0] in 'PO'},
+        {'P': 0.94, 'OSPA, m': -0.07},
+    ),
+}
+"""Name: vectors, parameters, score, limits: at least so much, or at most where negative."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--runs', type=int, default=4, help='seeds')
+    parser.add_argument('--particles', type=int, default=20_000)
+    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
+    options = parser.parse_args()
+    table: dict[str, Any] = {}
+    print(f'{options.runs} seeds, {options.particles} particles')
+    for name, (file, settings, score, limits) in CASES.items():
+        with np.load(FOLDER / file) as kept:
+            truth = {key: kept[key] for key in kept}
+        runs = []
+        with TemporaryDirectory() as folder:
+            write_bag(truth, Path(folder) / 'bag')
+            for seed in range(options.runs):
+                out = Path(folder) / f'out_{seed}'
+                given = (*settings, f'seed={seed}', f'particles={options.particles}')
+                words = [word for each in given for word in ('--set', each)]
+                with contextlib.redirect_stdout(io.StringIO()):
+                    if command(['track', f'{folder}/bag', str(out), *words]):
+                        raise SystemExit(f'track failed on {name}')
+                runs.append(score(RunFolder(out).read_estimates(), truth))
+        for key, limit in limits.items():
+            values = [one[key] for one in runs]
+            most = key != 'P' and key != 'flagged' or limit < 0.0
+            worst = max(values) if most else min(values)
+            mean, bound = float(np.mean(values)), abs(limit)
+            good = mean <= bound if most else mean >= bound
+            table[f'{name}: {key}'] = {
+                'mean': mean,
+                'worst': float(worst),
+                'at most' if most else 'at least': bound,
+                'good': bool(good),
+            }
+            print(
+                f'{"ok  " if good else "MISS"} {name}: {key} {mean:.3f}, worst {worst:.3f}, '
+                f'{"at most" if most else "at least"} {bound:g}',
+                flush=True,
+            )
+    write_json(options.out, {**vars(options), 'out': None, 'table': table})
+
+
+if __name__ == '__main__':
+    main()
