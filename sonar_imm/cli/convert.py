@@ -22,9 +22,9 @@ from .convert_options import (
     csv_options,
     FILE,
     frame_option,
-    nanoseconds,
     options,
     place_options,
+    sensor_offsets,
     staves,
     storage_option,
     truth_option,
@@ -181,9 +181,9 @@ def truth(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     '--time-offset',
     'time_offset_ns',
     default='0',
-    callback=nanoseconds,
+    callback=sensor_offsets,
     metavar='SECONDS',
-    help='Added to the stamps of the detections.',
+    help='Added to the stamps of the detections, of all sensors or as radar=-1.5,lidar=0.1.',
 )
 @frame_option
 @storage_option

@@ -35,6 +35,14 @@ def nanoseconds(_ctx: click.Context, _param: click.Parameter, value: str) -> int
         raise click.BadParameter(f"'{value}' is not a number of seconds") from None
 
 
+def sensor_offsets(ctx: click.Context, param: click.Parameter, value: str) -> int | dict[str, int]:
+    """``-1.5`` for all sensors, or ``radar=-1.5,lidar=0.1``."""
+    if '=' not in value:
+        return nanoseconds(ctx, param, value)
+    pairs = dict(part.partition('=')[::2] for part in value.split(','))
+    return {name.strip(): nanoseconds(ctx, param, text) for name, text in pairs.items()}
+
+
 def staves(
     _ctx: click.Context, _param: click.Parameter, value: str | None
 ) -> list[list[int]] | None:

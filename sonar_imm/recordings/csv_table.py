@@ -194,7 +194,10 @@ class Row:
                 )
             return round(nanoseconds)
         except ArithmeticError:
-            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a time") from None
+            raise BadRow(
+                f"{self.table.header(name)} is '{text[:40]}', not a time: a number or "
+                '2024-05-31T10:00:00Z'
+            ) from None
 
     def stamp_ns(self, name: str = 'stamp') -> int:
         """A time since 1970 in integer nanoseconds, with the offset of the options added."""
@@ -221,6 +224,8 @@ class CsvTable:
                 first = next(lines, '')
         except OSError as error:
             raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
+        if _wide(self.path):
+            raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
         if not first or '\0' in first:
             raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
         if _binary(self.path):
@@ -299,6 +304,13 @@ class CsvTable:
             if name not in found and matches:
                 found[name] = matches[0]
         return found
+
+
+def _wide(path: Path) -> bool:
+    """Whether a file begins as text in UTF-16 does."""
+    with path.open('rb') as file:
+        start = file.read(64)
+    return start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start
 
 
 def _binary(path: Path) -> bool:

@@ -6,6 +6,7 @@ import math
 
 from msg_adapters.arrivals import FARTHEST
 
+from ..acoustics.geodesy import Origin
 from .csv_table import BadRow, CsvTable, Row
 from .sources import BagError
 
@@ -49,8 +50,6 @@ class LocalFrame:
         return {'origin': 'latitude {!r}, longitude {!r}, height {!r}'.format(*self.origin)}
 
     def _from_geodetic(self, row: Row) -> tuple[float, float, float]:
-        from pymap3d import geodetic2enu  # only needed for latitudes
-
         latitude, longitude = row.number('latitude'), row.number('longitude')
         if abs(latitude) > 90.0 or abs(longitude) > 360.0:
             raise BadRow(
@@ -60,8 +59,14 @@ class LocalFrame:
         height = 0.0 if math.isnan(height) else height
         if self.origin is None:
             self.origin = (latitude, longitude, 0.0)
-        east, north, up = geodetic2enu(latitude, longitude, height, *self.origin)
-        return float(east), float(north), float(up)
+        east, north, up = Origin(*self.origin).local(latitude, longitude, height).tolist()
+        return east, north, up
+
+
+def origin_parameters(origin: tuple[float, ...] | None) -> dict[str, float]:
+    """An origin by the names of the tracker's parameters; nothing for metres."""
+    names = ('origin_latitude', 'origin_longitude', 'origin_height')
+    return {} if origin is None else dict(zip(names, origin))
 
 
 def _checked(origin: tuple[float, ...]) -> tuple[float, float, float]:

@@ -180,3 +180,9 @@ def test_an_impossible_date_is_told_in_our_words(table):
     (row,) = table('time\n2024-13-40T10:00:00\n')
     with pytest.raises(BadRow, match='no date and time of the calendar'):
         row.stamp_ns()
+
+
+def test_text_in_utf_16_is_said(tmp_path):
+    (tmp_path / 'wide.csv').write_bytes('stamp,x,y\n1,2,3\n'.encode('utf-16'))
+    with pytest.raises(BagError, match='is text in UTF-16'):
+        CsvTable(tmp_path / 'wide.csv')

@@ -219,7 +219,8 @@ def test_metres_and_latitudes_without_an_origin_are_said(tmp_path):
         ((START + k) * SECOND, '/relative', beacon('stonefish_ros2/msg/BeaconInfo', k))
         for k in range(2, 6)
     ]
-    records += [geo(k, '/nav_fix') for k in range(1, 8)]
-    run, _ = tracked(write_bag(tmp_path / 'bag', records), tmp_path / 'run')
-    assert run['counts']['no_origin'] == 7
+    records += [geo(k, '/amy/fix') for k in range(1, 8)]
+    chosen = {'/nav': 'nav', '/relative': 'relative', '/amy/fix': 'fix'}
+    run, _ = tracked(write_bag(tmp_path / 'bag', records), tmp_path / 'run', chosen)
+    assert run['counts']['no_origin'] == 4
     assert 'origin_latitude' in run['warnings'][0]

@@ -30,8 +30,9 @@ from msg_adapters.arrivals import write_arrivals
 from ...measurements import Arrivals, Rejection
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import BadRow, CsvOptions, CsvTable, Row
-from ..local_frame import LocalFrame
+from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
+from ..own_parameters import write_own_parameters
 from ..sources import BagError
 from .truth import number_names, truth_records
 
@@ -116,7 +117,9 @@ def convert_arrivals(
         report.notes['receivers'] = ', '.join(f'{name} = {numbers[name]}' for name in numbers)
     if passive:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
-    return write_bag(out, records, report, source=Path(path).name, storage=storage)
+    report = write_bag(out, records, report, source=Path(path).name, storage=storage)
+    write_own_parameters(report.path, 'diver', origin_parameters(origin))
+    return report
 
 
 def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:

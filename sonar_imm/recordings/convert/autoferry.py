@@ -9,7 +9,7 @@ converted. The targets are boats, not divers.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 import json
 import math
 from pathlib import Path
@@ -39,7 +39,7 @@ def convert_autoferry(
     truth: str | Path | None = None,
     sensors: Collection[str] = ('radar',),
     std: float | None = None,
-    time_offset_ns: int = 0,
+    time_offset_ns: int | Mapping[str, int] = 0,
     frame_id: str = 'map',
     storage: str = 'mcap',
 ) -> ConversionReport:
@@ -49,13 +49,17 @@ def convert_autoferry(
     truth: the scenario's ground truth (JSON) for ``/truth/estimate``, velocity by central
     differences; sensors: of radar, lidar; std: standard deviation [m] on each axis to state in the
     fixes, None to leave the covariance open, because the data set states none; time_offset_ns:
-    added to the stamps of the detections, not of the truth.
+    added to the stamps of the detections, not of the truth, of all sensors or of each by its name.
     Raises `BagError` for a file of another kind.
     """
-    if unknown := [name for name in sensors if name not in SENSORS]:
+    late = time_offset_ns if isinstance(time_offset_ns, Mapping) else {}
+    if unknown := [name for name in (*sensors, *late) if name not in SENSORS]:
         raise BagError(f"there is no sensor '{unknown[0]}'; there are {' and '.join(SENSORS)}")
     numbers = {SENSORS[name] for name in sensors}
     names = {number: name for name, number in SENSORS.items()}
+    if not isinstance(time_offset_ns, Mapping):
+        time_offset_ns = dict.fromkeys(SENSORS, time_offset_ns)
+    offsets = {**dict.fromkeys(SENSORS, 0), **time_offset_ns}
     report = ConversionReport(
         Path(out), notes={'sensors': ', '.join(sorted(sensors)), 'targets': 'boats, not divers'}
     )
@@ -68,7 +72,7 @@ def convert_autoferry(
                 continue
             found = _east_north(record)
             scan = Fixes(
-                stamp_ns=_stamp_ns(record['time'], time_offset_ns),
+                stamp_ns=_stamp_ns(record['time'], offsets[names[record['sensorID']]]),
                 position=np.column_stack([found, np.zeros(len(found))]),
                 covariance=None if covariance is None else np.tile(covariance, (len(found), 1, 1)),
                 frame_id=frame_id,

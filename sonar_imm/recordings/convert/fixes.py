@@ -14,8 +14,9 @@ from msg_adapters.scans import write_scan
 from ...measurements import Fix, Fixes, NOBODY, Rejection, RepeatGuard
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
-from ..local_frame import LocalFrame
+from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
+from ..own_parameters import write_own_parameters
 from .truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
@@ -39,7 +40,8 @@ def convert_fixes(
     (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; ``id``: whose
     position it is, a number or a name. A row with empty uncertainties becomes a fix without
     covariance. Latitudes become metres around `origin`
-    (latitude, longitude[, height]), the first good row when None. `truth` is a CSV as in
+    (latitude, longitude[, height]), the first good row when None, which is told the tracker by
+    ``parameters.yaml`` beside the bag. `truth` is a CSV as in
     `convert_truth`, for the same bag and the same origin.
 
     Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
@@ -83,7 +85,9 @@ def convert_fixes(
             f'{len(repeated)} rows hold a position that came before, the first in line '
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
-    return write_bag(out, records, report, source=Path(path).name, storage=storage)
+    report = write_bag(out, records, report, source=Path(path).name, storage=storage)
+    write_own_parameters(report.path, 'diver', origin_parameters(frame.origin))
+    return report
 
 
 def _names_divers(

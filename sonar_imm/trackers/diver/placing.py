@@ -4,8 +4,9 @@ Latitude and longitude become metres east and north of the origin. A relative fi
 vessel's pose is known around its stamp, from ``nav`` or from ``nav_fix`` and ``heading``, and is
 composed with it. Everything else goes through as it is.
 
-Without a stated origin the first position in latitude and longitude is it. Then metres that others
-have measured are from somewhere else, and cannot be used beside it: what came first stays.
+Without a stated origin the first position in latitude and longitude is it, once one is used. Then
+metres that others have measured are from somewhere else, and cannot be used beside it: what came
+first stays.
 """
 
 from __future__ import annotations
@@ -90,6 +91,7 @@ class Placer:
         self.origin = config.origin()
         self._counts = counts
         self._stated = self.origin is not None
+        self._first: Origin | None = None
         self._metric = False
         kept = max(KEPT_NS, nanoseconds(config.history))
         self._poses, self._places, self._headings = (_Samples(kept) for _ in range(3))
@@ -120,15 +122,16 @@ class Placer:
         if isinstance(measurement, (Fix, Fixes, Arrivals)):
             return [measurement] if self._in_metres() else []
         if isinstance(measurement, VesselPose):
-            return self._after(self._poses, measurement) if self._in_metres() else []
+            return self._after(self._poses, measurement)
         if isinstance(measurement, VesselHeading):
             return self._after(self._headings, _turned(measurement))
         if isinstance(measurement, GeodeticFix):
-            if not self._on_earth(measurement):
-                return []
+            if self._first is None:
+                height = self.config.origin_height
+                self._first = Origin(measurement.latitude, measurement.longitude, height)
             if isinstance(measurement, VesselFix):
                 return self._after(self._places, self._moved(measurement))
-            return [self._fix_of(measurement)]
+            return [self._fix_of(measurement)] if self._on_earth() else []
         if isinstance(measurement, RelativeFix):
             if len(self._waiting) == MOST_WAITING:
                 self._waiting.pop(0)
@@ -147,23 +150,24 @@ class Placer:
         self._metric = True
         return True
 
-    def _on_earth(self, fix: GeodeticFix) -> bool:
-        """Whether latitude and longitude can be used; the first may be the origin."""
+    def _on_earth(self) -> bool:
+        """Whether latitude and longitude can be used; the first of them may be the origin."""
         if self.origin is None:
             if self._metric:
                 self._counts['no_origin'] += 1
                 return False
-            self.origin = Origin(fix.latitude, fix.longitude, self.config.origin_height)
+            self.origin = self._first
         return True
 
     def _local(self, fix: GeodeticFix) -> tuple[FloatArray, FloatArray | None]:
         """The place (3,) in metres of the origin, and its covariance (3, 3)."""
-        assert self.origin is not None
-        height = self.origin.height if np.isnan(fix.height) else fix.height
-        position = self.origin.local(fix.latitude, fix.longitude, height)
+        origin = self.origin or self._first
+        assert origin is not None
+        height = origin.height if np.isnan(fix.height) else fix.height
+        position = origin.local(fix.latitude, fix.longitude, height)
         if fix.covariance is None:
             return position, None
-        turn = self.origin.turn(fix.latitude, fix.longitude)
+        turn = origin.turn(fix.latitude, fix.longitude)
         return position, turn @ fix.covariance @ turn.T
 
     def _fix_of(self, fix: GeodeticFix) -> Fix:
@@ -197,6 +201,10 @@ class Placer:
         places, headings = self._places.buffer.stamps, self._headings.buffer.stamps
         return bool(self._poses.buffer.stamps or (places and headings))
 
+    def _by_places(self) -> bool:
+        """Whether the vessel is known by latitude and longitude, because there is no nav."""
+        return self.config.vessel == 'moving' and not self._poses.buffer.stamps
+
     def _after(self, samples: _Samples, pose: Navigation) -> list[Measurement]:
         """Take what an instrument says of the vessel; gives what is ready after it."""
         if samples.add(pose, self._counts):
@@ -213,7 +221,7 @@ class Placer:
                 waiting.append(fix)
             elif known == 'gap':
                 self._counts['vessel_pose_gap'] += 1
-            else:
+            elif self._on_earth() if self._by_places() else self._in_metres():
                 done.append(self._composed(fix, self._vessel(fix.stamp_ns)))
         self._waiting = waiting
         return sorted(done, key=lambda one: one.stamp_ns)
@@ -226,7 +234,7 @@ class Placer:
             nanoseconds(self.config.vessel_max_gap),
             nanoseconds(self.config.vessel_max_extrapolation),
         )
-        parts = (self._poses,) if self._poses.buffer.stamps else (self._places, self._headings)
+        parts = (self._places, self._headings) if self._by_places() else (self._poses,)
         said = [one.buffer.readiness(stamp_ns, stamp_ns, *limits) for one in parts]
         return 'wait' if 'wait' in said else 'gap' if 'gap' in said else 'ready'
 
@@ -242,8 +250,9 @@ class Placer:
             np.eye(3) * config.vessel_position_std**2,
             np.diag([attitude**2, attitude**2, heading**2]),
         )
-        where = self._poses if self._poses.buffer.stamps else self._places
-        lies = self._poses if self._poses.buffer.stamps else self._headings
+        places = self._by_places()
+        where = self._places if places else self._poses
+        lies = self._headings if places else self._poses
         pose = Pose(where.buffer.pose(stamp_ns).position, lies.buffer.pose(stamp_ns).R)
         near = where.nearest(stamp_ns)
         stated = Uncertainty(

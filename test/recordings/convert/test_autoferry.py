@@ -77,6 +77,13 @@ def test_two_sensors_have_a_topic_each_with_their_empty_scans(convert):
     assert [len(one) for one in scans] == [1, 0, 0]
 
 
+def test_each_sensor_may_be_late_by_itself(convert):
+    records = [record(2.0, [[1.0], [2.0]]), record(2.0, [[1.0], [2.0]], sensor=1)]
+    report = convert(records, sensors=('radar', 'lidar'), time_offset_ns={'radar': -1_500_000_000})
+    stamps = sorted(one.stamp_ns for one in fixes_of(report.path))
+    assert stamps == [500_000_000, 2_000_000_000]
+
+
 def test_late_stamps_are_moved_and_truth_is_not(convert):
     truth = [[{'targetID': 1, 'position': [0.0, 0.0, 0.0], 'time': 3.0}]]
     report = convert([record(3.0, [1.0, 2.0])], truth, time_offset_ns=-1_500_000_000)

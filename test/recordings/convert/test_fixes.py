@@ -3,6 +3,7 @@ import csv
 import numpy as np
 import pymap3d
 import pytest
+import yaml
 
 from msg_adapters.estimates import read_estimate
 from sonar_imm.recordings.conversion import MOST_NAMED
@@ -17,6 +18,7 @@ from sonar_imm.recordings.convert.truth import difference_velocity, number_names
 from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.reader import BagReader
 from sonar_imm.recordings.sources import BagError
+from sonar_imm.trackers.diver.config import DiverConfig
 
 
 @pytest.fixture
@@ -272,3 +274,18 @@ def test_a_flag_that_is_neither_is_said(tmp_path):
     report = convert_fixes(source, tmp_path / 'bag')
     assert report.messages == {'/fix': 1}
     assert "valid is 'perhaps', neither true nor false" in report.problems[0]
+
+
+def test_the_origin_of_latitudes_is_told_the_tracker(convert):
+    report = convert('time,lat,lon\n1,59.5,10.25\n2,59.50001,10.25\n')
+    told = yaml.safe_load((report.path / 'parameters.yaml').read_text())
+    assert told['diver']['ros__parameters'] == {
+        'origin_latitude': 59.5,
+        'origin_longitude': 10.25,
+        'origin_height': 0.0,
+    }
+    DiverConfig.from_mapping(told['diver']['ros__parameters'])
+
+
+def test_metres_have_no_parameters(convert):
+    assert not (convert('time,x,y\n1,2,3\n').path / 'parameters.yaml').exists()

@@ -94,11 +94,33 @@ def test_metres_without_an_origin_and_latitudes_do_not_mix():
     assert 'latitude' not in run(first, [fix(4)])[-1].extras
     second = DiverTracker(DiverConfig())
     run(second, [geodetic(1, (0, 0, 0)), fix(2), pose(3, (0, 0, 0), 0.0)])
+    assert second.counts['no_origin'] == 1
+    run(second, [relative(3.5, (9.0, 0.0, 0.0)), pose(4, (0, 0, 0), 0.0)])
     assert second.counts['no_origin'] == 2
     assert 'origin_latitude' in second.warnings()[0]
     stated = DiverTracker(DiverConfig(origin_latitude=59.0, origin_longitude=10.0))
     both = run(stated, [geodetic(1, (5.0, 0.2, 0.0)), fix(2)])
     assert not stated.counts['no_origin'] and len(both[-1]) == 1
+
+
+def test_navigation_that_nothing_needs_decides_nothing():
+    """A node hears nav, and the vessel's GPS, whoever they are for."""
+    tracker = DiverTracker(DiverConfig())
+    beside = [
+        pose(1, (0, 0, 0), 0.0),
+        geodetic(1, (900.0, 0, 0), VesselFix),
+        Fix(stamp_ns=2 * SECOND, position=(5.0, 0.0, 0.0), frame_id='map'),
+    ]
+    (estimate,) = run(tracker, beside)
+    assert estimate.state[0, 0] == pytest.approx(5.0) and tracker.origin is None
+    tracker = DiverTracker(DiverConfig())
+    (estimate,) = run(tracker, [*beside[:2], geodetic(2, (905.0, 0, 0))])
+    assert estimate.state[0, 0] == pytest.approx(5.0, abs=1e-3)
+    assert not tracker.counts['no_origin']
+    both = DiverTracker(DiverConfig())
+    poses = [pose(s, (0, 0, 0), 0.0) for s in (1, 2)]
+    (estimate,) = run(both, [*beside[1:2], *poses, relative(1.5, (30.0, 0, 0))])
+    assert estimate.frame_id == 'odom' and both.origin is None
 
 
 def test_an_unknown_height_is_that_of_the_origin():
