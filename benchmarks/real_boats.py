@@ -103,7 +103,7 @@ def ours(**values: Any) -> Make:
 
 
 TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
-    'plain CV Kalman, 40 lines': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
+    'plain CV Kalman': (lambda q, s, life: PlainKalman(q, s, *life), (0.1, 0.3, 1.0)),
     'CV Kalman, gnn': (ours(model_set='cv'), (0.1, 0.3, 1.0)),
     'CV Kalman, jipda': (ours(model_set='cv', association='jipda'), (0.1, 0.3, 1.0)),
     'heading_speed, gnn': (ours(**BOATS), (0.03, 0.1, 0.3)),

@@ -24,6 +24,7 @@ import math
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
+from .covariance import LIFT, LIMIT
 from .jit import kernel
 
 
@@ -74,6 +75,8 @@ def consider_scalar(
         S += h[a] * PHt[a]
     if not (S > 0.0 and math.isfinite(S)):
         return -math.inf
+    if not R > LIMIT * S:  # the rule of `covariance` for values that are too good
+        S += LIFT * S
     for a in range(n):
         if estimated[a]:
             x[a] += PHt[a] * innovation / S

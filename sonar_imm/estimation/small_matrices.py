@@ -83,6 +83,18 @@ def lift(P: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
+def lift_all(P: FloatArray) -> int:
+    """`lift` each of P (M, n, n) in place that is finite: how many needed it."""
+    L = np.empty(P.shape[1:])
+    repairs = 0
+    for j in range(len(P)):
+        if not sound(P[j], L) and np.isfinite(P[j]).all():
+            lift(P[j], L)
+            repairs += 1
+    return repairs
+
+
+@kernel
 def cholesky_lifted(S: FloatArray, L: FloatArray) -> bool:
     """`cholesky`, after lifting the diagonal of S in place until there is a factor."""
     share = LIFT

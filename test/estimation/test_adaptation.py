@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation import markov
-from sonar_imm.estimation.adaptation import AdaptiveChain, transition_posterior
+from sonar_imm.estimation.adaptation import (
+    adapt_counts,
+    AdaptiveChain,
+    corrected,
+    counts_correction,
+    transition_posterior,
+)
+from sonar_imm.estimation.adaptation_kernels import counts_transition, learn_counts
 
 PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
 
@@ -99,3 +106,46 @@ def test_the_posterior_of_transitions_has_the_right_margins():
 def test_an_unknown_form_is_named():
     with pytest.raises(ValueError, match='sticky'):
         AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'sticky')
+
+
+def test_the_ratio_form_unguarded_telescopes_as_the_docs_say():
+    """Whatever the chain said, a column ends up weighed by mu(k) / mu(0)."""
+    rng = np.random.default_rng(5)
+    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'ratio', guard=0.0)
+    learnt, mu = chain.fresh(1), simplex(rng, 6, 1)
+    for before, after in zip(mu[:-1], mu[1:]):
+        learnt = chain.learn(learnt, chain.transition(learnt, 1.0), before, after, 1.0)
+    P = PRIOR * mu[-1] / mu[0]
+    np.testing.assert_allclose(
+        chain.transition(learnt, 1.0)[0], P / P.sum(axis=1, keepdims=True), atol=1e-12
+    )
+
+
+def test_the_ratio_form_stands_models_that_were_impossible():
+    chain = AdaptiveChain(markov.RateChain(PRIOR, 1.0), 'ratio')
+    before, after = np.array([[1.0, 0.0, 0.0]]), np.array([[0.5, 0.5, 0.0]])
+    P = chain.transition(chain.learn(chain.fresh(1), PRIOR[None], before, after, 1.0), 1.0)[0]
+    np.testing.assert_allclose(P.sum(axis=1), 1.0)
+    assert (P >= 0.7 * PRIOR - 1e-12).all() and P[0, 1] > PRIOR[0, 1]
+
+
+@pytest.mark.parametrize('shared', [False, True])
+@pytest.mark.parametrize('M', [3, 8, 17])
+def test_the_kernels_of_counts_are_the_plain_forms(M, shared):
+    rng = np.random.default_rng(M)
+    nominal = rng.dirichlet(np.ones(M), M)
+    prior = rng.dirichlet(np.ones(M), M)
+    prior[0, 1] = nominal[0, 1] = 0.0
+    learnt = rng.uniform(0.0, 3.0, (5, 2, M, M))
+    learnt[:, :, 0, 1] = 0.0
+    want = corrected(nominal, counts_correction(learnt[:, 0], learnt[:, 1], prior, 2.0))
+    transition = counts_transition(nominal, learnt, prior, 2.0)
+    np.testing.assert_allclose(transition, want, rtol=1e-13)
+    transition = transition[:1] if shared else transition
+    before, after = rng.dirichlet(np.ones(M), (2, 5))
+    hit = np.array([0, 3])
+    found = learn_counts(learnt, hit, transition, before, after, nominal)
+    posterior = transition_posterior(transition, before, after)
+    want = np.stack(adapt_counts(learnt[:, 0], learnt[:, 1], posterior, nominal), axis=1)
+    np.testing.assert_allclose(found[hit], want[hit], rtol=1e-13)
+    np.testing.assert_array_equal(found[[1, 2, 4]], learnt[[1, 2, 4]])

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2, multivariate_normal
 
+from sonar_imm.estimation.association_kernels import choose
 from sonar_imm.estimation.association import (
     assign,
     assign_by_rank,
@@ -147,6 +148,26 @@ def test_ranks_choose_in_turn(seed, targets, detections):
         assert sum(table[t, d] for t, d in got) == pytest.approx(best)
         left = [d for d in left if d not in {d for _, d in got}]
     assert (chosen[rank < 0] == -1).all()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 5), st.integers(0, 5))
+def test_uncontested_choices_are_those_of_the_weighing(seed, targets, detections):
+    rng = np.random.default_rng(seed)
+    fit = np.where(
+        rng.uniform(size=(targets, detections)) < 0.3, rng.normal(size=(targets, detections)), -np.inf
+    )
+    tentative = rng.uniform(size=targets) < 0.5
+    pd, clutter = 0.9, 0.4
+    chosen, clear = choose(fit, tentative, np.log1p(-pd) - np.log(pd), np.log(clutter))
+    target, detection = np.nonzero(fit > -np.inf)
+    cost = association_cost(fit[target, detection], pd, clutter)
+    want = assign_by_rank(target, detection, cost, tentative.astype(np.int64), detections)
+    if clear:
+        np.testing.assert_array_equal(chosen, want)
+    else:  # then two worthwhile pairs do share a target or a detection
+        assert len(np.unique(target[cost < 0])) + len(np.unique(detection[cost < 0])) < 2 * np.sum(
+            cost < 0
+        )
 
 
 def test_association_cost_is_the_log_of_the_ratio_of_the_two_explanations():

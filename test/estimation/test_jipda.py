@@ -185,3 +185,42 @@ def test_without_a_detection_nothing_changes():
         x, P, c, h, H, z, R, np.empty((3, 0)), np.full(3, 0.4), np.zeros(3, bool)
     )
     assert all(np.array_equal(ours, theirs) for ours, theirs in zip(found, (x, P, c)))
+
+
+def test_pairs_outside_of_the_gate_are_left_out_alone():
+    """With a threshold the kernel gives what it gives without, wherever the nis is below."""
+    rng = np.random.default_rng(3)
+    x, P, c, h, H, z, R = problem(rng)
+    every, nis = jipda_kernels.likelihoods(h, H, P, c, z, R)
+    threshold = float(np.median(nis[np.isfinite(nis)]))
+    some, near = jipda_kernels.likelihoods(h, H, P, c, z, R, threshold)
+    inside = nis <= threshold
+    assert inside.any() and not inside.all()
+    np.testing.assert_array_equal(some[inside], every[inside])
+    np.testing.assert_array_equal(near[inside], nis[inside])
+    assert (near[~inside] > threshold).all()
+
+
+def test_the_nearest_older_track():
+    rng = np.random.default_rng(4)
+    T = 7
+    mean = rng.normal(size=(T, 2))
+    root = rng.normal(size=(T, 2, 2))
+    covariance = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(2)
+    ids, free, firm = rng.permutation(T), rng.uniform(size=T) < 0.8, rng.uniform(size=T) < 0.5
+    partner, distance = jipda_kernels.nearest_older(mean, covariance, ids, free, firm)
+    for t in range(T):
+        best = (np.inf, -1)
+        for u in range(T):
+            if free[t] and free[u] and ids[u] < ids[t] and (firm[u] or not firm[t]):
+                gap = mean[t] - mean[u]
+                now = gap @ np.linalg.solve(covariance[t] + covariance[u], gap)
+                best = min(best, (now, u))
+        assert partner[t] == best[1]
+        assert distance[t] == pytest.approx(best[0])
+
+
+def test_log_odds():
+    found = jipda_kernels.log_odds(np.array([0.0, 0.2, 0.9, 1.0]))
+    assert found[0] == -np.inf and np.isfinite(found[3])
+    np.testing.assert_allclose(found[1:3], np.log([0.25, 9.0]))

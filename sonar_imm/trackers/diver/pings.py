@@ -18,6 +18,7 @@ import numpy as np
 
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, EMISSION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.small_matrices import lift_all
 from ...estimation.student_t import DEGREES
 from ...measurements import Arrivals
 from .config import DiverConfig
@@ -91,13 +92,15 @@ class Ping(NamedTuple):
 
 class PingUpdate(NamedTuple):
     """A diver after a ping: x (M, n), P (M, n, n), mu (M,); good (C,): how sure each number is
-    this diver's; log_evidence, comparable between divers of the same ping."""
+    this diver's; log_evidence, comparable between divers of the same ping; repairs: covariances
+    repaired (`estimation.covariance`)."""
 
     x: FloatArray
     P: FloatArray
     mu: FloatArray
     good: FloatArray
     log_evidence: float
+    repairs: int
 
 
 def ping_numbers(
@@ -205,7 +208,7 @@ def update_by_ping(
     if ping.passive or ping.pairs > MOST_SUBSETS:
         starts = optima(ping, config)
         after = student_t_ping(x, P, mask, config.target_z, numbers, starts, DEGREES)
-        squared = (DEGREES + 1.0) / after[3] - DEGREES
+        squared = (DEGREES + 1.0) / np.maximum(after[3], 1e-300) - DEGREES
         good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
     else:
         eps = config.outlier_probability
@@ -218,12 +221,15 @@ def update_by_ping(
         return None
     share = np.exp(weight - best)
     updated = share / share.sum()
+    P = np.ascontiguousarray(after[1][:, :n, :n])
+    repairs = lift_all(P)
     return PingUpdate(
         np.ascontiguousarray(after[0][:, :n]),
-        np.ascontiguousarray(after[1][:, :n, :n]),
+        P,
         updated,
         updated @ good,
         float(best + np.log(share.sum())),
+        repairs,
     )
 
 
@@ -245,7 +251,9 @@ def begin_from_ping(
     at, covariance, evidence, _ = student_t_ping(
         x, P, mask, config.target_z, ping.numbers, position[None], DEGREES
     )
-    return at[:, :n], covariance[:, :n, :n], evidence
+    covariance = np.ascontiguousarray(covariance[:, :n, :n])
+    lift_all(covariance)
+    return at[:, :n], covariance, evidence
 
 
 def residuals(

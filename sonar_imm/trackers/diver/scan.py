@@ -19,6 +19,7 @@ from ...estimation.association import (
 )
 from ...estimation.association_kernels import choose, TENTATIVE
 from ...estimation.consider import consider_models
+from ...estimation.small_matrices import lift_all
 from ...measurements import Arrivals, NOBODY
 from . import fix_kernels
 from .config import DiverConfig
@@ -189,6 +190,7 @@ class Scan:
                 R[detection],
                 mask,
             )
+            self.repairs += sum(lift_all(one) for one in P)
             self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
             self.nis[tracks] += np.where(ok, nis, 0.0)
             self.nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
@@ -374,6 +376,7 @@ class Scan:
             self.nis[track] += float(residual @ np.linalg.solve(S, residual))
             self.nis_dof[track] += np.uint16(dof)
         self.x[track], self.P[track], self.mu[track] = after.x, after.P, after.mu
+        self.repairs += after.repairs
         if self.config.estimate_covariance_scale and (good & ping.echo).any():
             self._learn_from_ping(track, ping.compared(good & ping.echo), factor)
         return good

@@ -282,7 +282,8 @@ class DiverTracker:
         # All models of a copy begin alike: one of each is enough to ask.
         M = len(self.models.names)
         first = begin_from_ping(x[0, ::M], P[0, ::M], ping, birth.position, self.config, layout)
-        share = np.exp(first[2] - first[2].max())
+        known = np.isfinite(first[2]).any()
+        share = np.exp(first[2] - first[2].max()) if known else np.ones(len(first[2]))
         mu = mu * np.repeat(share / share.sum() * len(share), M)
         return np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None], mu
 

@@ -164,6 +164,89 @@ def test_bearings_across_half_a_turn_are_bearings(turn, learn_scale):
     assert same['scale_arrivals'] == pytest.approx(health['scale_arrivals'], rel=1e-5)
 
 
+def many_receivers(turn, elevation=False, scale=1.0, passive=False, seconds=40, **parameters):
+    """The estimates of a diver heard by eight receivers, with bearings, or elevations and a state
+    of depth; the scene turned about the first one by `turn` rad. The stated variances are those
+    of the errors divided by `scale`."""
+    rng = np.random.default_rng(21)
+    angle = 2.0 * np.pi * np.arange(7) / 7.0
+    rx = np.vstack([[0.0, 0.0], 60.0 * np.column_stack([np.cos(angle), np.sin(angle)])])
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    rx = np.column_stack([rx @ R.T, np.full(8, -2.0)])
+    tx = np.full(3, np.nan) if passive else rx[0]
+    tracker, estimates, divers = DiverTracker(DiverConfig(max_tracks=1, **parameters)), [], []
+    none = np.full(8, np.nan)
+    for second in range(1, seconds):
+        diver = np.append(R @ [70.0, 0.6 * second - 12.0], -9.0 if elevation else -2.0)
+        leg = diver - rx
+        r = np.linalg.norm(leg, axis=1)
+        path = r + (0.0 if passive else np.linalg.norm(diver - rx[0]))
+        path = path + 0.15 * rng.normal(size=8)
+        bearing = np.arctan2(leg[:, 1], leg[:, 0]) + 0.02 * rng.normal(size=8)
+        up = np.arctan2(leg[:, 2], np.hypot(leg[:, 0], leg[:, 1])) + 0.02 * rng.normal(size=8)
+        ping = Arrivals(
+            stamp_ns=second * SECOND,
+            tx_id=np.zeros(8),
+            rx_id=np.arange(8),
+            tx=np.tile(tx, (8, 1)),
+            rx=rx,
+            toa=path / 1500.0,
+            var_toa=np.full(8, (0.15 / 1500.0) ** 2 / scale),
+            bearing=none
+            if elevation or scale != 1.0
+            else np.mod(bearing + np.pi, 2 * np.pi) - np.pi,
+            var_bearing=np.full(8, 0.02**2),
+            elevation=up if elevation else none,
+            var_elevation=np.full(8, 0.02**2),
+            frame_id='map',
+        )
+        estimates.append(tracker.process(ping)[-1])
+        divers.append(diver)
+    return estimates, np.array(divers), tracker.health()
+
+
+@pytest.mark.parametrize('passive', [False, True])
+def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
+    """Eight receivers are more than subsets are tried of: heavy tails. Turned by pi, the diver
+    crosses the direction in which their bearings jump from pi to -pi."""
+    depth = {'target_z': -2.0, 'adaptation': 'fixed', 'passive': passive}
+    plain, divers, _ = many_receivers(0.0, **depth)
+    other, turned, _ = many_receivers(np.pi, **depth)
+    for one, two, diver in zip(plain[5:], other[5:], turned[5:]):
+        assert two.state[0, :2] == pytest.approx(-one.state[0, :2], abs=1e-5)
+        assert two.extras['nis_dof'].tolist() == one.extras['nis_dof'].tolist()
+        assert np.hypot(*(two.state[0, :2] - diver[:2])) < 0.6
+    with_bearing = np.mean([one.extras['nis_dof'][0] for one in plain[5:]])
+    assert with_bearing > (7 if passive else 8)  # more than the arrival times alone
+
+
+def test_elevations_show_the_depth():
+    """Two hundredths of a radian at 70 m are 1.4 m a receiver, and eight of them hear it."""
+    seen, divers, _ = many_receivers(0.0, elevation=True, dimensions=3)
+    error = np.array([one.state[0, :3] - diver for one, diver in zip(seen, divers)])[5:]
+    P = np.array([one.covariance[0, :3, :3] for one in seen])[5:]
+    nees = np.einsum('ka,ka->k', error, np.linalg.solve(P, error[..., None])[..., 0])
+    assert np.sqrt(np.mean(error[:, 2] ** 2)) < 0.5
+    assert np.sqrt(P[-1, 2, 2]) < 0.6 and 1.0 < nees.mean() < 6.0
+    unheard, _, _ = many_receivers(0.0, elevation=False, scale=1.01, dimensions=3)
+    assert np.sqrt(unheard[-1].covariance[0, 2, 2]) > 1.5 * np.sqrt(P[-1, 2, 2])
+
+
+@pytest.mark.parametrize('passive', [False, True])
+@pytest.mark.parametrize('scale', [1.01, 4.0])
+def test_the_scale_of_arrival_times_is_learnt(scale, passive):
+    """Arrivals of many receivers: what is stated is `scale` times too small a variance."""
+    found = many_receivers(
+        0.4,
+        scale=scale,
+        passive=passive,
+        seconds=120,
+        target_z=-2.0,
+        estimate_covariance_scale=True,
+    )[2]['scale_arrivals']
+    assert 0.75 * scale < found < 1.35 * scale
+
+
 def test_echoes_of_two_divers_at_each_receiver_are_told_apart():
     receivers = np.vstack([RECEIVERS, [[60.0, 70.0, 0.0]]])
     rng = np.random.default_rng(9)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation.covariance import sound
-from sonar_imm.measurements import Fix
+from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm.simulation.diver.simulator import RECEIVERS
 from sonar_imm.trackers.diver.config import MODEL_SETS
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -81,3 +82,46 @@ def test_ordinary_fixes_need_no_repair():
     for k in range(30):
         tracker.process(Fix(stamp_ns=(k + 1) * 10**9, position=np.array([0.4 * k, 0.0, 0.0])))
     assert tracker.health()['covariance_repairs'] == 0
+
+
+OFF = {'receiver_position_std': 1.0, 'receiver_clock_std': 5e-4, 'sound_speed_std': 5.0}
+
+
+def sharp_pings(seed, passive, count=12):
+    """Pings whose arrival times are good to 1e-11 s and worse, nanoseconds to seconds apart."""
+    rng = np.random.default_rng(seed)
+    stamp, tx = 10**9, np.full(3, np.nan) if passive else np.zeros(3)
+    for k in range(count):
+        diver = np.array([5.0 + 0.5 * k, 30.0, -6.0])
+        path = np.linalg.norm(diver - RECEIVERS, axis=1)
+        path += 0.0 if passive else np.linalg.norm(diver)
+        variance = 10.0 ** rng.uniform(-22, -7, size=4)
+        yield Arrivals(
+            stamp_ns=stamp,
+            tx_id=np.zeros(4),
+            rx_id=np.arange(4),
+            tx=np.tile(tx, (4, 1)),
+            rx=RECEIVERS,
+            toa=path / 1500.0 + np.sqrt(variance) * rng.normal(size=4),
+            var_toa=variance,
+            bearing=np.full(4, np.nan),
+            var_bearing=np.full(4, np.nan),
+        )
+        stamp += int(10 ** rng.uniform(0.0, 9.3))
+
+
+@pytest.mark.parametrize('passive', [False, True])
+@pytest.mark.parametrize(
+    'parameters',
+    [{}, {'dimensions': 3}, OFF, {**OFF, 'systematic_errors': 'estimate', 'dimensions': 3}],
+)
+def test_covariances_stay_sound_after_sharp_pings(parameters, passive):
+    """Before, a correlation had an eigenvalue of -7, and tracks of misplaced receivers broke."""
+    for seed in range(3):
+        tracker = DiverTracker(DiverConfig(max_tracks=1, **parameters))
+        for ping in sharp_pings(seed, passive):
+            for estimate in tracker.process(ping):
+                assert np.isfinite(estimate.state).all()
+                assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
+            assert sound(tracker._stream.state.P).all()
+        assert tracker.health()['broken_tracks'] == 0

@@ -150,7 +150,9 @@ def test_many_good_arrivals_outvote_any_prior():
     receivers = rng.uniform(-80.0, 80.0, (9, 3)) * [1.0, 1.0, 0.0]
     measurement = ping_of(np.array([20.0, 35.0, 0.0]), receivers, (np.nan,) * 3, rng=rng)
     numbers = ping_numbers(measurement, np.arange(9), config, 1.0, models, layout)
-    x, P, mu = (one[0] for one in models.new_tracks(np.array([[-30.0, 10.0]]), 25.0 * np.eye(2)[None]))
+    x, P, mu = (
+        one[0] for one in models.new_tracks(np.array([[-30.0, 10.0]]), 25.0 * np.eye(2)[None])
+    )
     after = update_by_ping(x, P, mu, numbers, config, layout)
     assert np.hypot(*(after.mu @ after.x[:, :2] - [20.0, 35.0])) < 1.0
     assert np.hypot(*(optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
@@ -163,7 +165,9 @@ def test_wild_echoes_only_leave_the_prediction():
     measurement = ping_of(np.array([20.0, 35.0, 0.0]))
     measurement = evolve(measurement, toa=measurement.toa + [0.02, 0.03, 0.025, 0.022])
     numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
-    x, P, mu = (one[0] for one in models.new_tracks(np.array([[20.0, 35.0]]), 0.25 * np.eye(2)[None]))
+    x, P, mu = (
+        one[0] for one in models.new_tracks(np.array([[20.0, 35.0]]), 0.25 * np.eye(2)[None])
+    )
     after = update_by_ping(x, P, mu, numbers, config, layout)
     assert (after.good < 1e-3).all()
     np.testing.assert_allclose(after.x, x, atol=0.01)
@@ -182,7 +186,12 @@ def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
     measurement = ping_of(v['truth'], v['rx'], tuple(v['tx']), sigma / 1500.0)
     measurement = evolve(measurement, toa=v['path'] / 1500.0)
     numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
-    x, P, mu = (one[0] for one in models.new_tracks(v['prior_mean'][None], float(v['prior_var']) * np.eye(2)[None], False))
+    x, P, mu = (
+        one[0]
+        for one in models.new_tracks(
+            v['prior_mean'][None], float(v['prior_var']) * np.eye(2)[None], False
+        )
+    )
     after = update_by_ping(x, P, mu, numbers, config, layout)
     mean = after.mu @ after.x
     spread = after.x - mean

@@ -1,0 +1,74 @@
+"""The kernels of fixes against the plain forms."""
+
+import numpy as np
+
+from sonar_imm.estimation import imm
+from sonar_imm.trackers.diver import fix_kernels
+
+T, M, N, D = 6, 3, 3, 8
+
+
+def problem(seed=0):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(T, M, N, N))
+    P = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(N)
+    E = np.zeros((1, M, 2, N))
+    E[:, :, 0, 0] = E[:, :, 1, 1] = 1.0
+    R = rng.normal(size=(D, 2, 2))
+    R = R @ np.swapaxes(R, -1, -2) + 0.2 * np.eye(2)
+    mu = rng.dirichlet(np.ones(M), T)
+    return rng.normal(size=(T, M, N)), P, mu, E, rng.normal(size=(D, 2)), R
+
+
+def test_taking_fixes_is_the_plain_update_of_those_tracks():
+    x, P, mu, H, z, R = problem()
+    h = fix_kernels.expected(x, H)
+    np.testing.assert_allclose(h, x[..., :2])
+    tracks, detection = np.array([4, 1]), np.array([0, 7])
+    v = z[detection][:, None] - h[tracks]
+    want = imm.update(x[tracks], P[tracks], mu[tracks], v, H, R[detection])
+    x1, P1, mu1 = x.copy(), P.copy(), mu.copy()
+    nis, dof = np.ones(T), np.ones(T, np.uint16)
+    repairs = fix_kernels.take(x1, P1, mu1, h, H, z, R, tracks, detection, nis, dof)
+    assert repairs == 0 and dof.tolist() == [1, 3, 1, 1, 3, 1]
+    np.testing.assert_allclose(nis[tracks], 1.0 + want.nis)
+    for got, plain, before in ((x1, want.x, x), (P1, want.P, P), (mu1, want.mu, mu)):
+        np.testing.assert_allclose(got[tracks], plain, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(np.delete(got, tracks, 0), np.delete(before, tracks, 0))
+
+
+def test_the_account_of_innovations():
+    x, P, mu, H, z, R = problem(1)
+    rng = np.random.default_rng(2)
+    tracks, detection = np.array([0, 2, 3, 5]), np.array([3, 1, 6, 0])
+    tentative = np.array([False, False, False, True, False, False])
+    white = rng.normal(size=(T, 2))
+    white[2] = np.nan  # never seen before
+    before, memory = white.copy(), 50.0
+    old = (49.0, 30.0, 40.0, 5.0, 35.0)
+    new = fix_kernels.watch(x, P, mu, H, z, R, tracks, detection, tentative, white, old, memory)
+    mean, covariance = imm.combine(x[tracks], P[tracks], mu[tracks], H[0])
+    root = np.linalg.cholesky(covariance + R[detection])
+    now = np.linalg.solve(root, (z[detection] - mean)[..., None])[..., 0]
+    np.testing.assert_allclose(white[tracks], now)
+    np.testing.assert_array_equal(np.delete(white, tracks, 0), np.delete(before, tracks, 0))
+    firm, paired = now[[0, 1, 3]], (now[[0, 3]], before[[0, 5]])
+    want = np.array(old) + [
+        3.0,
+        0.5 * np.sum(firm**2),
+        2.0,
+        np.sum(paired[0] * paired[1]),
+        0.5 * np.sum(paired[0] ** 2 + paired[1] ** 2),
+    ]
+    np.testing.assert_allclose(new, want * memory / want[0])
+
+
+def test_scores_and_numbers_that_are_not_finite():
+    score, chosen = np.zeros(3), np.array([1, -1, -1])
+    named = np.array([False, False, True])
+    fit = np.array([[0.0, -1.5], [0.0, 0.0], [0.0, 0.0]])
+    fix_kernels.keep_score(score, fit, chosen, named, -2.3, 2.2, -7.0)
+    np.testing.assert_allclose(score, [-2.3 - 1.5 + 2.2 + 7.0, -2.3, 0.0])
+    x, P = np.zeros((3, 2, 2)), np.zeros((3, 2, 2, 2))
+    x[1, 1, 0], P[2, 0, 1, 1] = np.nan, np.inf
+    assert fix_kernels.finite(x, P).tolist() == [True, False, False]
