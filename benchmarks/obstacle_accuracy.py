@@ -14,7 +14,9 @@ freed, 12 m to both sides. Every method holds obstacles for fixed (`behaviours: 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -126,20 +128,23 @@ def deferred_at(
     return [now - truth.vertical_offset[last], np.nan, np.nan]
 
 
-def case(name: str, runs: int) -> dict[str, dict[str, float]]:
-    """Every method of a case: RMSE, bias, NEES, coverage of the 90 % band at each range."""
+def case(
+    name: str, runs: int, scene_values: dict[str, Any], tracker_values: dict[str, Any]
+) -> dict[str, dict[str, float]]:
+    """Every method of a case: RMSE, bias, NEES, coverage of the 90 % band at each range. Values
+    given replace those of the scene and of the tracker."""
     results: dict[str, list[list[list[float] | None]]] = {method: [] for method in CASES[name]}
     for seed in range(runs):
-        setting = scenario(name, LEVER)
+        setting = scenario(name, {**LEVER, **scene_values})
         scene = simulate(setting, seed)
         for method, rows in results.items():
             if method != 'gaussian_sum' and seed >= runs // 3:
                 continue
             if method in ('deferred', 'refit'):
-                config = config_of(setting)
+                config = config_of(setting, **tracker_values)
                 rows.append([deferred_at(scene, config, at, method == 'refit') for at in RANGES])
             else:
-                final = track(scene, config_of(setting, method=method))
+                final = track(scene, config_of(setting, method=method, **tracker_values))
                 rows.append([offset_at(scene.truth[0], final, at) for at in RANGES])
     return {f'{name}, {method}': summary(rows) for method, rows in results.items()}
 
@@ -213,17 +218,29 @@ def ahead(truth: TrueObstacle, ping: int) -> bool:
     return bool(np.sqrt(max(r**2 - offset**2, 0.0)) * np.cos(truth.bearing[ping]) > 0.2 * r)
 
 
+def parsed(given: str) -> tuple[str, Any]:
+    """The name and the value, a number where it is one, of name=value."""
+    name, _, value = given.partition('=')
+    return name, json.loads(value) if value and value[0] in '-0123456789.tf[' else value
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--runs', type=int, default=300)
     parser.add_argument('--cases', nargs='*', choices=[*CASES, 'six'], default=[*CASES, 'six'])
+    parser.add_argument('--scene', nargs='*', default=[], help='name=value of the scene')
+    parser.add_argument('--tracker', nargs='*', default=[], help='name=value of the tracker')
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
+    changes = [dict(map(parsed, given)) for given in (options.scene, options.tracker)]
     tables: dict[str, dict[str, dict[str, float]]] = {}
     for name in options.cases:
-        tables[name] = several(options.runs // 3) if name == 'six' else case(name, options.runs)
+        if name == 'six':
+            tables[name] = several(options.runs // 3)
+        else:
+            tables[name] = case(name, options.runs, *changes)
         print(f'\n{markdown(tables[name], 2)}', flush=True)
     write_json(options.out, {'runs': options.runs, **tables})
 

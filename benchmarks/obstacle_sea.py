@@ -9,6 +9,7 @@ nearest, at most 5 m off; `lost` counts the runs without one. P is the mean prob
 behaviour at 30 m, v the RMSE of the velocity of each axis there.
 `velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
 while it is followed, begins to move or stops.
+`movers` has three movers in clutter at once, over their whole way.
 `calibration` compares stated probabilities of a collision with what happened, at 60, 40 and 25 m
 and for as many runs of a fixed, a swaying and a moving obstacle each: `over the beam` draws the
 vertical offset evenly over what the beam shows at the first ping, which is what the tracker
@@ -19,6 +20,7 @@ nothing but how often it happens.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ from benchmarks.obstacle_accuracy import (
 )
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
+from sonar_imm.evaluation.obstacle.scoring import score
+from sonar_imm.evaluation.obstacle.series import series_of, truth_of
 from sonar_imm.simulation.obstacle.scenario import SCENARIOS
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
@@ -143,7 +147,7 @@ def case(name: str, runs: int) -> dict[str, dict[str, float]]:
     kind, changes = CASES[name]
     setting = scenario(kind, {**LEVER, **changes})
     offsets: dict[str, list[list[list[float] | None]]] = {method: [] for method in METHODS}
-    told, tracks = [], dict.fromkeys(METHODS, 0)
+    does, tracks = [], dict.fromkeys(METHODS, 0)
     for seed in range(runs):
         scene = simulate(setting, seed)
         for method, values in METHODS.items():
@@ -157,19 +161,52 @@ def case(name: str, runs: int) -> dict[str, dict[str, float]]:
                 }
             )
             if method == 'all':
-                told.append(behaviour_at(scene.truth[0], final))
+                does.append(behaviour_at(scene.truth[0], final))
     table = {}
     for method, rows in offsets.items():
         table[f'{name}, {method}'] = {
             **{key: value for key, value in guarded(rows).items() if 'bias' not in key},
             'tracks per obstacle': tracks[method] / runs,
         }
-    known = np.array([one for one in told if one is not None])
+    known = np.array([one for one in does if one is not None])
     if len(known):
         mean = known.mean(axis=0)
         table[f'{name}, all'] |= {f'P {b}': float(mean[i]) for i, b in enumerate(BEHAVIOURS)}
         table[f'{name}, all']['v'] = float(np.sqrt(np.mean(known[:, 4:] ** 2)))
     return table
+
+
+def movers(runs: int) -> dict[str, dict[str, float]]:
+    """Three movers in clutter, as in the recording `obstacle_movers`, judged as a run is."""
+    setting = scenario('movers')
+    found = []
+    for seed in range(1, runs + 1):
+        scene = simulate(setting, seed)
+        final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
+        tables = [table for truth in scene.truth for table in told(truth)]
+        metrics, _ = score(series_of(final.values()), truth_of(tables), cutoff=NEAR, gap=60.0)
+        tracks = metrics['tracks']
+        found.append(
+            [
+                metrics['vertical_offset_near']['rmse_m'],
+                metrics['consistency']['band_coverage'],
+                metrics['consistency']['nees_offset']['mean'],
+                tracks['found_obstacles'] / tracks['true_obstacles'],
+                tracks['false_tracks'],
+                tracks['identity_switches'],
+            ]
+        )
+    names = ('RMSE within 50 m', 'cover', 'NEES', 'found', 'false tracks', 'switches')
+    return {
+        'mean': dict(zip(names, np.mean(found, axis=0).tolist())),
+        'median': dict(zip(names, np.median(found, axis=0).tolist())),
+    }
+
+
+def told(truth: TrueObstacle) -> Iterator[Estimate]:
+    """The truth of an obstacle as `evaluate` reads it from a recording."""
+    for table in truth.tables('odom'):
+        yield Estimate.from_columns(table.columns, stamp_ns=table.stamp_ns)
 
 
 def happened(truth: TrueObstacle, ping: int, radius: float, height: float) -> bool:
@@ -241,13 +278,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--runs', type=int, default=100)
-    every = [*CASES, 'velocity', *(f'calibration, {name}' for name in DRAWN)]
+    every = [*CASES, 'velocity', 'movers', *(f'calibration, {name}' for name in DRAWN)]
     parser.add_argument('--cases', nargs='*', choices=every, default=every)
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
     tables: dict[str, Any] = {}
     for name in options.cases:
-        if name == 'velocity':
+        if name == 'movers':
+            tables[name] = movers(options.runs)
+            parts = [tables[name]]
+        elif name == 'velocity':
             tables[name] = velocity(options.runs)
             parts = [{row: values} for row, values in tables[name].items()]
         elif name not in CASES:

@@ -1,10 +1,15 @@
-"""Draw docs/images/obstacle_offset.png from runs: python docs/draw_obstacle.py
+"""Draw the pictures of docs/obstacle.md from runs: python docs/draw_obstacle.py
+
+obstacle_offset.png   the offset while the range closes, and the deferred estimate
+obstacle_paper.png    the paper's Figures 3, 4 and 5 from our scenes; the distributions are those
+                      of docs/results/obstacle_section5.json (benchmarks.obstacle_section5)
 
 Needs matplotlib, which nothing else here does. Run it from the project root.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import sys
 
@@ -19,13 +24,17 @@ from matplotlib import pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
+from benchmarks.obstacle_section5 import echoes, encounter, OFFSETS, read  # noqa: E402
+from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
-from sonar_imm.measurements import Detections, Navigation  # noqa: E402
+from sonar_imm.measurements import Altitude, Detections, Navigation  # noqa: E402
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
 from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: E402
 
-OUT = ROOT / 'docs' / 'images' / 'obstacle_offset.png'
+OUT = ROOT / 'docs' / 'images'
+SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'
+COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN)
 SEED = 3
 
 
@@ -36,7 +45,12 @@ def main() -> None:
     draw_band(axes[1], 'calm', 'calm: roll 0.3 deg rms')
     axes[0].set_ylabel('vertical offset, m below the sonar')
     draw_curves(axes[2])
-    figure.savefig(OUT, dpi=130)
+    figure.savefig(OUT / 'obstacle_offset.png', dpi=130)
+    figure, axes = plt.subplots(2, 3, figsize=(11.0, 6.8), layout='constrained')
+    draw_sphere(*axes[:, 0])
+    draw_image(*axes[:, 1])
+    draw_readings(*axes[:, 2])
+    figure.savefig(OUT / 'obstacle_paper.png', dpi=130)
 
 
 def draw_band(ax: Axes, name: str, title: str) -> None:
@@ -88,6 +102,116 @@ def draw_curves(ax: Axes) -> None:
         ylim=(0.0, 8.0),
     )
     ax.legend(frameon=False)
+
+
+def draw_sphere(above: Axes, below: Axes) -> None:
+    """Figure 3: the altitude ping by ping, and where echoes are measured and predicted."""
+    setting, scene = encounter('sphere', {}, SEED)
+    z, poses = echoes(setting, scene)
+    z = read(z, 'by eye', SEED)
+    found = deferred(z, poses, config_of(setting), offsets=OFFSETS)
+    ping = np.arange(len(z))
+    heights = [one.measurement for one in scene.measurements]
+    heights = [one for one in heights if isinstance(one, Altitude)]
+    # An altitude every half second, as often as a ping.
+    altitude = np.array([one.altitude for one in heights])[: len(z)]
+    above.plot(ping[: len(altitude)], altitude, color=INK, lw=1, label='vehicle, altimeter')
+    floor = setting.depth + setting.altitude
+    estimated = floor - poses.position[0, 2] - found.best
+    above.axhline(estimated, color=BLUE, label='sphere, by the deferred estimate')
+    true = floor + scene.truth[0].position[0, 2]
+    above.axhline(true, color=BLUE, ls='--', lw=1, label='sphere, true')
+    above.set(title='Figure 3: a moored sphere', xlabel='ping', ylabel='above the sea floor, m')
+    above.legend(frameon=False, loc='lower left')
+    above.set_ylim(22.0, 26.5)
+    first = Pose(poses.position[0], poses.R[0])
+    for offset, colour, label in (
+        (found.best, BLUE, f'predicted, {found.best:.1f} m below'),
+        (setting.altitude, RED, 'predicted, on the sea floor'),
+    ):
+        m = geometry.to_world(first, geometry.reconstruct(*z[0], offset, first.R))
+        _, azimuth = geometry.project(geometry.to_body(poses, m))
+        below.plot(ping, np.degrees(azimuth), color=colour, label=label)
+    below.plot(ping, np.degrees(z[:, 1]), '.', color=INK, ms=3, label='measured')
+    below.set(xlabel='ping', ylabel='azimuth, deg to starboard')
+    below.legend(frameon=False, loc='lower left')
+
+
+def draw_image(above: Axes, below: Axes) -> None:
+    """Figure 4: a large obstacle, three floats, their chains and a bar. Not an image but the
+    detections that one ping of our scene gives, and those of a whole approach."""
+    setting, scene = encounter('large', {}, SEED)
+    _, poses = echoes(setting, scene)
+    middle = geometry.flip_world(scene.truth[0].position[0])
+    course = np.arctan2(*(poses.position[-1] - poses.position[0])[1::-1])
+    across = np.array([-np.sin(course), np.cos(course), 0.0])
+    rng = np.random.default_rng(SEED)
+    parts: list[tuple[str, str, np.ndarray]] = []
+    floats = [middle + side * across - [0.0, 0.0, 4.0] for side in (-5.0, 0.0, 5.0)]
+    parts.append(('floats', RED, np.array(floats)))
+    down = np.arange(1.0, 9.0, 0.5)[:, None] * [0.0, 0.0, 1.0]
+    parts.append(('chains', BLUE, np.concatenate([one + down for one in floats])))
+    bar = middle + [0.0, 0.0, 5.0] + np.arange(-5.0, 5.1, 0.5)[:, None] * across
+    parts.append(('bar', GREEN, bar))
+    one = 40
+    for ax, pings in ((above, [one]), (below, range(0, len(poses.position), 4))):
+        for name, colour, points in parts:
+            seen = []
+            for k in pings:
+                at = Pose(poses.position[k], poses.R[k])
+                d, azimuth = geometry.project(geometry.to_body(at, points))
+                # A chain echoes where it stands across the beam, here and there.
+                echoing = rng.uniform(size=len(points)) < (0.9 if name == 'floats' else 0.4)
+                d = d + rng.normal(0.0, 0.15, len(d))
+                azimuth = azimuth + rng.normal(0.0, np.radians(0.25), len(d))
+                seen.append(np.column_stack([azimuth, d])[echoing])
+            azimuth, d = np.concatenate(seen).T
+            ax.plot(d * np.sin(azimuth), d * np.cos(azimuth), '.', color=colour, ms=4, label=name)
+        edge = np.radians(22.5)
+        ax.plot([0.0, 100 * np.sin(edge)], [0.0, 100 * np.cos(edge)], color=INK, lw=0.5)
+        ax.plot([0.0, -100 * np.sin(edge)], [0.0, 100 * np.cos(edge)], color=INK, lw=0.5)
+        ax.set(xlim=(-25.0, 25.0), xlabel='m to starboard', ylabel='m ahead')
+    above.set(title='Figure 4: detections of a large obstacle', ylim=(50.0, 85.0))
+    below.set(ylim=(40.0, 100.0))
+    above.text(-24.0, 51.0, f'ping {one}')
+    below.text(-24.0, 41.5, 'every fourth ping')
+    above.legend(frameon=False, loc='upper right')
+
+
+def draw_readings(above: Axes, below: Axes) -> None:
+    """Figure 5: RMSD by eye and by a noisy detector, and what a single such number is worth."""
+    told = json.loads(SECTION5.read_text(encoding='utf-8'))['large']['estimates']
+    # One encounter that reads as the paper's did: 8 m by eye, 11 m by the detector.
+    off = np.abs(np.array(told['by eye']) - 8.0) + np.abs(np.array(told['noisy detector']) - 11.0)
+    seed = int(np.argmin(off))
+    setting, scene = encounter('large', {}, seed)
+    z, poses = echoes(setting, scene)
+    for name, colour in (('by eye', BLUE), ('noisy detector', '#CC79A7')):
+        found = deferred(read(z, name, seed), poses, config_of(setting), offsets=OFFSETS)
+        above.plot(found.offset, found.rmsd, color=colour, label=f'{name}: {found.best:.1f} m')
+        above.plot(found.best, found.least, 'o', color=colour)
+    above.axvline(8.0, color=INK, ls='--', lw=1)
+    above.set(
+        title=f'Figure 5: one encounter of {len(told["by eye"])}, chosen',
+        xlabel='offset tried, m below the sonar',
+        ylabel='RMSD, pixels',
+        ylim=(0.0, None),
+    )
+    above.legend(frameon=False)
+    for row, values in enumerate(told.values()):
+        low, middle, high = np.percentile(values, [5.0, 50.0, 95.0])
+        spread = np.random.default_rng(row).uniform(-0.25, 0.25, len(values))
+        below.plot(values, row + spread, '.', ms=2, color=COLOURS[row], alpha=0.5)
+        below.plot([low, high], [row, row], color=COLOURS[row], lw=2)
+        below.plot(middle, row, 'o', color=COLOURS[row])
+    below.axvline(8.0, color=INK, ls='--', lw=1)
+    below.axvline(11.0, color=INK, ls=':', lw=1)
+    below.set(
+        yticks=range(len(told)),
+        yticklabels=list(told),
+        xlabel='deferred estimate, m',
+    )
+    below.invert_yaxis()
 
 
 if __name__ == '__main__':

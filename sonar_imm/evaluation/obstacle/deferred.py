@@ -25,7 +25,9 @@ LEAST_ECHOES = 5
 
 @frozen(eq=False, kw_only=True)
 class DeferredEstimates:
-    """Both deferred curves of one track, and what to compare them with.
+    """The deferred curves of one track, and what to compare them with: `plain`, RMSD below the
+    sonar as the paper has it; `both`, RMSD on both sides; `refit`, both sides with first echo and
+    scale refitted.
 
     All offsets hold at the first echo of the track, m below the sonar, NaN when unknown. `truth`;
     `online` and `band`: what the tracker says at its last echo; `altitude`: of the vehicle above
@@ -35,6 +37,7 @@ class DeferredEstimates:
     track_id: int
     echoes: int
     plain: Deferred
+    both: Deferred
     refit: Deferred
     online: float
     band: tuple[float, float]
@@ -47,6 +50,7 @@ class DeferredEstimates:
             'track_id': self.track_id,
             'echoes': self.echoes,
             'rmsd_m': self.plain.best,
+            'rmsd_both_sides_m': self.both.best,
             'refit_m': self.refit.best,
             'online_m': self.online,
             'altitude_m': self.altitude,
@@ -55,6 +59,7 @@ class DeferredEstimates:
             result |= {
                 'truth_m': self.truth,
                 'rmsd_error_m': self.plain.best - self.truth,
+                'rmsd_both_sides_error_m': self.both.best - self.truth,
                 'refit_error_m': self.refit.best - self.truth,
                 'online_error_m': self.online - self.truth,
             }
@@ -97,7 +102,8 @@ def deferred_estimates(
         track_id=track_id,
         echoes=len(rows),
         plain=deferred(z, at, config),
-        refit=deferred(z, at, config, refit=True),
+        both=deferred(z, at, config, both_sides=True),
+        refit=deferred(z, at, config, both_sides=True, refit=True),
         online=float(track.state[last, 2]) + sunk,
         band=(float(track.low[last]) + sunk, float(track.high[last]) + sunk),
         altitude=min(heights, key=lambda one: abs(one.stamp_ns - int(first[0]))).altitude

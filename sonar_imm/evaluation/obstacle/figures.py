@@ -98,9 +98,10 @@ def image_figure(
 
 
 def rmsd_figure(deferred: DeferredEstimates) -> go.Figure:
-    """The paper's Figure 3: RMSD against the assumed offset, or the height above the floor."""
+    """RMSD against the assumed offset, as in the paper's Figure 5."""
     figure = go.Figure()
     for curve, name, colour in (
+        (deferred.both, 'RMSD, both sides', COLOURS[1]),
         (deferred.plain, 'RMSD, as the paper', COLOURS[0]),
         (deferred.refit, 'first echo and scale refitted', COLOURS[2]),
     ):

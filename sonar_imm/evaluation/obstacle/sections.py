@@ -127,7 +127,8 @@ def _sections(material: Material) -> list[Section]:
             Section(
                 f'Deferred estimate: RMSD of track {material.deferred.track_id}',
                 'The paper estimates the offset afterwards, from all echoes of the track. The '
-                'curve shows how badly each assumed offset explains them. Diamonds: least RMSD.',
+                'curve shows how badly each assumed offset explains them. Diamonds: least RMSD. '
+                'The paper looks below the sonar alone; a single such number is worth some 4 m.',
                 figures.rmsd_figure(material.deferred),
             )
         )

@@ -8,6 +8,8 @@ from typing import Any
 from ..numbers import chi2_line, error_line
 from .scoring import NEAR
 
+_DEFERRED = ('online', 'rmsd', 'rmsd_both_sides', 'refit')
+
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
@@ -80,8 +82,8 @@ def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
     if deferred := metrics.get('deferred'):
         result.append(
             (
-                'vertical offset: online / RMSD / refitted',
-                ' / '.join(f'{deferred[name]:+.2f}' for name in ('online_m', 'rmsd_m', 'refit_m'))
+                'vertical offset: online / RMSD / of both sides / refitted',
+                ' / '.join(f'{deferred[f"{name}_m"]:+.2f}' for name in _DEFERRED)
                 + ' m'
                 + (f', truth {deferred["truth_m"]:+.2f} m' if 'truth_m' in deferred else ''),
             )

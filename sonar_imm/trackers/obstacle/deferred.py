@@ -5,7 +5,10 @@ every later echo. The deferred estimate is the d_st whose echoes come nearest to
 
     argmin over d_st of  RMSD = sqrt(mean((dd / step_d)^2 + (ddelta / step_delta)^2)),     eq. (8)
 
-with the pixels of the sonar image as units. It hangs on the error of the first echo; `refit` frees
+with the pixels of the sonar image as units. (1), which turns an echo and an offset into a point,
+and (8) are lost in the copies of the paper that we know; both are reconstructed from what the text
+says of them. The paper looks for offsets below the sonar, which is the default; `both_sides` looks
+above it too. The estimate hangs on the error of the first echo; `refit` frees
 range and azimuth of the first echo and the scale of the navigation for each d_st, which brings it
 close to what the tracker does online.
 """
@@ -65,19 +68,20 @@ def deferred(
     config: ObstacleConfig,
     *,
     offsets: FloatArray | None = None,
+    both_sides: bool = False,
     refit: bool = False,
 ) -> Deferred:
     """The deferred estimate from one obstacle's echoes.
 
     z (N, 2): range and azimuth (to starboard), N >= 2; poses: of the sonar, (N,); offsets (G,):
-    where to draw the curve, by default every 0.25 m over what a beam can hold. The minimum is
-    found to a micrometre between them.
+    where to draw the curve, by default every 0.25 m over what a beam can hold, below the sonar or
+    on both sides. The minimum is found to a micrometre between them.
     """
     if len(z) < 2:
         raise ValueError('a deferred estimate needs two echoes at least')
     if offsets is None:
         reach = 0.25 * np.ceil(4.0 * z[0, 0] * np.sin(np.radians(0.8 * config.vertical_fov_deg)))
-        offsets = np.arange(-reach, reach + 0.125, 0.25)
+        offsets = np.arange(-reach if both_sides else 0.0, reach + 0.125, 0.25)
     curve = _rmsd(offsets, z, poses, config, refit)
     if not np.isfinite(curve).any():
         return Deferred(offsets, curve, np.nan, np.nan)

@@ -61,6 +61,34 @@ def test_movers_that_cross_keep_their_tracks():
         assert min(np.linalg.norm(np.array(stated) - one) for one in true) < 0.1
 
 
+def test_crossing_in_clutter_while_another_is_born():
+    """Nothing is given: echoes are missed, three in a ping are false, and a third obstacle comes
+    into view when the two pass each other."""
+    from helpers.obstacle_crossing import crossing
+
+    estimates, true = crossing(detected=0.9, clutter=3.0, late=30)
+
+    def confirmed(estimate):
+        return set(estimate.extras['track_id'][estimate.extras['track_state'] > 0].tolist())
+
+    two = confirmed(estimates[25])
+    assert len(two) == 2
+    assert sum(two <= confirmed(one) for one in estimates[25:]) == len(estimates[25:])
+    born = confirmed(estimates[50]) - two
+    assert len(born) == 1
+    last = estimates[-1]
+    known = two | born
+    assert len(confirmed(last) - known) <= 1
+    stated = {
+        int(number): np.array([vx, vy])
+        for number, vx, vy in zip(*(last.extras[name] for name in ('track_id', 'vx', 'vy')))
+        if number in known
+    }
+    assert np.linalg.norm(stated[born.pop()] - true[2]) < 0.05
+    north = sorted(v[1] for number, v in stated.items() if number in two)
+    assert north == pytest.approx([-0.5, 0.5], abs=0.1)
+
+
 def test_a_drifting_navigation_is_said():
     """The ground moves under a log that measures against the water: all obstacles move alike."""
     drift = np.array([0.3, 0.1, 0.0])

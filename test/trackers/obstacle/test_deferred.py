@@ -1,5 +1,7 @@
 """The deferred estimate of the paper on approaches computed elsewhere."""
 
+from pathlib import Path
+
 from helpers.obstacle_runs import approach, lever, meta, rows
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig
 
+SECTION5 = Path(__file__).parents[2] / 'vectors' / 'obstacle_sea' / 'paper_section5.npz'
 GRID = np.arange(-12.0, 12.025, 0.05)
 NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')
 
@@ -57,8 +60,8 @@ def test_refitting_the_first_echo_helps():
     """The paper's open loop hangs on the error of one echo: 6 m for 3 m here."""
     true = meta('approach_dst+3_noisy')['dst_first_ping']
     series = echoes('approach_dst+3_noisy')
-    assert abs(deferred(*series).best - true) > 2.5
-    assert abs(deferred(*series, refit=True).best - true) < 1.0
+    assert abs(deferred(*series, both_sides=True).best - true) > 2.5
+    assert abs(deferred(*series, both_sides=True, refit=True).best - true) < 1.0
 
 
 def test_poses_are_not_invented():
@@ -84,3 +87,24 @@ def test_what_cannot_be():
     nowhere = deferred(z, poses, config, offsets=np.array([150.0, 200.0]))
     assert np.isnan(nowhere.best) and np.isnan(nowhere.rmsd).all()
     assert len(rows(NOISE_FREE[0])) > len(z)
+
+
+def test_the_paper_looks_below_the_sonar_alone():
+    z, poses, config = echoes('approach_level_mirror_noisy')
+    below, both = deferred(z, poses, config), deferred(z, poses, config, both_sides=True)
+    assert below.offset[0] == 0.0 and both.offset[0] == -both.offset[-1]
+    np.testing.assert_array_equal(both.rmsd[-len(below.rmsd) :], below.rmsd)
+
+
+@pytest.mark.parametrize('body', ['large', 'sphere'])
+@pytest.mark.parametrize('echo', ['hand', 'noisy'])
+def test_curves_of_the_papers_encounters(body, echo):
+    """The same pings read by eye and by a noisy detector: curves computed elsewhere."""
+    with np.load(SECTION5) as file:
+        told = {key.removeprefix(f'{body}/'): file[key] for key in file.files if body in key}
+    z = np.column_stack([told[f'{echo}_range'], told[f'{echo}_azimuth']])
+    seen = np.isfinite(z).all(axis=1)
+    poses = Pose(told['sonar_p_ned'][seen], told['sonar_R_ned'][seen])
+    found = deferred(z[seen], poses, ObstacleConfig(), offsets=told['d_st'])
+    np.testing.assert_allclose(found.rmsd, told[f'{echo}_rmsd'], rtol=1e-9)
+    assert found.best == pytest.approx(float(told[f'{echo}_estimate']), abs=0.05)
