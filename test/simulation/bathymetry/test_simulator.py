@@ -4,7 +4,8 @@ import pytest
 from sonar_imm.acoustics import array, coherence, variances
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate, snr
+from sonar_imm.simulation.bathymetry.hearing import snr
+from sonar_imm.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate
 
 
 def run(name='paper', seed=1, **overrides):
