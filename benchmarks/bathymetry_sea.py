@@ -38,6 +38,12 @@ def unknown(height: float) -> dict[str, Any]:
     return {**APART, 'sonar_height': height, 'first_range': 5.0}
 
 
+EXACT = {**GRID, 'smoothing': 'states', 'sigmas': [0.01, 0.7]}
+LOUD = {'snr_far_db': 30.0}
+EXACT_NAVIGATION = {
+    f'nav_{what}': 0.0
+    for what in ('attitude_error_deg', 'heading_error_deg', 'heave_error', 'position_error')
+}
 TOLD = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
 
 # Name: scenario, what it changes, parameters beside those of the instruments.
@@ -56,6 +62,16 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     'summer profile ignored': ('moving_profile', APART, {**GRID, 'sound_speed_profile': []}),
     'height 10 m, told 15, grid': ('moving', unknown(10.0), {**TOLD, **GRID}),
     'height 10 m, told 15, particles': ('moving', unknown(10.0), TOLD),
+    'height 10 m, told 10, grid': (
+        'moving',
+        unknown(10.0),
+        {**GRID, 'sonar_height': 10.0, 'initial_std': 1.0},
+    ),
+    'height 10 m, told 15, grid, exact navigation': (
+        'moving',
+        {**unknown(10.0), **EXACT_NAVIGATION},
+        {**TOLD, **GRID},
+    ),
     'height 20 m, told 15, grid': ('moving', unknown(20.0), {**TOLD, **GRID}),
     'height 20 m, told 15, particles': ('moving', unknown(20.0), TOLD),
     'nadir, angles, drift, grid': ('paper', NADIR, {**ANGLES, **GRID}),
@@ -87,6 +103,22 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     ),
     'labels, slope .1, bank': ('slope', {}, BANK),
     'labels, slope .05, bank': ('slope', {'slope': 0.05}, BANK),
+    'labels, slope .07, bank': ('slope', {'slope': 0.07}, BANK),
+    'labels, slope .1, bank, 30 dB everywhere': ('slope', LOUD, BANK),
+    'labels, undulation .5 m in 15 m, bank, 30 dB everywhere': ('undulating', LOUD, BANK),
+    **{
+        f'coupling {strength:g}': ('moving', {}, {**EXACT, 'ping_coupling': strength})
+        for strength in (0.0, 0.15, 0.35, 0.7)
+    },
+    **{
+        f'staves 2, {spacing:g} wavelengths, {share:.0%} differ, told {told:.0%}': (
+            'paper',
+            {'staves': 2, 'spacing_wavelengths': spacing, 'decorrelation': share},
+            {**GRID, 'decorrelation': told},
+        )
+        for spacing in (0.5, 3.66)
+        for share, told in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.05), (0.2, 0.0), (0.2, 0.2))
+    },
 }
 
 
@@ -103,6 +135,7 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     estimates = [
         estimate for item in scene.measurements for estimate in tracker.process(item.measurement)
     ]
+    estimates += tracker.finish()
     records = [record for true in scene.truth for record in records_of(true, '')]
     truth = [read_estimate(message) for _, _, message in records]
     swath = profiles_of(estimates, truth)
@@ -133,6 +166,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--only', default='', help='cases whose name begins so')
     parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
+    parser.add_argument('--keep', action='store_true', help='keep what is in --out beside them')
     options = parser.parse_args()
     print(f'{options.pings} pings, seed {options.seed}')
     print(f'{"":42}{"all":>8}{"patch":>8}{"within":>8}{"iou":>8}{"lost":>6}')
@@ -144,6 +178,12 @@ def main() -> None:
         names = ('rmse_m', 'patch_rmse_m', 'inside_two_sd', 'iou')
         cells = ''.join(f'{row[column]:8.3f}' for column in names)
         print(f'{name:42}{cells}{row["lost_pings"]:6d}', flush=True)
+    if options.out and options.keep:
+        before = json.loads(options.out.read_text())
+        if (before['pings'], before['seed']) != (options.pings, options.seed):
+            parser.error('the file is of another run')
+        results = {**before['cases'], **results}
+        results = {name: results[name] for name in CASES if name in results}
     if options.out:
         run_of = {'pings': options.pings, 'seed': options.seed, 'cases': results}
         options.out.write_text(json.dumps(run_of, indent=2) + '\n')

@@ -1,10 +1,12 @@
-"""Draw the figures of docs/bathymetry.md from a run: python docs/draw_bathymetry.py
+"""Draw the figures of docs/bathymetry.md from runs: python docs/draw_bathymetry.py
 
-Needs matplotlib, which nothing else here does. Run it from the project root.
+The pictures of the paper are at the paper's settings, `variant: paper`. Needs matplotlib, which
+nothing else here does. Run it from the project root.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 import sys
@@ -19,7 +21,10 @@ sys.path.insert(0, str(ROOT))
 from matplotlib import pyplot as plt  # noqa: E402
 
 from sonar_imm.acoustics import array, spatial  # noqa: E402
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate, snr  # noqa: E402
+from sonar_imm.simulation.bathymetry.hearing import snr  # noqa: E402
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate  # noqa: E402
+from sonar_imm.trackers.bathymetry.engines import run_particles  # noqa: E402
+from sonar_imm.trackers.bathymetry.ping import look, Ping  # noqa: E402
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'
@@ -29,6 +34,14 @@ SETS = {
     'height_two_rw': {'sigmas': (0.01, 0.5)},
     'angle_two_rw': {'model_set': 'angle_two_rw'},
 }
+AS_PRINTED = {
+    'RW and NCS': {'variant': 'paper', 'model_set': 'height_rw_ncs'},
+    'two RW': {'variant': 'paper', 'model_set': 'height_two_rw'},
+}
+ANGLES = {'variant': 'paper', 'model_set': 'angle_two_rw'}
+SHADOW = (35.0, 36.0)
+"""Slant ranges of the discontinuity in the picture of particle clouds, m."""
+CLOUDS_AT = (20.0, 35.5, 45.0, 70.0)
 
 
 def main() -> None:
@@ -40,13 +53,21 @@ def main() -> None:
         name: BathymetryTracker(BathymetryConfig(**values)).process(ping)[0]
         for name, values in SETS.items()
     }
+    printed = {
+        name: BathymetryTracker(BathymetryConfig(**values)).process(ping)[0]
+        for name, values in AS_PRINTED.items()
+    }
+    angles = BathymetryTracker(BathymetryConfig(**ANGLES)).process(ping)[0]
     draw_scene(config, truth)
-    draw_spectra(ping, truth, runs['height_two_rw'])
+    draw_spectra(ping, truth, printed, angles)
     draw_profile(ping, truth, runs)
+    draw_clouds()
+    draw_sensitivity()
 
 
-def save(figure, name: str) -> None:
-    figure.tight_layout()
+def save(figure, name: str, *, tight: bool = True) -> None:
+    if tight:
+        figure.tight_layout()
     figure.savefig(IMAGES / name, dpi=80, pil_kwargs={'optimize': True})
     print(IMAGES / name)
 
@@ -66,38 +87,119 @@ def draw_scene(config, truth) -> None:
     save(figure, 'bathymetry_scene.png')
 
 
-def draw_spectra(ping, truth, estimate) -> None:
-    """Figures 2 and 3: pseudo-spectra, what they find alone, and what the filter finds."""
-    figure, axes = plt.subplots(2, 1, figsize=(9, 6.4), sharex=True)
+def draw_spectra(ping, truth, printed, angles) -> None:
+    """Figures 2 to 4: pseudo-spectra, what they find alone, what the filter finds, and the
+    probabilities of its models, all at the paper's settings."""
+    figure, axes = plt.subplots(
+        4, 1, figsize=(9, 10), sharex=True, height_ratios=(2, 1, 2, 1), layout='constrained'
+    )
+    spectrum(axes[0], ping, truth, 'music', printed['RW and NCS'])
+    for colour, (name, estimate) in zip((RED, BLUE), printed.items()):
+        rough = estimate.probabilities[:, 0 if name == 'RW and NCS' else 1]
+        axes[1].plot(ping.range, rough, color=colour, linewidth=0.9, label=name)
+    axes[1].set(ylabel='P(rough)', title='heights: the random walk of 1 m')
+    spectrum(axes[2], ping, truth, 'capon', angles)
+    for model, colour, name in ((0, BLUE, '0.1 deg'), (1, RED, '0.1 to 2 deg')):
+        axes[3].plot(
+            ping.range, angles.probabilities[:, model], color=colour, linewidth=0.9, label=name
+        )
+    axes[3].set(ylabel='probability', title='angles: both random walks')
+    for axis in (axes[1], axes[3]):
+        axis.axvspan(40, 50, color=AMBER, alpha=0.15)
+        axis.legend(loc='upper right', fontsize=8)
+    axes[-1].set_xlabel('slant range [m]')
+    save(figure, 'bathymetry_spectra.png', tight=False)
+
+
+def spectrum(axis, ping, truth, method, estimate) -> None:
     largest = array.largest_sine(0.5)
     grid = np.linspace(-largest, largest, 361)
     degrees = np.degrees(np.arcsin(grid))
-    for axis, method in zip(axes, ('music', 'capon')):
-        power = spatial.ping_spectrum(ping.iq, grid, 0.5, method=method)
-        decibels = 10 * np.log10(power / power.max(axis=1, keepdims=True))
-        axis.pcolormesh(
-            ping.range, degrees, decibels.T, vmin=-25, vmax=0, cmap='Greys_r', rasterized=True
+    power = spatial.ping_spectrum(ping.iq, grid, 0.5, method=method)
+    decibels = 10 * np.log10(power / power.max(axis=1, keepdims=True))
+    axis.pcolormesh(
+        ping.range, degrees, decibels.T, vmin=-25, vmax=0, cmap='Greys_r', rasterized=True
+    )
+    alone = np.degrees(np.arcsin(spatial.peak_sines(power, grid)))
+    axis.plot(ping.range, alone, '.', color=AMBER, markersize=2, label=f'{method} alone')
+    axis.plot(truth.range, np.degrees(truth.angle), color='white', linewidth=0.6, label='truth')
+    found = columns(estimate)['angle']
+    axis.plot(ping.range, np.degrees(found), color=RED, linewidth=1.0, label='particle filter')
+    axis.set(ylim=(-30, 35), ylabel='angle [deg]', title=method)
+    axis.legend(loc='upper right', fontsize=8, facecolor='0.85')
+
+
+def draw_clouds() -> None:
+    """Figure 5: the particles of both models along the ping and at four ranges, and what becomes
+    of them at a discontinuity."""
+    config = scenario('paper', {'pings': 1, 'shadows': SHADOW})
+    scene = simulate(config, 1)
+    ping, truth = scene.measurements[0].measurement, scene.truth[0]
+    seen = look(Ping(BathymetryConfig(**ANGLES), ping, None))
+    clouds = []
+
+    def watch(_bin, particles) -> None:
+        clouds.append(np.degrees(particles.x[:, 0].copy()))
+
+    track = run_particles(
+        seen.models, seen.likelihood, 100, (0, ping.stamp_ns, 0), resample=True, watch=watch
+    )
+    x = np.array(clouds)  # (T, 2, 100)
+    figure = plt.figure(figsize=(9, 8), layout='constrained')
+    rows = figure.add_gridspec(3, 4, height_ratios=(2, 1, 1.3))
+    top = figure.add_subplot(rows[0, :])
+    names = (('0.1 deg', BLUE), ('0.1 to 2 deg', RED))
+    for model, (name, colour) in reversed(list(enumerate(names))):
+        place = np.repeat(ping.range[::4], 100)
+        top.plot(
+            place, x[::4, model].ravel(), ',', color=colour, alpha=0.5, rasterized=True, label=name
         )
-        alone = np.degrees(np.arcsin(spatial.peak_sines(power, grid)))
-        axis.plot(ping.range, alone, '.', color=AMBER, markersize=2, label=f'{method} alone')
-        axis.plot(
-            truth.range, np.degrees(truth.angle), color='white', linewidth=0.6, label='truth'
+    top.plot(truth.range, np.degrees(truth.angle), color=INK, linewidth=0.6, label='truth')
+    top.axvspan(*SHADOW, color=AMBER, alpha=0.3)
+    top.set(ylabel='angle [deg]', title='particles of both models; no echo from 35 to 36 m')
+    for handle in top.legend(loc='upper right', fontsize=8).legend_handles:
+        handle.set_marker('o')
+    middle = figure.add_subplot(rows[1, :], sharex=top)
+    for model, (_, colour) in enumerate(names):
+        middle.plot(ping.range, track.probability[:, model], color=colour, linewidth=0.9)
+    middle.axvspan(*SHADOW, color=AMBER, alpha=0.3)
+    middle.set(xlabel='slant range [m]', ylabel='probability', ylim=(-0.03, 1.03))
+    for k, where in enumerate(CLOUDS_AT):
+        t = int(np.argmin(np.abs(ping.range - where)))
+        axis = figure.add_subplot(rows[2, k])
+        centre = float(np.degrees(truth.angle[t]))
+        width = max(1.0, 1.1 * float(np.abs(x[t] - centre).max()))
+        edges = np.linspace(centre - width, centre + width, 31)
+        for model, (_, colour) in enumerate(names):
+            axis.hist(x[t, model], edges, color=colour, alpha=0.6)
+        axis.axvline(centre, color=INK, linewidth=0.8)
+        axis.set(title=f'{where:g} m', xlabel='angle [deg]')
+    save(figure, 'bathymetry_clouds.png', tight=False)
+
+
+def draw_sensitivity() -> None:
+    """How the labels depend on the noise of the rough walk, from benchmarks/bathymetry_paper."""
+    found = json.loads((ROOT / 'docs/results/bathymetry_paper.json').read_text())['cases']
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3))
+    for colour, name in ((RED, 'height_rw_ncs'), (BLUE, 'height_two_rw')):
+        rows = {
+            float(case.split(', ')[1].split()[0]): row
+            for case, row in found.items()
+            if case.startswith(name)
+        }
+        left.semilogx(list(rows), [row['overlap'] for row in rows.values()], 'o-', color=colour)
+        label = f'{name}, as printed'
+        right.semilogx(
+            list(rows), [row['all_m'] for row in rows.values()], 'o-', color=colour, label=label
         )
-        axis.plot(
-            ping.range,
-            np.degrees(estimate.extras['angle']),
-            color=RED,
-            linewidth=1.0,
-            label='IMM particle filter',
-        )
-        axis.set(ylim=(-30, 35), ylabel='angle from broadside [deg]')
-        axis.legend(loc='upper right', fontsize=8, facecolor='0.85')
-    axes[-1].set_xlabel('slant range [m]')
-    save(figure, 'bathymetry_spectra.png')
+    left.set(xlabel='sigma of the rough walk [m]', ylabel='overlap', ylim=(0, 1))
+    right.set(xlabel='sigma of the rough walk [m]', ylabel='RMSE of the height [m]', ylim=(0, 0.4))
+    right.legend(fontsize=8)
+    save(figure, 'bathymetry_sensitivity.png')
 
 
 def draw_profile(ping, truth, runs) -> None:
-    """Figures 4 and 5: heights with their bands, and the probability of the rough model."""
+    """Heights with their bands, and the probability of rough floor, of the corrected sets."""
     figure, axes = plt.subplots(len(runs) + 1, 1, figsize=(9, 7.2), sharex=True)
     for axis, (name, estimate) in zip(axes, runs.items()):
         height = columns(estimate)['height']

@@ -73,10 +73,13 @@ def diffuse_bins(ratio: FloatArray, silent: BoolArray, usable: BoolArray) -> Boo
     """Bins (n,) of `ratio` (n,) noise powers in a stretch that is very loud and mostly not
     coherent, `silent` (n,): echoes of a diffuse floor. A burst of noise is incoherent too, but
     alone among echoes that are coherent."""
-    loud = loud_bins(ratio, VERY_LOUD, bins=1, usable=usable)
+    above = usable & (ratio > VERY_LOUD)
+    if np.count_nonzero(above & silent) < _BURST_BINS // 4:
+        return np.zeros(len(ratio), bool)  # what holds for most pings, so it had better be quick
+    loud = above & ~bursts(ratio)
     share = moving_mean(silent, _BURST_BINS // 2, loud)
     stretch = moving_mean(loud, _BURST_BINS // 2) >= 0.5
-    return loud & stretch & (np.nan_to_num(share) > 0.5)
+    return loud & stretch & (share > 0.5)
 
 
 def bursts(power: FloatArray) -> BoolArray:
@@ -84,7 +87,7 @@ def bursts(power: FloatArray) -> BoolArray:
     n = min(_BURST_BINS, len(power))
     half = n // 2
     shift = n - half
-    centred = median_filter(np.nan_to_num(power), size=n, mode='nearest')
+    centred = median_filter(np.where(np.isfinite(power), power, 0.0), size=n, mode='nearest')
     place = np.arange(len(power))
     before = centred[np.clip(place - shift, 0, len(power) - 1)]
     after = centred[np.clip(place + shift, 0, len(power) - 1)]

@@ -22,6 +22,7 @@ from .convert_options import (
     csv_options,
     FILE,
     frame_option,
+    interferometer_options,
     options,
     place_options,
     sensor_offsets,
@@ -273,56 +274,7 @@ def images(
 )
 @click.argument('source', metavar='IN', type=BAG)
 @click.argument('out_bag', type=BAG_OUT)
-@click.option('--amplitude', default='', metavar='TOPIC', help='Topic with the amplitudes.')
-@click.option(
-    '--phase',
-    default='',
-    metavar='TOPIC',
-    help='Topic with the phases, of stave 1 against stave 0, or one of each stave.',
-)
-@click.option(
-    '--iq',
-    multiple=True,
-    metavar='TOPIC',
-    help='Topic with the complex samples of a stave, the uppermost first; once for each.',
-)
-@pairs_option(
-    '--field',
-    'fields',
-    metavar='WHAT=PATH',
-    help='Where something stands in the messages, e.g. phase=sidescan.phase.',
-)
-@click.option(
-    '--side', type=click.Choice(['port', 'starboard']), default=None, help='Of the array.'
-)
-@click.option(
-    '--phase-scale',
-    'radians_per_count',
-    type=float,
-    metavar='RAD',
-    help='Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
-    'full circle over their range.',
-)
-@click.option(
-    '--element-spacing',
-    type=click.FloatRange(min=1e-5, max=10.0),
-    metavar='METRES',
-    help='Distance between staves, to be stated in the snapshots.',
-)
-@click.option(
-    '--sound-speed',
-    type=click.FloatRange(min=1300.0, max=1700.0),
-    default=1500.0,
-    show_default=True,
-    help='Speed of sound in m/s, where a message states none.',
-)
-@click.option(
-    '--order',
-    type=click.Choice(['range_major', 'beam_major']),
-    default='range_major',
-    show_default=True,
-    help='Order of the samples in an image with several channels.',
-)
+@interferometer_options
 @storage_option
 @json_option
 def interferometer(

@@ -112,9 +112,20 @@ def _spread(
     for lag in range(reach + 1):
         taps[lag] = math.exp(-0.5 * (lag / sigma) ** 2) if lag > 0 else 1.0
         total += 2.0 * taps[lag]
-    for lag in range(-reach, reach + 1):
-        tap = taps[abs(lag)] / total
-        for g in range(max(out_low, low + lag), min(out_high, high + lag)):
+    tap = taps[0] / total
+    for g in range(max(out_low, low), min(out_high, high)):
+        out[g] += tap * source[g]
+    for lag in range(1, reach + 1):
+        tap = taps[lag] / total
+        # Where both the source `lag` above and that `lag` below exist they come in one pass.
+        above, above_end = max(out_low, low - lag), min(out_high, high - lag)
+        below, below_end = max(out_low, low + lag), min(out_high, high + lag)
+        both, both_end = max(above, below), max(min(above_end, below_end), max(above, below))
+        for g in range(above, min(above_end, both)):
+            out[g] += tap * source[g + lag]
+        for g in range(both, both_end):
+            out[g] += tap * (source[g + lag] + source[g - lag])
+        for g in range(max(below, both_end if both_end > both else below), below_end):
             out[g] += tap * source[g - lag]
 
 
@@ -151,14 +162,26 @@ def update(
         exponentials(log_likelihood, scratch, q)
     for j in range(M):
         row = p[j, low:high]
-        for g in range(n):
-            before += row[g]
-    if possible:
-        for g in range(n):
-            sums = 0.0
-            for j in range(M):
-                sums += p[j, low + g]
-            after += sums * q[g]
+        # Four sums at a time: each addition would wait for the one before.
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for g in range(0, n - 3, 4):
+            a += row[g]
+            b += row[g + 1]
+            c += row[g + 2]
+            d += row[g + 3]
+        for g in range(n - n % 4, n):
+            a += row[g]
+        before += (a + b) + (c + d)
+        if possible:
+            a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            for g in range(0, n - 3, 4):
+                a += row[g] * q[g]
+                b += row[g + 1] * q[g + 1]
+                c += row[g + 2] * q[g + 2]
+                d += row[g + 3] * q[g + 3]
+            for g in range(n - n % 4, n):
+                a += row[g] * q[g]
+            after += (a + b) + (c + d)
     possible = possible and after > 0.0
     total = after if possible else before
     for j in range(M):

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics import variances
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate, snr
+from sonar_imm.simulation.bathymetry.hearing import snr
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 
 
 @pytest.fixture(scope='module')

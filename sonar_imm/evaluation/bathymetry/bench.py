@@ -25,6 +25,7 @@ from .peers import config, cut, numpy_filter, SIGMAS, stone_soup_filter
 
 PEER_BINS = 400
 GOAL, GOAL_RATIO = 80_000, 30
+SEA_GOALS = {'particles': 120_000, 'grid': 25_000}
 
 Timed = tuple[Callable[[], Any], int]
 
@@ -36,17 +37,22 @@ def a_ping(**values: Any) -> Snapshot:
     return ping
 
 
-def rates(methods: Mapping[str, Timed], rounds: int) -> dict[str, float]:
+def rates(
+    methods: Mapping[str, Timed],
+    rounds: int,
+    clock: Callable[[], float] | None = None,
+) -> dict[str, float]:
     """Bins per second of each method in the best of `rounds` rounds. `methods` maps a name to a
     function and the number of bins that it processes."""
+    clock = clock or time.perf_counter
     best = dict.fromkeys(methods, math.inf)
     for run, _ in methods.values():
         run()
     for _ in range(rounds):
         for name, (run, _) in methods.items():
-            begin = time.perf_counter()
+            begin = clock()
             run()
-            best[name] = min(best[name], time.perf_counter() - begin)
+            best[name] = min(best[name], clock() - begin)
     return {name: bins / best[name] for name, (_, bins) in methods.items()}
 
 
@@ -80,6 +86,28 @@ def bench_numpy(rounds: int = 7) -> dict[str, Any]:
         'wanted': GOAL,
         'rms_difference_m': apart,
         'good': ratio >= GOAL_RATIO and speed['particles'] >= GOAL,
+    }
+
+
+def bench_sea(rounds: int = 7) -> dict[str, Any]:
+    """Bins per second on a ship that moves, in CPU time: poses, rays through a profile, soundings'
+    uncertainties; particles and grid."""
+    config = scenario('moving_profile', {'pings': 1, 'last_range': 117.0})
+    heard = [one.measurement for one in simulate(config, 1).measurements]
+    ping = next(one for one in heard if isinstance(one, Snapshot))
+    methods: dict[str, Timed] = {}
+    for engine in ('particles', 'grid'):
+        told = BathymetryConfig.from_mapping({**config.told(), 'engine': engine})
+        tracker = BathymetryTracker(told.for_inputs(frozenset({'snapshot', 'nav'})))
+        for one in heard:
+            if one is not ping:
+                tracker.process(one)
+        methods[engine] = partial(tracker.process, ping), len(ping)
+    speed = rates(methods, rounds, clock=time.process_time)
+    return {
+        'bins_per_second': speed,
+        'wanted': SEA_GOALS,
+        'good': all(speed[name] >= goal for name, goal in SEA_GOALS.items()),
     }
 
 
@@ -149,6 +177,12 @@ def _numpy_sentence(result: Mapping[str, Any]) -> str:
     )
 
 
+def _sea_sentence(result: Mapping[str, Any]) -> str:
+    speed, wanted = result['bins_per_second'], result['wanted']
+    each = ', '.join(f'{name} {speed[name]:,.0f} (wanted {wanted[name]:,})' for name in wanted)
+    return f'a moving ship and bent rays, bins a second of CPU time: {each}'
+
+
 def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
     speed = result['bins_per_second']
     return (
@@ -164,6 +198,7 @@ def _rates_sentence(result: Mapping[str, Any], what: str) -> str:
 
 BENCHES = (
     Bench('numpy', bench_numpy, _numpy_sentence),
+    Bench('sea', bench_sea, _sea_sentence),
     Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
     Bench(
         'scaling',

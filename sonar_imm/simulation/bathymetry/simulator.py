@@ -5,9 +5,6 @@ The signal-to-noise ratio falls from 30 to 10 dB along the swath, linearly in de
 logarithm of range, as spreading loss does. The other scenarios add one difficulty each: slope,
 undulation, roughness that is correlated as real roughness is, shadows, spikes, echoes by way of
 the surface, Gaussian echoes, a second side; and a ship that moves (`ship`).
-
-One bin is y = sqrt(z) (s a(u) + n), the observation model of `acoustics.laplace`. Surface echoes
-fade with a z of their own. A spike is a strong burst of noise, incoherent across the array.
 """
 
 from __future__ import annotations
@@ -20,15 +17,16 @@ from attrs import frozen
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from ...acoustics import array, geometry, rays, sounding
-from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
-from ...measurements import Snapshot
+from ...acoustics import array, geometry, sounding
+from ...estimation.arrays import BoolArray, FloatArray
 from ...parameters import parameter
 from ..scene import Received, Scene, TrueProfile
+from .hearing import hear
 from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
 
 SIDES = ('starboard', 'port', 'both')
-LAWS = ('laplace', 'gaussian')
+LAWS = ('laplace', 'gaussian', 'k')
+ROUGHNESS_LAWS = ('gaussian', 'laplace', 'fractal')
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 
 
@@ -68,6 +66,13 @@ class BathymetryScenario(ShipScenario):
     state_noise: bool = parameter(True, 'the snapshot says its noise variance')
     state_signal: bool = parameter(False, 'the snapshot says its signal variance')
     law: str = parameter('laplace', 'how the power of echoes varies', choices=LAWS)
+    texture_shape: float = parameter(
+        0.5, 'law k: shape of the gamma law of that power; 1 is laplace', low=0.05, high=100.0
+    )
+    noise_fades: bool = parameter(
+        True,
+        'the noise varies with the echo, as the observation model has it; thermal noise does not',
+    )
     decorrelation: float = parameter(
         0.0, 'share of the power of an echo that differs from stave to stave', low=0.0, high=1.0
     )
@@ -82,6 +87,12 @@ class BathymetryScenario(ShipScenario):
     )
     patch_drift: float = parameter(
         0.0, 'the patch lies so much further out from ping to ping', unit='m'
+    )
+    roughness_law: str = parameter(
+        'gaussian',
+        'law of its heights; fractal: Gaussian with a spectrum that falls with the square of the '
+        'wave number',
+        choices=ROUGHNESS_LAWS,
     )
     correlation_length: float = parameter(
         0.0,
@@ -155,6 +166,12 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         {'first_range': 5.0, 'state_noise': False},
     ),
     'gaussian': ('paper with Gaussian echoes', {'law': 'gaussian'}),
+    'thermal': ('paper with noise that does not fade with the echo', {'noise_fades': False}),
+    'foreign': (
+        'paper under other laws than the tracker supposes: fractal roughness, echoes with heavier '
+        'tails, noise that does not fade',
+        {'noise_fades': False, 'law': 'k', 'roughness_law': 'fractal'},
+    ),
     'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
     'moving': (
         'a ship under way in a swell, with navigation and its errors; a rough patch with a wavy '
@@ -207,7 +224,7 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
             else:
                 profile = _floor_below(config, ship, since_start, ranges, rng, side, namespace)
             truth.append(profile)
-            snapshot = _hear(config, profile, rng)
+            snapshot = hear(config, profile, rng)
             received.append(Received(stamp + listening_ns, snapshot, namespace))
     if ship is not None:
         seconds = (config.pings - 1) / config.ping_rate
@@ -215,14 +232,6 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
         received = [*(Received(one.stamp_ns, one) for one in stated), *received]
         received.sort(key=lambda one: one.received_ns)
     return Scene(tuple(received), tuple(truth), frame_id=truth[0].frame_id)
-
-
-def snr(config: BathymetryScenario, ranges: FloatArray) -> FloatArray:
-    """Signal-to-noise ratio (n,) at one stave, linear."""
-    nearest = max(config.first_range, min(config.sonar_height, 0.5 * config.last_range))
-    share = np.log(np.maximum(ranges, nearest) / nearest) / math.log(config.last_range / nearest)
-    decibels = config.snr_near_db + share * (config.snr_far_db - config.snr_near_db)
-    return 10.0 ** (0.1 * decibels)
 
 
 def _floor(
@@ -312,75 +321,20 @@ def _lit(config: BathymetryScenario, ranges: FloatArray) -> BoolArray:
 
 
 def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
-    white = rng.normal(size=bins)
+    if config.roughness_law == 'laplace':
+        white = rng.laplace(scale=math.sqrt(0.5), size=bins)
+    else:
+        white = rng.normal(size=bins)
+    if config.roughness_law == 'fractal':
+        wave = np.fft.rfft(white)
+        longest = (config.patch_end - config.patch_start) / config.bin_width
+        wave /= np.maximum(np.arange(len(wave)) * longest / bins, 1.0)
+        wave[0] = 0.0
+        white = np.fft.irfft(wave, bins)
+        white /= white.std()
     width = config.correlation_length / config.bin_width
     if width > 0.0:
         smooth = gaussian_filter1d(white, width, mode='wrap')
         kernel = gaussian_filter1d(np.eye(1, bins, bins // 2)[0], width, mode='wrap')
         white = smooth / np.linalg.norm(kernel)
     return config.patch_std * white
-
-
-def _hear(config: BathymetryScenario, floor: TrueProfile, rng: np.random.Generator) -> Snapshot:
-    """The samples of the staves for one ping over a floor."""
-    bins = len(floor.range)
-    sine = np.nan_to_num(np.sin(floor.angle))
-    signal = config.noise_variance * snr(config, floor.range) * floor.valid
-    y = np.sqrt(signal)[:, None] * _echo(config, sine, rng)
-    y += math.sqrt(config.noise_variance) * _circular(rng, bins, config.staves)
-    y *= np.sqrt(_fading(config, bins, rng))[:, None]
-    if config.multipath:
-        level = np.sqrt(signal * 10.0 ** (0.1 * config.multipath_level_db))
-        depth = config.sonar_height - floor.height
-        tilt = math.radians(config.tilt_deg)
-        others = array.multipath_sines(depth, floor.range, tilt, config.sonar_depth)
-        for other in others.T:
-            strength = level * np.sqrt(_fading(config, bins, rng)) * np.isfinite(other)
-            y += strength[:, None] * _echo(config, np.nan_to_num(other), rng)
-    spikes = rng.uniform(size=bins) < config.spike_probability
-    if spikes.any():
-        power = (signal + config.noise_variance) * 10.0 ** (0.1 * config.spike_db) * spikes
-        y += np.sqrt(power)[:, None] * _circular(rng, bins, config.staves)
-    return Snapshot(
-        stamp_ns=floor.stamp_ns,
-        frame_id='sonar',
-        range=floor.range,
-        iq=y.astype(np.complex64),
-        noise_variance=np.full(bins, config.noise_variance) if config.state_noise else None,
-        signal_variance=signal if config.state_signal else None,
-        sound_speed=config.sound_speed,
-        frequency=config.frequency,
-        element_spacing=config.spacing_wavelengths * _speed_at_array(config) / config.frequency,
-        sample_rate=0.5 * config.sound_speed / config.bin_width,
-    )
-
-
-def _speed_at_array(config: BathymetryScenario) -> float:
-    """Sound speed that makes the wavelength at the array, m/s."""
-    if not config.sound_speed_profile:
-        return config.sound_speed
-    return float(rays.profile_of(config.sound_speed_profile).at(config.sonar_depth))
-
-
-def _echo(config: BathymetryScenario, sine: FloatArray, rng: np.random.Generator) -> ComplexArray:
-    """Plane waves (n, P) of unit power from direction sines (n,), less what differs from stave to
-    stave."""
-    vectors = array.steering(
-        sine, config.staves, config.spacing_wavelengths, conjugate=config.conjugate
-    )
-    share = config.decorrelation
-    wave = vectors * _circular(rng, len(sine), 1)
-    if not share > 0.0:
-        return wave
-    own = _circular(rng, len(sine), config.staves)
-    return math.sqrt(1.0 - share) * wave + math.sqrt(share) * own
-
-
-def _fading(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
-    """The power z (n,) of echoes, one on average."""
-    return rng.exponential(size=bins) if config.law == 'laplace' else np.ones(bins)
-
-
-def _circular(rng: np.random.Generator, *shape: int) -> ComplexArray:
-    """Circular complex Gaussian numbers of unit variance."""
-    return rng.normal(size=(*shape, 2)).view(np.complex128)[..., 0] * math.sqrt(0.5)

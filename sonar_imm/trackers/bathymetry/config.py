@@ -20,7 +20,8 @@ DEFAULT_SIGMAS = {
     'height_bank': (0.003, 0.03, 0.07, 0.5),
 }
 """Noise of each model a range bin: metres, but 1/m for the slope model `ncs`."""
-DEFAULT_STAY, BANK_STAY = 0.995, 0.998
+PAPER_SIGMAS = {'height_rw_ncs': (1.0, 1.0), 'height_two_rw': (0.01, 1.0)}
+DEFAULT_STAY, BANK_STAY, PAPER_STAY = 0.995, 0.998, 0.98
 DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
 MODEL_SETS = ('height_rw_ncs', 'height_two_rw', 'angle_two_rw', 'height_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
@@ -37,7 +38,9 @@ class BathymetryConfig(SeaParameters):
     )
     variant: str = parameter(
         'corrected',
-        'corrected, or the formulas as the paper prints them (see the docs for what is wrong)',
+        'corrected, or paper: the formulas as printed (see the docs for what is wrong), and what '
+        'the paper takes where nothing else is stated: sigmas 1 m and 1/m of height_rw_ncs, 0.01 '
+        'and 1 m of height_two_rw, stay_probability 0.98; neither shadow_gate nor angle_drift',
         choices=('corrected', 'paper'),
     )
     sigmas: tuple[float, ...] = parameter(
@@ -83,7 +86,7 @@ class BathymetryConfig(SeaParameters):
     stay_probability: float = parameter(
         0.0,
         'probability of keeping the model over a range bin, without transition_matrix; 0: 0.995, '
-        'or 0.998 in height_bank; the paper has 0.98',
+        'or 0.998 in height_bank, or 0.98 in variant paper',
         low=0.0,
         high=1.0,
     )
@@ -288,7 +291,30 @@ class BathymetryConfig(SeaParameters):
     @property
     def stay_used(self) -> float:
         """Probability of keeping the model over a range bin."""
-        return self.stay_probability or (BANK_STAY if self.in_bank else DEFAULT_STAY)
+        usual = BANK_STAY if self.in_bank else DEFAULT_STAY
+        return self.stay_probability or (PAPER_STAY if self.as_printed else usual)
+
+    @property
+    def sigmas_used(self) -> tuple[float, ...]:
+        """Noise of each model over a range bin, of the sets of heights."""
+        usual = DEFAULT_SIGMAS[self.model_set]
+        return self.sigmas or (
+            PAPER_SIGMAS.get(self.model_set, usual) if self.as_printed else usual
+        )
+
+    @property
+    def gate_used(self) -> bool:
+        """Whether bins without an echo are passed over; the paper tracks through them."""
+        return self.shadow_gate and not self.as_printed
+
+    @property
+    def drift_used(self) -> bool:
+        """Whether angles are predicted at constant height; in the paper they are not."""
+        return self.angle_drift and not self.as_printed
+
+    @property
+    def as_printed(self) -> bool:
+        return self.variant == 'paper'
 
     @property
     def in_bank(self) -> bool:
@@ -298,4 +324,4 @@ class BathymetryConfig(SeaParameters):
         """Number of models in the set these parameters describe."""
         if self.model_set == 'angle_two_rw':
             return 2
-        return len(self.sigmas or DEFAULT_SIGMAS[self.model_set])
+        return len(self.sigmas_used)

@@ -6,6 +6,8 @@ noise of the particles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ...estimation.arrays import FloatArray
@@ -25,12 +27,13 @@ def run_particles(
     entropy: tuple[int, ...],
     *,
     resample: bool = False,
+    watch: Callable[[int, Particles], None] | None = None,
 ) -> Track:
     """The IMM particle filter along a ping, with `count` particles per model.
 
     entropy: integers that name this ping; the same ones give the same bits, whatever other pings
     there were. resample: resample each model after the update, as the paper's effective sample
-    size of always one demands.
+    size of always one demands. watch: called with each bin and its particles, for pictures.
     """
     seeds = np.random.SeedSequence(entropy).spawn(3)
     start, draws, noises = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)
@@ -52,7 +55,13 @@ def run_particles(
         normals(uniform, noise)
         block_noise = noise[: bins * size].reshape(bins, M, k, count)
         random = Draws(draws.random((bins, 2, M)), block_noise)
-        filter_block(first, particles, motion, random, ping, resample, track)
+        if watch is None:
+            filter_block(first, particles, motion, random, ping, resample, track)
+            continue
+        for b in range(bins):
+            one = Draws(random.uniform[b : b + 1], random.noise[b : b + 1])
+            filter_block(first + b, particles, motion, one, ping, resample, track)
+            watch(first + b, particles)
     return _with_constants(track, ping)
 
 

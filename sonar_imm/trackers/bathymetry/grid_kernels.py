@@ -142,7 +142,7 @@ def filter_ping(
         for j in range(M):
             width = sigma[t, j if heard else coast]
             grid.walk(mixed[j], low, high, width, scratch, p[j], new_low, new_high)
-        low, high = new_low, new_high
+        low, high = grid.trim(p, new_low, new_high)
         n = high - low
         here = value[:n]
         if heard:

@@ -32,7 +32,7 @@ from scipy.special import ndtr, ndtri
 from ...acoustics.array import angle_of_depth
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.markov import check_transition_matrix, persistent
-from .config import BathymetryConfig, DEFAULT_SIGMAS, DEFAULT_SIGMAS_DEG
+from .config import BathymetryConfig, DEFAULT_SIGMAS_DEG
 from .kernels import Geometry
 
 HEIGHT_STD, ANGLE_STD = 1.0, math.radians(5.0)
@@ -181,7 +181,7 @@ def _states(config: BathymetryConfig) -> tuple[str, ...]:
 def _rough(config: BathymetryConfig, models: int) -> BoolArray:
     if not config.in_bank:
         return np.arange(models) == (0 if config.model_set == 'height_rw_ncs' else 1)
-    return np.array(config.sigmas or DEFAULT_SIGMAS['height_bank']) >= config.rough_sigma
+    return np.array(config.sigmas_used) >= config.rough_sigma
 
 
 def _bin_width(ranges: FloatArray) -> float:
@@ -196,10 +196,8 @@ def _growth(config: BathymetryConfig, ranges: FloatArray) -> float:
 
 def _slope_motions(config: BathymetryConfig, ranges: FloatArray) -> tuple[FloatArray, FloatArray]:
     """F (2, 2, 2) and G (2, 2, 2) of `rw` and `ncs`, noises included."""
-    rough, bend = _growth(config, ranges) * np.array(
-        config.sigmas or DEFAULT_SIGMAS['height_rw_ncs']
-    )
-    width, paper = _bin_width(ranges), config.variant == 'paper'
+    rough, bend = _growth(config, ranges) * np.array(config.sigmas_used)
+    width, paper = _bin_width(ranges), config.as_printed
     keep = 0.5 * width**2 if paper else 1.0
     F = np.array([[[1.0, 0.0], [0.0, 0.0]], [[1.0, width], [0.0, keep]]])
     G = np.zeros((2, 2, 2))
@@ -215,7 +213,7 @@ def _noises(config: BathymetryConfig, ranges: FloatArray) -> FloatArray:
         along = (ranges - ranges[0]) / (ranges[-1] - ranges[0])
         noises = np.column_stack([np.full(len(ranges), first), start + (end - start) * along])
     else:
-        noises = np.array([config.sigmas or DEFAULT_SIGMAS[config.model_set]])
+        noises = np.array([config.sigmas_used])
     return _growth(config, ranges) * noises
 
 

@@ -107,7 +107,7 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
             likelihood,
             config.particles_per_model,
             entropy,
-            resample=config.variant == 'paper',
+            resample=config.as_printed,
         )
     if config.smoothing_used == 'modes':
         smoothed = smooth_modes(track.probability, models.transition, likelihood.heard)

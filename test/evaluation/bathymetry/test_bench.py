@@ -44,6 +44,19 @@ def test_the_goal_is_met_by_speed_and_by_ratio(short, monkeypatch, particles, nu
     assert (result['ratio'], result['good']) == (ratio, good)
 
 
+@pytest.mark.parametrize('grid, good', [(26e3, True), (24e3, False)])
+def test_the_goal_at_sea_is_met_by_both_engines(monkeypatch, grid, good):
+    heard = {}
+
+    def rates(methods, rounds, clock):
+        heard.update({name: (len(run()[0]), bins) for name, (run, bins) in methods.items()})
+        return {'particles': 121e3, 'grid': grid}
+
+    monkeypatch.setattr(bench, 'rates', rates)
+    assert bench.bench_sea(rounds=1)['good'] is good
+    assert heard == {'particles': (2000, 2000), 'grid': (2000, 2000)}
+
+
 def test_stone_soup_follows_the_same_floor(short):
     pytest.importorskip('stonesoup')
     height = stone_soup_filter(cut(short, 60))

@@ -4,7 +4,8 @@ import pytest
 from sonar_imm.acoustics import array, coherence, variances
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate, snr
+from sonar_imm.simulation.bathymetry.hearing import snr
+from sonar_imm.simulation.bathymetry.simulator import scenario, SCENARIOS, simulate
 
 
 def run(name='paper', seed=1, **overrides):
@@ -151,3 +152,38 @@ def test_mistakes_are_named(overrides, word):
 def test_an_unknown_scenario_is_named():
     with pytest.raises(ConfigError, match="did you mean 'shadow'"):
         scenario('shadows')
+
+
+def test_noise_that_does_not_fade_is_the_same_everywhere():
+    shadow = {'shadows': (17.0, 37.0), 'pings': 40}
+    spread = {}
+    for fades in (True, False):
+        pings = [ping.iq[:400] for ping, _ in run(noise_fades=fades, **shadow)]
+        power = variances.mean_power(np.concatenate(pings))
+        assert power.mean() == pytest.approx(1.0, abs=0.03)
+        spread[fades] = power.var()
+    # z Gamma(8)/8 against Gamma(8)/8
+    assert spread[True] == pytest.approx(1.25, rel=0.15)
+    assert spread[False] == pytest.approx(1.0 / 8.0, rel=0.1)
+
+
+def test_other_laws_of_echoes_and_of_rough_floor():
+    shape = 0.5
+    power = [
+        ping.iq[:100, 0] for ping, _ in run(law='k', texture_shape=shape, pings=200, snr_far_db=30)
+    ]
+    power = np.square(np.abs(np.concatenate(power)))
+    # |s|^2 z, exponential times a gamma law: E x^2 / (E x)^2 = 2 (1 + 1 / shape).
+    assert (power**2).mean() / power.mean() ** 2 == pytest.approx(6.0, rel=0.2)
+    laplace = [true.height[true.patch] for _, true in run(roughness_law='laplace', pings=60)]
+    laplace = np.concatenate(laplace)
+    assert laplace.std() == pytest.approx(0.5, rel=0.05)
+    assert (laplace**4).mean() / laplace.var() ** 2 == pytest.approx(6.0, rel=0.25)
+    fractal = [
+        true.height
+        for _, true in run(roughness_law='fractal', pings=60, patch_end=77, patch_start=17)
+    ]
+    spectrum = np.mean([np.square(np.abs(np.fft.rfft(one))) for one in fractal], axis=0)
+    low, high = spectrum[4:8].mean(), spectrum[40:80].mean()
+    assert low / high == pytest.approx(100.0, rel=0.4)
+    assert np.std(fractal) == pytest.approx(0.5, rel=0.05)

@@ -1,0 +1,92 @@
+"""A world turned or lifted gives the same floor turned or lifted: headings through south, and
+profiles counted from the surface."""
+
+from attrs import evolve
+from helpers.sea import motion_case, navigation, sea_config, snapshots
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_imm.measurements import Navigation, Snapshot
+from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+
+CASE = motion_case()
+EXACT = {
+    f'nav_{what}': 0.0
+    for what in ('attitude_error_deg', 'heading_error_deg', 'heave_error', 'position_error')
+}
+
+
+def tracked(config, measurements):
+    tracker = BathymetryTracker(config)
+    return [one for measurement in measurements for one in tracker.process(measurement)]
+
+
+def test_a_heading_that_passes_through_180_degrees_is_no_jump():
+    """The heading of the case, about 30 degrees, put to south; and quaternions that change their
+    sign, which says nothing."""
+    config = sea_config(CASE, engine='grid')
+    poses, pings = navigation(CASE), list(snapshots(CASE))[:3]
+    plain = tracked(config, [*poses, *pings])
+    heading = np.array(
+        [Rotation.from_quat(np.array(one.orientation)).as_euler('ZYX')[0] for one in poses]
+    )
+    turn = Rotation.from_euler('z', np.pi - np.median(heading))
+    turned = []
+    for k, one in enumerate(poses):
+        q = (turn * Rotation.from_quat(np.array(one.orientation))).as_quat()
+        turned.append(
+            evolve(
+                one, position=turn.apply(np.array(one.position)), orientation=q if k % 2 else -q
+            )
+        )
+    south = np.array(
+        [Rotation.from_quat(np.array(one.orientation)).as_euler('ZYX')[0] for one in turned]
+    )
+    assert (south > 3.0).any() and (south < -3.0).any()
+    found = tracked(config, [*turned, *pings])
+    for a, b in zip(plain, found, strict=True):
+        assert b.state == pytest.approx(a.state, abs=1e-6)
+        assert b.xyz == pytest.approx(turn.apply(np.array(a.xyz, float)), abs=2e-5)
+
+
+def in_summer(**changes):
+    scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT, **changes})
+    made = simulate(scene, 3)
+    config = BathymetryConfig.from_mapping({**scene.told(), 'engine': 'grid'})
+    config = config.for_inputs(frozenset({'snapshot', 'nav'}))
+    return made, config, [one.measurement for one in made.measurements]
+
+
+def height_error(estimates, truth):
+    error = np.array([one.state[:, 0] for one in estimates]) - [one.height for one in truth]
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+def test_depth_in_the_profile_is_counted_from_the_surface():
+    """The same sea 40 m higher: the floor is 40 m higher, and bends as before."""
+    made, config, measurements = in_summer()
+    lifted = [
+        evolve(one, position=one.position + [0.0, 0.0, 40.0])
+        if isinstance(one, Navigation)
+        else one
+        for one in measurements
+    ]
+    plain = tracked(config, measurements)
+    higher = tracked(evolve(config, water_level=config.water_level + 40.0), lifted)
+    for a, b in zip(plain, higher, strict=True):
+        assert b.state[:, 0] - 40.0 == pytest.approx(a.state[:, 0], abs=1e-6)
+    assert height_error(plain, made.truth) < 0.17
+
+
+@pytest.mark.parametrize('mistake', ['from the sonar', 'from the zero of the world'])
+def test_a_profile_counted_from_elsewhere_is_seen(mistake):
+    level = 0.0 if mistake == 'from the sonar' else 10.0
+    made, config, measurements = in_summer(water_level=level)
+    array = level - 5.0  # the array is 5 m deep
+    wrong = evolve(config, water_level=array if mistake == 'from the sonar' else 0.0)
+    pings = sum(isinstance(one, Snapshot) for one in measurements)
+    found, right = (tracked(one, measurements) for one in (wrong, config))
+    assert len(found) == pings
+    assert height_error(found, made.truth) > 0.4 > 0.2 > height_error(right, made.truth)
