@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -24,6 +24,8 @@ class InputTopic:
     settings: parameters of the tracker that its readers take as keywords too: what messages do not
     say themselves.
     companion: describes another input; found by its topic name, never enough alone.
+    required: whether the tracker makes nothing without it, by the parameters of the tracker. Of
+    the inputs that are neither required nor companions, one is enough.
     """
 
     name: str
@@ -36,6 +38,9 @@ class InputTopic:
     one_topic: bool = field(default=False, kw_only=True)
     settings: tuple[str, ...] = field(default=(), kw_only=True)
     companion: bool = field(default=False, kw_only=True)
+    required: Callable[[Mapping[str, Any]], bool] = field(
+        default=lambda settings: False, kw_only=True
+    )
 
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any]
@@ -43,3 +48,15 @@ class InputTopic:
         """Give the reader of a message type with its settings; `settings` may hold more."""
         told = {name: settings[name] for name in self.settings if name in settings}
         return partial(self.readers[type_name], world_frame=world_frame, **told)
+
+
+def needed(
+    topics: Sequence[InputTopic], settings: Mapping[str, Any]
+) -> tuple[list[str], list[str]]:
+    """Names of the inputs that a tracker with these parameters cannot do without, and of those of
+    which one is enough."""
+    required = [topic for topic in topics if topic.required(settings)]
+    if any(not topic.companion for topic in required):
+        return [topic.name for topic in required], []
+    one_of = [topic.name for topic in topics if not topic.companion]
+    return [topic.name for topic in required], one_of

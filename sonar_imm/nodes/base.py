@@ -36,7 +36,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic, needed
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
@@ -89,7 +89,9 @@ class TrackerNode(Node):
             ),
             post_callback=self._on_clock_back,
         )
-        self._reporter = Reporter(self.get_fully_qualified_name().lstrip('/'), hears, self._meter)
+        name, told = self.get_fully_qualified_name().lstrip('/'), self.tracker.config.as_dict()
+        required, one_of = needed(self._topics, told)
+        self._reporter = Reporter(name, hears, self._meter, required=required, one_of=one_of)
         self.create_timer(
             self._node_config.diagnostics_period,
             self._report,
