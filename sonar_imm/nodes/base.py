@@ -44,6 +44,7 @@ from ..measurements import FrameGuard, Rejection
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
+from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
@@ -326,9 +327,13 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     node = None
     try:
         _init(args)
+        if text := help_text(args):
+            print(text)
+            return 0
         stopper.on_stop(rclpy.try_shutdown, START_PATIENCE)
         executor = SingleThreadedExecutor()
         node = make_node()
+        warn_of_foreign_files(node, args)
         stopper.on_stop(rclpy.try_shutdown)
         rclpy.spin(node, executor)
     except ExternalShutdownException:

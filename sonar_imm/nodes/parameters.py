@@ -132,14 +132,17 @@ class NodeParameters:
         }
 
     def _declare(self, spec: ParameterSpec) -> None:
-        value = (self._values() | self._chosen)[spec.name]
-        # rclpy takes an empty list for an array of bytes: declare its type, without a value.
-        self._node.declare_parameter(
-            spec.name,
-            _TYPES[spec.kind] if value == [] else value,
-            descriptor(spec),
-            ignore_override=True,
-        )
+        value, told = (self._values() | self._chosen)[spec.name], descriptor(spec)
+        if value != []:
+            self._node.declare_parameter(spec.name, value, told, ignore_override=True)
+            return
+        # rclpy takes an empty list for an array of bytes. A parameter that has only a type has no
+        # value, and then `ros2 param dump` shows those of no parameter of the node.
+        kind = _TYPES[spec.kind]
+        self._node.declare_parameter(spec.name, kind, ignore_override=True)
+        self._node.set_parameters([Parameter(spec.name, kind, [])])
+        told.name, told.type = spec.name, kind.value
+        self._node.set_descriptor(spec.name, told)
 
     def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [p for p in parameters if p.name in self._specs]
