@@ -14,9 +14,14 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
 
-from .fixes import UNKNOWN_VARIANCE
 from .headers import Make, make_header, stamp_ns
 from .table import decode_table, encode_table, require_columns
+
+NOT_ESTIMATED = 1.0
+"""Variance of a z or a vertical speed that is not estimated, m^2 and m^2/s^2: it says nothing, but
+RViz would draw a million as an ellipsoid two kilometres high."""
+ALIGNED = 1e-9
+"""Variance, rad^2, of an orientation that is so by definition; some programs refuse zeros."""
 
 
 def write_estimate(estimate: Estimate, make: Make) -> Any:
@@ -44,22 +49,26 @@ def read_estimate(message: Any) -> Estimate:
 def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
     """Write one diver as nav_msgs/Odometry.
 
-    The orientation is the identity and the child frame ``diver_<track_id>`` is aligned with the
-    world, so the twist is the velocity in the world. What is not estimated (z, attitude, turn
-    rates) has a large variance, not zero.
+    The child frame ``diver_<track_id>`` is aligned with the world, so the twist is the velocity in
+    the world, and orientation and turn rates are exact: `ALIGNED`. z and its rate, where the
+    tracker does not estimate them, have the variance `NOT_ESTIMATED`: displays draw it.
     """
-    index = [estimate.state_names.index(name) for name in ('px', 'py', 'vx', 'vy')]
-    px, py, vx, vy = (float(value) for value in estimate.state[row, index])
-    covariance = estimate.covariance[row][np.ix_(index, index)]
+    axes = 'xyz' if 'pz' in estimate.state_names else 'xy'
+    at, moving = ([estimate.state_names.index(f'{kind}{axis}') for axis in axes] for kind in 'pv')
+    place, velocity = np.zeros(3), np.zeros(3)
+    place[: len(at)], velocity[: len(at)] = estimate.state[row, at], estimate.state[row, moving]
+    if len(at) == 2:
+        place[2] = estimate.xyz[row, 2]
+    covariance = estimate.covariance[row]
     track_id = int(estimate.extras['track_id'][row]) if 'track_id' in estimate.extras else row
     pose = make(
         'geometry_msgs/msg/Pose',
-        position=make('geometry_msgs/msg/Point', x=px, y=py, z=float(estimate.xyz[row, 2])),
+        position=make('geometry_msgs/msg/Point', **dict(zip('xyz', place.tolist()))),
         orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
     )
     twist = make(
         'geometry_msgs/msg/Twist',
-        linear=make('geometry_msgs/msg/Vector3', x=vx, y=vy, z=0.0),
+        linear=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', velocity.tolist()))),
         angular=make('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0),
     )
     return make(
@@ -69,12 +78,12 @@ def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
         pose=make(
             'geometry_msgs/msg/PoseWithCovariance',
             pose=pose,
-            covariance=_planar(covariance[:2, :2]),
+            covariance=_six(covariance[np.ix_(at, at)]),
         ),
         twist=make(
             'geometry_msgs/msg/TwistWithCovariance',
             twist=twist,
-            covariance=_planar(covariance[2:, 2:]),
+            covariance=_six(covariance[np.ix_(moving, moving)]),
         ),
     )
 
@@ -106,8 +115,8 @@ def write_model_shares(estimate: Estimate, make: Make) -> Any:
     )
 
 
-def _planar(block: np.ndarray) -> np.ndarray:
-    """Put an x-y covariance (2, 2) into the 36 numbers of ROS."""
-    covariance = np.diag(np.full(6, UNKNOWN_VARIANCE))
-    covariance[:2, :2] = block
+def _six(block: np.ndarray) -> np.ndarray:
+    """Put a covariance (2, 2) of x and y, or (3, 3), into the 36 numbers of ROS."""
+    covariance = np.diag([NOT_ESTIMATED] * 3 + [ALIGNED] * 3)
+    covariance[: len(block), : len(block)] = block
     return covariance.ravel()

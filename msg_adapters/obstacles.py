@@ -3,7 +3,8 @@
 A point in a display would suggest that the height is known. So each obstacle is drawn as a bar
 over the 90 % band of its vertical offset, coloured by whether it is above or below, with a ball at
 the mean, coloured by the probability of a collision, and a label. The id of a marker
-is the track id. Markers have a lifetime: they vanish when the obstacle is no longer published.
+is the track id. Markers of a track that is over are deleted; all have a lifetime besides, so that
+they vanish when nothing is published any more.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from sonar_imm.estimates import Estimate
 
 from .headers import Make, make_header
 
-_ADD, _DELETE_ALL = 0, 3
+_ADD, _DELETE, _DELETE_ALL = 0, 2, 3
+NAMES = ('band', 'obstacle', 'label')
+"""Namespaces of the markers of one obstacle."""
 _CUBE, _SPHERE, _TEXT = 1, 2, 9
 LIFETIME = 5
 """Seconds."""
@@ -42,6 +45,22 @@ def write_poses(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
 def write_markers(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
     """Write a MarkerArray of bars, balls and labels."""
     markers = [marker for row in rows for marker in _obstacle(estimate, row, make)]
+    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def write_ended(frame_id: str, track_ids: Iterable[int], make: Make) -> Any:
+    """Write what removes the bars, balls and labels of tracks that are over."""
+    markers = [
+        make(
+            'visualization_msgs/msg/Marker',
+            header=make_header(0, frame_id, make),
+            ns=name,
+            id=track_id,
+            action=_DELETE,
+        )
+        for track_id in track_ids
+        for name in NAMES
+    ]
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
 
 

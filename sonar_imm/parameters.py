@@ -276,6 +276,28 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
     return values
 
 
+def sections_of(text: str) -> list[str]:
+    """The nodes that a ROS 2 parameter file is for, e.g. ``/**`` or ``/diver``; of nodes in a
+    namespace the whole name. Nothing for a text that is none, or a plain mapping."""
+    import yaml
+
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError:
+        return []
+    return list(_sections(tree, '')) if isinstance(tree, dict) else []
+
+
+def _sections(tree: Mapping[Any, Any], before: str) -> Iterable[str]:
+    for key, section in tree.items():
+        name = str(key)
+        full = f'{before.rstrip("/")}/{name.lstrip("/")}' if before else name
+        if isinstance(section, dict) and 'ros__parameters' in section:
+            yield full
+        elif isinstance(section, dict):
+            yield from _sections(section, full)
+
+
 def markdown_table(specs: Iterable[ParameterSpec]) -> str:
     """The table of `specs` for the documentation, one row a parameter."""
     rows = ['| parameter | type | default | unit | range | what |', '|---|---|---|---|---|---|']

@@ -48,6 +48,7 @@ TOPICS = (
         write=write_navigation,
         doubt=doubt_navigation,
         companion=True,
+        required=lambda settings: settings.get('navigation') == 'required',
     ),
     InputTopic(
         'altitude',

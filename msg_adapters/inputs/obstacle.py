@@ -36,6 +36,7 @@ TOPICS = (
         },
         write=write_detections,
         settings=('beam_axes', 'bearing_positive', 'sound_speed'),
+        required=lambda settings: True,
     ),
     InputTopic(
         'nav',
@@ -45,6 +46,7 @@ TOPICS = (
         write=write_navigation,
         doubt=doubt_navigation,
         settings=('nav_twist_frame',),
+        required=lambda settings: True,
     ),
     InputTopic(
         'altitude',

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -35,6 +35,8 @@ class InputTopic:
     named_by: parameters of the tracker that list names, of tags or of sensors: below each name
     there is an input of its own (``<name>/fix``), and a measurement is labelled by the name in its
     topic or its frame.
+    required: whether the tracker makes nothing without it, by the parameters of the tracker. Of
+    the inputs that are neither required nor companions, one is enough.
     """
 
     name: str
@@ -52,6 +54,9 @@ class InputTopic:
     by_name: frozenset[str] = field(default=frozenset(), kw_only=True)
     second: frozenset[str] = field(default=frozenset(), kw_only=True)
     named_by: tuple[str, ...] = field(default=(), kw_only=True)
+    required: Callable[[Mapping[str, Any]], bool] = field(
+        default=lambda settings: False, kw_only=True
+    )
 
     def may_be(self, topic: str, type_name: str) -> bool:
         """Whether a topic of that name and type could be this input, if a user says so."""
@@ -82,3 +87,15 @@ class InputTopic:
         read = partial(self.readers[type_name], world_frame=world_frame, **told)
         label = Labels.of(topic, settings, self.named_by)
         return read if label is None else lambda message: label(read(message))
+
+
+def needed(
+    topics: Sequence[InputTopic], settings: Mapping[str, Any]
+) -> tuple[list[str], list[str]]:
+    """Names of the inputs that a tracker with these parameters cannot do without, and of those of
+    which one is enough."""
+    required = [topic for topic in topics if topic.required(settings)]
+    if any(not topic.companion for topic in required):
+        return [topic.name for topic in required], []
+    one_of = [topic.name for topic in topics if not topic.companion]
+    return [topic.name for topic in required], one_of

@@ -22,6 +22,8 @@ how much it adds.
 
 from __future__ import annotations
 
+import math
+
 from attrs import frozen
 import numpy as np
 from numpy.typing import ArrayLike
@@ -321,12 +323,15 @@ def _covariance(fit: ArrivalFit, information: FloatArray) -> FloatArray:
     is then no more than numbers can hold beside it.
     """
     least = 1.0 / fit.max_range**2
+    (a, b), (_, d) = information.tolist()
+    # The larger eigenvalue times the smaller one is the determinant.
+    larger = 0.5 * (a + d) + math.hypot(0.5 * (a - d), b)
+    if larger**2 <= MOST_CONDITION * max(a * d - b * b, larger * least):
+        return np.asarray(np.linalg.inv(information + least * np.eye(2)))
     known, axes = np.linalg.eigh(information)
-    if known[1] > MOST_CONDITION * max(known[0] + least, least):
-        known = np.maximum(known, 0.0) + least
-        known[1] = min(known[1], MOST_CONDITION * known[0])
-        return np.asarray((axes / known) @ axes.T)
-    return np.asarray(np.linalg.inv(information + least * np.eye(2)))
+    known = np.maximum(known, 0.0) + least
+    known[1] = min(known[1], MOST_CONDITION * known[0])
+    return np.asarray((axes / known) @ axes.T)
 
 
 def _doubt(

@@ -13,13 +13,23 @@ from typing import Any
 import click
 
 from ..node_config import node_config_type, NodeConfig, type_specs
-from ..parameters import Config, ConfigError, did_you_mean, parameters_from_yaml, ParameterSpec
+from ..parameters import (
+    Config,
+    ConfigError,
+    did_you_mean,
+    parameters_from_yaml,
+    ParameterSpec,
+    sections_of,
+)
+from ..recordings.own_parameters import NAME as OWN_PARAMETERS
 from ..trackers import System, SYSTEMS
 
 Advance = Callable[[int], None]
 
 BAG = click.Path(path_type=Path)
 SECONDS_BETWEEN_LINES = 5.0
+OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+"""Parameters that `ros2 param dump` writes of every node, and no tracker needs."""
 
 
 def example(*lines: str) -> str:
@@ -141,15 +151,26 @@ def load_config(
 
 def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
     try:
-        values = parameters_from_yaml(path.read_text(encoding='utf-8'), node_name=node_name)
+        text = path.read_text(encoding='utf-8')
+        values = parameters_from_yaml(text, node_name=node_name)
     except UnicodeDecodeError:
         raise ConfigError(f'{path} is not a text file') from None
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
-    # Parameters of every ROS 2 node that no tracker needs.
-    return {
-        key: value for key, value in values.items() if key not in ('use_sim_time', 'qos_overrides')
-    }
+    # Beside a recording the file describes the instruments for one tracker; others do without.
+    if not values and path.name != OWN_PARAMETERS and (names := _others(text, node_name)):
+        raise ConfigError(
+            f"{path} is for {', '.join(names)}, and not for '{node_name}': rename the section, or "
+            "call it '/**' for any node"
+        )
+    return {key: value for key, value in values.items() if key.split('.')[0] not in OF_EVERY_NODE}
+
+
+def _others(text: str, node_name: str) -> list[str]:
+    """The nodes that a parameter file is for where `node_name` is not among them."""
+    names = sections_of(text)
+    mine = [one for one in names if one in ('/**', '/*') or one.split('/')[-1] == node_name]
+    return [] if mine else names
 
 
 def print_json(result: Any) -> None:

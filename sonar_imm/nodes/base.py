@@ -37,7 +37,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic, needed
 from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
@@ -45,6 +45,7 @@ from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
+from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
@@ -95,7 +96,9 @@ class TrackerNode(Node):
             ),
             post_callback=self._on_clock_back,
         )
-        self._reporter = Reporter(self.get_fully_qualified_name().lstrip('/'), hears, self._meter)
+        name, told = self.get_fully_qualified_name().lstrip('/'), self.tracker.config.as_dict()
+        required, one_of = needed(self._topics, told)
+        self._reporter = Reporter(name, hears, self._meter, required=required, one_of=one_of)
         self.create_timer(
             self._node_config.diagnostics_period,
             self._report,
@@ -338,9 +341,13 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
     node = None
     try:
         _init(args)
+        if text := help_text(args):
+            print(text)
+            return 0
         stopper.on_stop(rclpy.try_shutdown, START_PATIENCE)
         executor = SingleThreadedExecutor()
         node = make_node()
+        warn_of_foreign_files(node, args)
         stopper.on_stop(rclpy.try_shutdown)
         rclpy.spin(node, executor)
     except ExternalShutdownException:

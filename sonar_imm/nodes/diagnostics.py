@@ -11,13 +11,15 @@ The class knows nothing of subscriptions and clocks; the node tells it what happ
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
 _WINDOW = 1000
+_PATIENCE = 5.0
+"""Mean intervals after which an input that is not needed is said to be gone."""
 
 
 class Meter:
@@ -28,13 +30,20 @@ class Meter:
         self.refused: Counter[str] = Counter()
         self.doubted: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}
         self._durations: deque[float] = deque(maxlen=_WINDOW)
 
     def arrived(self, topic: str, now: float) -> None:
         """Note a message on `topic`."""
         self.received[topic] += 1
+        self.first.setdefault(topic, now)
         self.last[topic] = now
+
+    def interval(self, topic: str) -> float:
+        """Mean seconds between the messages on `topic`; 0 where there were less than two."""
+        gaps = self.received[topic] - 1
+        return (self.last[topic] - self.first[topic]) / gaps if gaps > 0 else 0.0
 
     def spent(self, seconds: float) -> None:
         """Note how long one message took from the middleware to its last output."""
@@ -51,10 +60,22 @@ class Meter:
 class Reporter:
     """Turns a `Meter` and the tracker's own numbers into a DiagnosticArray, once a period."""
 
-    def __init__(self, name: str, topics: Mapping[str, str], meter: Meter):
-        """Report as `name`; `topics` maps input names to resolved topic names."""
+    def __init__(
+        self,
+        name: str,
+        topics: Mapping[str, str],
+        meter: Meter,
+        *,
+        required: Collection[str] = (),
+        one_of: Collection[str] = (),
+    ):
+        """Report as `name`; `topics` maps input names to resolved topic names.
+
+        required: inputs that are all needed; one_of: inputs of which one is enough.
+        """
         self._name = name
         self._topics = dict(topics)
+        self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
         self._before = (None, Counter(), Counter(), 0)
 
@@ -80,11 +101,12 @@ class Reporter:
         dropped = meter.dropped.total()
         self._before = (now, meter.received.copy(), meter.refused.copy(), dropped)
 
+        stale = self._stale(now, stale_after)
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
             self._input_status(
-                now, elapsed, fresh, refused, enabled, stale_after, lost, incompatible
+                now, elapsed, fresh, refused, enabled, stale_after, lost, incompatible, stale
             ),
             self._tracker_status(
                 fresh.total() / elapsed,
@@ -93,9 +115,32 @@ class Reporter:
                 counts,
                 health,
                 warnings,
+                stale,
             ),
         ]
         return message
+
+    def _stale(self, now: float, stale_after: float) -> list[str]:
+        """Sentences about what is needed and does not come."""
+        told, last = [], self._meter.last
+        for names in self._needed:
+            heard = [name for name in names if name in last]
+            silence = now - max((last[name] for name in heard), default=-np.inf)
+            where = ' or '.join(self._topics[name] for name in heard or names)
+            if not heard:
+                told.append(f'no message yet on {where}')
+            elif silence > stale_after:
+                told.append(f'no message for {silence:.1f} s on {where}')
+        return told
+
+    def _gone(self, now: float, stale_after: float) -> list[str]:
+        """Sentences about other inputs that came, and do not any more."""
+        told = []
+        for name, last in self._meter.last.items():
+            limit = max(stale_after, _PATIENCE * self._meter.interval(name))
+            if now - last > limit:
+                told.append(f'nothing more on {self._topics[name]} for {now - last:.1f} s')
+        return told
 
     def _input_status(
         self,
@@ -107,6 +152,7 @@ class Reporter:
         stale_after: float,
         lost: Mapping[str, int],
         incompatible: Mapping[str, str],
+        stale: Sequence[str],
     ) -> DiagnosticStatus:
         meter = self._meter
         values: dict[str, Any] = {}
@@ -124,12 +170,9 @@ class Reporter:
             f'incompatible peer on {topic}': policy
             for topic, policy in sorted(incompatible.items())
         }
-        silence = now - max(meter.last.values(), default=-np.inf)
         level, text = DiagnosticStatus.OK, 'receiving'
-        if not meter.last:
-            level, text = DiagnosticStatus.STALE, 'no message yet'
-        elif silence > stale_after:
-            level, text = DiagnosticStatus.STALE, f'no message for {silence:.1f} s'
+        if stale:
+            level, text = DiagnosticStatus.STALE, '; '.join(stale)
         elif refused and refused.total() >= fresh.total():
             level, text = DiagnosticStatus.ERROR, f'every message is refused: {_most(refused)}'
         elif refused:
@@ -138,6 +181,8 @@ class Reporter:
             level, text = DiagnosticStatus.WARN, 'a peer has an incompatible quality of service'
         elif lost:
             level, text = DiagnosticStatus.WARN, 'messages were lost before they could be read'
+        elif gone := self._gone(now, stale_after):
+            level, text = DiagnosticStatus.WARN, '; '.join(gone)
         if not enabled:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
@@ -150,12 +195,15 @@ class Reporter:
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str],
+        stale: Sequence[str],
     ) -> DiagnosticStatus:
         p50, p99 = self._meter.compute_ms()
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
         level, text = DiagnosticStatus.OK, 'tracking' if enabled else 'disabled'
+        if stale and enabled:
+            level, text = DiagnosticStatus.STALE, f'waiting for input: {stale[0]}'
         if warnings:
             level, text = DiagnosticStatus.WARN, '; '.join(warnings)
         if dropped:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from msg_adapters.estimates import write_model_probabilities
-from msg_adapters.obstacles import write_markers, write_no_markers, write_poses
+from msg_adapters.obstacles import write_ended, write_markers, write_no_markers, write_poses
 
 from ..estimates import Estimate
 from .base import run, TrackerNode
@@ -38,6 +38,7 @@ class ObstacleNode(TrackerNode):
 
     def __init__(self, **options: Any):
         self._frame_id = ''
+        self._shown: set[int] = set()
         super().__init__('obstacle', **options)
 
     def advertise_displays(self) -> None:
@@ -50,6 +51,10 @@ class ObstacleNode(TrackerNode):
         confirmed = np.flatnonzero(newest.extras['track_state'] >= CONFIRMED)
         if self._obstacles.get_subscription_count():
             self._obstacles.publish(write_poses(newest, confirmed, make))
+        ids = set(newest.extras['track_id'][confirmed].tolist())
+        ended, self._shown = sorted(self._shown - ids), ids
+        if ended and self._markers.get_subscription_count():
+            self._markers.publish(write_ended(self._frame_id, ended, make))
         if not len(confirmed):
             return
         if self._markers.get_subscription_count():
@@ -59,6 +64,7 @@ class ObstacleNode(TrackerNode):
             self._probabilities.publish(write_model_probabilities(newest, oldest, make))
 
     def forget(self) -> None:
+        self._shown = set()
         self._markers.publish(write_no_markers(self._frame_id, make))
 
 

@@ -81,8 +81,11 @@ class NodeParameters:
 
         def take_over(changed: list[Parameter]) -> None:
             if ours := self._ours(changed):
-                self._configs = self._build(self._values() | _plain_values(ours))
+                values = _plain_values(ours)
+                self._configs = self._build(self._values() | values)
                 apply()
+                told = ', '.join(f'{name} is {value} now' for name, value in values.items())
+                self._node.get_logger().info(f'parameters changed: {told}')
 
         self._node.add_post_set_parameters_callback(take_over)
 
@@ -94,9 +97,20 @@ class NodeParameters:
         for name in _overrides(self._node):
             if not self._node.has_parameter(name):
                 self._node.get_logger().warning(
-                    f"parameter '{name}' is not known and has no "
-                    f'effect{did_you_mean(name, self._specs)}'
+                    f"parameter '{name}' is not known and has no effect{self._meant(name)}"
                 )
+
+    def _meant(self, name: str) -> str:
+        """What could be meant by an unknown name: of a quality of service often the topic as it
+        was called before it was remapped."""
+        family, _, rest = name.partition('.')
+        topic, _, what = rest.partition('.')
+        if family == 'qos_overrides' and topic:
+            now = f'{family}.{self._node.resolve_topic_name(topic)}.{what}'
+            if now != name and self._node.has_parameter(now):
+                return f" (that topic is remapped: write '{now}')"
+            return did_you_mean(name, self._node._parameters)
+        return did_you_mean(name, self._specs)
 
     def _start_values(self) -> dict[str, Any]:
         given = self._ours(_overrides(self._node).values())
@@ -132,14 +146,17 @@ class NodeParameters:
         }
 
     def _declare(self, spec: ParameterSpec) -> None:
-        value = (self._values() | self._chosen)[spec.name]
-        # rclpy takes an empty list for an array of bytes: declare its type, without a value.
-        self._node.declare_parameter(
-            spec.name,
-            _TYPES[spec.kind] if value == [] else value,
-            descriptor(spec),
-            ignore_override=True,
-        )
+        value, told = (self._values() | self._chosen)[spec.name], descriptor(spec)
+        if value != []:
+            self._node.declare_parameter(spec.name, value, told, ignore_override=True)
+            return
+        # rclpy takes an empty list for an array of bytes. A parameter that has only a type has no
+        # value, and then `ros2 param dump` shows those of no parameter of the node.
+        kind = _TYPES[spec.kind]
+        self._node.declare_parameter(spec.name, kind, ignore_override=True)
+        self._node.set_parameters([Parameter(spec.name, kind, [])])
+        told.name, told.type = spec.name, kind.value
+        self._node.set_descriptor(spec.name, told)
 
     def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [p for p in parameters if p.name in self._specs]

@@ -73,7 +73,9 @@ class Endpoints:
     ) -> Subscription:
         """Subscribe, counting what is lost and naming peers that cannot be heard."""
         events = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be heard'),
+            incompatible_qos=lambda event: self._mismatch(
+                topic, event, 'cannot be heard', 'subscription'
+            ),
             message_lost=lambda event: self._lost(topic, event),
         )
         return self._node.create_subscription(
@@ -88,7 +90,9 @@ class Endpoints:
     def advertise(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
         """Offer a topic, naming listeners that cannot be reached."""
         events = PublisherEventCallbacks(
-            incompatible_qos=lambda event: self._mismatch(topic, event, 'cannot be reached')
+            incompatible_qos=lambda event: self._mismatch(
+                topic, event, 'cannot be reached', 'publisher'
+            )
         )
         return self._node.create_publisher(
             message_type,
@@ -98,12 +102,13 @@ class Endpoints:
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
-    def _mismatch(self, topic: str, event: Any, effect: str) -> None:
+    def _mismatch(self, topic: str, event: Any, effect: str, side: str) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind)
         if topic not in self.incompatible:
+            name = self._node.resolve_topic_name(topic)
             self._node.get_logger().warning(
-                f"a peer on '{topic}' {effect}: its {policy} quality of service does not fit; "
-                'change it there, or here with the qos_overrides parameters'
+                f"a peer on '{name}' {effect}: its {policy} quality of service does not fit; "
+                f'change it there, or here with -p qos_overrides.{name}.{side}.{policy.lower()}'
             )
         self.incompatible[topic] = policy
 

@@ -1,3 +1,4 @@
+from attrs import evolve
 import numpy as np
 import pytest
 
@@ -7,7 +8,6 @@ from msg_adapters.estimates import (
     write_model_probabilities,
     write_odometry,
 )
-from msg_adapters.fixes import UNKNOWN_VARIANCE
 from msg_adapters.table import encode_table
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
@@ -111,8 +111,27 @@ def test_odometry_shows_one_diver_with_velocity_in_the_world():
     ):
         matrix = got.reshape(6, 6)
         assert (matrix[:2, :2] == block).all()
-        assert (matrix[2:, 2:] == np.eye(4) * UNKNOWN_VARIANCE).all()
+        assert (matrix[2:, 2:] == np.diag([1.0, 1e-9, 1e-9, 1e-9])).all()
         assert not matrix[:2, 2:].any() and not matrix[2:, :2].any()
+
+
+def test_odometry_shows_the_depth_where_it_is_a_state():
+    rng = np.random.default_rng(3)
+    root = rng.standard_normal((1, 6, 6))
+    deep = evolve(
+        estimate(rows=1),
+        state_names=('px', 'py', 'pz', 'vx', 'vy', 'vz'),
+        state=rng.standard_normal((1, 6)),
+        covariance=root @ root.transpose(0, 2, 1),
+    )
+    message = through_cdr(write_odometry(deep, 0, ros_message))
+    place, speed = message.pose.pose.position, message.twist.twist.linear
+    assert [place.x, place.y, place.z, speed.x, speed.y, speed.z] == deep.state[0].tolist()
+    for got, block in (
+        (message.pose.covariance, deep.covariance[0, :3, :3]),
+        (message.twist.covariance, deep.covariance[0, 3:, 3:]),
+    ):
+        assert (got.reshape(6, 6)[:3, :3] == block).all()
 
 
 def test_model_probabilities_are_named_scalars():

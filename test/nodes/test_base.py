@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from rosgraph_msgs.msg import Clock
@@ -248,7 +249,25 @@ def test_an_incompatible_publisher_is_named(make_bench, capfd):
     bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)
     bench.spin_until(lambda: node._endpoints.incompatible)
     assert node._endpoints.incompatible == {'fix': 'RELIABILITY'}
-    assert "a peer on 'fix' cannot be heard: its RELIABILITY" in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert "a peer on '/fix' cannot be heard: its RELIABILITY" in said
+    assert '-p qos_overrides./fix.subscription.reliability' in said
+
+
+def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, capfd):
+    bench = make_bench(
+        '-r', 'fix:=/usbl/fix', '-p', 'qos_overrides./fix.subscription.reliability:=reliable'
+    )
+    bench.add(TrackerNode('walker', context=bench.context))
+    told = "remapped: write 'qos_overrides./usbl/fix.subscription.reliability'"
+    assert told in capfd.readouterr().err
+
+
+def test_accepted_changes_are_said_on_rosout(rig):
+    heard = rig.bench.listen(Log, '/rosout', 10)
+    rig.bench.spin_until(lambda: rig.node.count_subscribers('/rosout'))
+    rig.node.set_parameters([Parameter('stale_after', value=3.5)])
+    rig.bench.spin_until(lambda: any('stale_after is 3.5 now' in one.msg for one in heard))
 
 
 def test_a_clock_that_goes_back_resets_and_its_first_tick_does_not(make_bench):

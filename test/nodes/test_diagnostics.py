@@ -6,6 +6,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 
+from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.diagnostics import Meter, Reporter
 from sonar_imm.nodes.qos import output_qos
@@ -16,7 +17,8 @@ class Desk:
 
     def __init__(self):
         self.meter = Meter()
-        self.reporter = Reporter('diver', {'fix': '/fix', 'arrivals': '/arrivals'}, self.meter)
+        topics = {'fix': '/usbl/fix', 'arrivals': '/arrivals', 'altitude': '/altitude'}
+        self.reporter = Reporter('diver', topics, self.meter, one_of=('fix', 'arrivals'))
 
     def report(self, now, **changes):
         state = {
@@ -65,7 +67,66 @@ def test_silence_becomes_stale(desk):
     assert desk.input.level == DiagnosticStatus.OK
     desk.report(6.5)
     assert desk.input.level == DiagnosticStatus.STALE
-    assert desk.input.message == 'no message for 5.5 s'
+    assert desk.input.message == 'no message for 5.5 s on /usbl/fix'
+    assert desk.tracker.level == DiagnosticStatus.STALE
+
+
+def test_each_input_that_is_needed_is_looked_at_alone():
+    meter = Meter()
+    topics = {'detections': '/sonar/detections', 'nav': '/auv/nav', 'altitude': '/altitude'}
+    desk = Desk()
+    desk.meter, desk.reporter = (
+        meter,
+        Reporter('obstacle', topics, meter, required=('detections', 'nav')),
+    )
+    for second in range(20):
+        meter.arrived('detections', second)
+    desk.report(19.5)
+    assert desk.input.level == desk.tracker.level == DiagnosticStatus.STALE
+    assert desk.input.message == 'no message yet on /auv/nav'
+    assert desk.tracker.message == 'waiting for input: no message yet on /auv/nav'
+    meter.arrived('nav', 20.0)
+    desk.report(21.0)
+    assert desk.input.level == desk.tracker.level == DiagnosticStatus.OK
+    for second in range(21, 30):
+        meter.arrived('detections', second)
+    desk.report(29.5)
+    assert desk.input.message == 'no message for 9.5 s on /auv/nav'
+    assert desk.input.level == DiagnosticStatus.STALE
+
+
+def test_what_is_not_needed_is_missed_once_it_was_heard_and_not_when_it_is_slow(desk):
+    for second in range(40):
+        desk.meter.arrived('fix', second)
+    for second in (0, 1, 2, 3):
+        desk.meter.arrived('altitude', second)
+    desk.report(39.5)
+    assert desk.input.level == DiagnosticStatus.WARN
+    assert desk.input.message == 'nothing more on /altitude for 36.5 s'
+    desk.meter.arrived('altitude', 39.6)  # slower from now on: every ten seconds in the mean
+    for second in range(40, 60):
+        desk.meter.arrived('fix', second)
+    desk.report(59.5)
+    assert desk.input.level == DiagnosticStatus.OK
+
+
+@pytest.mark.parametrize(
+    'system, settings, required, one_of',
+    [
+        ('diver', {}, [], ['fix', 'fixes', 'arrivals']),
+        ('obstacle', {}, ['detections', 'nav'], []),
+        ('bathymetry', {}, [], ['snapshot', 'port/snapshot', 'starboard/snapshot']),
+        (
+            'bathymetry',
+            {'navigation': 'required'},
+            ['nav'],
+            ['snapshot', 'port/snapshot', 'starboard/snapshot'],
+        ),
+        ('fathometer', {}, [], ['csdm', 'pressure', 'trace']),
+    ],
+)
+def test_what_each_system_needs(system, settings, required, one_of):
+    assert needed(inputs_of(system), settings) == (required, one_of)
 
 
 def test_refusals_warn_while_they_last(desk):
@@ -144,9 +205,12 @@ def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker
     ]
     values = {pair.key: pair.value for pair in heard[-1].status[0].values}
     assert values['fix topic'] == '/auv1/fix'
+    told = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/arrivals'
+    assert heard[-1].status[0].message == told
 
 
 def test_obstacles_that_all_move_alike_warn_of_the_navigation(desk):
+    desk.meter.arrived('fix', 0.0)
     desk.report(0.0, health={'moving_alike': 1})
     assert desk.tracker.level == DiagnosticStatus.WARN
     assert 'navigation' in desk.tracker.message

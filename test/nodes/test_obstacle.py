@@ -126,8 +126,12 @@ def test_confirmed_obstacles_are_shown_and_the_oldest_gives_the_probabilities(ri
     assert {marker.id for marker in rig.markers[0].markers} == {9, 3, 5}
     assert list(rig.probabilities[0].name) == ['above', 'below']
     rig.node.show(an_estimate([2], [0]))
-    rig.bench.spin_until(lambda: len(rig.poses) == 2)
-    assert not rig.poses[1].poses and len(rig.markers) == 1
+    rig.bench.spin_until(lambda: len(rig.poses) == 2 and len(rig.markers) == 2)
+    assert not rig.poses[1].poses
+    drawn = {(marker.ns, marker.id) for marker in rig.markers[0].markers}
+    assert {(marker.ns, marker.id) for marker in rig.markers[1].markers} == drawn
+    assert {marker.action for marker in rig.markers[1].markers} == {Marker.DELETE}
+    assert {marker.header.frame_id for marker in rig.markers[1].markers} == {'odom'}
 
 
 def test_reset_deletes_all_markers(rig):

@@ -125,6 +125,8 @@ def test_a_node_that_cannot_start_ends_the_run_with_its_sentence(bag, tmp_path):
         (('-p', 'qos_overrides./fix.subscription.reliability:=often'), 'often'),
         (('--params-file', 'nowhere.yaml'), "Couldn't parse params file"),
         (('--no-such-flag',), '--no-such-flag'),
+        (('--', '-p', 'sound_speed:=1500.0'), "'-p' has to follow --ros-args"),
+        (('--', 'quick'), "'quick' is no argument"),
     ],
 )
 def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence):
@@ -133,7 +135,8 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
     ):
         assert node.process.wait(30.0) == 2
-        lines = [line for line in node.log().splitlines() if '[rcl]' not in line]
+        own = ('[rcl]', 'compiling numerical kernels')
+        lines = [line for line in node.log().splitlines() if not any(w in line for w in own)]
     assert len(lines) == 1
     assert sentence in lines[0]
 
@@ -229,3 +232,28 @@ def test_modules_of_the_nodes_load_neither_scipy_nor_numba():
     )
     said = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == '[]'
+
+
+def test_help_is_said_without_starting():
+    with (
+        reserved_domain_id() as domain,
+        NodeProcess('diver', domain_id=domain, arguments=('--', '--help')) as node,
+    ):
+        assert node.process.wait(30.0) == 0
+        assert node.log().startswith('usage: diver [--ros-args')
+
+
+def test_a_parameter_file_for_another_node_is_named(tmp_path):
+    file = tmp_path / 'obstacle.yaml'
+    file.write_text('/obstacle:\n  ros__parameters:\n    frame_id: odom\n')
+    with (
+        reserved_domain_id() as domain,
+        NodeProcess('diver', domain_id=domain, arguments=('--params-file', str(file))) as node,
+    ):
+        wait_until_ready([node])
+        end = time.monotonic() + 10.0
+        while 'has no effect' not in node.log():
+            assert time.monotonic() < end, node.log()
+            time.sleep(0.02)
+        assert "it is for /obstacle, and this is '/diver'" in node.log()
+        assert_clean_end([node], signal.SIGTERM)

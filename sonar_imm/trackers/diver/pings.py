@@ -73,11 +73,14 @@ class Ping(NamedTuple):
     def kept(self, keep: BoolArray) -> BoolArray:
         """`keep` (C,) without those whose parent is not kept."""
         parent = self.numbers.parent
-        return np.asarray(keep & ((parent < 0) | keep[np.maximum(parent, 0)]))
+        orphaned = (parent >= 0) & ~keep[parent]
+        return np.asarray(keep & ~orphaned)
 
     def compared(self, keep: BoolArray) -> Ping:
         """As `only`, but at most `MOST_NUMBERS`, evenly chosen."""
-        return self.only(np.isin(np.arange(len(keep)), spread(np.flatnonzero(keep))))
+        if np.count_nonzero(keep) > MOST_NUMBERS:
+            keep = np.isin(np.arange(len(keep)), spread(np.flatnonzero(keep)))
+        return self.only(keep)
 
     @property
     def nodes(self) -> IntArray:

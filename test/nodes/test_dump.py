@@ -1,0 +1,96 @@
+"""What `ros2 param dump` writes of a live node loads again, in the node and in ``track``."""
+
+import pytest
+from rcl_interfaces.msg import ParameterType
+from rcl_interfaces.srv import GetParameters, ListParameters
+from rclpy.parameter import parameter_value_to_python
+import yaml
+
+from sonar_imm.cli import main
+from sonar_imm.cli.common import load_config
+from sonar_imm.nodes.base import TrackerNode
+from sonar_imm.nodes.fls_detector import FlsDetectorNode
+from sonar_imm.parameters import ConfigError, sections_of
+from sonar_imm.trackers import SYSTEMS
+
+NODES = {name: lambda name=name, **more: TrackerNode(name, **more) for name in SYSTEMS}
+
+
+def dumped(bench, name):
+    """The text that the real command writes, by the two services that it asks."""
+    listed = bench.call(ListParameters, f'{name}/list_parameters', ListParameters.Request())
+    names = sorted(listed.result.names)
+    asked = GetParameters.Request(names=names)
+    values = bench.call(GetParameters, f'{name}/get_parameters', asked).values
+    assert len(values) == len(names) > 5
+    unset = [one for one, v in zip(names, values) if v.type == ParameterType.PARAMETER_NOT_SET]
+    assert not unset
+    tree = {}
+    for one, value in zip(names, values):
+        *folders, last = one.split('.')
+        inside = tree
+        for folder in folders:
+            inside = inside.setdefault(folder, {})
+        plain = parameter_value_to_python(value)
+        inside[last] = plain if isinstance(plain, (bool, int, float, str)) else list(plain)
+    return yaml.safe_dump({name: {'ros__parameters': tree}})
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_a_dump_of_every_node_holds_all_and_loads_again(make_bench, tmp_path, system, capfd):
+    """Real trackers start here twice: that takes some seconds."""
+    settings = ('-p', 'stale_after:=7.5', '-p', 'frame_id:=harbour')
+    bench = make_bench(*settings)
+    node = bench.add(NODES[system](context=bench.context))
+    file = tmp_path / 'live.yaml'
+    file.write_text(dumped(bench, f'/{system}'))
+    config, told = load_config(SYSTEMS[system], file, {})
+    assert config == node.tracker.config
+    assert (told.stale_after, told.frame_id) == (7.5, 'harbour')
+    again = make_bench('--params-file', str(file))
+    second = again.add(NODES[system](context=again.context))
+    assert second.tracker.config == config
+    assert dumped(again, f'/{system}') == file.read_text()
+    assert 'has no effect' not in capfd.readouterr().err
+
+
+def test_the_detector_has_a_value_for_every_parameter_too(make_bench):
+    pytest.importorskip('marine_acoustic_msgs')
+    bench = make_bench()
+    bench.add(FlsDetectorNode(context=bench.context))
+    dumped(bench, '/fls_detector')
+
+
+def test_a_file_for_another_node_is_named(tmp_path):
+    file = tmp_path / 'live.yaml'
+    file.write_text('/obstacle:\n  ros__parameters:\n    frame_id: odom\n')
+    with pytest.raises(ConfigError, match="is for /obstacle, and not for 'diver'"):
+        load_config(SYSTEMS['diver'], file, {})
+    beside = tmp_path / 'parameters.yaml'  # of a recording that another tracker looks at
+    file.rename(beside)
+    assert load_config(SYSTEMS['diver'], beside, {})[1].frame_id == ''
+    assert load_config(SYSTEMS['obstacle'], beside, {})[1].frame_id == 'odom'
+
+
+def test_sections_are_found_in_namespaces():
+    text = (
+        '/**:\n  ros__parameters: {}\n/auv1:\n  bow:\n    ros__parameters: {}\n'
+        'diver:\n  ros__parameters:\n    a: 1\n'
+    )
+    assert sections_of(text) == ['/**', '/auv1/bow', 'diver']
+    assert sections_of('a: 1') == sections_of('{[') == sections_of('5') == []
+
+
+def test_the_command_takes_a_dump_as_it_is(tmp_path, capsys):
+    file = tmp_path / 'live.yaml'
+    file.write_text(
+        '/diver:\n  ros__parameters:\n    start_type_description_service: true\n'
+        '    use_sim_time: false\n    sound_speed: 1480.0\n'
+        '    qos_overrides:\n      /fix:\n        subscription:\n          depth: 7\n'
+    )
+    scene = ['simulate', 'diver', str(tmp_path / 'bag'), '--set', 'duration=10']
+    assert main(scene) == 0
+    assert (
+        main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), '--params', str(file)]) == 0
+    )
+    assert '"sound_speed": 1480.0' in (tmp_path / 'run' / 'run.json').read_text()

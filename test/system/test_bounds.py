@@ -1,0 +1,33 @@
+"""What the hardest messages may cost, each in a process of its own: docs/reliability.md.
+
+The limits are a few times what was measured there: a loaded machine must not fail, what grows with
+the square of a message must.
+"""
+
+import pytest
+
+from benchmarks.bounds import CASES, measured
+
+pytestmark = pytest.mark.system
+
+LIMITS = {
+    'fixes': (2.0, 100.0),
+    'fixes_softly': (10.0, 200.0),
+    'arrivals_wild_tag': (5.0, 50.0),
+    'arrivals_many_divers': (15.0, 50.0),
+    'detections': (2.0, 100.0),
+    'snapshot': (5.0, 100.0),
+    'pressure': (5.0, 500.0),
+    'csdm': (5.0, 200.0),
+    'trace': (5.0, 500.0),
+}
+"""Seconds of CPU and megabytes of one message."""
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_the_hardest_message_of_each_kind_is_bounded(name):
+    told = measured(name)
+    seconds, megabytes = LIMITS[name]
+    assert not told['refused']
+    assert 0.0 < told['cpu_s'] < seconds
+    assert told['memory_mb'] < megabytes
