@@ -15,6 +15,7 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .set_model import Sets
 from .set_particles import Proposals
+from .set_scatter import ScatterFit
 from .set_shifts import draw_shift
 
 SUMS, SHIFTED_SUMS = 5, 8
@@ -284,6 +285,7 @@ def weigh(
     last: int,
     b: FloatArray,
     amplitudes: AmplitudeModel,
+    scatter: ScatterFit,
     sets: Sets,
     log_weight: FloatArray,
     amplitude: FloatArray,
@@ -292,15 +294,22 @@ def weigh(
     alone, and writes amplitude (N, J). Cholesky: A = L L', y = L^-1 h, a = L'^-1 y."""
     order, cell, mean, variance, sign, shift = sets
     gram, memory = amplitudes.gram, amplitudes.memory > 0.0
-    J = cell.shape[1]
-    L, y = np.empty((J, J)), np.empty(J)
+    J, scattered = cell.shape[1], scatter.level.shape[0] > 0
+    L, y, scale = np.empty((J, J)), np.empty(J), np.ones(J)
     for i in range(first, last):
         m = order[i]
         if not log_weight[i] > -math.inf:
             continue
-        value = 0.0
+        value, begin, level, profile = 0.0, 0, 0.0, 0
+        if scattered and m > 0:
+            begin = cell[i, 0] + shift[i]
+            value, level, profile = scatter.evidence[begin], scatter.level[begin], scatter.row[begin]
         for r in range(m):
             z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
+            if scattered:
+                behind = level * scatter.profile[profile, b.shape[0] - 1 + z + shift[i] - begin]
+                scale[r] = math.sqrt(1.0 + (scatter.spread * behind) ** 2)
+                h = (h - behind) / scale[r]
             if memory:
                 precision = 1.0 / variance[i, r]
                 h += precision * mean[i, r]
@@ -338,6 +347,9 @@ def weigh(
                 if not a[r] * sign[i, r] > 0.0:
                     value = -math.inf
                     break
+            if scattered:
+                for r in range(m):
+                    a[r] *= scale[r]
         log_weight[i] += value
 
 

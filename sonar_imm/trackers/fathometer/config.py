@@ -158,6 +158,23 @@ class FathometerConfig(StampParameters):
         '', 'file: a CSV of two columns, distance in m from 0 on, and value'
     )
 
+    # -- volume scatter ---------------------------------------------------------------------------
+    scatter_decay: tuple[float, ...] = parameter(
+        (),
+        'volume scatter below the first reflector, for envelopes: the depths over which it may '
+        'fall to 1/e, tried in each record; empty: no volume scatter',
+        kind='float[]',
+        unit='m',
+        low=0.01,
+        high=1000.0,
+    )
+    scatter_spread: float = parameter(
+        0.5,
+        'scatter_decay: standard deviation of the scatter over its mean',
+        low=0.0,
+        high=2.0,
+    )
+
     # -- sediment ---------------------------------------------------------------------------------
     sediment_sound_speed: float = live(
         0.0,

@@ -58,6 +58,7 @@ from .response import (
     rank_deficient,
     residual_sigma,
     Response,
+    scatter_of,
     trace_response,
 )
 
@@ -346,5 +347,6 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         amplitude_memory=config.amplitude_memory,
         negative_probability=config.negative_share,
         shift=heave_shift(config, step),
+        scatter=scatter_of(config, lattice),
         **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )
