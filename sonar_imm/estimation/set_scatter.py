@@ -31,6 +31,7 @@ from typing import NamedTuple
 
 from attrs import field, frozen
 import numpy as np
+from scipy.ndimage import median_filter
 
 from .arrays import FloatArray, IntArray
 
@@ -48,6 +49,7 @@ class Scatter:
     profile: FloatArray = field(repr=False)
     spread: float
     share: float
+    window: int
 
     def __attrs_post_init__(self) -> None:
         if self.profile.ndim != 2 or not self.profile.shape[1] % 2:
@@ -96,24 +98,22 @@ def fit_scatter(scatter: Scatter | None, b: FloatArray) -> ScatterFit:
     middle = profile.shape[1] // 2
     D = np.ascontiguousarray(profile[:, middle - (n - 1) : middle + n])
     size = 1 << math.ceil(math.log2(3 * n))
-    square, linear = np.fft.rfft(np.square(b), size), np.fft.rfft(b, size)
+    dull = np.maximum(without_peaks(b, scatter.window), 0.0) + 1.0
+    spectrum = np.fft.rfft(dull, size)
     total, best = np.zeros(n), np.zeros(n)
     level, row = np.zeros(n), np.zeros(n, np.int64)
-    steps = math.log(max(1.0, float(np.max(b)))) / math.log(LEVEL_RATIO)
+    looks = scatter.spread**-2
+    steps = math.log(max(1.0, float(np.max(dull)))) / math.log(LEVEL_RATIO)
     levels = LEVEL_RATIO ** np.arange(int(steps) + 1)
     for which, lags in enumerate(D):
         for v in levels:
-            mean = v * lags
-            variance = 1.0 + np.square(scatter.spread * mean)
-            quadratic, slope = 0.5 - 0.5 / variance, mean / variance
-            constant = -0.5 * mean * slope - 0.5 * np.log(variance)
+            mean = 1.0 + v * lags
+            slope, constant = 1.0 - 1.0 / mean, -np.log(mean)
             # Reversed by lag, the correlation is a convolution.
-            spectrum = square * np.fft.rfft(quadratic[::-1], size)
-            spectrum += linear * np.fft.rfft(slope[::-1], size)
-            F = np.fft.irfft(spectrum, size)[n - 1 : 2 * n - 1]
+            F = np.fft.irfft(spectrum * np.fft.rfft(slope[::-1], size), size)[n - 1 : 2 * n - 1]
             running = np.append(0.0, np.cumsum(constant))
             k = np.arange(n)
-            F = scatter.share * (F + running[2 * n - 1 - k] - running[n - 1 - k])
+            F = looks * scatter.share * (F + running[2 * n - 1 - k] - running[n - 1 - k])
             above = F > best
             greatest = np.where(above, F, best)
             # total is the sum of exp(F - best) over all that was tried besides `best` itself.
@@ -123,6 +123,12 @@ def fit_scatter(scatter: Scatter | None, b: FloatArray) -> ScatterFit:
     tried = 1 + len(levels) * len(D)
     evidence = best + np.log1p(np.maximum(total, 0.0)) - math.log(tried)
     return ScatterFit(evidence, level, row, D, scatter.spread)
+
+
+def without_peaks(b: FloatArray, window: int) -> FloatArray:
+    """b (n,) where nothing stands out: no cell above the median of the `window` cells around it.
+    Echoes narrower than half of that are gone, edges of what is wide are where they were."""
+    return np.minimum(b, median_filter(b, size=min(window, len(b)), mode='nearest'))
 
 
 def seen_against(fit: ScatterFit, b: FloatArray, k: int) -> FloatArray:

@@ -19,7 +19,7 @@ from ...estimation.arrays import FloatArray
 from ...parameters import parameter
 from ..scene import Scenario
 
-LEVELS = ('csdm', 'response', 'trace', 'pressure')
+LEVELS = ('csdm', 'response', 'trace', 'pressure', 'envelope')
 MOST_MEMORY = 2e9
 """Bytes of cross-spectra that one scene may hold."""
 PRESENT = 0.4
@@ -100,15 +100,28 @@ class FathometerScenario(Scenario):
         (), 'records between which a ship comes by, a hundred times louder', kind='int[]', low=0
     )
     noise_sigma: float = parameter(
-        1.3e-3, 'trace: standard deviation of the noise', low=1e-9, high=1.0
+        1.3e-3, 'trace, envelope: standard deviation of the noise', low=1e-9, high=1.0
     )
+    pulse_width: float = parameter(
+        0.45, 'envelope: standard deviation of the pulse', unit='m', low=1e-3, high=100.0
+    )
+    scatter: float = parameter(
+        0.0,
+        'envelope: rms of the volume scatter just below the first layer',
+        low=0.0,
+        high=10.0,
+    )
+    scatter_decay: float = parameter(
+        5.0, 'envelope: depth over which it falls to 1/e', unit='m', low=0.01, high=1000.0
+    )
+    stack: int = parameter(4, 'envelope: pings averaged to one record', low=1, high=1000)
     processor: str = parameter(
         'mvdr', 'response: beamformer that looks up and down', choices=PROCESSORS
     )
-    depth_min: float = parameter(122.0, 'response, trace: least depth', unit='m', low=0.0)
-    depth_max: float = parameter(172.0, 'response, trace: greatest depth', unit='m', low=0.1)
+    depth_min: float = parameter(122.0, 'response, trace, envelope: least depth', unit='m', low=0.0)
+    depth_max: float = parameter(172.0, 'response, trace, envelope: greatest depth', unit='m', low=0.1)
     depth_step: float = parameter(
-        0.03125, 'response, trace: distance of depths', unit='m', low=1e-4
+        0.03125, 'response, trace, envelope: distance of depths', unit='m', low=1e-4
     )
 
     def check(self) -> list[str]:
@@ -178,6 +191,30 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         },
     ),
     'ship_pass': ('drift with a ship that comes by', {'ship_pass': (150, 190)}),
+    'diffuse': (
+        'a profiler over a diffuse floor: envelopes, three layers in volume scatter',
+        {
+            'level': 'envelope',
+            'record_seconds': 1.0,
+            'array_depth': 0.0,
+            'array_depth_std': 0.0,
+            'heave': 0.0,
+            'first_depth': 16.0,
+            'layers': 3,
+            'layer_spacing': 5.0,
+            'tilt_walk': 0.1,
+            'depth_walk': 0.02,
+            'amplitude': 0.3,
+            'amplitude_swing': 0.3,
+            'appearing': (),
+            'fading': (),
+            'scatter': 0.25,
+            'noise_sigma': 0.01,
+            'depth_min': 4.5,
+            'depth_max': 45.0,
+            'depth_step': 0.2,
+        },
+    ),
     'pressure': (
         'ten seconds of pressure over two strong layers',
         {

@@ -321,7 +321,14 @@ def scatter_of(config: FathometerConfig, lattice: Lattice) -> Scatter | None:
     independent = independent_samples(pulse, step * cells, 0.25 * step) / cells
     decays = np.asarray(config.scatter_decay) / step
     profile = decaying_profile(pulse(step * np.arange(cells)), decays)
-    return Scatter(profile=profile, spread=config.scatter_spread, share=min(1.0, independent))
+    # Wide enough to take out a pulse: twice what of it is above one half.
+    half = float(np.count_nonzero(pulse(0.01 * step * np.arange(100 * cells)) > 0.5)) / 100.0
+    return Scatter(
+        profile=profile,
+        spread=config.scatter_spread,
+        share=min(1.0, independent),
+        window=2 * int(np.ceil(2.0 * half)) + 1,
+    )
 
 
 def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:

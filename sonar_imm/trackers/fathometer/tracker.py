@@ -256,7 +256,9 @@ class FathometerTracker:
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
-        self._ids, ids = self._ids.name(reflectors.depth, self.config)
+        self._ids, ids = self._ids.name(
+            reflectors.depth, reflectors.is_bottom, self.config
+        )
         self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
@@ -271,7 +273,9 @@ class FathometerTracker:
     def _preview(self, response: Response) -> Estimate:
         response, step = self._try(response)
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
-        _, ids = self._ids.name(reflectors.depth, self.config)
+        _, ids = self._ids.name(
+            reflectors.depth, reflectors.is_bottom, self.config
+        )
         self.counts['previews'] += 1
         return self._write(reflectors, ids, pmf, response, preview=True)
 
