@@ -15,7 +15,7 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .set_model import Sets
 from .set_particles import Proposals
-from .set_scatter import ScatterFit
+from .set_scatter import against, ScatterFit
 from .set_shifts import draw_shift
 
 SUMS, SHIFTED_SUMS = 5, 8
@@ -300,16 +300,12 @@ def weigh(
         m = order[i]
         if not log_weight[i] > -math.inf:
             continue
-        value, begin, level, profile = 0.0, 0, 0.0, 0
-        if scattered and m > 0:
-            begin = cell[i, 0] + shift[i]
-            value, level, profile = scatter.evidence[begin], scatter.level[begin], scatter.row[begin]
+        begin = cell[i, 0] + shift[i]
+        value = scatter.evidence[begin] if scattered and m > 0 else 0.0
         for r in range(m):
             z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
             if scattered:
-                behind = level * scatter.profile[profile, b.shape[0] - 1 + z + shift[i] - begin]
-                scale[r] = math.sqrt(1.0 + (scatter.spread * behind) ** 2)
-                h = (h - behind) / scale[r]
+                h, scale[r] = against(scatter, h, begin, z + shift[i])
             if memory:
                 precision = 1.0 / variance[i, r]
                 h += precision * mean[i, r]
@@ -348,8 +344,7 @@ def weigh(
                     value = -math.inf
                     break
             if scattered:
-                for r in range(m):
-                    a[r] *= scale[r]
+                a[:m] *= scale[:m]
         log_weight[i] += value
 
 

@@ -4,18 +4,21 @@ What scatters everywhere below a surface is no sum of a few things. Its mean in 
 level v times a decaying profile D that begins at the first member, in cell k, and its own
 fluctuation is a share of that mean:
 
-    b(z) = v D(z - k) + what the members leave + noise,    s(z)^2 = 1 + (spread v D(z - k))^2
+    mean of the background:  v D(z - k),    its deviation:  spread v D(z - k)
 
-D is ``exp(-lag / decay)`` from lag 0 on, smoothed by the pulse. Against a record of noise alone,
+D is ``exp(-lag / decay)`` from lag 0 on, smoothed by the pulse. What remains of the record when all
+that stands out is cut off (`without_peaks`) has this background alone, and noise. An envelope of
+scatter is never near zero where its mean is not: it has a gamma distribution, of shape
+1 / spread^2. With x = that record plus one, the noise, and mu = v D + 1, against noise alone,
 
-    F(k, v, decay) = share * sum_z [b^2 / 2 - (b - v D)^2 / (2 s^2) - log s]
+    F(k, v, decay) = share / spread^2 * sum_z [x (1 - 1 / mu) - log mu]
 
-where `share` is how many independent samples a cell is worth. F is a sum of two correlations, of b
-and of its square, for all k at once. Levels and decays are tried on a grid, also the level 0:
+where `share` is how many independent samples a cell is worth. F is a correlation of x, for all k
+at once. Levels and decays are tried on a grid, also the level 0:
 
     evidence(k)    log of the mean of exp F over the grid; a set whose first member is at k has it;
     level, decay   the best of the grid for that k: members are seen against this background, as
-                   ``(b - v D) / s`` in place of b.
+                   ``(b - v D) / s`` in place of b, ``s^2 = 1 + (spread v D)^2``.
 
 A set without members has no background. As s changes little within a pulse, the pulses of members
 keep their form.
@@ -34,17 +37,18 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from .arrays import FloatArray, IntArray
+from .jit import kernel
 
 LEVEL_RATIO = 1.5
 """From one level of the grid to the next; the least is one standard deviation of the noise."""
-_REACH = 9.0
 _CERTAIN = 5.0
 
 
 @frozen(eq=False, kw_only=True)
 class Scatter:
     """profile (D, 2 n - 1) by lag -(n - 1) .. n - 1 in cells, a row for each decay; spread: standard
-    deviation over mean; share: independent samples for each cell, at most 1."""
+    deviation over mean; share: independent samples for each cell, at most 1; window: cells of which
+    `without_peaks` takes the median."""
 
     profile: FloatArray = field(repr=False)
     spread: float
@@ -56,8 +60,8 @@ class Scatter:
             raise ValueError('the profile of scatter needs a row for each decay, lag 0 in the middle')
         if not (np.isfinite(self.profile).all() and (self.profile >= 0.0).all()):
             raise ValueError('the profile of scatter must be finite and not negative')
-        if not (self.spread >= 0.0 and 0.0 < self.share <= 1.0):
-            raise ValueError('scatter needs spread >= 0 and a share in (0, 1]')
+        if not (self.spread > 0.0 and 0.0 < self.share <= 1.0):
+            raise ValueError('scatter needs a positive spread and a share in (0, 1]')
 
 
 class ScatterFit(NamedTuple):
@@ -129,6 +133,15 @@ def without_peaks(b: FloatArray, window: int) -> FloatArray:
     """b (n,) where nothing stands out: no cell above the median of the `window` cells around it.
     Echoes narrower than half of that are gone, edges of what is wide are where they were."""
     return np.minimum(b, median_filter(b, size=min(window, len(b)), mode='nearest'))
+
+
+@kernel
+def against(fit: ScatterFit, value: float, k: int, z: int) -> tuple[float, float]:
+    """(value - v D) / s and s in the cell z, for a first member in the cell k."""
+    middle = fit.profile.shape[1] // 2
+    mean = fit.level[k] * fit.profile[fit.row[k], middle + z - k]
+    s = math.sqrt(1.0 + (fit.spread * mean) ** 2)
+    return (value - mean) / s, s
 
 
 def seen_against(fit: ScatterFit, b: FloatArray, k: int) -> FloatArray:

@@ -42,9 +42,15 @@ def first_arrivals(amplitude: FloatArray) -> IntArray:
     )
 
 
-def measured_instrument(amplitude: FloatArray, spacing: float) -> tuple[float, float] | None:
+def measured_instrument(
+    amplitude: FloatArray, spacing: float, stack: int = 1
+) -> tuple[float, float] | None:
     """Standard deviation of the pulse, m, and noise, for envelopes (T, n) with samples `spacing` m
-    apart; None when too few first arrivals stand free."""
+    apart, of which `stack` successive ones are averaged; None when too few first arrivals stand
+    free."""
+    step = _step(amplitude)
+    count = len(amplitude) // stack
+    amplitude = amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1)
     arrivals = first_arrivals(amplitude)
     free = [(trace, int(i)) for trace, i in zip(amplitude, arrivals) if i >= _REACH]
     widths = [width for trace, i in free if (width := _width(trace, i)) is not None]
@@ -53,7 +59,7 @@ def measured_instrument(amplitude: FloatArray, spacing: float) -> tuple[float, f
     pulse = spacing * max(float(np.quantile(widths, 0.25)) / _FWHM, 0.4)
     quiet = np.concatenate([trace[: i - _REACH] for trace, i in free] or [np.empty(0)])
     rms = float(np.sqrt(np.mean(np.square(quiet)))) if len(quiet) else 0.0
-    return pulse, max(rms, 0.5 * _step(amplitude), 1e-3 * float(amplitude.max()))
+    return pulse, max(rms, 0.5 * step, 1e-3 * float(amplitude.max()))
 
 
 def _width(trace: FloatArray, peak: int) -> float | None:

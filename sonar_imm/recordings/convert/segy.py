@@ -159,11 +159,9 @@ def _instrument(
     report: ConversionReport, amplitude: NDArray, spacing: float, stack: int
 ) -> dict[str, Any]:
     """Parameters of the tracker for the traces (T, n), none unless they are envelopes."""
-    count = len(amplitude) // stack
-    if not count or not np.isfinite(amplitude).all() or not is_envelope(amplitude):
+    if len(amplitude) < stack or not np.isfinite(amplitude).all() or not is_envelope(amplitude):
         return {}
-    stacked = amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1)
-    measured = measured_instrument(stacked, spacing)
+    measured = measured_instrument(amplitude, spacing, stack)
     if measured is None:
         report.problems.append(
             'the traces are envelopes, but no first arrival stands free to measure the pulse; '

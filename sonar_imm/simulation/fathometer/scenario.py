@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ...acoustics.fathometer import PROCESSORS
 from ...estimation.arrays import FloatArray
 from ...parameters import parameter
+from ...trackers.fathometer.envelopes import envelope_parameters
 from ..scene import Scenario
 
 LEVELS = ('csdm', 'response', 'trace', 'pressure', 'envelope')
@@ -151,6 +152,10 @@ class FathometerScenario(Scenario):
         if self.level == 'csdm':
             # They are drawn frequency by frequency: no window makes their noise fade with depth.
             told |= {'window': 'rectangular', 'overlap': 0.0}
+        if self.level == 'envelope':
+            # A profiler has no array: of the instrument only its pulse and its noise matter.
+            told = {'sound_speed': self.sound_speed}
+            told |= envelope_parameters(self.pulse_width, self.noise_sigma)
         return told
 
     def spectra_bytes(self) -> float:
@@ -209,7 +214,7 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'appearing': (),
             'fading': (),
             'scatter': 0.25,
-            'noise_sigma': 0.01,
+            'noise_sigma': 0.02,
             'depth_min': 4.5,
             'depth_max': 45.0,
             'depth_step': 0.2,

@@ -35,6 +35,7 @@ from ...estimation.set_model import banded_transition, gaussian_move, SetModel, 
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
+from .fit import Fit
 from .multiples import Multiples
 from .pressure import PressureStream
 from .reflectors import (
@@ -109,6 +110,7 @@ class FathometerTracker:
         self._smoother = LagSmoother(self.config.smoothing_lag)
         self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
         self._health: dict[str, float] = {}
+        self._fit = Fit()
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
@@ -138,6 +140,10 @@ class FathometerTracker:
         """Numbers of the last record: effective sample size, log evidence against an empty one,
         noise, most probable number of reflectors; and hydrophones left out, snapshots waiting."""
         return {**self._health, 'snapshots_waiting': float(self._pressure.waiting)}
+
+    def warnings(self) -> list[str]:
+        """Sentences on records that do not go with what was assumed of them."""
+        return self._fit.warnings(self.config)
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
@@ -266,6 +272,7 @@ class FathometerTracker:
             sigma=float(np.median(response.sigma)),
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
+        self._fit.add(step.ok, reflectors, response, float(pmf[-1]))
         newest = self._write(reflectors, ids, pmf, response)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config))
         return [*self._smoothed(step), newest]
