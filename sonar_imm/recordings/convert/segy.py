@@ -70,8 +70,9 @@ def convert_segy(
     depth, amplitude = depth[part], line.amplitude[:, part]
     if amplitude.shape[1] < 2:
         raise BagError(f'{path}: fewer than two samples of a trace are left')
-    report.notes['sample_spacing'] = f'{spacing:g} m'
+    report.notes['sample_spacing'] = f'{spacing!r} m'
     report.notes['stack'] = str(stack)
+    report.notes['depth_of_sample_0'] = f'{depth_offset + start!r} m'
     if not sample_spacing:
         offset = start + spacing * first_sample
         if doubt := doubted_spacing(amplitude, spacing, offset, line.water_depth):
