@@ -136,7 +136,9 @@ def _export_horizons(
         raise BagError(f'{run} is of {told["system"]}: only the fathometer has horizons')
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
-        raise click.UsageError('SEG-Y needs --segy, the file that the recording was converted from')
+        raise click.UsageError(
+            'SEG-Y needs --segy, the file that the recording was converted from'
+        )
     if segy and original is not None and out.exists() and out.samefile(original):
         raise click.UsageError('OUT is the file given by --segy, which stays as it is')
     positions, notes = None, {}

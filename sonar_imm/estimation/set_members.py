@@ -6,8 +6,8 @@ narrower than that is a probability: that there is a member in it. Members are t
 other, the window that holds most first; what lies within the separation of one is its own.
 
 Where the sets are of two minds about one member, its hill has two humps, and the mean lies where
-nothing is. Then the moments are those of the greater hump alone, a mode with its own spread; the
-existence is that of the member, in whichever hump.
+nothing is. With `modes` the moments are then those of the greater hump alone, a mode with its own
+spread; the existence is that of the member, in whichever hump.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ class Members(NamedTuple):
     existence: FloatArray
 
 
-def find_members(sums: FloatArray, separation: int, most: int, least_existence: float) -> Members:
+def find_members(
+    sums: FloatArray, separation: int, most: int, least_existence: float, *, modes: bool = False
+) -> Members:
     """At most `most` members whose existence is at least `least_existence`.
 
     sums (5, n): intensity, first and second moment of the amplitude, its prior variance, and the
@@ -54,7 +56,9 @@ def find_members(sums: FloatArray, separation: int, most: int, least_existence: 
             break
         hill = left[:, low:high]
         foremost = min(1.0, float(hill[4].sum()))
-        first, last = _greatest_hump(weight, max(1, separation // 4))
+        first, last = 0, len(weight)
+        if modes:
+            first, last = _greatest_hump(weight, max(1, separation // 4))
         hump = _moments(hill[:, first:last], low + first)
         found.append((*hump, foremost, min(1.0, existence)))
         left[:, low:high] = 0.0

@@ -350,11 +350,7 @@ def weigh(
 
 @kernel
 def remember(
-    first: int,
-    last: int,
-    amplitudes: AmplitudeModel,
-    amplitude: FloatArray,
-    sets: Sets,
+    first: int, last: int, amplitudes: AmplitudeModel, amplitude: FloatArray, sets: Sets
 ) -> None:
     """Amplitudes (N, J) after a record become those expected before the next, a' = phi a + noise:
     prior_mean and prior_variance of `sets`, in place. Each is kept for itself, given the others:

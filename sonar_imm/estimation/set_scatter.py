@@ -57,7 +57,9 @@ class Scatter:
 
     def __attrs_post_init__(self) -> None:
         if self.profile.ndim != 2 or not self.profile.shape[1] % 2:
-            raise ValueError('the profile of scatter needs a row for each decay, lag 0 in the middle')
+            raise ValueError(
+                'the profile of scatter needs a row for each decay, lag 0 in the middle'
+            )
         if not (np.isfinite(self.profile).all() and (self.profile >= 0.0).all()):
             raise ValueError('the profile of scatter must be finite and not negative')
         if not (self.spread > 0.0 and 0.0 < self.share <= 1.0):

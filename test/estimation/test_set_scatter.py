@@ -77,7 +77,9 @@ def test_the_evidence_is_the_mean_over_levels_and_decays():
 
 def test_the_scatter_begins_where_it_does():
     rng = np.random.default_rng(2)
-    found = [np.argmax(fit_scatter(SCATTER, diffuse(rng, first)).evidence) for first in (12, 24, 40)]
+    found = [
+        np.argmax(fit_scatter(SCATTER, diffuse(rng, first)).evidence) for first in (12, 24, 40)
+    ]
     assert np.abs(np.array(found) - (12, 24, 40)).max() <= 2
 
 

@@ -141,9 +141,7 @@ def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
     return np.column_stack([east, np.radians(line.latitude - origin[1]) * _EARTH])
 
 
-def _meetings(
-    a: FloatArray, b: FloatArray
-) -> list[tuple[int, int, float, float, float]]:
+def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float, float]]:
     """Where the polygons a (T, 2) and b (U, 2) cross: segment of each, the share of it that is
     passed, and the angle between them in degrees."""
     found = []
@@ -161,9 +159,7 @@ def _meetings(
     return found
 
 
-def _horizons(
-    line: Line, track: FloatArray, at: float, position_std: float
-) -> list[Horizon]:
+def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> list[Horizon]:
     """The horizons of a line around the fractional record `at`."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(track, axis=0).T)))
     here = float(np.interp(at, np.arange(len(way)), way))

@@ -119,8 +119,12 @@ class FathometerScenario(Scenario):
     processor: str = parameter(
         'mvdr', 'response: beamformer that looks up and down', choices=PROCESSORS
     )
-    depth_min: float = parameter(122.0, 'response, trace, envelope: least depth', unit='m', low=0.0)
-    depth_max: float = parameter(172.0, 'response, trace, envelope: greatest depth', unit='m', low=0.1)
+    depth_min: float = parameter(
+        122.0, 'response, trace, envelope: least depth', unit='m', low=0.0
+    )
+    depth_max: float = parameter(
+        172.0, 'response, trace, envelope: greatest depth', unit='m', low=0.1
+    )
     depth_step: float = parameter(
         0.03125, 'response, trace, envelope: distance of depths', unit='m', low=1e-4
     )

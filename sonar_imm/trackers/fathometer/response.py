@@ -14,17 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acoustics import fathometer
-from ...acoustics.pulse import (
-    band_pulse,
-    gaussian_pulse,
-    independent_samples,
-    measured_pulse,
-    Pulse,
-)
+from ...acoustics.pulse import band_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
 from ...estimation.set_model import move_reach
-from ...estimation.set_scatter import decaying_profile, Scatter
 from ...estimation.set_shifts import Shift
 from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError
@@ -309,26 +302,6 @@ def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
     std = config.array_depth_std / step
     fine = min(config.depth_std / step / 3.0, 0.5 * std * np.sqrt(1.0 - memory**2))
     return Shift(std=std, memory=memory, step=int(max(1.0, fine, np.ceil(4.0 * std / 200.0))))
-
-
-def scatter_of(config: FathometerConfig, lattice: Lattice) -> Scatter | None:
-    """The background below the first reflector, on the cells of a record."""
-    if not config.scatter_decay:
-        return None
-    pulse, step = pulse_of(config), lattice.step
-    shift = heave_shift(config, step)
-    cells = lattice.cells + (2 * shift.pad if shift else 0)
-    independent = independent_samples(pulse, step * cells, 0.25 * step) / cells
-    decays = np.asarray(config.scatter_decay) / step
-    profile = decaying_profile(pulse(step * np.arange(cells)), decays)
-    # Wide enough to take out a pulse: twice what of it is above one half.
-    half = float(np.count_nonzero(pulse(0.01 * step * np.arange(100 * cells)) > 0.5)) / 100.0
-    return Scatter(
-        profile=profile,
-        spread=config.scatter_spread,
-        share=min(1.0, independent),
-        window=2 * int(np.ceil(2.0 * half)) + 1,
-    )
 
 
 def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:

@@ -35,6 +35,7 @@ from ...estimation.set_model import banded_transition, gaussian_move, SetModel, 
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .config import FathometerConfig
+from .envelopes import scatter_of
 from .fit import Fit
 from .multiples import Multiples
 from .pressure import PressureStream
@@ -59,7 +60,6 @@ from .response import (
     rank_deficient,
     residual_sigma,
     Response,
-    scatter_of,
     trace_response,
 )
 
@@ -262,9 +262,7 @@ class FathometerTracker:
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
-        self._ids, ids = self._ids.name(
-            reflectors.depth, reflectors.is_bottom, self.config
-        )
+        self._ids, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
@@ -280,9 +278,7 @@ class FathometerTracker:
     def _preview(self, response: Response) -> Estimate:
         response, step = self._try(response)
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
-        _, ids = self._ids.name(
-            reflectors.depth, reflectors.is_bottom, self.config
-        )
+        _, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self.counts['previews'] += 1
         return self._write(reflectors, ids, pmf, response, preview=True)
 
@@ -329,7 +325,8 @@ class FathometerTracker:
         pmf, sums = self._filter.summary(step, w, sets)
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
-        members = find_members(sums, separation, most, self.config.existence_min)
+        modes = bool(self.config.scatter_decay)
+        members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
         if self._filter.model.shift:
             mean, std = self._filter.shift(w, sets)

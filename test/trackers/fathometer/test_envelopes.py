@@ -27,9 +27,7 @@ def told(**overrides):
 
 def track(scene, config):
     tracker = FathometerTracker(config)
-    return tracker, [
-        tracker.process(one.measurement)[0] for one in scene.measurements
-    ]
+    return tracker, [tracker.process(one.measurement)[0] for one in scene.measurements]
 
 
 def test_the_scene_is_quiet_above_the_floor_and_scatters_below(scene):
@@ -49,9 +47,7 @@ def test_the_floor_is_followed_under_one_identity(scene):
     _, estimates = track(scene, told())
     rows = [one.columns() for one in estimates]
     first = [int(np.argmax(one['is_bottom'])) for one in rows]
-    away = [
-        one['depth'][k] - true.depth.min() for one, k, true in zip(rows, first, scene.truth)
-    ]
+    away = [one['depth'][k] - true.depth.min() for one, k, true in zip(rows, first, scene.truth)]
     assert np.mean(np.abs(away) < 1.0) >= 0.95
     assert len({int(one['track_id'][k]) for one, k in zip(rows, first)}) == 1
     right = [len(r.found) == len(t.depth) for r, t in zip(records_of(estimates), scene.truth)]
@@ -111,3 +107,12 @@ def test_unexplained_records_are_said():
 def test_what_does_not_go_with_scatter(values, words):
     with pytest.raises(ConfigError, match=words):
         FathometerConfig(**{'pulse': 'gaussian', 'scatter_decay': (4.0,), **values})
+
+
+def test_too_fine_a_lattice_is_refused_with_a_sentence():
+    config = told(depth_step=0.001, depth_std=0.001, particles=10)
+    tracker = FathometerTracker(config)
+    depth = 5.0 + 0.1 * np.arange(400)
+    amplitude = np.exp(-0.5 * np.square(depth - 20.0))
+    assert tracker.process(Trace(stamp_ns=SECOND, depth=depth, amplitude=amplitude)) == []
+    assert tracker.counts['too_crowded'] == 1
