@@ -12,10 +12,13 @@ from .common import BAG, example, json_option, print_json, say
 
 @click.command(
     epilog=example(
-        'sonar-imm evaluate out', 'sonar-imm evaluate out --truth gps.bag --report gps.html'
+        'sonar-imm evaluate out',
+        'sonar-imm evaluate out --truth gps.bag --report gps.html',
+        'sonar-imm evaluate line1 line9 --crossing',
     )
 )
 @click.argument('out_dir', type=click.Path(path_type=Path))
+@click.argument('other', metavar='[OTHER]', required=False, type=click.Path(path_type=Path))
 @click.option(
     '--truth',
     'truth_bag',
@@ -50,23 +53,45 @@ from .common import BAG, example, json_option, print_json, say
     type=click.Path(path_type=Path, dir_okay=False),
     help='Where to write the report; by default OUT_DIR/report.html.',
 )
+@click.option(
+    '--crossing',
+    is_flag=True,
+    help='Compare the horizons of two fathometer runs, OUT_DIR and OTHER, where their lines cross.',
+)
+@click.option(
+    '--position-std',
+    type=click.FloatRange(min=0.0),
+    default=3.0,
+    show_default=True,
+    metavar='METRES',
+    help='crossing: error of a position, which counts by the slope of a horizon.',
+)
 @click.option('--no-report', is_flag=True, help='Only write metrics.json.')
 @json_option
 def command(
     out_dir: Path,
+    other: Path | None,
     truth_bag: Path | None,
     truth_lag: float,
     truth_gap: float,
     cutoff: float | None,
     report: Path | None,
+    crossing: bool,
+    position_std: float,
     no_report: bool,
     as_json: bool,
 ) -> None:
     """Score the run that `sonar-imm track` left in OUT_DIR.
 
     Writes metrics.json and one self-contained HTML report. Without truth only what needs none is
-    scored: the normalised innovations (NIS) and the model probabilities.
+    scored: the normalised innovations (NIS) and the model probabilities. With --crossing nothing
+    is written: the depths of two lines are compared where they cross.
     """
+    if crossing != (other is not None):
+        raise click.UsageError('--crossing compares two runs: OUT_DIR and OTHER')
+    if other is not None:
+        _compare_crossing(out_dir, other, position_std, as_json)
+        return
     judgement = evaluate_run(
         out_dir, JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
     )
@@ -76,6 +101,18 @@ def command(
 
         write_report(page, [judgement.part([])])
     print_json(judgement.metrics) if as_json else _print(judgement, page)
+
+
+def _compare_crossing(a: Path, b: Path, position_std: float, as_json: bool) -> None:
+    from ..evaluation.fathometer.crossing import crossing_lines, crossing_metrics
+    from ..evaluation.run_folder import RunFolder
+
+    metrics = crossing_metrics(RunFolder(a), RunFolder(b), position_std)
+    if as_json:
+        print_json(metrics)
+        return
+    for line in crossing_lines(metrics):
+        say(line)
 
 
 def evaluate_run(out_dir: Path, options: JudgeOptions | None = None) -> Judgement:

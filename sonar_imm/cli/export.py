@@ -10,6 +10,7 @@ import click
 from .common import example, json_option, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
+HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
 
 
 def _numbers(
@@ -30,6 +31,8 @@ def _numbers(
         'sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.tif --cell 0.5 --epsg 32632 --origin 500000,6000000',
         'sonar-imm export out survey.xyz',
+        'sonar-imm export out horizons.csv --epsg 32615',
+        'sonar-imm export out picks.sgy --segy line.seg',
     )
 )
 @click.argument('run', type=click.Path(path_type=Path, file_okay=False))
@@ -49,6 +52,12 @@ def _numbers(
     show_default=True,
     help='Side of the cells of a grid, in metres.',
 )
+@click.option(
+    '--segy',
+    'original',
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help='horizons: the SEG-Y file that the recording was converted from.',
+)
 @click.option('--overwrite', is_flag=True, help='Replace OUT.')
 @json_option
 def command(
@@ -57,14 +66,17 @@ def command(
     epsg: int | None,
     origin: tuple[float, float, float],
     cell: float,
+    original: Path | None,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Write the soundings of a tracked RUN to OUT for charts and other programs.
+    """Write the soundings or horizons of a tracked RUN to OUT for charts and other programs.
 
-    What is written follows from the ending of OUT: .xyz (easting, northing, height and its
-    standard deviation as text), .las and .laz (points with all columns), .tif (a grid of depth,
-    uncertainty, label and count). Soundings come from recordings with navigation.
+    What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
+    its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
+    depth, uncertainty, label and count); they come from recordings with navigation. Horizons of
+    the fathometer: .csv (picks by horizon), .geojson (points along the track), .sgy, .segy or .seg
+    (the file given by --segy with picks in place of its samples).
     """
     from ..evaluation.run_folder import RunFolder, SOUNDINGS
     from ..recordings.export.grid import grid_of, write_geotiff
@@ -72,13 +84,15 @@ def command(
     from ..recordings.sources import BagError
 
     kind = out.suffix.lower().lstrip('.')
-    if kind not in FORMATS:
-        raise click.UsageError(
-            f"'{out.name}' ends in none of {', '.join(f'.{name}' for name in FORMATS)}"
-        )
+    if kind not in FORMATS + HORIZON_FORMATS:
+        known = ', '.join(f'.{name}' for name in FORMATS + HORIZON_FORMATS)
+        raise click.UsageError(f"'{out.name}' ends in none of {known}")
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
-    RunFolder(run).read_run()
+    told = RunFolder(run).read_run()
+    if kind in HORIZON_FORMATS:
+        _export_horizons(run, told, out, kind, epsg, original, as_json)
+        return
     if not (run / SOUNDINGS).is_file():
         raise BagError(
             f'{run} holds no soundings: the recording has no navigation, or is of another system'
@@ -99,3 +113,52 @@ def command(
         return
     shape = f' in {result["rows"]} by {result["columns"]} cells' if 'rows' in result else ''
     say(f'{out}: {len(points)} soundings{shape}')
+
+
+def _export_horizons(
+    run: Path,
+    told: dict[str, Any],
+    out: Path,
+    kind: str,
+    epsg: int | None,
+    original: Path | None,
+    as_json: bool,
+) -> None:
+    """Picks of a run of the fathometer; told: its run.json."""
+    from ..evaluation.run_folder import RunFolder
+    from ..recordings.export.horizons import picks_of, write_geojson, write_horizons
+    from ..recordings.export.picks import write_picks
+    from ..recordings.positions import read_positions
+    from ..recordings.reader import BagReader
+    from ..recordings.sources import BagError
+
+    if told['system'] != 'fathometer':
+        raise BagError(f'{run} is of {told["system"]}: only the fathometer has horizons')
+    segy = kind in ('sgy', 'segy', 'seg')
+    if segy and original is None:
+        raise click.UsageError(
+            'SEG-Y needs --segy, the file that the recording was converted from'
+        )
+    if segy and original is not None and out.exists() and out.samefile(original):
+        raise click.UsageError('OUT is the file given by --segy, which stays as it is')
+    positions, notes = None, {}
+    if Path(told['bag']).exists():
+        with BagReader(told['bag']) as bag:
+            positions, notes = read_positions(bag), bag.custom_data
+    elif segy or kind == 'geojson':
+        raise BagError(f'{told["bag"]}, the recording of {run}, is gone')
+    speed = float(told['parameters'].get('sound_speed', 1500.0))
+    picks = picks_of(RunFolder(run).read_estimates(), speed, positions)
+    result: dict[str, Any] = {'out': str(out), 'picks': len(picks), 'left_out': 0}
+    result['horizons'] = len(set(picks.horizon.tolist()))
+    if kind == 'csv':
+        write_horizons(out, picks, notes.get('source', run.name), epsg)
+    elif kind == 'geojson':
+        result['left_out'] = write_geojson(out, picks)
+    elif original is not None:
+        result['left_out'] = write_picks(out, picks, original, notes)
+    if as_json:
+        print_json(result)
+        return
+    left = f', {result["left_out"]} left out' if result['left_out'] else ''
+    say(f'{out}: {result["picks"]} picks of {result["horizons"]} horizons{left}')

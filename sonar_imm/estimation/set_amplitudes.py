@@ -10,6 +10,7 @@ import numpy as np
 from .arrays import FloatArray
 from .jit import kernel
 from .set_model import Sets
+from .set_scatter import against, ScatterFit
 
 SLOTS = 8192
 
@@ -27,12 +28,22 @@ class AmplitudeModel(NamedTuple):
     variance: float
 
 
+class Scratch(NamedTuple):
+    """Room of one thread: L (J, J) and y (J,) of the Cholesky factor, and the scale (J,) of the
+    amplitudes in front of volume scatter."""
+
+    L: FloatArray
+    y: FloatArray
+    scale: FloatArray
+
+
 @kernel
 def weigh(
     first: int,
     last: int,
     b: FloatArray,
     amplitudes: AmplitudeModel,
+    scatter: ScatterFit,
     sets: Sets,
     log_weight: FloatArray,
     amplitude: FloatArray,
@@ -43,13 +54,13 @@ def weigh(
     Particles crowd at the peaks of a record: of twenty thousand some three thousand differ. What
     was found for one is kept, in a slot by its members, for those that are the same."""
     J, memory = sets.cell.shape[1], amplitudes.memory > 0.0
-    L, y = np.empty((J, J)), np.empty(J)
+    scratch = Scratch(np.empty((J, J)), np.empty(J), np.ones(J))
     owner, kept = np.full(SLOTS, -1, np.int64), np.empty(SLOTS)
     for i in range(first, last):
         if not log_weight[i] > -math.inf:
             continue
         if memory:
-            log_weight[i] += _explain(i, b, amplitudes, sets, amplitude, L, y)
+            log_weight[i] += _explain(i, b, amplitudes, scatter, sets, amplitude, scratch)
             continue
         slot = sets.shift[i]
         for k in range(sets.order[i]):
@@ -60,7 +71,8 @@ def weigh(
             for k in range(sets.order[i]):
                 amplitude[i, k] = amplitude[j, k]
         else:
-            owner[slot], kept[slot] = i, _explain(i, b, amplitudes, sets, amplitude, L, y)
+            owner[slot] = i
+            kept[slot] = _explain(i, b, amplitudes, scatter, sets, amplitude, scratch)
         log_weight[i] += kept[slot]
 
 
@@ -79,18 +91,22 @@ def _explain(
     i: int,
     b: FloatArray,
     amplitudes: AmplitudeModel,
+    scatter: ScatterFit,
     sets: Sets,
     amplitude: FloatArray,
-    L: FloatArray,
-    y: FloatArray,
+    scratch: Scratch,
 ) -> float:
     """Log likelihood of the set i, whose row of `amplitude` is written. Cholesky: A = L L',
-    y = L^-1 h, a = L'^-1 y; L (J, J) and y (J,) are scratch."""
+    y = L^-1 h, a = L'^-1 y."""
     order, cell, mean, variance, sign, shift = sets
+    L, y, scale = scratch
     gram, memory, m = amplitudes.gram, amplitudes.memory > 0.0, order[i]
-    value = 0.0
+    scattered, begin = scatter.level.shape[0] > 0, cell[i, 0] + shift[i]
+    value = scatter.evidence[begin] if scattered and m > 0 else 0.0
     for r in range(m):
         z, h, precision = cell[i, r], b[cell[i, r] + shift[i]], amplitudes.ridge
+        if scattered:
+            h, scale[r] = against(scatter, h, begin, z + shift[i])
         if memory:
             precision = 1.0 / variance[i, r]
             h += precision * mean[i, r]
@@ -128,6 +144,8 @@ def _explain(
             if not a[r] * sign[i, r] > 0.0:
                 value = -math.inf
                 break
+        if scattered:
+            a[:m] *= scale[:m]
     return value
 
 

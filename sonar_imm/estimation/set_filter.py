@@ -27,6 +27,7 @@ from .particles import effective_sample_size, normalise
 from .resampling import systematic
 from .set_model import SetModel, Sets
 from .set_particles import gains, Proposals, propose_births
+from .set_scatter import fit_scatter, ScatterFit
 from .set_shifts import shift_tables
 
 _STEP, _START, _RESAMPLE = range(3)
@@ -103,11 +104,13 @@ class SetFilter:
         None before the first record. key: seed and name of the record, each in 0 .. 2^64 - 1.
         gram (n,): of this record, where it is not the model's."""
         answer = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
+        fit = fit_scatter(self.model.scatter, b)
+        g = gains(self.model, b, fit)
         if before is None:
-            before = self._start(b, key)
-        sets, log_ratio = self._propagate(before.sets, b, _uniform(key, _STEP))
+            before = self._start(g, key)
+        sets, log_ratio = self._propagate(before.sets, g, _uniform(key, _STEP))
         log_weight = before.log_weight + log_ratio
-        amplitude = self._weigh(sets, b, log_weight, answer)
+        amplitude = self._weigh(sets, b, fit, log_weight, answer)
         w, log_sum = normalise(log_weight)
         _, log_before = normalise(before.log_weight)
         ok = bool(np.isfinite(log_sum))
@@ -144,13 +147,13 @@ class SetFilter:
         spread = float(np.sqrt(w @ np.square(sets.shift - mean)))
         return mean - self.model.pad, spread
 
-    def _start(self, b: FloatArray, key: tuple[int, int]) -> Weighted:
+    def _start(self, g: FloatArray, key: tuple[int, int]) -> Weighted:
         model, sets = self.model, Sets.empty(self.model, self.particles)
         uniform = _uniform(key, _START).random(
             (self.particles, 1 + model.order_max + (model.shift is not None))
         )
         log_ratio = np.zeros(self.particles)
-        proposals = self._proposals(b)
+        proposals = self._proposals(g)
         self._split(
             lambda first, last: kernels.start(
                 first, last, self._motion, self._charge, proposals, uniform, sets, log_ratio
@@ -161,23 +164,22 @@ class SetFilter:
         # The sets are draws from the prior in disguise: as many particles as if they were.
         return Weighted(sets, log_ratio)
 
-    def _proposals(self, b: FloatArray) -> Proposals:
-        """The tables of one record, moves not filled in."""
-        births = propose_births(self.model, b)
+    def _proposals(self, g: FloatArray) -> Proposals:
+        """The tables of one record of gains g (S, n), moves not filled in."""
+        births = propose_births(self.model, g)
         return Proposals(self._move, self._move_ratio, *births, self._shifts)
 
     def _propagate(
-        self, old: Sets, b: FloatArray, rng: np.random.Generator
+        self, old: Sets, g: FloatArray, rng: np.random.Generator
     ) -> tuple[Sets, FloatArray]:
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
-        proposals = self._proposals(b)
+        proposals = self._proposals(g)
         if model.shift:
-            kernels.fill_all_moves(gains(model, b), model.move, model.move_share, proposals)
+            kernels.fill_all_moves(g, model.move, model.move_share, proposals)
         else:
             filled = np.zeros(len(self._move), np.bool_)
-            g = gains(model, b)
             kernels.fill_moves(old, g, model.move, model.move_share, filled, proposals)
         self._split(
             lambda first, last: kernels.propagate(
@@ -198,13 +200,14 @@ class SetFilter:
         self,
         sets: Sets,
         b: FloatArray,
+        fit: ScatterFit,
         log_weight: FloatArray,
         answer: amplitudes.AmplitudeModel,
     ) -> FloatArray:
         amplitude = np.zeros(sets.cell.shape)
         self._split(
             lambda first, last: amplitudes.weigh(
-                first, last, b, answer, sets, log_weight, amplitude
+                first, last, b, answer, fit, sets, log_weight, amplitude
             )
         )
         return amplitude

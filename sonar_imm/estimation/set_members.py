@@ -4,6 +4,10 @@ The **intensity** of the particles, how many members are expected on each cell, 
 member. No set has two members closer than the separation, so the intensity summed over a window
 narrower than that is a probability: that there is a member in it. Members are taken one after the
 other, the window that holds most first; what lies within the separation of one is its own.
+
+Where the sets are of two minds about one member, its hill has two humps, and the mean lies where
+nothing is. With `modes` the moments are then those of the greater hump alone, a mode with its own
+spread; the existence is that of the member, in whichever hump.
 """
 
 from __future__ import annotations
@@ -14,9 +18,11 @@ import numpy as np
 
 from .arrays import FloatArray
 
+_VALLEY, _ASIDE = 0.05, 0.1
+
 
 class Members(NamedTuple):
-    """K members by place: place (K,) in cells, mean over the hill; amplitude (K,) mean in units of
+    """K members by place: place (K,) in cells, mean over the hill or its greatest hump; amplitude (K,) mean in units of
     the noise; covariance (K, 2, 2) of both, the spread of the particles; prior_variance (K,) of
     the amplitude before the record, given the place; foremost (K,), the probability that it is the
     first of its set; existence (K,), the probability that it is there, at most 1."""
@@ -29,7 +35,9 @@ class Members(NamedTuple):
     existence: FloatArray
 
 
-def find_members(sums: FloatArray, separation: int, most: int, least_existence: float) -> Members:
+def find_members(
+    sums: FloatArray, separation: int, most: int, least_existence: float, *, modes: bool = False
+) -> Members:
     """At most `most` members whose existence is at least `least_existence`.
 
     sums (5, n): intensity, first and second moment of the amplitude, its prior variance, and the
@@ -46,7 +54,13 @@ def find_members(sums: FloatArray, separation: int, most: int, least_existence: 
         existence = float(weight.sum())
         if not existence > 0.0 or existence < least_existence:
             break
-        found.append((*_moments(left[:, low:high], low), min(1.0, existence)))
+        hill = left[:, low:high]
+        foremost = min(1.0, float(hill[4].sum()))
+        first, last = 0, len(weight)
+        if modes:
+            first, last = _greatest_hump(weight, max(1, separation // 4))
+        hump = _moments(hill[:, first:last], low + first)
+        found.append((*hump, foremost, min(1.0, existence)))
         left[:, low:high] = 0.0
     found.sort(key=lambda member: member[0])
     if not found:
@@ -55,18 +69,33 @@ def find_members(sums: FloatArray, separation: int, most: int, least_existence: 
     return Members(*(np.array(column) for column in zip(*found)))
 
 
-def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, float, float]:
+def _greatest_hump(weight: FloatArray, width: int) -> tuple[int, int]:
+    """First cell and the one after the last of the greatest hump of a hill (n,), seen through a
+    window of `width` cells: from its top as far as it stays above `_VALLEY` of that; the whole
+    hill when less than `_ASIDE` of it lies elsewhere."""
+    seen = np.convolve(weight, np.ones(width), 'same')
+    top = int(np.argmax(seen))
+    low = np.flatnonzero(seen <= _VALLEY * seen[top])
+    first = int(low[low < top].max(initial=-1)) + 1
+    last = int(low[low > top].min(initial=len(weight)))
+    inside = float(weight[first:last].sum())
+    if inside >= (1.0 - _ASIDE) * float(weight.sum()):
+        return 0, len(weight)
+    return first, last
+
+
+def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, float]:
     cells = first + np.arange(sums.shape[1])
     total = sums[0].sum()
     place, amplitude = float(sums[0] @ cells) / total, float(sums[1].sum()) / total
-    foremost, prior = min(1.0, float(sums[4].sum())), float(sums[3].sum()) / total
+    prior = float(sums[3].sum()) / total
     if len(sums) > 5:
         place, second = float(sums[5].sum()) / total, float(sums[6].sum()) / total
         cross = float(sums[7].sum()) / total - place * amplitude
         spread_of = max(0.0, second - place**2), cross
         left = float(sums[2].sum()) / total - amplitude**2
         left = max(left, cross**2 / spread_of[0] if spread_of[0] else 0.0)
-        return place, amplitude, np.array([spread_of, (cross, left)]), prior, foremost
+        return place, amplitude, np.array([spread_of, (cross, left)]), prior
     spread = cells - place
     cross = float(sums[1] @ spread) / total
     covariance = np.array(
@@ -75,7 +104,7 @@ def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, fl
             [cross, max(0.0, float(sums[2].sum()) / total - amplitude**2)],
         ]
     )
-    return place, amplitude, covariance, prior, foremost
+    return place, amplitude, covariance, prior
 
 
 def _windowed(intensity: FloatArray, half: int) -> FloatArray:

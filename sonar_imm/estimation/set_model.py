@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
 from .markov import check_transition_matrix
+from .set_scatter import Scatter
 from .set_shifts import Shift
 
 PRIORS = ('marginal', 'bic_half', 'paper')
@@ -45,7 +46,8 @@ class SetModel:
     0; amplitude_prior: one of PRIORS, with amplitude_std: s, and independent_samples: N;
     move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
     noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
-    negative_probability: that a member is negative; shift: that all members share, None for none.
+    negative_probability: that a member is negative; shift: that all members share, None for none;
+    scatter: background below the first member, None for none.
     With a shift, records b have ``record_cells`` cells, the lattice with the largest shift before
     and after it.
     """
@@ -65,12 +67,17 @@ class SetModel:
     amplitude_memory: float = 0.0
     negative_probability: float = 0.0
     shift: Shift | None = None
+    scatter: Scatter | None = None
 
     def __attrs_post_init__(self) -> None:
         if self.amplitude_prior not in PRIORS:
             raise ValueError(f'amplitude_prior is one of {PRIORS}, not {self.amplitude_prior!r}')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
             raise ValueError('only marginal amplitudes can have a memory')
+        if self.amplitude_memory and self.scatter:
+            raise ValueError('amplitudes against scatter cannot have a memory')
+        if self.scatter and self.scatter.profile.shape[1] < 2 * self.record_cells - 1:
+            raise ValueError('the profile of scatter is shorter than the record')
         if not 0.0 <= self.negative_probability < 1.0:
             raise ValueError('negative_probability lies in [0, 1)')
         if self.order_min < 0 or self.separation < 1 or len(self.gram) < self.cells:

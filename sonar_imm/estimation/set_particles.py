@@ -36,6 +36,9 @@ The record
     ``paper``      the best a, and a penalty of log(N) for each. The prior of births already
                    charges for the place, so this charges twice: too much.
 
+    With ``scatter`` the things stand in a background that begins at the first of them: see
+    `set_scatter`.
+
     Each member has a sign for life, drawn at its birth: negative with ``negative_probability``. A
     set that needs an amplitude of another sign is impossible.
 
@@ -71,6 +74,7 @@ import numpy as np
 
 from .arrays import FloatArray
 from .set_model import SetModel, Sets
+from .set_scatter import fit_scatter, guide, ScatterFit
 from .set_shifts import propose_shift, shift_tables, ShiftTables
 
 IMPOSSIBLE = -math.inf
@@ -96,8 +100,10 @@ def gain(b: FloatArray) -> FloatArray:
     return np.asarray(0.5 * np.square(np.maximum(b, 0.0)))
 
 
-def gains(model: SetModel, b: FloatArray) -> FloatArray:
+def gains(model: SetModel, b: FloatArray, fit: ScatterFit) -> FloatArray:
     """g (S, n) for each sign."""
+    if model.scatter:
+        b = guide(fit, b)
     return np.stack([gain(sign * b) for sign in model.signs])
 
 
@@ -106,9 +112,10 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
     n, radius = model.record_cells, len(model.move) // 2
     to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
     there = (to >= 0) & (to < n)
+    gained = gains(model, b, fit_scatter(model.scatter, b))
     K = np.where(there, model.move, 0.0)
     signs = len(model.signs)
-    g = np.where(there, gains(model, b)[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
+    g = np.where(there, gained[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
     K = np.tile(K, (signs, 1))
     best = g.max(axis=1, keepdims=True)
     data_driven = K * np.exp(g - best)
@@ -118,13 +125,14 @@ def propose(model: SetModel, b: FloatArray) -> Proposals:
         ratio = np.where(q > 0.0, np.log(K / q), IMPOSSIBLE)
     log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
     shifts = shift_tables(model.shift, log_sum, model.move_share)
-    return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, b), shifts)
+    return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, gained), shifts)
 
 
-def propose_births(model: SetModel, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """birth (n + 1,), birth_ratio (S, n) and birth_positive (n,) of `Proposals`."""
+def propose_births(model: SetModel, g: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """birth (n + 1,), birth_ratio (S, n) and birth_positive (n,) of `Proposals`, from the gains
+    g (S, n)."""
     prior = np.array(list(model.signs.values()))[:, None]
-    data_driven = prior * np.exp(np.minimum(gains(model, b), model.birth_cap))
+    data_driven = prior * np.exp(np.minimum(g, model.birth_cap))
     weight = (
         model.birth_share * data_driven / data_driven.sum()
         + (1.0 - model.birth_share) * prior / model.cells
@@ -258,6 +266,7 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
     in units of the noise."""
     log_likelihood = np.zeros(len(sets.order))
     amplitude = np.zeros(sets.cell.shape)
+    fit = fit_scatter(model.scatter, b)
     for m in np.unique(sets.order[sets.order > 0]):
         at = np.flatnonzero(sets.order == m)
         z = sets.cell[at, :m]
@@ -266,7 +275,14 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
             precision = 1.0 / sets.prior_variance[at, :m]
         else:
             precision = np.full(z.shape, model.ridge)
-        h = b[z + sets.shift[at, None]] + precision * sets.prior_mean[at, :m]
+        place = z + sets.shift[at, None]
+        seen, scale = b[place], np.ones(z.shape)
+        if model.scatter:
+            k = place[:, :1]
+            mean = fit.level[k] * fit.profile[fit.row[k], len(b) - 1 + place - k]
+            scale = np.sqrt(1.0 + np.square(fit.spread * mean))
+            seen = (seen - mean) / scale
+        h = seen + precision * sets.prior_mean[at, :m]
         A = A + precision[:, :, None] * np.eye(m)
         a = np.linalg.solve(A, h[..., None])[..., 0]
         value = 0.5 * np.einsum('im,im->i', h, a) - m * model.penalty
@@ -275,6 +291,8 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
         if model.amplitude_memory:
             value -= 0.5 * np.sum(precision * np.square(sets.prior_mean[at, :m]), axis=1)
             value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
-        amplitude[at, :m] = a
+        if model.scatter:
+            value += fit.evidence[place[:, 0]]
+        amplitude[at, :m] = scale * a
         log_likelihood[at] = np.where((a * sets.sign[at, :m] > 0.0).all(axis=1), value, IMPOSSIBLE)
     return log_likelihood, amplitude

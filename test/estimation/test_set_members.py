@@ -39,3 +39,23 @@ def test_a_member_at_the_edge_and_a_separation_of_one():
     assert found.place == pytest.approx([0.0])
     assert found.existence == pytest.approx([0.8])
     assert found.prior_variance == pytest.approx([2.0])
+
+
+def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
+    sums = hills((40, 0.55, 5.0), (52, 0.4, 3.0))
+    mean = find_members(sums, 16, 1, 0.5)
+    assert mean.place == pytest.approx([45.05], abs=0.1) and mean.covariance[0, 0, 0] > 30.0
+    mode = find_members(sums, 16, 1, 0.5, modes=True)
+    assert mode.place == pytest.approx([40.0], abs=0.1)
+    assert mode.amplitude == pytest.approx([5.0], abs=0.01)
+    assert mode.covariance[0] == pytest.approx(np.array([[1.0, 0.0], [0.0, 0.25]]), abs=0.15)
+    # That there is a member is as sure as before, wherever it is.
+    assert mode.existence == pytest.approx(mean.existence) and mode.existence > 0.9
+    assert mode.foremost == pytest.approx(mean.foremost)
+
+
+def test_one_hump_and_what_is_rare_beside_it_stay_whole():
+    sums = hills((40, 0.9, 5.0), (52, 0.05, 3.0))
+    with_modes = find_members(sums, 16, 1, 0.5, modes=True)
+    for one, other in zip(with_modes, find_members(sums, 16, 1, 0.5)):
+        assert np.array_equal(one, other)

@@ -1,1 +1,1 @@
-"""Soundings for charts and other programs: points as XYZ, LAS and LAZ, grids as GeoTIFF."""
+"""For other programs: soundings as XYZ, LAS, LAZ and GeoTIFF; horizons as CSV, GeoJSON, SEG-Y."""

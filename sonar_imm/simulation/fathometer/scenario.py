@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from ...acoustics.fathometer import PROCESSORS
 from ...estimation.arrays import FloatArray
 from ...parameters import parameter
+from ...trackers.fathometer.envelopes import envelope_parameters
 from ..scene import Scenario
 
-LEVELS = ('csdm', 'response', 'trace', 'pressure')
+LEVELS = ('csdm', 'response', 'trace', 'pressure', 'envelope')
 MOST_MEMORY = 2e9
 """Bytes of cross-spectra that one scene may hold."""
 PRESENT = 0.4
@@ -112,15 +113,32 @@ class FathometerScenario(Scenario):
         1.0, 'pressure: length of a message', unit='s', low=1e-3, high=60.0
     )
     noise_sigma: float = parameter(
-        1.3e-3, 'trace: standard deviation of the noise', low=1e-9, high=1.0
+        1.3e-3, 'trace, envelope: standard deviation of the noise', low=1e-9, high=1.0
     )
+    pulse_width: float = parameter(
+        0.45, 'envelope: standard deviation of the pulse', unit='m', low=1e-3, high=100.0
+    )
+    scatter: float = parameter(
+        0.0,
+        'envelope: rms of the volume scatter just below the first layer',
+        low=0.0,
+        high=10.0,
+    )
+    scatter_decay: float = parameter(
+        5.0, 'envelope: depth over which it falls to 1/e', unit='m', low=0.01, high=1000.0
+    )
+    stack: int = parameter(4, 'envelope: pings averaged to one record', low=1, high=1000)
     processor: str = parameter(
         'mvdr', 'response: beamformer that looks up and down', choices=PROCESSORS
     )
-    depth_min: float = parameter(122.0, 'response, trace: least depth', unit='m', low=0.0)
-    depth_max: float = parameter(172.0, 'response, trace: greatest depth', unit='m', low=0.1)
+    depth_min: float = parameter(
+        122.0, 'response, trace, envelope: least depth', unit='m', low=0.0
+    )
+    depth_max: float = parameter(
+        172.0, 'response, trace, envelope: greatest depth', unit='m', low=0.1
+    )
     depth_step: float = parameter(
-        0.03125, 'response, trace: distance of depths', unit='m', low=1e-4
+        0.03125, 'response, trace, envelope: distance of depths', unit='m', low=1e-4
     )
 
     def check(self) -> list[str]:
@@ -154,6 +172,10 @@ class FathometerScenario(Scenario):
             # Snapshots are the tracker's own; they are as long as the depths to be tracked need.
             del told['snapshot_seconds']
             told |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
+        if self.level == 'envelope':
+            # A profiler has no array: of the instrument only its pulse and its noise matter.
+            told = {'sound_speed': self.sound_speed}
+            told |= envelope_parameters(self.pulse_width, self.noise_sigma)
         return told
 
     def spectra_bytes(self) -> float:
@@ -192,6 +214,30 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
         },
     ),
     'ship_pass': ('drift with a ship that comes by', {'ship_pass': (150, 190)}),
+    'diffuse': (
+        'a profiler over a diffuse floor: envelopes, three layers in volume scatter',
+        {
+            'level': 'envelope',
+            'record_seconds': 1.0,
+            'array_depth': 0.0,
+            'array_depth_std': 0.0,
+            'heave': 0.0,
+            'first_depth': 16.0,
+            'layers': 3,
+            'layer_spacing': 5.0,
+            'tilt_walk': 0.1,
+            'depth_walk': 0.02,
+            'amplitude': 0.3,
+            'amplitude_swing': 0.3,
+            'appearing': (),
+            'fading': (),
+            'scatter': 0.25,
+            'noise_sigma': 0.02,
+            'depth_min': 4.5,
+            'depth_max': 45.0,
+            'depth_step': 0.2,
+        },
+    ),
     'pressure': (
         'twelve records of eight seconds of pressure at 16 hydrophones over three layers',
         {

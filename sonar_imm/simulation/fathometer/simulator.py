@@ -6,7 +6,8 @@ written of a scene:
               noise of ships from the horizontal and noise of the hydrophones;
     response  traces processed from such cross-spectra;
     trace     traces made directly, of pulses and noise in the same band: hundreds per second;
-    pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
+     envelope  of a sub-bottom profiler over a floor that scatters, see `envelope`;
+     pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from ...acoustics.pulse import band_pulse
 from ...estimation.arrays import FloatArray
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from ..scene import Received, Scene, TrueReflectors
+from .envelope import envelope
 from .field import expected_csdm, pressure_field
 from .scenario import Drift, drift_of, FathometerScenario, PRESENT, scenario, SCENARIOS
 
@@ -90,6 +92,8 @@ def _measurements(
             yield pressure_blocks(config, drift, record, told, rng)
         elif config.level == 'trace':
             yield [_trace(config, drift, record, told, rng)]
+        elif config.level == 'envelope':
+            yield [_envelope(config, drift, record, told, rng)]
         else:
             spectra = cross_spectra(config, drift, record, told, rng)
             yield [spectra if config.level == 'csdm' else _response(config, spectra, drift)]
@@ -176,6 +180,23 @@ def _trace(
         depth=depth,
         amplitude=there + noise,
         sigma=np.full(len(depth), config.noise_sigma),
+        reference_depth=told,
+    )
+
+
+def _envelope(
+    config: FathometerScenario,
+    drift: Drift,
+    record: int,
+    told: float | None,
+    rng: np.random.Generator,
+) -> Trace:
+    depth = _depths(config)
+    return Trace(
+        stamp_ns=stamp_of(config, record),
+        frame_id=FRAME_ID,
+        depth=depth,
+        amplitude=envelope(config, drift, record, depth, rng),
         reference_depth=told,
     )
 

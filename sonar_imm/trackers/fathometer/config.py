@@ -21,6 +21,7 @@ POLARITIES = ('positive', 'both')
 MULTIPLES = ('mark', 'off')
 HEAVES = ('none', 'independent', 'memory')
 MAX_MEMBERS = 50_000_000
+MAX_DECAYS = 8
 
 
 @frozen(kw_only=True)
@@ -174,6 +175,23 @@ class FathometerConfig(StampParameters):
         '', 'file: a CSV of two columns, distance in m from 0 on, and value'
     )
 
+    # -- volume scatter ---------------------------------------------------------------------------
+    scatter_decay: tuple[float, ...] = parameter(
+        (),
+        'volume scatter below the first reflector, for envelopes: the depths over which it may '
+        'fall to 1/e, tried in each record; empty: no volume scatter',
+        kind='float[]',
+        unit='m',
+        low=0.01,
+        high=1000.0,
+    )
+    scatter_spread: float = parameter(
+        0.4,
+        'scatter_decay: standard deviation of the scatter over its mean',
+        low=0.01,
+        high=2.0,
+    )
+
     # -- sediment ---------------------------------------------------------------------------------
     sediment_sound_speed: float = live(
         0.0,
@@ -300,12 +318,26 @@ class FathometerConfig(StampParameters):
             problems.append('pulse file needs pulse_file')
         if self.amplitude_memory and self.amplitude_prior != 'marginal':
             problems.append('amplitude_memory needs amplitude_prior marginal')
+        if self.scatter_decay:
+            problems += self._scatter_problems()
         if self.preview_seconds > self.record_seconds:
             problems.append('preview_seconds cannot exceed record_seconds')
         if 0.0 < self.snapshot_seconds < 1e-3:
             problems.append('snapshot_seconds is 0 or at least 0.001')
         if self.record_seconds < self.snapshot_seconds:
             problems.append('record_seconds cannot be less than snapshot_seconds')
+        return problems
+
+    def _scatter_problems(self) -> list[str]:
+        problems = []
+        if self.pulse == 'band':
+            problems.append('scatter_decay is for envelopes: it needs pulse gaussian or file')
+        if self.negative_share:
+            problems.append('scatter_decay is for envelopes: it needs polarity positive')
+        if self.amplitude_memory:
+            problems.append('scatter_decay and amplitude_memory exclude each other')
+        if len(self.scatter_decay) > MAX_DECAYS:
+            problems.append(f'scatter_decay has at most {MAX_DECAYS} values')
         return problems
 
     @property

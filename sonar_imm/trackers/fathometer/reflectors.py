@@ -25,6 +25,8 @@ from .multiples import Seen
 from .response import Lattice, Response
 
 IdArray = NDArray[np.uint32]
+_REACH, BOTTOM_REACH = 4.0, 12.0
+"""How many `depth_std` a reflector, and the first return in scatter, may jump and keep its id."""
 
 
 class Identified(NamedTuple):
@@ -41,10 +43,17 @@ class Identities:
 
     reflectors: tuple[Identified, ...] = ()
     next_id: int = 1
+    bottom_id: int = 0
 
-    def name(self, depth: FloatArray, config: FathometerConfig) -> tuple[Identities, IdArray]:
-        """Ids (K,) for reflectors at `depth` (K,) of the next record."""
+    def name(
+        self, depth: FloatArray, is_bottom: FloatArray, config: FathometerConfig
+    ) -> tuple[Identities, IdArray]:
+        """Ids (K,) for reflectors at `depth` (K,) of the next record, is_bottom (K,) the
+        probability of each to be the first return."""
         ids = nearest_ids(depth, self.reflectors, config)
+        bottom_id = self.bottom_id
+        if config.scatter_decay and len(depth):
+            bottom_id = self._follow_bottom(depth, is_bottom, ids, config)
         new = np.flatnonzero(ids == 0)
         ids[new] = self.next_id + np.arange(len(new))
         seen = [Identified(int(i), float(z), 0) for i, z in zip(ids, depth)]
@@ -53,11 +62,39 @@ class Identities:
             for one in self.reflectors
             if one.track_id not in ids and one.missed < config.track_memory
         ]
-        return Identities((*seen, *missed), self.next_id + len(new)), ids
+        if config.scatter_decay and len(depth) and not bottom_id:
+            bottom_id = _id_of_bottom(ids, is_bottom)
+        return Identities((*seen, *missed), self.next_id + len(new), bottom_id), ids
+
+    def _follow_bottom(
+        self, depth: FloatArray, is_bottom: FloatArray, ids: IdArray, config: FathometerConfig
+    ) -> int:
+        """Give the first return the id of the one before, and say which it has now, 0 for a new one.
+
+        Within the reach of a reflector it has that id before any other looks for the nearest.
+        Further away, on a slope or a wall, it has it when it would get a new one, also where what
+        is below it is nearer to where it was; further than `BOTTOM_REACH` it is another one."""
+        row = int(np.argmax(is_bottom))
+        if not is_bottom[row] > 0.5:
+            return self.bottom_id
+        before = next((one for one in self.reflectors if one.track_id == self.bottom_id), None)
+        if before is None:
+            return int(ids[row])
+        steps = abs(depth[row] - before.depth) / np.sqrt(1.0 + before.missed) / config.depth_std
+        if steps > (BOTTOM_REACH if not ids[row] else _REACH):
+            return int(ids[row])
+        ids[ids == before.track_id] = 0
+        ids[row] = before.track_id
+        return before.track_id
 
     def forget(self) -> Identities:
         """Ids given so far belong to no reflector any more; later ones go on counting."""
-        return evolve(self, reflectors=())
+        return evolve(self, reflectors=(), bottom_id=0)
+
+
+def _id_of_bottom(ids: IdArray, is_bottom: FloatArray) -> int:
+    row = int(np.argmax(is_bottom))
+    return int(ids[row]) if is_bottom[row] > 0.5 else 0
 
 
 def nearest_ids(
@@ -71,7 +108,7 @@ def nearest_ids(
         return ids
     distance = np.abs(depth[:, None] - np.array([one.depth for one in earlier]))
     records = 1.0 + np.array([one.missed for one in earlier])
-    reach = np.maximum(config.min_separation, 4.0 * config.depth_std * np.sqrt(records))
+    reach = np.maximum(config.min_separation, _REACH * config.depth_std * np.sqrt(records))
     for place in np.argsort(distance, axis=None, kind='stable'):
         row, column = divmod(int(place), len(earlier))
         if not ids[row] and not taken[column] and distance[row, column] <= reach[column]:

@@ -36,6 +36,8 @@ from ..stream import OnceStream, StreamRules
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
 from .array_response import array_response, rank_deficient
 from .config import FathometerConfig
+from .envelopes import scatter_of
+from .fit import Fit
 from .multiples import Multiples
 from .pressure import Collected, PressureStream
 from .reflectors import (
@@ -106,6 +108,7 @@ class FathometerTracker:
         self._smoother = LagSmoother(self.config.smoothing_lag)
         self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
         self._health: dict[str, float] = {}
+        self._fit = Fit()
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
@@ -137,8 +140,8 @@ class FathometerTracker:
         return {**self._health, 'snapshots_waiting': float(self._pressure.waiting)}
 
     def warnings(self) -> list[str]:
-        """What of the input leads to estimates that are worse than they say."""
-        return array_warnings(self.counts)
+        """What of the input leads to estimates that are worse than they say, in sentences."""
+        return [*array_warnings(self.counts), *self._fit.warnings(self.config)]
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
@@ -266,7 +269,7 @@ class FathometerTracker:
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
-        self._ids, ids = self._ids.name(reflectors.depth, self.config)
+        self._ids, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
             effective_sample_size=step.effective,
@@ -274,6 +277,7 @@ class FathometerTracker:
             sigma=float(np.median(response.sigma)),
             order=float(self.config.order_min + int(np.argmax(pmf))),
         )
+        self._fit.add(step.ok, reflectors, response, float(pmf[-1]))
         newest = self._write(reflectors, ids, pmf, response)
         self._multiples = self._multiples.after(seen_as(reflectors, ids, self.config))
         return [*self._smoothed(step), newest]
@@ -281,7 +285,7 @@ class FathometerTracker:
     def _preview(self, response: Response) -> Estimate:
         response, step = self._try(response)
         reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
-        _, ids = self._ids.name(reflectors.depth, self.config)
+        _, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self.counts['previews'] += 1
         return self._write(reflectors, ids, pmf, response, preview=True)
 
@@ -328,7 +332,8 @@ class FathometerTracker:
         pmf, sums = self._filter.summary(step, w, sets)
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
-        members = find_members(sums, separation, most, self.config.existence_min)
+        modes = bool(self.config.scatter_decay)
+        members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
         if self._filter.model.shift:
             mean, std = self._filter.shift(w, sets)
@@ -358,5 +363,6 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         amplitude_memory=config.amplitude_memory,
         negative_probability=config.negative_share,
         shift=heave_shift(config, step),
+        scatter=scatter_of(config, lattice),
         **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )

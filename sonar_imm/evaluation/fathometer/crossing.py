@@ -1,0 +1,227 @@
+"""Two lines that cross: the horizons of both at the place where they do, compared.
+
+Where two profiler lines cross, each saw the same floor at another time and on another course, with
+nothing in common but the instrument. The difference of a horizon's depths, divided by what both
+runs state of its error, is the only independent judgement that such data allow.
+
+The tracks are straight between positions, in metres around the first of them. At each crossing a
+horizon counts that was found within `REACH` metres of it; its depth there is that of the nearest
+record, moved along the slope of the horizon, and its variance that of the record plus
+(slope * position_std)^2. Horizons are matched by least total distance, none further apart than the
+larger `min_separation` of both runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...estimates import Estimate
+from ...estimation.arrays import FloatArray
+from ...recordings.positions import read_positions
+from ...recordings.reader import BagReader
+from ...recordings.sources import BagError
+from ..run_folder import RunFolder
+
+REACH = 25.0
+_EARTH = 6_371_008.8
+
+
+class Line(NamedTuple):
+    """A tracked line: its records in order of time that have a place; east and north (T,) m;
+    separation: `min_separation` of the run, m."""
+
+    name: str
+    records: tuple[Estimate, ...]
+    longitude: FloatArray
+    latitude: FloatArray
+    separation: float
+
+
+class Horizon(NamedTuple):
+    """A horizon at a crossing: depth and std m, slope in m per m along the line."""
+
+    track_id: int
+    depth: float
+    std: float
+    slope: float
+    is_bottom: float
+
+
+def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[str, Any]:
+    """The crossings of two runs of the fathometer as plain values. Raises `BagError`."""
+    lines = _line(a), _line(b)
+    origin = float(lines[0].longitude[0]), float(lines[0].latitude[0])
+    tracks = [_plane(line, origin) for line in lines]
+    crossings = []
+    for i, j, s, t, angle in _meetings(*tracks):
+        found = [
+            _horizons(line, track, row + share, position_std)
+            for line, track, row, share in zip(lines, tracks, (i, j), (s, t))
+        ]
+        limit = max(line.separation for line in lines)
+        crossings.append(
+            {
+                'stamp_a_ns': lines[0].records[i].stamp_ns,
+                'stamp_b_ns': lines[1].records[j].stamp_ns,
+                'longitude': _between(lines[0].longitude, i, s),
+                'latitude': _between(lines[0].latitude, i, s),
+                'angle_deg': angle,
+                **_compared(*found, limit),
+            }
+        )
+    sigmas = [one['sigmas'] for crossing in crossings for one in crossing['horizons']]
+    differences = [one['difference_m'] for crossing in crossings for one in crossing['horizons']]
+    return {
+        'line_a': lines[0].name,
+        'line_b': lines[1].name,
+        'position_std_m': position_std,
+        'crossings': crossings,
+        'matched': len(sigmas),
+        'rms_difference_m': _rms(differences),
+        'rms_sigmas': _rms(sigmas),
+        'inside_2_sigmas': float(np.mean(np.abs(sigmas) <= 2.0)) if sigmas else float('nan'),
+    }
+
+
+def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """What `crossing_metrics` found, as sentences."""
+    if not metrics['crossings']:
+        return [f'{metrics["line_a"]} and {metrics["line_b"]} do not cross']
+    lines = []
+    for one in metrics['crossings']:
+        lines.append(
+            f'crossing at {one["latitude"]:.6f}, {one["longitude"]:.6f} under '
+            f'{one["angle_deg"]:.0f} deg: {len(one["horizons"])} horizons matched, '
+            f'{one["only_a"]} and {one["only_b"]} seen by one line only'
+        )
+        for h in one['horizons']:
+            lines.append(
+                f'  {h["depth_a_m"]:8.2f} m and {h["depth_b_m"]:8.2f} m: {h["difference_m"]:+.2f} m'
+                f' = {h["sigmas"]:+.1f} stated sigma of {h["std_m"]:.2f} m'
+                + (', bottom' if h['bottom'] else '')
+            )
+    if metrics['matched']:
+        lines.append(
+            f'{metrics["matched"]} horizons: {metrics["rms_difference_m"]:.2f} m rms, '
+            f'{metrics["rms_sigmas"]:.1f} stated sigmas rms, '
+            f'{100.0 * metrics["inside_2_sigmas"]:.0f} % within two'
+        )
+    return lines
+
+
+def _line(folder: RunFolder) -> Line:
+    run = folder.read_run()
+    if run['system'] != 'fathometer':
+        raise BagError(f'{folder.path} is a run of {run["system"]}, not of the fathometer')
+    if not Path(run['bag']).exists():
+        raise BagError(f'{run["bag"]}, the recording of {folder.path}, is gone; it has the places')
+    with BagReader(run['bag']) as bag:
+        positions = read_positions(bag)
+    if positions is None:
+        raise BagError(f'{run["bag"]} has no positions (sensor_msgs/NavSatFix)')
+    records = [one for one in folder.read_estimates() if not one.columns()['preview'][0]]
+    stamps = np.array([one.stamp_ns for one in records], np.int64)
+    east, north = positions.at(stamps)
+    there = np.isfinite(east)
+    if there.sum() < 2:
+        raise BagError(f'{folder.path}: fewer than two records have a place')
+    kept = tuple(one for one, good in zip(records, there) if good)
+    separation = float(run['parameters'].get('min_separation', 0.4))
+    return Line(folder.path.name, kept, east[there], north[there], separation)
+
+
+def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
+    """East and north (T, 2) of the origin in metres: lines are short against the Earth."""
+    turned = (line.longitude - origin[0] + 180.0) % 360.0 - 180.0
+    east = np.radians(turned) * _EARTH * np.cos(np.radians(origin[1]))
+    return np.column_stack([east, np.radians(line.latitude - origin[1]) * _EARTH])
+
+
+def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float, float]]:
+    """Where the polygons a (T, 2) and b (U, 2) cross: segment of each, the share of it that is
+    passed, and the angle between them in degrees."""
+    found = []
+    u, v = np.diff(a, axis=0), np.diff(b, axis=0)
+    for i in np.flatnonzero(np.hypot(*u.T) > 0.0):
+        apart = b[:-1] - a[i]
+        across = u[i, 0] * v[:, 1] - u[i, 1] * v[:, 0]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            s = (apart[:, 0] * v[:, 1] - apart[:, 1] * v[:, 0]) / across
+            t = (apart[:, 0] * u[i, 1] - apart[:, 1] * u[i, 0]) / across
+        # Half-open, so that a crossing at a position counts once.
+        for j in np.flatnonzero((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)):
+            angle = np.degrees(np.arctan2(abs(across[j]), abs(float(u[i] @ v[j]))))
+            found.append((int(i), int(j), float(s[j]), float(t[j]), float(angle)))
+    return found
+
+
+def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> list[Horizon]:
+    """The horizons of a line around the fractional record `at`."""
+    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(track, axis=0).T)))
+    here = float(np.interp(at, np.arange(len(way)), way))
+    seen: dict[int, list[tuple[float, float, float, float]]] = {}
+    for k in np.flatnonzero(np.abs(way - here) <= REACH):
+        columns = line.records[k].columns()
+        for row in np.flatnonzero(np.isfinite(columns['depth'])):
+            seen.setdefault(int(columns['track_id'][row]), []).append(
+                (
+                    float(way[k]) - here,
+                    float(columns['depth'][row]),
+                    float(columns['cov_depth_depth'][row]),
+                    float(columns['is_bottom'][row]),
+                )
+            )
+    horizons = []
+    for track_id, rows in seen.items():
+        ahead, depth, variance, bottom = (np.array(column) for column in zip(*rows))
+        near = int(np.argmin(np.abs(ahead)))
+        slope = 0.0
+        spread = ahead - ahead.mean()
+        # Of two records side by side the slope is noise.
+        if len(rows) >= 5 and np.ptp(ahead) > 0.5 * REACH:
+            slope = float(spread @ depth / (spread @ spread))
+        std = float(np.sqrt(variance[near] + (slope * position_std) ** 2))
+        place = float(depth[near] - slope * ahead[near])
+        horizons.append(Horizon(track_id, place, std, slope, float(bottom[near])))
+    return sorted(horizons, key=lambda one: one.depth)
+
+
+def _compared(a: Sequence[Horizon], b: Sequence[Horizon], limit: float) -> dict[str, Any]:
+    from scipy.optimize import linear_sum_assignment
+
+    depth_a, depth_b = np.array([one.depth for one in a]), np.array([one.depth for one in b])
+    distance = np.abs(depth_a.reshape(-1, 1) - depth_b.reshape(1, -1))
+    rows, columns = linear_sum_assignment(np.minimum(distance, limit))
+    pairs = [(a[i], b[j]) for i, j in zip(rows, columns) if distance[i, j] < limit]
+    horizons = []
+    for one, other in pairs:
+        std = float(np.hypot(one.std, other.std))
+        horizons.append(
+            {
+                'track_id_a': one.track_id,
+                'track_id_b': other.track_id,
+                'depth_a_m': one.depth,
+                'depth_b_m': other.depth,
+                'difference_m': one.depth - other.depth,
+                'std_m': std,
+                'sigmas': (one.depth - other.depth) / std,
+                'bottom': one.is_bottom > 0.5 and other.is_bottom > 0.5,
+            }
+        )
+    return {
+        'horizons': horizons,
+        'only_a': len(a) - len(pairs),
+        'only_b': len(b) - len(pairs),
+    }
+
+
+def _between(values: FloatArray, row: int, share: float) -> float:
+    return float(values[row] + share * (values[row + 1] - values[row]))
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else float('nan')

@@ -1,0 +1,81 @@
+"""Where an instrument was: positions by satellite in a recording, at the stamps of estimates.
+
+They are the messages ``sensor_msgs/NavSatFix`` of the topic ``position``, or of the only topic of
+that type. Between two of them the place is interpolated; a stamp further than `GAP_S` from both
+has none.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+
+from ..estimation.arrays import FloatArray, IntArray
+from .messages import ros_message
+from .reader import BagReader
+from .sources import BagError
+
+TYPE, TOPIC = 'sensor_msgs/msg/NavSatFix', 'position'
+GAP_S = 30.0
+_NO_FIX = -1
+
+
+@frozen(eq=False)
+class Positions:
+    """Fixes of one instrument by time: stamp_ns (n,) increasing, longitude and latitude (n,) in
+    degrees."""
+
+    stamp_ns: IntArray
+    longitude: FloatArray
+    latitude: FloatArray
+
+    def at(self, stamp_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Longitude and latitude (k,) at stamp_ns (k,), NaN where there is no fix near."""
+        seconds = 1e-9 * (self.stamp_ns - self.stamp_ns[0])
+        when = 1e-9 * (stamp_ns - self.stamp_ns[0])
+        after = np.clip(np.searchsorted(seconds, when), 0, len(seconds) - 1)
+        before = np.maximum(after - 1, 0)
+        away = np.minimum(np.abs(seconds[after] - when), np.abs(seconds[before] - when))
+        # Across the date line the longitude goes on.
+        turned = np.unwrap(self.longitude, period=360.0)
+        east = (np.interp(when, seconds, turned) + 180.0) % 360.0 - 180.0
+        north = np.interp(when, seconds, self.latitude)
+        near = away <= GAP_S
+        return np.where(near, east, np.nan), np.where(near, north, np.nan)
+
+
+def read_positions(bag: BagReader) -> Positions | None:
+    """The positions in an open recording, None when there are none. Raises `BagError` when several
+    topics have some."""
+    topics = [topic.name for topic in bag.topics if topic.type_name == TYPE]
+    named = [name for name in topics if f'/{name}'.endswith(f'/{TOPIC}')]
+    chosen = named or topics
+    if len(chosen) > 1:
+        raise BagError(f'several topics have positions: {", ".join(chosen)}')
+    if not chosen:
+        return None
+    rows = {}
+    for item in bag.messages(chosen):
+        message = item.message
+        place = float(message.longitude), float(message.latitude)
+        good = np.isfinite(place).all() and abs(place[0]) <= 360.0 and abs(place[1]) <= 90.0
+        if good and message.status.status != _NO_FIX:
+            stamp = message.header.stamp
+            rows[stamp.sec * 10**9 + stamp.nanosec] = place
+    if not rows:
+        return None
+    stamps = sorted(rows)
+    places = np.array([rows[stamp] for stamp in stamps])
+    return Positions(np.array(stamps, np.int64), places[:, 0], places[:, 1])
+
+
+def write_position(stamp_ns: int, longitude: float, latitude: float) -> Any:
+    """A fix as a message; its height is not known."""
+    seconds, rest = divmod(stamp_ns, 10**9)
+    stamp = ros_message('builtin_interfaces/msg/Time', sec=seconds, nanosec=rest)
+    header = ros_message('std_msgs/msg/Header', stamp=stamp, frame_id='wgs84')
+    return ros_message(
+        TYPE, header=header, longitude=longitude, latitude=latitude, altitude=float('nan')
+    )

@@ -1,0 +1,114 @@
+"""Two simulated lines over one floor, which they see along different courses."""
+
+import json
+
+import numpy as np
+import pytest
+
+from msg_adapters.array_records import write_trace
+from sonar_imm.cli import main
+from sonar_imm.evaluation.fathometer.crossing import crossing_metrics
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.measurements import Trace
+from sonar_imm.recordings.conversion import ConversionReport, write_bag
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.own_parameters import write_own_parameters
+from sonar_imm.recordings.positions import write_position
+from sonar_imm.recordings.sources import BagError
+from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+
+SECOND = 10**9
+LON, LAT, METRE = -91.64, 17.13, 180.0 / (np.pi * 6_371_008.8)
+DEPTH = 0.25 * np.arange(140)
+
+
+def floor(east, north):
+    """Depths of two layers there: the lower one slopes to the north."""
+    return 12.0 + 0.01 * east, 20.0 + 0.05 * north
+
+
+def line(folder, name, places, shift=0.0, positions=True):
+    """A tracked line past `places` (T, 2) m, of traces that are too deep by `shift`."""
+    rng, records = np.random.default_rng(len(name)), []
+    for k, (east, north) in enumerate(places):
+        stamp = (1000 + k) * SECOND
+        echo = 0.01 * np.abs(rng.standard_normal(len(DEPTH)))
+        for depth in floor(east, north):
+            echo += np.exp(-0.5 * np.square((DEPTH - depth - shift) / 0.5))
+        trace = Trace(stamp_ns=stamp, depth=DEPTH, amplitude=echo, reference_depth=0.0)
+        if positions:
+            place = LON + east * METRE / np.cos(np.radians(LAT)), LAT + north * METRE
+            records.append((stamp, '/position', write_position(stamp, *place)))
+        records.append((stamp, '/trace', write_trace(trace, ros_message)))
+    bag = folder / f'{name}.bag'
+    write_bag(bag, records, ConversionReport(bag), source=name)
+    own = {**envelope_parameters(0.5, 0.05), 'particles': 400, 'depth_std': 0.1}
+    write_own_parameters(bag, 'fathometer', own)
+    assert main(['track', str(bag), str(folder / name)]) == 0
+    return folder / name
+
+
+@pytest.fixture(scope='module')
+def lines(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('lines')
+    way = np.linspace(-40.0, 40.0, 41)
+    return {
+        'we': line(folder, 'we', np.column_stack([way, np.full(41, 5.0)])),
+        'sn': line(folder, 'sn', np.column_stack([np.full(41, -8.0), way])),
+        'deep': line(folder, 'deep', np.column_stack([np.full(41, -8.0), way]), shift=0.6),
+        'far': line(folder, 'far', np.column_stack([np.full(41, 90.0), way])),
+        'lost': line(folder, 'lost', np.column_stack([way, way]), positions=False),
+    }
+
+
+def crossed(lines, a, b, position_std=3.0):
+    return crossing_metrics(RunFolder(lines[a]), RunFolder(lines[b]), position_std)
+
+
+def test_where_lines_cross_their_horizons_agree(lines):
+    metrics = crossed(lines, 'we', 'sn')
+    [one] = metrics['crossings']
+    assert one['longitude'] == pytest.approx(LON - 8.0 * METRE / np.cos(np.radians(LAT)), abs=1e-7)
+    assert one['latitude'] == pytest.approx(LAT + 5.0 * METRE, abs=1e-7)
+    assert one['angle_deg'] == pytest.approx(90.0, abs=0.1)
+    assert one['stamp_a_ns'] == 1016 * SECOND and one['stamp_b_ns'] == 1022 * SECOND
+    assert one['only_a'] == one['only_b'] == 0
+    for horizon, true in zip(one['horizons'], floor(-8.0, 5.0)):
+        assert horizon['depth_a_m'] == pytest.approx(true, abs=0.25)
+        assert abs(horizon['difference_m']) < 0.3 and abs(horizon['sigmas']) < 2.5
+    assert [horizon['bottom'] for horizon in one['horizons']] == [True, False]
+
+
+def test_the_error_of_a_position_counts_by_the_slope(lines):
+    without, with_it = (crossed(lines, 'we', 'sn', std)['crossings'][0] for std in (0.0, 20.0))
+    level, steep = (
+        np.sqrt(b['std_m'] ** 2 - a['std_m'] ** 2)
+        for a, b in zip(without['horizons'], with_it['horizons'])
+    )
+    # Only along the line to the north the lower layer slopes, by 0.05; the upper one by 0.01.
+    assert steep == pytest.approx(20.0 * 0.05, abs=0.25) and level < 0.4
+
+
+def test_a_line_that_is_too_deep_shows(lines):
+    metrics = crossed(lines, 'we', 'deep')
+    for horizon in metrics['crossings'][0]['horizons']:
+        assert horizon['difference_m'] == pytest.approx(-0.6, abs=0.3)
+    assert metrics['rms_sigmas'] > 2.0
+
+
+def test_no_crossing_and_no_places_are_said(lines, capsys):
+    assert crossed(lines, 'we', 'far')['crossings'] == []
+    with pytest.raises(BagError, match='has no positions'):
+        crossed(lines, 'we', 'lost')
+    assert main(['evaluate', str(lines['we']), str(lines['far']), '--crossing']) == 0
+    assert 'do not cross' in capsys.readouterr().out
+    assert main(['evaluate', str(lines['we']), '--crossing']) == 2
+    assert main(['evaluate', str(lines['we']), str(lines['sn'])]) == 2
+
+
+def test_the_command_says_it(lines, capsys):
+    assert main(['evaluate', str(lines['we']), str(lines['sn']), '--crossing']) == 0
+    out = capsys.readouterr().out
+    assert '2 horizons matched' in out and ', bottom' in out and 'stated sigma' in out
+    assert main(['evaluate', str(lines['we']), str(lines['sn']), '--crossing', '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['matched'] == 2

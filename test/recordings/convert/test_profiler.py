@@ -1,0 +1,96 @@
+"""What SEG-Y traces tell of their instrument: pulse, noise, spacing and place."""
+
+import numpy as np
+import pytest
+import yaml
+
+from sonar_imm.recordings.convert import convert_segy
+from sonar_imm.recordings.convert.profiler import (
+    doubted_spacing,
+    first_arrivals,
+    is_envelope,
+    measured_instrument,
+)
+from sonar_imm.recordings.positions import read_positions
+from sonar_imm.recordings.reader import BagReader
+
+segyio = pytest.importorskip('segyio')
+T, N = 40, 90
+ARRIVAL = 30 + np.arange(T) // 8
+LAG = np.arange(N) - ARRIVAL[:, None]
+ECHO = 1000.0 * np.exp(-0.5 * np.square(LAG / 1.5)) + np.where(LAG > 6, 200.0, 0.0)
+
+
+def write_segy(path, amplitude, *, interval=66, depth_m=0.0, arcsec=True):
+    spec = segyio.spec()
+    spec.format, spec.tracecount = 1, len(amplitude)
+    spec.samples = np.arange(amplitude.shape[1], dtype=float)
+    with segyio.create(str(path), spec) as file:
+        for k, trace in enumerate(amplitude):
+            file.trace[k] = trace.astype(np.float32)
+            file.header[k] = {
+                segyio.TraceField.TRACE_SAMPLE_INTERVAL: interval,
+                segyio.TraceField.TRACE_SAMPLE_COUNT: amplitude.shape[1],
+                segyio.TraceField.YearDataRecorded: 2018,
+                segyio.TraceField.DayOfYear: 72,
+                segyio.TraceField.HourOfDay: 10,
+                segyio.TraceField.SecondOfMinute: k // 4,
+                segyio.TraceField.ElevationScalar: -10,
+                segyio.TraceField.SourceWaterDepth: round(10.0 * depth_m),
+                segyio.TraceField.SourceGroupScalar: -1000,
+                segyio.TraceField.CoordinateUnits: 2 if arcsec else 1,
+                segyio.TraceField.SourceX: round(-91.64 * 3.6e6) + 40 * (k // 4),
+                segyio.TraceField.SourceY: round(17.13 * 3.6e6),
+            }
+    return path
+
+
+def test_the_pulse_and_the_noise_are_measured():
+    assert list(first_arrivals(ECHO)) == list(ARRIVAL)
+    pulse, noise = measured_instrument(ECHO, 0.4)
+    # A Gaussian of 1.5 samples: its width at half height, linear between samples.
+    assert pulse == pytest.approx(0.4 * 1.5, rel=0.05)
+    assert noise == pytest.approx(1.0)
+    coarse = 100.0 * np.round(ECHO / 100.0)
+    assert measured_instrument(coarse, 0.4)[1] == pytest.approx(50.0)
+    assert measured_instrument(ECHO[:, 34:], 0.4) is None
+    assert is_envelope(ECHO) and not is_envelope(ECHO - 1.0) and not is_envelope(0.0 * ECHO)
+
+
+def test_an_impossible_spacing_is_said():
+    stated = np.full(T, 12.8)
+    assert doubted_spacing(ECHO, 0.4, 0.0, stated) is None
+    said = doubted_spacing(ECHO, 0.05, 0.0, stated)
+    assert '0.4 m a sample would fit' in said and '12.8 m of water' in said
+    # Samples that were left out before count as way.
+    assert doubted_spacing(ECHO[:, 10:], 0.4, 4.0, stated) is None
+    assert doubted_spacing(ECHO, 0.05, 0.0, np.zeros(T)) is None
+    assert 'end at 0.09 m' in doubted_spacing(ECHO, 0.001, 0.0, np.zeros(T))
+
+
+def test_an_envelope_brings_its_parameters_and_places(tmp_path):
+    path = write_segy(tmp_path / 'line.seg', ECHO, depth_m=12.8)
+    report = convert_segy(path, tmp_path / 'bag', stack=2)
+    assert any('would fit' in one for one in report.problems)
+    report = convert_segy(path, tmp_path / 'good', stack=2, sample_spacing=0.4)
+    assert not report.problems and report.messages == {'/position': 10, '/trace': 20}
+    own = yaml.safe_load((tmp_path / 'good' / 'parameters.yaml').read_text())
+    own = own['fathometer']['ros__parameters']
+    assert own['pulse'] == 'gaussian' and own['pulse_width'] == pytest.approx(0.6, rel=0.05)
+    assert own['scatter_decay'] and own['min_separation'] == pytest.approx(3 * own['pulse_width'])
+    with BagReader(tmp_path / 'good') as bag:
+        places = read_positions(bag)
+    assert places.latitude == pytest.approx(np.full(10, 17.13), abs=1e-6)
+    east, north = places.at(places.stamp_ns[:2] + np.array([500_000_000, -60 * 10**9]))
+    assert east[0] == pytest.approx(places.longitude[:2].mean(), abs=1e-9)
+    assert np.isnan(east[1]) and np.isnan(north[1])
+
+
+def test_what_is_no_envelope_is_left_alone(tmp_path):
+    path = write_segy(tmp_path / 'line.seg', ECHO - 100.0, arcsec=False)
+    report = convert_segy(path, tmp_path / 'bag', sample_spacing=0.4)
+    assert report.messages == {'/trace': 40} and not report.problems
+    assert not (tmp_path / 'bag' / 'parameters.yaml').exists()
+    path = write_segy(tmp_path / 'deaf.seg', ECHO[:, 34:])
+    report = convert_segy(path, tmp_path / 'deaf', sample_spacing=0.4)
+    assert 'no first arrival stands free' in report.problems[0]

@@ -1,0 +1,171 @@
+"""Horizons for other programs: read back by other means than those that wrote them."""
+
+import csv
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.recordings.convert import convert_segy
+
+segyio = pytest.importorskip('segyio')
+T, N, STACK = 48, 90, 4
+SPACING, FIRST = 0.4, 8
+LAYERS = 30.0 + 4.0 * np.sin(np.arange(T) / 12.0), 48.0 + np.zeros(T)
+"""Samples of two layers in each trace."""
+
+
+def write_line(path, fmt=3):
+    rng = np.random.default_rng(3)
+    sample = np.arange(N)
+    spec = segyio.spec()
+    spec.format, spec.tracecount, spec.samples = fmt, T, sample.astype(float)
+    with segyio.create(str(path), spec) as file:
+        for k in range(T):
+            trace = 40.0 * np.abs(rng.standard_normal(N))
+            for layer in LAYERS:
+                trace += 3000.0 * np.exp(-0.5 * np.square((sample - layer[k]) / 1.5))
+            file.trace[k] = np.round(trace).astype(file.dtype)
+            file.header[k] = {
+                segyio.TraceField.TRACE_SAMPLE_COUNT: N,
+                segyio.TraceField.TRACE_SAMPLE_INTERVAL: 533,
+                segyio.TraceField.YearDataRecorded: 2018,
+                segyio.TraceField.DayOfYear: 72,
+                segyio.TraceField.SecondOfMinute: k // STACK,
+                segyio.TraceField.SourceGroupScalar: -1000,
+                segyio.TraceField.CoordinateUnits: 2,
+                segyio.TraceField.SourceX: round(-91.64 * 3.6e6) + 40 * (k // STACK),
+                segyio.TraceField.SourceY: round(17.13 * 3.6e6),
+                segyio.TraceField.CDP: 500 + k,
+            }
+    return path
+
+
+@pytest.fixture(scope='module')
+def tracked(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('horizons')
+    line = write_line(folder / 'line.seg')
+    convert_segy(line, folder / 'bag', sample_spacing=SPACING, first_sample=FIRST, stack=STACK)
+    assert main(['track', str(folder / 'bag'), str(folder / 'run'), '--set', 'particles=500']) == 0
+    return folder
+
+
+def export(folder, name, *options):
+    return main(['export', str(folder / 'run'), str(folder / name), *map(str, options)])
+
+
+def estimates(folder):
+    with (folder / 'run' / 'estimate.csv').open() as file:
+        return [row for row in csv.DictReader(file) if row['depth'] != 'nan']
+
+
+def test_the_table_has_every_pick_by_horizon(tracked):
+    assert export(tracked, 'h.csv') == 0
+    with (tracked / 'h.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    known = estimates(tracked)
+    assert len(rows) == len(known) >= 2 * T // STACK
+    order = [(int(row['horizon']), int(row['trace'])) for row in rows]
+    assert order == sorted(order) and {row['line'] for row in rows} == {'line.seg'}
+    by_depth = sorted(float(row['depth_m']) for row in rows)
+    assert by_depth == pytest.approx(sorted(float(row['depth']) for row in known), abs=6e-4)
+    for row in rows:
+        assert float(row['twt_ms']) == pytest.approx(
+            2e3 * float(row['depth_m']) / 1500.0, abs=2e-3
+        )
+        assert row['x'] == '' and float(row['latitude']) == pytest.approx(17.13, abs=1e-5)
+    assert rows[0]['time_utc'].startswith('2018-03-13T00:00:00.')
+
+
+def test_map_coordinates(tracked):
+    pytest.importorskip('rasterio')
+    assert export(tracked, 'm.csv', '--epsg', 32615) == 0
+    with (tracked / 'm.csv').open() as file:
+        row = next(csv.DictReader(file))
+    # Zone 15 by the series for the transverse Mercator projection, worked out by hand.
+    a, e2, k0 = 6_378_137.0, 0.00669437999014, 0.9996
+    lat, dlon = np.radians(17.13), np.radians(float(row['longitude']) + 93.0)
+    n = a / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
+    A = dlon * np.cos(lat)
+    east = 500_000.0 + k0 * n * (A + (1.0 - np.tan(lat) ** 2) * A**3 / 6.0)
+    assert float(row['x']) == pytest.approx(east, abs=0.5)
+
+
+def test_points_along_the_track(tracked):
+    assert export(tracked, 'h.geojson') == 0
+    content = json.loads((tracked / 'h.geojson').read_text())
+    assert content['type'] == 'FeatureCollection'
+    assert len(content['features']) == len(estimates(tracked))
+    for one in content['features']:
+        east, north, up = one['geometry']['coordinates']
+        assert one['geometry']['type'] == 'Point' and -91.65 < east < -91.63
+        assert up == -one['properties']['depth_m'] and north == pytest.approx(17.13, abs=1e-5)
+
+
+def test_segy_read_by_segyio_and_by_hand(tracked):
+    original = tracked / 'line.seg'
+    assert export(tracked, 'p.sgy', '--segy', original) == 0
+    known = estimates(tracked)
+    with segyio.open(str(tracked / 'p.sgy'), ignore_geometry=True) as file:
+        picks = file.trace.raw[:]
+        cdp = file.attributes(segyio.TraceField.CDP)[:]
+    assert list(cdp) == list(500 + np.arange(T)) and picks.shape == (T, N)
+    stamps = sorted({row['stamp_ns'] for row in known})
+    for record, stamp in enumerate(stamps):
+        rows = [row for row in known if row['stamp_ns'] == stamp]
+        wanted = {round(float(row['depth']) / SPACING): int(row['track_id']) for row in rows}
+        for trace in picks[STACK * record : STACK * record + STACK]:
+            assert {int(z): int(trace[z]) for z in np.flatnonzero(trace)} == wanted
+    # By hand: 3200 and 400 bytes of header, 240 before each trace of two bytes a sample.
+    raw, before = (tracked / 'p.sgy').read_bytes(), original.read_bytes()
+    size = 240 + 2 * N
+    assert len(raw) == len(before) == 3600 + T * size and raw[:3600] == before[:3600]
+    for k in range(T):
+        start = 3600 + k * size
+        assert raw[start : start + 232] == before[start : start + 232]
+        thousandths, number = struct.unpack('>ii', raw[start + 232 : start + 240])
+        assert thousandths / 1000.0 == pytest.approx(LAYERS[0][k - k % STACK + 1], abs=2.5)
+        samples = struct.unpack(f'>{N}h', raw[start + 240 : start + size])
+        assert samples[round(thousandths / 1000.0)] == number > 0
+    # The file that was converted is as it was.
+    assert convert_segy(original, tracked / 'again', sample_spacing=SPACING).rows == T
+
+
+@pytest.mark.parametrize(
+    'name, options, words',
+    [
+        ('x.sgy', (), 'needs --segy'),
+        ('x.txt', (), 'ends in none of'),
+        ('line.seg', ('--segy', 'line.seg', '--overwrite'), 'stays as it is'),
+        ('x.sgy', ('--segy', 'other.seg'), 'its times are others'),
+        ('x.xyz', (), 'no soundings'),
+    ],
+)
+def test_what_cannot_be_exported_is_one_sentence(tracked, capsys, name, options, words):
+    other = tracked / 'other.seg'
+    if not other.exists():
+        write_line(other)
+        with segyio.open(str(other), 'r+', ignore_geometry=True) as file:
+            for k in range(T):
+                file.header[k].update({segyio.TraceField.HourOfDay: 5})
+    options = [tracked / one if str(one).endswith('.seg') else one for one in options]
+    assert export(tracked, name, *options) == 2
+    error = capsys.readouterr().err
+    assert words in error and 'Traceback' not in error
+    assert not (tracked / 'x.sgy').exists()
+
+
+def test_without_places_there_is_a_table_but_no_map(tracked, tmp_path, capsys):
+    scene = ('simulate', 'fathometer', str(tmp_path / 'bag'), '--scenario', 'diffuse')
+    assert main([*scene, '--set', 'records=4']) == 0
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run')]) == 0
+    assert export(tmp_path, 'h.csv') == 0
+    for name, options, words in (
+        ('h.geojson', (), 'no positions'),
+        ('m.csv', ('--epsg', 32615), 'no positions'),
+        ('p.sgy', ('--segy', tracked / 'line.seg'), 'does not say how it was made'),
+    ):
+        assert export(tmp_path, name, *options) == 2
+        assert words in capsys.readouterr().err

@@ -1,0 +1,118 @@
+"""Envelopes over a floor that scatters: the scene, the first return, its identity, the warnings."""
+
+from attrs import evolve
+import numpy as np
+import pytest
+
+from sonar_imm.evaluation.fathometer.records import records_of
+from sonar_imm.measurements import Trace
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.fathometer.simulator import scenario, simulate
+from sonar_imm.trackers.fathometer.reflectors import Identities
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+
+SECOND = 10**9
+
+
+@pytest.fixture(scope='module')
+def scene():
+    return simulate(scenario('diffuse', {'records': 60}), 5)
+
+
+def told(**overrides):
+    return FathometerConfig.from_mapping(
+        {**scenario('diffuse').told(), 'particles': 1000, **overrides}, ignore_unknown=True
+    )
+
+
+def track(scene, config):
+    tracker = FathometerTracker(config)
+    return tracker, [tracker.process(one.measurement)[0] for one in scene.measurements]
+
+
+def test_the_scene_is_quiet_above_the_floor_and_scatters_below(scene):
+    above, below = [], []
+    for one, true in zip(scene.measurements, scene.truth):
+        trace = one.measurement
+        above.append(trace.amplitude[trace.depth < true.depth.min() - 2.0])
+        inside = (trace.depth > true.depth.min() + 1.5) & (trace.depth < true.depth.min() + 3.5)
+        below.append(trace.amplitude[inside])
+    assert np.concatenate(above).max() == 0.0
+    # Rayleigh of rms 0.25 at the top, falling to 1/e over 5 m, less the threshold of 0.06.
+    expected = 0.886 * 0.25 * np.exp(-2.5 / 5.0) - 0.06
+    assert np.concatenate(below).mean() == pytest.approx(expected, rel=0.15)
+
+
+def test_the_floor_is_followed_under_one_identity(scene):
+    _, estimates = track(scene, told())
+    rows = [one.columns() for one in estimates]
+    first = [int(np.argmax(one['is_bottom'])) for one in rows]
+    away = [one['depth'][k] - true.depth.min() for one, k, true in zip(rows, first, scene.truth)]
+    assert np.mean(np.abs(away) < 1.0) >= 0.95
+    assert len({int(one['track_id'][k]) for one, k in zip(rows, first)}) == 1
+    right = [len(r.found) == len(t.depth) for r, t in zip(records_of(estimates), scene.truth)]
+    assert np.mean(right) >= 0.9
+
+
+def test_the_first_return_keeps_its_name_on_a_wall():
+    config = evolve(told(), depth_std=0.3, min_separation=1.0)
+    first, ids = Identities().name(np.array([10.0, 14.0]), np.array([1.0, 0.0]), config)
+    assert list(ids) == [1, 2]
+    # It rises by 2 m, and something below it is nearer to where it was.
+    after, ids = first.name(np.array([8.0, 9.9, 14.0]), np.array([1.0, 0.0, 0.0]), config)
+    assert list(ids) == [1, 3, 2] and after.bottom_id == 1
+    # Ten metres are no slope.
+    _, ids = after.name(np.array([20.0]), np.array([1.0]), config)
+    assert ids[0] not in (1, 2, 3)
+    # Without scatter there is no notion of a first return: the nearest counts.
+    plain = evolve(config, scatter_decay=())
+    _, ids = first.name(np.array([8.0, 9.9, 14.0]), np.array([1.0, 0.0, 0.0]), plain)
+    assert list(ids) == [3, 1, 2]
+
+
+def test_a_wrong_pulse_is_said_with_its_remedy(scene):
+    tracker, _ = track(scene, FathometerConfig(noise_sigma=0.02, particles=300))
+    said = ' '.join(tracker.warnings())
+    assert 'envelopes need pulse gaussian' in said and 'no set of reflectors' in said
+    tracker, _ = track(scene, told(particles=300))
+    assert tracker.warnings() == []
+
+
+def test_a_full_set_is_said(scene):
+    tracker, _ = track(scene, told(order_max=2, particles=300))
+    said = ' '.join(tracker.warnings())
+    assert 'against a limit of 2' in said and 'order_max may not fit' in said
+
+
+def test_unexplained_records_are_said():
+    tracker = FathometerTracker(
+        FathometerConfig(pulse='gaussian', noise_sigma=0.1, order_min=6, order_max=6, particles=50)
+    )
+    depth = 0.25 * np.arange(80)
+    for second in range(1, 13):
+        amplitude = -np.exp(-0.5 * np.square(depth - 10.0))
+        tracker.process(Trace(stamp_ns=second * SECOND, depth=depth, amplitude=amplitude))
+    assert any('no set of reflectors explains 100 %' in one for one in tracker.warnings())
+
+
+@pytest.mark.parametrize(
+    'values, words',
+    [
+        ({'pulse': 'band'}, 'pulse gaussian or file'),
+        ({'polarity': 'both'}, 'polarity positive'),
+        ({'amplitude_memory': 0.5}, 'exclude each other'),
+        ({'scatter_decay': (1.0,) * 9}, 'at most 8'),
+    ],
+)
+def test_what_does_not_go_with_scatter(values, words):
+    with pytest.raises(ConfigError, match=words):
+        FathometerConfig(**{'pulse': 'gaussian', 'scatter_decay': (4.0,), **values})
+
+
+def test_too_fine_a_lattice_is_refused_with_a_sentence():
+    config = told(depth_step=0.001, depth_std=0.001, particles=10)
+    tracker = FathometerTracker(config)
+    depth = 5.0 + 0.1 * np.arange(400)
+    amplitude = np.exp(-0.5 * np.square(depth - 20.0))
+    assert tracker.process(Trace(stamp_ns=SECOND, depth=depth, amplitude=amplitude)) == []
+    assert tracker.counts['too_crowded'] == 1
