@@ -10,10 +10,18 @@ from importlib import import_module
 
 from .topic import InputTopic
 
-__all__ = ['InputTopic', 'inputs_of']
+__all__ = ['FEEDERS', 'InputTopic', 'inputs_of', 'made_inputs']
+
+FEEDERS = {'obstacle': 'fls_detector'}
+"""Systems whose node has another one before it, by name: it makes one of their inputs."""
 
 
 def inputs_of(system: str) -> tuple[InputTopic, ...]:
     """The inputs of `system`. Raises ModuleNotFoundError when there is no such system."""
     topics: tuple[InputTopic, ...] = import_module(f'{__name__}.{system}').TOPICS
     return topics
+
+
+def made_inputs(system: str) -> tuple[InputTopic, ...]:
+    """The inputs of the node before that of `system`; nothing where there is none."""
+    return inputs_of(FEEDERS[system]) if system in FEEDERS else ()

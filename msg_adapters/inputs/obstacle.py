@@ -14,6 +14,7 @@ from ..detections import (
 )
 from ..navigation import (
     doubt_navigation,
+    read_dave_dvl,
     read_dvl,
     read_navigation,
     read_range,
@@ -53,6 +54,8 @@ TOPICS = (
         readers={
             'sensor_msgs/msg/Range': read_range,
             'marine_acoustic_msgs/msg/Dvl': read_dvl,
+            'stonefish_ros2/msg/DVL': read_dvl,
+            'dave_interfaces/msg/DVL': read_dave_dvl,
         },
         write=write_range,
     ),

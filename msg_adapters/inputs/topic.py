@@ -24,6 +24,9 @@ class InputTopic:
     settings: parameters of the tracker that its readers take as keywords too: what messages do not
     say themselves.
     companion: describes another input; found by its topic name, never enough alone.
+    makes: the input of a tracker that a node before it makes of this one; '' for an input of the
+    tracker itself. ambiguous: types that hold other things too, so that a topic fits by its name
+    only; for inputs of a node before a tracker, which fit by type as well.
     """
 
     name: str
@@ -36,6 +39,8 @@ class InputTopic:
     one_topic: bool = field(default=False, kw_only=True)
     settings: tuple[str, ...] = field(default=(), kw_only=True)
     companion: bool = field(default=False, kw_only=True)
+    makes: str = field(default='', kw_only=True)
+    ambiguous: tuple[str, ...] = field(default=(), kw_only=True)
 
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any]

@@ -13,6 +13,7 @@ from .common import (
     example,
     json_option,
     load_config,
+    load_detector,
     print_json,
     progress,
     say,
@@ -82,6 +83,7 @@ def command(
         frame_id=node.frame_id,
         world_frame=node.world_frame_convention,
         smooth=smooth,
+        detector=load_detector(chosen, params, overrides),
     )
     run = track_recording(
         bag, out_dir, chosen, config, options, overwrite=overwrite, strict=strict, quiet=as_json

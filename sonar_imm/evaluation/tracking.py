@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 import time
 from typing import Any
 
-from attrs import asdict, define, frozen
+from attrs import asdict, define, field, frozen
 import numpy as np
 
 from ..estimates import Estimate
@@ -32,7 +32,8 @@ class InputOptions:
     """How to treat a recording.
 
     topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
-    later input too, which takes memory in proportion to the recording.
+    later input too, which takes memory in proportion to the recording; detector: parameters of the
+    detector of images that are not the default.
     """
 
     topics: Mapping[str, str] | None = None
@@ -40,6 +41,7 @@ class InputOptions:
     world_frame: str = 'enu'
     frame_id: str = ''
     smooth: bool = False
+    detector: Mapping[str, Any] = field(factory=dict)
 
 
 @define
@@ -152,9 +154,12 @@ class OfflineRun:
             world_frame=self.options.world_frame,
             order=self.options.order,
             settings=self.tracker.config.as_dict(),
+            detector=self.options.detector,
         ):
             self.messages += 1
             advance(1)
+            if heard.measurement is None:
+                continue
             try:
                 if isinstance(heard.measurement, Rejection):
                     raise heard.measurement
@@ -223,6 +228,7 @@ def write_run(
         warnings=offline.warnings(),
         problems=list(offline.bag.problems),
         parameters=offline.tracker.config.as_dict(),
+        **({'detector': dict(options.detector)} if options.detector else {}),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )
     folder.write_json(RUN, run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 
 from ..simulation.scene import Scene
 from ..trackers import SYSTEMS
@@ -19,7 +19,7 @@ def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) ->
     report = ConversionReport(Path(out))
     inputs: dict[type, InputTopic] = {}
     for system in SYSTEMS:
-        for entry in inputs_of(system):
+        for entry in (*inputs_of(system), *made_inputs(system)):
             inputs.setdefault(entry.measurement, entry)
     records: list[Record] = []
     for one in scene.measurements:
