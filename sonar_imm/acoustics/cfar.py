@@ -78,7 +78,8 @@ def noise_level(
 
     The greater of the means over `training` cells nearer and farther in range, beyond `guard`
     cells, and over `beams` beams around. A side with less than half of its cells inside the image
-    does not count; where neither does, the level is infinite and the number of sides 0.
+    does not count. Without the nearer side the level is infinite and the number of sides 0: water
+    scatters back more the nearer it is, and the farther side alone would be too quiet.
 
     Raises ValueError for an image that is not two-dimensional.
     """

@@ -52,29 +52,26 @@ def greatest_of_level(
         for b in range(B):
             total[b] /= last - r
     least = (training + 1) // 2
-    level = np.empty((R, B))
+    level = np.full((R, B), np.inf)
     sides = np.zeros(R)
     for r in range(R):
-        level[r] = np.inf
+        end = r - guard  # the side before ends here, exclusive
+        if end < least:
+            continue
+        sides[r] = 1.0
+        if end >= training:
+            level[r] = window[end - training]
+        else:
+            total = level[r]
+            total[:] = 0.0
+            for k in range(end):
+                for b in range(B):
+                    total[b] += smooth[k, b]
+            for b in range(B):
+                total[b] /= end
         behind = r + guard + 1
         if R - behind >= least:
-            level[r] = window[behind]
-            sides[r] += 1.0
-        end = r - guard  # the side before ends here, exclusive
-        if end >= training:
-            before = window[end - training]
-            if sides[r] > 0.0:
-                for b in range(B):
-                    level[r, b] = max(level[r, b], before[b])
-            else:
-                level[r] = before
-            sides[r] += 1.0
-        elif end >= least:
+            sides[r] = 2.0
             for b in range(B):
-                total_before = 0.0
-                for k in range(end):
-                    total_before += smooth[k, b]
-                mean = total_before / end
-                level[r, b] = max(level[r, b], mean) if sides[r] > 0.0 else mean
-            sides[r] += 1.0
+                level[r, b] = max(level[r, b], window[behind, b])
     return level, sides

@@ -42,8 +42,8 @@ class EchoRules:
     beam_width rad and range_resolution m: -3 dB widths of the echo of a point; false_alarm: of a
     cell of Rayleigh noise; margin: that threshold is so much higher (power), for noise with longer
     tails; growth: false alarm probability of the other cells of an echo; sidelobe: cells below
-    this share of the loudest power of their range are left out; join_distance m; beams, training,
-    guard: see `cfar.noise_level`.
+    this share of the loudest power of their range are left out; join_distance m; nearest m: cells
+    nearer tell noise only; beams, training, guard: see `cfar.noise_level`.
     """
 
     beam_width: float
@@ -53,6 +53,7 @@ class EchoRules:
     growth: float = 1e-3
     sidelobe: float = 10.0**-1.7
     join_distance: float = 1.5
+    nearest: float = 0.0
     beams: int = 25
     training: int = 16
     guard: int = 4
@@ -96,7 +97,9 @@ def find_echoes(
     cells *= effective_cells(min(rules.beams, power.shape[1]), width[1] / step[1])
     high = _thresholds(rules.false_alarm, cells, sides) * rules.margin
     low = _thresholds(rules.growth, cells, sides)
-    loud = power > low[:, None] * level
+    low[distance < rules.nearest] = np.inf
+    with np.errstate(invalid='ignore'):  # an infinite threshold of a silent cell
+        loud = power > low[:, None] * level
     loud &= power >= rules.sidelobe * power.max(axis=1, keepdims=True)
     row, beam, part = _cells(loud, power)
     if not len(row):

@@ -91,6 +91,12 @@ def test_an_onset_of_the_sea_floor_is_no_echo():
     assert len(found(noise).range) == 0
 
 
+def test_water_that_scatters_back_is_no_echo_where_the_sonar_begins_to_see():
+    noise = image(seed=4) * (3.0 / np.linspace(0.3, 9.0, len(RANGE)))[:, None]
+    assert len(found(noise, margin=1.0, false_alarm=1e-5).range) == 0
+    assert len(found(image(Point(15.0, 0.1, 25.0)), nearest=16.0).range) == 0
+
+
 def test_correlated_noise_gives_few_false_alarms():
     # 1e-4 of 48,300 cells, 1.5 x 1.3 widths of 4 x 3 cells each: some 2.5 groups per image
     count = sum(

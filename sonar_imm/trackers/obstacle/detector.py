@@ -106,7 +106,12 @@ class DetectorConfig(Config):
         1.5, 'what comes nearer to each other is one obstacle', unit='m', low=0.0, high=100.0
     )
     min_range: float = parameter(
-        1.0, 'echoes from nearer are the vehicle', unit='m', low=0.0, high=1e4
+        1.0,
+        'echoes from nearer are the vehicle; none are found either in the first rows of an image, '
+        'half of training and guard, where no nearer ones tell the noise',
+        unit='m',
+        low=0.0,
+        high=1e4,
     )
     max_detections: int = parameter(100, 'of a ping, the strongest', low=1, high=10_000)
 
@@ -139,6 +144,7 @@ class DetectorConfig(Config):
             growth=self.growth_false_alarm,
             sidelobe=10.0 ** (-0.1 * self.sidelobe_db),
             join_distance=self.join_distance,
+            nearest=self.min_range,
             beams=self.training_beams,
             training=self.training,
             guard=self.guard,
@@ -231,7 +237,7 @@ def _whole(sweep: list[SonarImage]) -> SonarImage:
 
 def detect(image: SonarImage, config: DetectorConfig) -> Detections:
     """The echoes in an image, strongest first. Raises `Rejection`."""
-    amplitude, distance, bearing, delay = _in_order(image, config)
+    amplitude, distance, bearing, delay = _in_order(image)
     if config.image_scale == 'power':
         amplitude = np.sqrt(np.maximum(amplitude, 0.0))
     elif config.image_scale == 'decibel':
@@ -253,11 +259,10 @@ def detect(image: SonarImage, config: DetectorConfig) -> Detections:
     )
 
 
-def _in_order(image: SonarImage, config: DetectorConfig) -> tuple[np.ndarray, ...]:
-    """Amplitudes (R, B), ranges, bearings and delays of what has a place and is no part of the
-    vehicle, with ranges and bearings ascending."""
-    rows = _ascending(image.range, image.range >= config.min_range)
-    beams = _ascending(image.bearing, np.isfinite(image.bearing))
+def _in_order(image: SonarImage) -> tuple[np.ndarray, ...]:
+    """Amplitudes (R, B), ranges, bearings and delays of what has a place, with ranges and bearings
+    ascending."""
+    rows, beams = _ascending(image.range), _ascending(image.bearing)
     bearing = image.bearing[beams]
     if len(bearing) and np.ptp(bearing) > 2.0 * np.pi:
         raise Rejection('out_of_range', 'the beams of the image span more than a turn')
@@ -266,11 +271,10 @@ def _in_order(image: SonarImage, config: DetectorConfig) -> tuple[np.ndarray, ..
     return amplitude, image.range[rows], bearing, delay[beams]
 
 
-def _ascending(axis: FloatArray, wanted: np.ndarray) -> np.ndarray | slice:
-    """What puts the wanted places of an axis in order; a slice, which copies nothing, where they
-    are in order already."""
-    wanted = wanted & np.isfinite(axis)
-    places = np.flatnonzero(wanted)
+def _ascending(axis: FloatArray) -> np.ndarray | slice:
+    """What puts the places of an axis that are numbers in order; a slice, which copies nothing,
+    where they are in order already."""
+    places = np.flatnonzero(np.isfinite(axis))
     if len(places) and places[-1] - places[0] == len(places) - 1:
         steps = np.diff(axis[places])
         if (steps > 0.0).all():
