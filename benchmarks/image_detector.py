@@ -28,7 +28,13 @@ DETECTORS = {
     'as it is': DetectorConfig(),
     'without the margin': DetectorConfig(threshold_margin_db=0.0),
 }
-FLOORS = {'Rayleigh': 1000.0, 'K 4': 4.0, 'K 1.5': 1.5}
+FLOORS = {
+    'Rayleigh': (1000.0, 1.0),
+    'K 4': (4.0, 1.0),
+    'K 1.5': (1.5, 1.0),
+    'K 1.5, patches of 5 m': (1.5, 5.0),
+}
+"""Shape of the power of patches of the sea floor, and their side in metres."""
 STUDY_FALSE = {
     'without the margin': {'Rayleigh': 0.1, 'K 4': 1.7, 'K 1.5': 7.3},
     'as it is': {'Rayleigh': 0.0, 'K 4': 0.08, 'K 1.5': 0.2},
@@ -61,8 +67,9 @@ def scene(**values: Any) -> ObstacleScenario:
 def false_alarms(images: int) -> dict[str, dict[str, float]]:
     """Detections per image without a target."""
     table: dict[str, dict[str, float]] = {}
-    for floor, shape in FLOORS.items():
-        sonar = ImageSonar(scene(seabed_shape=shape), np.random.default_rng(1))
+    for floor, (shape, patch) in FLOORS.items():
+        config = scene(seabed_shape=shape, seabed_patch=patch)
+        sonar = ImageSonar(config, np.random.default_rng(1))
         pictures = [image(sonar, []) for _ in range(images)]
         for name, config in DETECTORS.items():
             counts = [len(detect(one, config)) for one in pictures]
@@ -127,8 +134,16 @@ def centroids(runs: int) -> list[dict[str, float]]:
 
 
 def five_targets(scenes: int) -> dict[str, Any]:
-    """Three points, a chain and a float over a K sea floor: detections of each, and false ones."""
-    kinds = (('point', 20.0), ('point', 19.0), ('point', 35.0), ('chain', 20.0), ('float', 21.0))
+    """Points, chains across and along the line of sight and a float over a K sea floor: detections
+    of each, and false ones."""
+    kinds = (
+        ('point', 20.0),
+        ('point', 19.0),
+        ('point', 35.0),
+        ('chain across', 20.0),
+        ('float', 21.0),
+        ('chain along', 20.0),
+    )
     sizes = {'point': 0.0, 'chain': 6.0, 'float': 1.0}
     counts: dict[str, list[int]] = {}
     false = 0
@@ -140,13 +155,19 @@ def five_targets(scenes: int) -> dict[str, Any]:
         )
         spots = []
         for k, (kind, level) in enumerate(kinds):
-            r, b = rng.uniform(28.0, 38.0) + 12.0 * k, rng.uniform(-0.3, 0.3)
-            values = {'target': kind, 'target_snr_db': level, 'target_size': sizes[kind]}
+            r, b = rng.uniform(26.0, 34.0) + 11.0 * k, rng.uniform(-0.3, 0.3)
+            target = kind.split()[0]
+            values = {'target': target, 'target_snr_db': level, 'target_size': sizes[target]}
             config = scene(**values)
             one = ImageSonar(config, rng)
-            mean = base._mean_power(LEVEL)
-            total = total + config.image_gain * one._echo(LEVEL, place(r, b), 1.0, mean)
-            spots.append((f'{kind} {level:g} dB', r, b, NEAR + 0.5 * sizes[kind]))
+            one.heading = (0.5 * np.pi if kind.endswith('across') else 0.0) - b
+            mean = base.mean_power(LEVEL)
+            echo = one.echo(LEVEL, place(r, b), 1.0, mean)
+            if target != 'point':  # as in the study, the level is that of the loudest glint
+                around = mean[np.argmin(np.abs(base.range - r))].mean()
+                echo = echo * np.sqrt(10.0 ** (0.1 * level) * around) / np.abs(echo).max()
+            total = total + config.image_gain * echo
+            spots.append((f'{kind} {level:g} dB', r, b, NEAR + 0.5 * sizes[target]))
         picture = np.minimum(np.round(np.abs(total)), 255.0)
         ping = detect(
             SonarImage(stamp_ns=1, range=base.range, bearing=base.bearing, amplitude=picture),
@@ -160,8 +181,8 @@ def five_targets(scenes: int) -> dict[str, Any]:
         false += int((~hit).sum())
     return {
         'scenes': scenes,
-        'found': float(np.mean([n > 0 for one in counts.values() for n in one])),
-        'per target': {name: float(np.mean(one)) for name, one in counts.items()},
+        'found': {name: float(np.mean(np.array(one) > 0)) for name, one in counts.items()},
+        'detections': {name: float(np.mean(one)) for name, one in counts.items()},
         'false per image': false / scenes,
     }
 

@@ -17,11 +17,18 @@ FEEDERS = {'obstacle': 'fls_detector'}
 
 
 def inputs_of(system: str) -> tuple[InputTopic, ...]:
-    """The inputs of `system`. Raises ModuleNotFoundError when there is no such system."""
+    """The inputs of `system`, or of a node before one. Raises ModuleNotFoundError when there is no
+    such system."""
+    for fed, name in FEEDERS.items():
+        if system == name:
+            return made_inputs(fed)
     topics: tuple[InputTopic, ...] = import_module(f'{__name__}.{system}').TOPICS
     return topics
 
 
 def made_inputs(system: str) -> tuple[InputTopic, ...]:
     """The inputs of the node before that of `system`; nothing where there is none."""
-    return inputs_of(FEEDERS[system]) if system in FEEDERS else ()
+    if system not in FEEDERS:
+        return ()
+    images: tuple[InputTopic, ...] = import_module(f'{__name__}.{system}').IMAGES
+    return images

@@ -28,7 +28,8 @@ def write_scene(scene: Scene, out: str | Path, *, provenance: dict[str, str]) ->
         records.append((one.received_ns, topic, entry.write(one.measurement, ros_message)))
     for true in scene.truth:
         records += records_of(true, scene.frame_id)
-    with BagWriter(out, custom_data=provenance) as bag:
+    images = any(inputs[type(one.measurement)].makes for one in scene.measurements)
+    with BagWriter(out, custom_data=provenance, compressed=images) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)
             report.messages[topic] = report.messages.get(topic, 0) + 1

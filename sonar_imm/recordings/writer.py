@@ -17,7 +17,13 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer,
+    WriterError,
+)
 
 from .messages import ros_message, typestore
 from .sources import BagError
@@ -55,7 +61,8 @@ def naming(path: Path) -> Iterator[None]:
 class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
-    custom_data: notes kept in the metadata of the bag, e.g. where the data come from. What was
+    custom_data: notes kept in the metadata of the bag, e.g. where the data come from. compressed:
+    by zstd, chunk by chunk, which every reader of rosbag2 takes. What was
     written before an exception is still a whole bag. Raises `BagError` when the bag cannot be
     made.
     """
@@ -66,6 +73,7 @@ class BagWriter:
         *,
         storage: str = 'mcap',
         custom_data: Mapping[str, str] | None = None,
+        compressed: bool = False,
     ):
         if storage not in STORAGES:
             raise ValueError(f"storage must be one of {', '.join(STORAGES)}, got '{storage}'")
@@ -78,6 +86,9 @@ class BagWriter:
             )
             for key, note in sorted((custom_data or {}).items()):
                 self._writer.set_custom_data(key, str(note))
+            if compressed:
+                mode = CompressionMode.STORAGE if storage == 'mcap' else CompressionMode.MESSAGE
+                self._writer.set_compression(mode, CompressionFormat.ZSTD)
             self._writer.open()
         except WriterError:
             raise BagError(f'{path} exists already; remove it or choose another name') from None

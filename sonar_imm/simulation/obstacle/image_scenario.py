@@ -69,10 +69,12 @@ class ImageScenario(Scenario):
     )
     seabed_shape: float = parameter(
         4.0,
-        'shape of the gamma distribution of the power of its patches of 1 m: the smaller, the '
-        'rougher',
+        'shape of the gamma distribution of the power of its patches: the smaller, the rougher',
         low=0.1,
         high=1000.0,
+    )
+    seabed_patch: float = parameter(
+        1.0, 'side of a patch of the sea floor', unit='m', low=0.01, high=1000.0
     )
 
     def told_feeder(self) -> dict[str, Any]:

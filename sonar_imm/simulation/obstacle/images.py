@@ -35,7 +35,8 @@ _FAR_SIDELOBES = 6.0
 class ImageSonar:
     """Makes the images of one scene; every call of `image` draws from the same generator.
 
-    range (R,) m: centres of the bins; bearing (B,) rad, positive to port, port first.
+    range (R,) m: centres of the bins; bearing (B,) rad, positive to port, port first; heading:
+    rad from north of the line of a chain.
     """
 
     def __init__(self, config: ObstacleScenario, rng: np.random.Generator):
@@ -54,7 +55,7 @@ class ImageSonar:
         shape = config.seabed_shape
         self._texture = rng.gamma(shape, 1.0 / shape, (_TEXTURE, _TEXTURE))
         self._chain = rng.uniform(-0.5, 0.5, 60) * config.target_size
-        self._heading = rng.uniform(0.0, np.pi)
+        self.heading = rng.uniform(0.0, np.pi)
         ball = rng.normal(size=(10, 3))
         radius = 0.5 * config.target_size * rng.uniform(size=(10, 1)) ** (1.0 / 3.0)
         self._ball = radius * ball / np.linalg.norm(ball, axis=1, keepdims=True)
@@ -62,10 +63,10 @@ class ImageSonar:
     def image(self, sonar: Pose, places: list[FloatArray], sound: float) -> np.ndarray:
         """The image (R, B), 0 to 255, that the sonar at `sonar` (NED) makes of obstacles at
         `places` (3,) NED. `sound` is the scale error of the ranges."""
-        mean = self._mean_power(sonar)
+        mean = self.mean_power(sonar)
         speckle = self._speckle() * np.sqrt(mean)
         for place in places:
-            speckle += self._echo(sonar, place, sound, mean)
+            speckle += self.echo(sonar, place, sound, mean)
         counts = self.config.image_gain * np.abs(speckle)
         return np.minimum(np.round(counts), 255.0).astype(np.uint8)
 
@@ -77,7 +78,7 @@ class ImageSonar:
             parts = convolve1d(parts, pattern, axis=axis, mode='wrap')
         return parts[0] + 1j * parts[1]
 
-    def _mean_power(self, sonar: Pose) -> FloatArray:
+    def mean_power(self, sonar: Pose) -> FloatArray:
         """(R, B) of noise, water and sea floor."""
         config, r = self.config, self.range[:, None]
         mean = np.ones((len(self.range), len(self.bearing)))
@@ -96,10 +97,10 @@ class ImageSonar:
         power = 10.0 ** (0.1 * config.seabed_power_db) * 4.0 * np.square(onset / r)
         power = power * self._vertical(seen) * there
         patch = np.stack([sonar.position[0] + north, sonar.position[1] + east])
-        i, j = np.floor(patch).astype(int) % _TEXTURE
+        i, j = np.floor(patch / config.seabed_patch).astype(int) % _TEXTURE
         return mean + power * self._texture[i, j]
 
-    def _echo(
+    def echo(
         self, sonar: Pose, place: FloatArray, sound: float, mean: FloatArray
     ) -> ComplexArray | float:
         """Complex amplitudes (R, B) of one obstacle."""
@@ -132,7 +133,7 @@ class ImageSonar:
         if self.config.target == 'float':
             return self._ball
         if self.config.target == 'chain':
-            line = np.array([np.cos(self._heading), np.sin(self._heading), 0.0])
+            line = np.array([np.cos(self.heading), np.sin(self.heading), 0.0])
             return self._chain[:, None] * line
         return np.zeros((1, 3))
 
