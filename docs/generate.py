@@ -10,9 +10,10 @@ import textwrap
 
 import yaml
 
-from sonar_imm.node_config import node_config_type, type_specs
+from sonar_imm.node_config import DetectorNodeConfig, node_config_type, type_specs
 from sonar_imm.parameters import markdown_table, ParameterSpec
 from sonar_imm.trackers import System, SYSTEMS
+from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -27,7 +28,7 @@ YAML_HEAD = """\
 """
 
 MARKDOWN = """\
-# Parameters of the {name} tracker
+# Parameters of the {what}
 
 {summary}.
 Written by `make docs` from the configuration classes; `ros2 param describe` shows the same.
@@ -36,7 +37,7 @@ Written by `make docs` from the configuration classes; `ros2 param describe` sho
 A parameter that may change while running keeps the tracks; every other one is read at start.
 A wrong value is refused with one sentence that names it, a misspelt name is warned about.
 
-## Tracker
+## {part}
 
 {tracker}
 ## Node
@@ -45,25 +46,47 @@ The live node takes these besides; offline tracking ignores them.
 
 {node}"""
 
+DETECTOR = (
+    'Echoes in images of a forward-looking sonar, for the obstacle tracker. Offline the same '
+    'parameters are taken from the section `fls_detector` of a parameter file, and from `--set`'
+)
+
 
 def generated() -> dict[str, str]:
     """Give every generated file: its text by its path below the project root."""
     files = {}
     for system in SYSTEMS.values():
+        tracker = system.config_type().specs()
         files[f'config/{system.name}.yaml'] = parameter_file(system)
         files[f'docs/parameters/{system.name}.md'] = MARKDOWN.format(
             name=system.name,
+            what=f'{system.name} tracker',
+            part='Tracker',
             summary=system.summary[0].upper() + system.summary[1:],
-            tracker=markdown_table(system.config_type().specs()),
+            tracker=markdown_table(tracker),
             node=markdown_table(node_specs(system)),
         )
+    detector = DetectorConfig.specs()
+    node = (*type_specs('fls_detector'), *DetectorNodeConfig.specs())
+    files['config/fls_detector.yaml'] = _parameter_file('fls_detector', (*detector, *node))
+    files['docs/parameters/fls_detector.md'] = MARKDOWN.format(
+        name='fls_detector',
+        what='detector of sonar images',
+        part='Detector',
+        summary=DETECTOR,
+        tracker=markdown_table(detector),
+        node=markdown_table(node),
+    )
     return files
 
 
 def parameter_file(system: System) -> str:
     """Give the ROS 2 parameter file of `system`, every parameter with its description above."""
-    entries = [_entry(spec) for spec in (*system.config_type().specs(), *node_specs(system))]
-    return YAML_HEAD.format(name=system.name) + '\n'.join(entries)
+    return _parameter_file(system.name, (*system.config_type().specs(), *node_specs(system)))
+
+
+def _parameter_file(name: str, specs: tuple[ParameterSpec, ...]) -> str:
+    return YAML_HEAD.format(name=name) + '\n'.join(_entry(spec) for spec in specs)
 
 
 def node_specs(system: System) -> tuple[ParameterSpec, ...]:

@@ -3,7 +3,8 @@
 Our own message is a table with one row per echo and one message per ping. A ping in which nothing
 was seen is a table without rows, because a miss is evidence too. Columns: ``x y z`` f4 [m, for
 display]; ``range`` [m], ``bearing`` [rad, REP-103: positive to port]; optional ``var_range``,
-``var_bearing``, ``intensity``. A table without range and bearing is read from x, y, z.
+``var_bearing``, ``intensity``, ``extent_range``, ``extent_bearing``. A table without range and
+bearing is read from x, y, z.
 
 The other messages use different axes; the rules are these. In the messages of
 marine_acoustic_msgs receive angles count to starboard, and beams point along z with x up and y to
@@ -25,13 +26,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import BEAM_AXES, Detections, Rejection
+from sonar_imm.measurements import BEAM_AXES, Detections, OPTIONAL_COLUMNS, Rejection
 
 from .headers import Make, stamp_ns
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 MAX_DETECTIONS = 10_000
-COLUMNS = ('x', 'y', 'z', 'range', 'bearing', 'var_range', 'var_bearing', 'intensity')
+COLUMNS = ('x', 'y', 'z', 'range', 'bearing', *OPTIONAL_COLUMNS)
 SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
 NEAREST, FARTHEST = 0.01, 1e5
@@ -55,11 +56,7 @@ def read_detections(message: Any, *, bearing_positive: str = 'port', **_: Any) -
         distance, bearing = _polar(*(scalar_column(columns, name) for name in 'xyz'))
     else:
         distance = bearing = np.empty(0)
-    optional = {
-        name: scalar_column(columns, name)
-        for name in ('var_range', 'var_bearing', 'intensity')
-        if name in columns
-    }
+    optional = {name: scalar_column(columns, name) for name in OPTIONAL_COLUMNS if name in columns}
     for name in ('var_range', 'var_bearing'):
         if name in optional:
             optional[name] = _variances(optional[name])
@@ -142,7 +139,7 @@ def write_detections(detections: Detections, make: Make) -> Any:
         'range': distance,
         'bearing': bearing,
     }
-    for name in ('var_range', 'var_bearing', 'intensity'):
+    for name in OPTIONAL_COLUMNS:
         values = getattr(detections, name)
         if np.isfinite(values).any():
             columns[name] = values.astype(np.float32)

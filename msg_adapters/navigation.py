@@ -1,4 +1,5 @@
-"""Navigation of a vehicle: nav_msgs/Odometry, and altitudes from sensor_msgs/Range or a Dvl.
+"""Navigation of a vehicle: nav_msgs/Odometry, and altitudes from sensor_msgs/Range or a Doppler
+log, whose velocity is not read: the pose of the navigation has it already.
 
 The twist of an Odometry is defined in the child frame, the vehicle's own; many drivers state it in
 the axes of the world instead, which `nav_twist_frame` undoes. With `world_frame` ``'ned'`` the
@@ -70,11 +71,17 @@ def read_range(message: Any, **_: Any) -> Altitude:
 
 
 def read_dvl(message: Any, **_: Any) -> Altitude:
-    """Read the altitude of a marine_acoustic_msgs/Dvl; not positive means no bottom lock."""
-    height = float(message.altitude)
-    if np.isfinite(height) and height <= 0.0:
-        raise Rejection('no_bottom', 'the Doppler log has no bottom lock')
-    return _altitude(message, height, np.nan)
+    """Read the altitude of a marine_acoustic_msgs/Dvl or a stonefish_ros2/DVL; not positive means
+    no bottom lock."""
+    return _lock(message, float(message.altitude))
+
+
+def read_dave_dvl(message: Any, **_: Any) -> Altitude:
+    """Read the altitude of a dave_interfaces/DVL: the range of its target, unless that is the
+    water."""
+    if 'water' in str(message.target.type).lower():
+        raise Rejection('no_bottom', 'the Doppler log tracks the water, not the bottom')
+    return _lock(message, float(message.target.range))
 
 
 def write_navigation(navigation: Navigation, make: Make) -> Any:
@@ -120,6 +127,13 @@ def write_range(altitude: Altitude, make: Make) -> Any:
         range=float(altitude.altitude),
         variance=float(altitude.variance) if known else 0.0,
     )
+
+
+def _lock(message: Any, height: float) -> Altitude:
+    """The altitude of a Doppler log."""
+    if np.isfinite(height) and height <= 0.0:
+        raise Rejection('no_bottom', 'the Doppler log has no bottom lock')
+    return _altitude(message, height, np.nan)
 
 
 def _altitude(message: Any, height: float, variance: float) -> Altitude:

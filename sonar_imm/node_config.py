@@ -70,6 +70,21 @@ class BathymetryNodeConfig(NodeConfig):
     max_wait: float = inherited(NodeConfig, 'max_wait', 0.5)
 
 
+@frozen(kw_only=True)
+class DetectorNodeConfig(Config):
+    """What the node of the detector of images can be told besides the detector."""
+
+    queue_depth: int = inherited(
+        NodeConfig,
+        'queue_depth',
+        10,
+        description='images held while the node is busy',
+        high=1000,
+    )
+    diagnostics_period: float = inherited(NodeConfig, 'diagnostics_period', 1.0)
+    stale_after: float = inherited(NodeConfig, 'stale_after', 10.0)
+
+
 def node_config_type(system: System) -> type[NodeConfig]:
     """What the node of `system` can be told besides the parameters of its tracker."""
     found: type[NodeConfig] = globals()[system.node_config]

@@ -10,10 +10,25 @@ from importlib import import_module
 
 from .topic import InputTopic, needed
 
-__all__ = ['InputTopic', 'inputs_of', 'needed']
+__all__ = ['FEEDERS', 'InputTopic', 'inputs_of', 'made_inputs', 'needed']
+
+FEEDERS = {'obstacle': 'fls_detector'}
+"""Systems whose node has another one before it, by name: it makes one of their inputs."""
 
 
 def inputs_of(system: str) -> tuple[InputTopic, ...]:
-    """The inputs of `system`. Raises ModuleNotFoundError when there is no such system."""
+    """The inputs of `system`, or of a node before one. Raises ModuleNotFoundError when there is no
+    such system."""
+    for fed, name in FEEDERS.items():
+        if system == name:
+            return made_inputs(fed)
     topics: tuple[InputTopic, ...] = import_module(f'{__name__}.{system}').TOPICS
     return topics
+
+
+def made_inputs(system: str) -> tuple[InputTopic, ...]:
+    """The inputs of the node before that of `system`; nothing where there is none."""
+    if system not in FEEDERS:
+        return ()
+    images: tuple[InputTopic, ...] = import_module(f'{__name__}.{system}').IMAGES
+    return images

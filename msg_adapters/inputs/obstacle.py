@@ -1,8 +1,8 @@
-"""Input topics of the obstacle tracker."""
+"""Input topics of the obstacle tracker, and of the detector that makes detections of images."""
 
 from __future__ import annotations
 
-from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage
 
 from ..detections import (
     read_detections,
@@ -14,12 +14,15 @@ from ..detections import (
 )
 from ..navigation import (
     doubt_navigation,
+    read_dave_dvl,
     read_dvl,
     read_navigation,
     read_range,
     write_navigation,
     write_range,
 )
+from ..sonar_images import read_picture, read_projected_image, read_raw_image, write_picture
+from ..vendor_images import read_oculus_ping, read_ping360_echo, read_sonoptix_echo
 from .topic import InputTopic
 
 TOPICS = (
@@ -55,7 +58,40 @@ TOPICS = (
         readers={
             'sensor_msgs/msg/Range': read_range,
             'marine_acoustic_msgs/msg/Dvl': read_dvl,
+            'stonefish_ros2/msg/DVL': read_dvl,
+            'dave_interfaces/msg/DVL': read_dave_dvl,
         },
         write=write_range,
     ),
 )
+
+IMAGES = (
+    InputTopic(
+        'image',
+        'images of a forward-looking sonar',
+        measurement=SonarImage,
+        readers={
+            'marine_acoustic_msgs/msg/ProjectedSonarImage': read_projected_image,
+            'marine_acoustic_msgs/msg/RawSonarImage': read_raw_image,
+            'oculus_interfaces/msg/Ping': read_oculus_ping,
+            'ping360_sonar_msgs/msg/SonarEcho': read_ping360_echo,
+            'sensors/msg/SonoptixECHO': read_sonoptix_echo,
+            'sensor_msgs/msg/Image': read_picture,
+        },
+        write=write_picture,
+        one_topic=True,
+        makes='detections',
+        by_name=frozenset({'sensor_msgs/msg/Image'}),
+        settings=(
+            'image_order',
+            'beam_axes',
+            'sound_speed',
+            'image_near_range',
+            'image_far_range',
+            'image_fov_deg',
+            'image_first_beam',
+            'image_first_range',
+        ),
+    ),
+)
+"""What the detector before the tracker hears."""

@@ -37,6 +37,8 @@ class InputTopic:
     topic or its frame.
     required: whether the tracker makes nothing without it, by the parameters of the tracker. Of
     the inputs that are neither required nor companions, one is enough.
+    makes: the input of a tracker that a node before it makes of this one; '' for an input of the
+    tracker itself.
     """
 
     name: str
@@ -57,6 +59,7 @@ class InputTopic:
     required: Callable[[Mapping[str, Any]], bool] = field(
         default=lambda settings: False, kw_only=True
     )
+    makes: str = field(default='', kw_only=True)
 
     def may_be(self, topic: str, type_name: str) -> bool:
         """Whether a topic of that name and type could be this input, if a user says so."""

@@ -1,57 +1,90 @@
-"""Echoes in an image of a forward-looking sonar: cell-averaging CFAR.
+"""How loud a cell of a sonar image has to be to be an echo: a constant rate of false alarms.
 
-A cell holds an echo when its power exceeds the mean of the cells before and behind it in range by
-a factor that keeps the rate of false alarms constant, whatever the level of the noise. For noise
-of exponentially distributed power, what is left after a beamformer of many elements, N averaged
-cells and a false alarm probability p ask for the factor ``N (p^(-1/N) - 1)``. Cells next to the
-one under test are left out (guard), because an echo is wider than a cell. Of the cells of one echo
-only the strongest counts.
+A cell holds an echo when its power exceeds the level of the noise around it by a factor. The level
+is the *greater of* two means, over the cells nearer and over those farther in range, each averaged
+over several beams as well: at the onset of the sea floor, where the level climbs, the mean of both
+sides would be too low and the whole edge an echo (GO-CFAR). Cells next to the one under test are
+left out (guard), because an echo is wider than a cell.
 
-Source: Finn & Johnson 1968, 'Adaptive detection mode with threshold control'.
+For noise of exponentially distributed power, N independent cells on either side and the factor T
+the probability of a false alarm is, with t = T / N,
+
+    P = 2 (1 + t)^-N - 2 sum_{k=0}^{N-1} C(N+k-1, k) (2 + t)^-(N+k)
+
+Cells of an image are not independent: speckle is as wide as the beam and as long as the pulse.
+`effective_cells` says how many independent ones a window holds. Taking all for independent makes
+ten times as many false alarms.
+
+Sources: Hansen & Sawyers 1980, 'Detectability loss due to greatest-of selection in a
+cell-averaging CFAR'; Finn & Johnson 1968 for a single side.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
-from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import gammaln
 
 from ..estimation.arrays import FloatArray
+from .cfar_kernels import greatest_of_level
+
+_LARGEST_FACTOR = 1e6
 
 
-def noise_level(power: FloatArray, guard: int, training: int) -> tuple[FloatArray, FloatArray]:
-    """Mean power (R, B) of the `training` cells on either side in range beyond `guard` cells, and
-    how many cells (R,) were averaged: fewer at the ends."""
-    rows = len(power)
-    total = np.vstack([np.zeros((1, power.shape[1])), np.cumsum(power, axis=0)])
-    cell = np.arange(rows)
-    before = np.clip(cell - guard - training, 0, rows), np.clip(cell - guard, 0, rows)
-    behind = np.clip(cell + guard + 1, 0, rows), np.clip(cell + guard + 1 + training, 0, rows)
-    count = (before[1] - before[0] + behind[1] - behind[0]).astype(float)
-    summed = total[before[1]] - total[before[0]] + total[behind[1]] - total[behind[0]]
-    return summed / np.maximum(count, 1.0)[:, None], count
+def effective_cells(cells: int, width: float) -> float:
+    """How many independent values of power a row of `cells` holds, when an echo of a point is
+    `width` cells wide (-3 dB); a Gaussian pattern is assumed."""
+    lag = np.arange(1, cells)
+    correlation = np.exp(-2.0 * np.log(2.0) * np.square(lag / max(width, 1e-6)))
+    return float(cells / (1.0 + 2.0 * np.sum((1.0 - lag / cells) * correlation)))
 
 
-def cfar_peaks(
-    amplitude: FloatArray, *, guard: int = 2, training: int = 12, false_alarm: float = 1e-6
-) -> NDArray[np.intp]:
-    """Range bin and beam (n, 2) of the echoes in `amplitude` (R, B), strongest first.
+def false_alarm_probability(factor: float, cells: int, sides: int = 2) -> float:
+    """That a cell of noise exceeds `factor` times the greater of `sides` (1 or 2) means, each of
+    `cells` independent values."""
+    t = factor / cells
+    alone = (1.0 + t) ** -cells
+    if sides == 1:
+        return float(alone)
+    k = np.arange(cells)
+    log_terms = gammaln(cells + k) - gammaln(cells) - gammaln(k + 1.0)
+    both = np.exp(log_terms - (cells + k) * np.log(2.0 + t)).sum()
+    return float(2.0 * (alone - both))
 
-    Raises ValueError for an image that is not two-dimensional. Cells that are not finite count as
-    silence.
+
+@lru_cache(maxsize=256)
+def threshold_factor(false_alarm: float, cells: int, sides: int = 2) -> float:
+    """The factor that gives this probability of a false alarm; infinite when so few cells cannot
+    give it. Raises ValueError for a probability outside 0 to 1."""
+    if not 0.0 < false_alarm < 1.0:
+        raise ValueError(f'a false alarm probability lies between 0 and 1, got {false_alarm}')
+    if sides == 1:
+        return float(cells * np.expm1(-np.log(false_alarm) / cells))
+
+    def excess(factor: float) -> float:
+        return false_alarm_probability(factor, cells) - false_alarm
+
+    if excess(_LARGEST_FACTOR) > 0.0:
+        return float('inf')
+    return float(brentq(excess, 0.0, _LARGEST_FACTOR, xtol=1e-9, rtol=1e-12))
+
+
+def noise_level(
+    power: FloatArray, *, beams: int, training: int, guard: int
+) -> tuple[FloatArray, FloatArray]:
+    """Level (R, B) around each cell of `power` (R, B), and how many sides (R,) it comes from.
+
+    The greater of the means over `training` cells nearer and farther in range, beyond `guard`
+    cells, and over `beams` beams around. A side with less than half of its cells inside the image
+    does not count. Without the nearer side the level is infinite and the number of sides 0: water
+    scatters back more the nearer it is, and the farther side alone would be too quiet.
+
+    Raises ValueError for an image that is not two-dimensional.
     """
-    if amplitude.ndim != 2:
-        raise ValueError(f'an image (R, B) is needed, got the shape {amplitude.shape}')
-    if not amplitude.size:
-        return np.empty((0, 2), np.intp)
-    from scipy.ndimage import maximum_filter
-
-    # Squares of the largest float32 still fit into a float64.
-    power = np.square(np.where(np.isfinite(amplitude), amplitude, 0.0).clip(-1e38, 1e38))
-    noise, count = noise_level(power, guard, training)
-    N = np.maximum(count, 1.0)
-    factor = N * np.expm1(-np.log(false_alarm) / N)
-    loud = (power > factor[:, None] * noise) & (count >= training)[:, None]
-    loud &= power == maximum_filter(power, size=(2 * guard + 1, 3), mode='constant')
-    found = np.argwhere(loud)
-    order = np.argsort(-power[loud], kind='stable')
-    return found[order]
+    if power.ndim != 2:
+        raise ValueError(f'an image (R, B) is needed, got the shape {power.shape}')
+    return greatest_of_level(
+        np.ascontiguousarray(power, np.float64), max(beams // 2, 0), training, guard
+    )

@@ -19,7 +19,7 @@ from ..parameters import Config
 from ..recordings.own_parameters import own_parameters
 from ..resources import share_folder
 from ..trackers import SYSTEMS
-from .common import load_config, progress
+from .common import load_config, load_detector, progress
 from .evaluate import evaluate_run
 from .track import track_recording
 
@@ -79,7 +79,11 @@ def check_recording(
     """
     params = params or own_parameters(bag)
     config, node = load_config(SYSTEMS[system], params, {})
-    options = InputOptions(frame_id=node.frame_id, world_frame=node.world_frame_convention)
+    options = InputOptions(
+        frame_id=node.frame_id,
+        world_frame=node.world_frame_convention,
+        detector=load_detector(SYSTEMS[system], params, {}),
+    )
     run = track_recording(
         bag, folder / 'offline', SYSTEMS[system], config, options, overwrite=True, quiet=quiet
     )

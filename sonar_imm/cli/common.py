@@ -12,6 +12,8 @@ from typing import Any
 
 import click
 
+from msg_adapters.inputs import FEEDERS
+
 from ..node_config import node_config_type, NodeConfig, type_specs
 from ..parameters import (
     Config,
@@ -130,10 +132,11 @@ def load_config(
     values = _parameters_of(params, system.name) if params else {}
     specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
+    others = _detector_specs(system)
     unknown = [
         f"unknown parameter '{name}'{did_you_mean(name, specs)}"
         for name in values
-        if name not in specs
+        if name not in specs and name not in others
     ]
     # The message types a live node subscribes to are checked too, though a recording has its own.
     problems = unknown + [
@@ -147,6 +150,37 @@ def load_config(
         config_type.from_mapping(values, ignore_unknown=True) for config_type in types
     )
     return tracker, node
+
+
+def load_detector(
+    system: System, params: Path | None, overrides: dict[str, str]
+) -> dict[str, Any]:
+    """Parameters of the detector before the tracker that are not the default: of the section of
+    its node in the file, then ``--set``. Empty for a system without one.
+
+    Raises `ConfigError` with one sentence for each mistake.
+    """
+    specs = _detector_specs(system)
+    if not specs:
+        return {}
+    from ..trackers.obstacle.detector import DetectorConfig
+
+    values = _parameters_of(params, FEEDERS[system.name]) if params else {}
+    values.update(
+        {name: _typed(text, specs[name]) for name, text in overrides.items() if name in specs}
+    )
+    config = DetectorConfig.from_mapping(values, ignore_unknown=True)
+    defaults = DetectorConfig().as_dict()
+    return {k: value for k, value in config.as_dict().items() if value != defaults[k]}
+
+
+def _detector_specs(system: System) -> dict[str, ParameterSpec]:
+    """Parameters of the detector before the tracker, by name."""
+    if system.name not in FEEDERS:
+        return {}
+    from ..trackers.obstacle.detector import DetectorConfig
+
+    return {spec.name: spec for spec in DetectorConfig.specs()}
 
 
 def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:

@@ -8,10 +8,12 @@ from typing import Any
 
 import click
 
+from ..trackers import SYSTEMS
 from .common import (
     BAG,
     example,
     json_option,
+    load_detector,
     pairs_option,
     print_json,
     say,
@@ -240,6 +242,7 @@ def snapshots(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None
 )
 @click.argument('source', metavar='IN', type=BAG)
 @click.argument('out_bag', type=BAG_OUT)
+@click.option('--topic', help='Topic of the images, where several could be.')
 @set_option
 @storage_option
 @json_option
@@ -248,18 +251,21 @@ def images(
 ) -> None:
     """Bag with images of a forward-looking sonar to /detections, for the obstacle tracker.
 
-    Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage. Navigation and altitudes are
-    copied. --set changes the detector: image_order, beam_axes, sound_speed, guard, training,
-    false_alarm, min_range, max_detections.
+    Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage, pings of the Oculus, echoes
+    of the Ping360, SonoptixECHO and sensor_msgs/Image. Navigation and altitudes are copied. --set
+    changes the detector, whose parameters docs/parameters/fls_detector.md lists; those beside the
+    recording, in its parameters.yaml, are used.
     """
+    from ..recordings.own_parameters import own_parameters
     from ..trackers.obstacle.detector import DetectorConfig
 
+    own = load_detector(SYSTEMS['obstacle'], own_parameters(source), {})
     _convert(
         'images',
         source,
         out_bag,
         as_json,
-        parameters=typed_overrides(DetectorConfig, overrides),
+        parameters=own | typed_overrides(DetectorConfig, overrides),
         **values,
     )
 

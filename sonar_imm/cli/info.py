@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from .common import BAG, example, json_option, print_json, progress
+from ..trackers import SYSTEMS
+from .common import BAG, example, json_option, load_detector, print_json, progress
 
 
 @click.command(epilog=example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
@@ -27,10 +28,17 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
     with BagReader(bag, strict=strict) as reader:
         total = sum(topic.count for topic in reader.topics)
         with progress('reading', total, quiet=as_json) as advance:
-            found = inspect(reader, advance)
+            found = inspect(reader, advance, _detector(bag))
     print_json(found) if as_json else _print(found)
     if not found['systems']:
         raise click.exceptions.Exit(1)
+
+
+def _detector(bag: Path) -> dict[str, Any]:
+    """What the parameter file beside a recording says of its images."""
+    from ..recordings.own_parameters import own_parameters
+
+    return load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})
 
 
 def _print(found: dict[str, Any]) -> None:

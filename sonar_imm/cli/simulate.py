@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from msg_adapters.inputs import FEEDERS
+
 from .. import __version__
 from ..trackers import SYSTEMS
 from .common import example, json_option, print_json, say, set_option, typed_overrides
@@ -74,7 +76,11 @@ def command(
         },
     )
     told = unusual(config.told(), SYSTEMS[system].config_type())
-    parameters = write_own_parameters(out_bag, system, told)
+    sections = {system: told}
+    if fed := config.told_feeder():
+        # A scene writes its images as the only type that needs no further package.
+        sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
+    parameters = write_own_parameters(out_bag, sections)
     targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
     result = {
         'bag': str(out_bag),

@@ -15,6 +15,7 @@ from .common import (
     example,
     json_option,
     load_config,
+    load_detector,
     print_json,
     progress,
     say,
@@ -113,6 +114,7 @@ def command(
             topics=inputs_by_topic(topics),
             frame_id=node.frame_id,
             world_frame=node.world_frame_convention,
+            detector=load_detector(SYSTEMS[system], params, {}) if params else scene.told_feeder(),
         ),
     )
     if out is not None:

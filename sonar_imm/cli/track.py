@@ -15,6 +15,7 @@ from .common import (
     example,
     json_option,
     load_config,
+    load_detector,
     print_json,
     progress,
     say,
@@ -139,7 +140,8 @@ class Plan:
         from ..evaluation.tracking import InputOptions
 
         chosen = choose_system(bag, self.system, self.topics)
-        config, node = load_config(chosen, self.parameters_of(bag), self.overrides)
+        params = self.parameters_of(bag)
+        config, node = load_config(chosen, params, self.overrides)
         options = InputOptions(
             topics=inputs_by_topic(self.topics),
             order=self.order,
@@ -147,6 +149,7 @@ class Plan:
             world_frame=node.world_frame_convention,
             smooth=self.smooth,
             jobs=self.jobs,
+            detector=load_detector(chosen, params, self.overrides),
         )
         return track_recording(
             bag,

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from attrs import define, field
 import numpy as np
 
 from msg_adapters.headers import stamp_ns
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 
 from ..measurements import Rejection
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
@@ -37,16 +37,21 @@ class _Heard:
     examples: dict[str, str] = field(factory=dict)
 
 
-def inspect(bag: BagReader, advance: Callable[[int], None] = lambda count: None) -> dict[str, Any]:
+def inspect(
+    bag: BagReader,
+    advance: Callable[[int], None] = lambda count: None,
+    detector: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Read a whole open recording. Gives plain values, fit for JSON.
 
+    detector: what readers of images have to be told, by the names of its parameters.
     topics: one entry per topic with count, rate, frames, scans, the tracker inputs it suits and
     its problems. problems: of the recording as a whole. systems: topics by input for each tracker.
     """
     heard = {topic.name: _Heard(topic) for topic in bag.topics}
     for item in bag.messages():
         advance(1)
-        _look_at(item, heard[item.topic])
+        _look_at(item, heard[item.topic], detector or {})
     topics = [_topic_entry(entry) for entry in heard.values()]
     first = min((entry.logs[0] for entry in heard.values() if entry.logs), default=0)
     last = max((entry.logs[-1] for entry in heard.values() if entry.logs), default=0)
@@ -60,7 +65,7 @@ def inspect(bag: BagReader, advance: Callable[[int], None] = lambda count: None)
     }
 
 
-def _look_at(item: BagMessage, heard: _Heard) -> None:
+def _look_at(item: BagMessage, heard: _Heard, detector: Mapping[str, Any]) -> None:
     heard.logs.append(item.log_ns)
     header = getattr(item.message, 'header', None)
     if header is not None:
@@ -71,7 +76,8 @@ def _look_at(item: BagMessage, heard: _Heard) -> None:
             heard.no_stamp += 1
     for system, entry in _readers(item):
         try:
-            entry.readers[item.type_name](item.message)
+            told = detector if entry.makes else {}
+            entry.reader(item.type_name, 'enu', told)(item.message)
             heard.good[system, entry.name] += 1
             if (code := entry.doubt(item.message)) is not None:
                 heard.doubts[code] += 1
@@ -95,7 +101,11 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     own = item.topic.split('/')[-1]
     found = []
     for system in SYSTEMS:
-        fitting = [one for one in inputs_of(system) if one.may_be(item.topic, item.type_name)]
+        fitting = [
+            one
+            for one in (*inputs_of(system), *made_inputs(system))
+            if one.may_be(item.topic, item.type_name)
+        ]
         named = [one for one in fitting if one.name.split('/')[-1] == own]
         # A topic of several sides is named by its namespace too, see `InputTopic.name`.
         found += [(system, entry) for entry in named or fitting]

@@ -214,8 +214,9 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
             run['topics'],
             world_frame=run.get('world_frame', 'enu'),
             settings=run.get('parameters'),
+            detector=run.get('detector'),
         ):
-            if not isinstance(heard.measurement, Rejection):
+            if heard.measurement is not None and not isinstance(heard.measurement, Rejection):
                 yield heard.measurement
 
 

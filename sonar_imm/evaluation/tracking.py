@@ -14,7 +14,7 @@ from concurrent.futures import Future
 import time
 from typing import Any
 
-from attrs import asdict, define, frozen
+from attrs import asdict, define, field, frozen
 import numpy as np
 
 from ..estimates import Estimate
@@ -38,7 +38,8 @@ class InputOptions:
 
     topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
     later input too, which takes memory in proportion to the recording. jobs: processes that share
-    the work where a tracker can share it; the estimates do not depend on it.
+    the work where a tracker can share it; the estimates do not depend on it. detector: parameters of
+    the detector of images that are not the default.
     """
 
     topics: Mapping[str, str] | None = None
@@ -47,6 +48,7 @@ class InputOptions:
     frame_id: str = ''
     smooth: bool = False
     jobs: int = 1
+    detector: Mapping[str, Any] = field(factory=dict)
 
 
 @define
@@ -189,9 +191,12 @@ class OfflineRun:
             world_frame=self.options.world_frame,
             order=self.options.order,
             settings=self.tracker.config.as_dict(),
+            detector=self.options.detector,
         ):
             self.messages += 1
             advance(1)
+            if heard.measurement is None:
+                continue
             try:
                 if isinstance(heard.measurement, Rejection):
                     raise heard.measurement
@@ -275,6 +280,7 @@ def write_run(
         problems=list(offline.bag.problems),
         **offline.origin(),
         parameters=offline.tracker.config.as_dict(),
+        **({'detector': dict(options.detector)} if options.detector else {}),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )
     folder.write_json(RUN, run)

@@ -12,7 +12,16 @@ from .checks import check_covariance, check_stamp, nanoseconds, Rejection
 from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .frames import frame_role, FrameGuard
-from .obstacle import Altitude, BEAM_AXES, Detections, IMAGE_ORDERS, Navigation, SonarImage
+from .obstacle import (
+    Altitude,
+    BEAM_AXES,
+    Detections,
+    IMAGE_ORDERS,
+    MAX_IMAGE_CELLS,
+    Navigation,
+    OPTIONAL_COLUMNS,
+    SonarImage,
+)
 from .positions import GeodeticFix, RelativeFix, VesselFix, VesselHeading, VesselPose
 from .repeats import RepeatGuard
 
@@ -32,10 +41,12 @@ __all__ = [
     'GeodeticFix',
     'IMAGE_ORDERS',
     'MAX_BINS',
+    'MAX_IMAGE_CELLS',
     'Measurement',
     'nanoseconds',
     'Navigation',
     'NOBODY',
+    'OPTIONAL_COLUMNS',
     'Pressure',
     'Rejection',
     'RelativeFix',

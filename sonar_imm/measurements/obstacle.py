@@ -15,6 +15,12 @@ BEAM_AXES = ('marine', 'rep103', 'auto')
 which of the two the beams point along."""
 IMAGE_ORDERS = ('range_major', 'beam_major')
 """How the samples of an image may lie: all beams of a range together, or all ranges of a beam."""
+MAX_IMAGE_CELLS = 4_000_000
+"""No sonar makes larger images."""
+
+
+OPTIONAL_COLUMNS = ('var_range', 'var_bearing', 'intensity', 'extent_range', 'extent_bearing')
+"""What a detection may say besides range and bearing."""
 
 
 @frozen(eq=False, kw_only=True)
@@ -23,8 +29,9 @@ class Detections:
 
     The stamp is the transmission. range: (n,) metres; bearing: (n,) rad, REP-103: positive to
     port; var_range: (n,) m^2 and var_bearing: (n,) rad^2, NaN where the sender does not know them;
-    intensity: (n,), NaN where unknown. Columns left out are unknown. A row without a finite range
-    and bearing is no echo.
+    intensity: (n,), NaN where unknown; extent_range: (n,) m and extent_bearing: (n,) rad, spread
+    (standard deviation) of the echo, NaN where unknown. Columns left out are unknown. A row
+    without a finite range and bearing is no echo.
     """
 
     FRAME: ClassVar[str] = 'own'
@@ -36,14 +43,16 @@ class Detections:
     var_bearing: FloatArray | None = None
     intensity: FloatArray | None = None
     frame_id: str = ''
+    extent_range: FloatArray | None = None
+    extent_bearing: FloatArray | None = None
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
-        for name in ('var_range', 'var_bearing', 'intensity'):
+        for name in OPTIONAL_COLUMNS:
             given = getattr(self, name)
             column = np.full(len(self.range), np.nan) if given is None else given
             object.__setattr__(self, name, floats(None)(column))
-        for name in ('bearing', 'var_range', 'var_bearing', 'intensity'):
+        for name in ('bearing', *OPTIONAL_COLUMNS):
             rows = len(getattr(self, name))
             if rows != len(self):
                 raise Rejection(
@@ -64,14 +73,31 @@ class Detections:
 class SonarImage:
     """A ping of a forward-looking sonar before detection; no tracker takes it in.
 
-    range (R,) m and bearing (B,) rad, positive to port, of the magnitudes amplitude (R, B).
+    range (R,) m and bearing (B,) rad, positive to port, of the magnitudes amplitude (R, B); rows
+    and beams without a finite place, and samples that are not finite, are left out by a detector.
+    scanning: one direction of a sonar that turns, of which a detector gathers many. delay: (B,) s
+    after the stamp at which each beam was taken, None for a sonar that takes all at once.
     """
 
+    FRAME: ClassVar[str] = 'own'
+
     stamp_ns: int
-    range: FloatArray
-    bearing: FloatArray
+    range: FloatArray = field(converter=floats(None))
+    bearing: FloatArray = field(converter=floats(None))
     amplitude: FloatArray
     frame_id: str = ''
+    scanning: bool = False
+    delay: FloatArray | None = None
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        shape = len(self.range), len(self.bearing)
+        if self.amplitude.shape != shape:
+            raise Rejection(
+                'bad_shape', f'an image of shape {self.amplitude.shape} has axes of {shape}'
+            )
+        if shape[0] * shape[1] > MAX_IMAGE_CELLS:
+            raise Rejection('too_large', f'an image of {shape[0]} ranges and {shape[1]} beams')
 
 
 @frozen(eq=False, kw_only=True)

@@ -25,7 +25,6 @@ import traceback
 from typing import Any
 
 from attrs import evolve
-import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
@@ -38,13 +37,13 @@ from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import inputs_of, InputTopic, needed
-from msg_adapters.table import encode_table
 
 from ..estimates import Estimate
 from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
+from .answers import answer
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
@@ -274,15 +273,7 @@ class TrackerNode(Node):
             'refused': self._meter.refused.total(),
             'estimates': self._published,
         }
-        answer = encode_table(
-            {name: np.array([n], np.uint32) for name, n in row.items()},
-            stamp_ns=0,
-            frame_id='',
-            make=make,
-        )
-        if stamp is not None:
-            answer.header.stamp = stamp
-        self._processed.publish(answer)
+        self._processed.publish(answer(row, stamp))
 
     def _start_afresh(self) -> None:
         self.tracker.reset()

@@ -1,7 +1,10 @@
 """Echoes in live sonar images: ``ros2 run sonar_imm fls_detector_node``.
 
-Hears ``image`` (marine_acoustic_msgs, which has to be installed) and publishes ``detections``,
-what the obstacle node hears. It is a convenience: a detector that knows the sonar is better.
+Hears ``image`` and publishes ``detections``, what the obstacle node hears, one message per image
+(of a scanning sonar one per sweep). Images that no package here can decode are said at the start.
+
+Every image is answered on ``~/processed``, as the trackers answer their messages; there,
+`estimates` counts the messages of detections and `listeners` those who hear them.
 """
 
 from __future__ import annotations
@@ -14,62 +17,140 @@ if __name__ == '__main__':
     one_blas_thread()  # before numpy is imported
 
 from collections import Counter
+from collections.abc import Mapping
 import sys
+import time
+import traceback
 from typing import Any
 
-from attrs import frozen
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from msg_adapters.detections import write_detections
-from msg_adapters.sonar_images import IMAGE_TYPES, read_sonar_image
+from msg_adapters.inputs import inputs_of
 
-from ..measurements import Rejection
-from ..parameters import Config, ConfigError, parameter
-from ..trackers.obstacle.detector import detect, DetectorConfig
+from ..measurements import FrameGuard, Rejection
+from ..node_config import DetectorNodeConfig, type_specs
+from ..parameters import ConfigError
+from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
+from .answers import answer
 from .base import run
+from .diagnostics import Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
-from .qos import input_qos, output_qos
+from .qos import Endpoints, input_qos, latched_qos, output_qos
 
-
-@frozen(kw_only=True)
-class ImageInput(Config):
-    """What the node hears."""
-
-    image_type: str = parameter(IMAGE_TYPES[0], 'message type of the images', choices=IMAGE_TYPES)
-    queue_depth: int = parameter(10, 'images held while the node is busy', low=1, high=1000)
+NAME = 'fls_detector'
 
 
 class FlsDetectorNode(Node):
     """One message of detections for every image."""
 
     def __init__(self, **options: Any):
-        super().__init__('fls_detector', **options)
-        settings = NodeParameters(self, (DetectorConfig, ImageInput))
-        self._config, heard = settings[DetectorConfig], settings[ImageInput]
-        self.refused: Counter[str] = Counter()
+        """Raises `ConfigError` for parameters that cannot be used, and when the type of the images
+        is not installed."""
+        super().__init__(NAME, **options)
+        (topic,) = inputs_of(NAME)
+        settings = NodeParameters(self, (DetectorConfig, DetectorNodeConfig), type_specs(NAME))
+        self._config = settings[DetectorConfig]
+        self._node_config = settings[DetectorNodeConfig]
+        type_name = settings.choice('image_type')
+        self._read = topic.reader(type_name, 'enu', self._config.as_dict())
+        self._detector = ImageDetector(self._config)
+        self._detector.warm()
+        self._guard = FrameGuard()
+        self._meter = Meter()
+        self._errors: Counter[str] = Counter()
+        self._published = 0
         try:
-            image_class = message_class(heard.image_type)
+            image_class = message_class(type_name)
         except ImportError as error:
             raise ConfigError(str(error)) from None
-        self._detections = self.create_publisher(
-            message_class('sensor_msgs/msg/PointCloud2'), 'detections', output_qos()
+        self._endpoints = Endpoints(self)
+        table = message_class('sensor_msgs/msg/PointCloud2')
+        self._processed = self._endpoints.advertise(table, '~/processed', latched_qos())
+        self._detections = self._endpoints.advertise(
+            table, 'detections', output_qos(), matched=lambda: self._acknowledge(None)
         )
-        self.create_subscription(image_class, 'image', self.receive, input_qos(heard.queue_depth))
+        self._diagnostics = self._endpoints.advertise(
+            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
+        )
+        heard = self._endpoints.subscribe(
+            image_class, topic.name, self.receive, input_qos(self._node_config.queue_depth)
+        )
+        self._reporter = Reporter(
+            self.get_fully_qualified_name().lstrip('/'),
+            {topic.name: heard.topic_name},
+            self._meter,
+        )
+        self.create_timer(
+            self._node_config.diagnostics_period,
+            self._report,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
         settings.warn_of_unknown()
-        self.get_logger().info('ready')
+        self._acknowledge(None)
+        self.get_logger().info(f'ready, hears {heard.topic_name} ({type_name})')
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Images refused so far, by reason."""
+        return self._meter.refused
 
     def receive(self, message: Any) -> None:
         """Detect and publish; an image that cannot be used is refused, said once a reason."""
+        start = time.monotonic()
+        self._meter.arrived('image', start)
         try:
-            image = read_sonar_image(message, **self._config.reading())
-            detections = detect(image, self._config)
+            self._detect(message)
         except Rejection as rejection:
-            if rejection.reason not in self.refused:
-                self.get_logger().warning(f'an image is refused: {rejection.sentence} (said once)')
-            self.refused[rejection.reason] += 1
-            return
-        self._detections.publish(write_detections(detections, make))
+            if rejection.reason not in self._meter.refused:
+                self.get_logger().warning(
+                    f'an image is refused: {rejection.sentence} (said once; '
+                    f"'{rejection.reason}' is counted in /diagnostics)"
+                )
+            self._meter.refused[rejection.reason] += 1
+        except Exception:
+            if not self.context.ok():
+                raise  # the middleware went away under our feet: `run` knows
+            self._errors['internal_error'] += 1
+            self.get_logger().error(
+                f'internal error on an image; please report this:\n{traceback.format_exc()}'
+            )
+            self._detector = ImageDetector(self._config)
+        self._acknowledge(message.header.stamp)
+        self._meter.spent(time.monotonic() - start)
+
+    def _detect(self, message: Any) -> None:
+        image = self._read(message)
+        self._guard.check(image)
+        found = self._detector.process(image)
+        if found is not None:
+            self._detections.publish(write_detections(found, make))
+            self._published += 1
+
+    def _acknowledge(self, stamp: Any) -> None:
+        counts = {
+            'messages': self._meter.received.total(),
+            'refused': self._meter.refused.total(),
+            'estimates': self._published,
+            'listeners': self._detections.get_subscription_count(),
+        }
+        self._processed.publish(answer(counts, stamp))
+
+    def _report(self) -> None:
+        self._diagnostics.publish(
+            self._reporter.report(
+                self.get_clock().now().to_msg(),
+                time.monotonic(),
+                enabled=True,
+                stale_after=self._node_config.stale_after,
+                counts={'published': self._published, **self._errors},
+                health={},
+                lost=self._endpoints.lost,
+                incompatible=self._endpoints.incompatible,
+            )
+        )
 
 
 def main(args: list[str] | None = None) -> int:

@@ -21,12 +21,13 @@ from typing import Any
 from attrs import evolve, frozen
 import numpy as np
 
-from msg_adapters.inputs import InputTopic
+from msg_adapters.inputs import FEEDERS, InputTopic
 
 from ..estimates import Estimate
 from ..recordings.measurements import fitting_topics
 from ..recordings.reader import BagReader
 from ..trackers import SYSTEMS
+from .chain import Chain, FirstStep
 from .link import Link, LinkError
 from .lockstep import Counts, LockStep, Recorder
 from .player import NAME, Player, PlayOptions
@@ -83,18 +84,40 @@ def run_lockstep(
             name: evolve(entry, name=entry.instance(name, settings or {}))
             for name, entry in fitting_topics(bag, system, topics).items()
         }
+        inputs = fitting_topics(bag, system, topics)
+        fed = {topic: entry for topic, entry in inputs.items() if entry.makes}
+        direct = {topic: entry for topic, entry in inputs.items() if not entry.makes}
         domain = stack.enter_context(reserved_domain_id())
         stack.enter_context(
             _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
         )
-        node = stack.enter_context(
-            NodeProcess(
-                system, domain_id=domain, arguments=_arguments(bag, system, inputs, params_file)
-            )
-        )
+        arguments = _arguments(bag, direct, params_file)
+        arguments += _losing_nothing(f'/{system}/estimate.publisher')
+        arguments += ['-p', 'max_wait:=0.0', '-p', 'max_revisions:=0']
+        for entry in fed.values():
+            arguments += _losing_nothing(f'{entry.makes}.subscription')
+        node = stack.enter_context(NodeProcess(system, domain_id=domain, arguments=arguments))
         link = stack.enter_context(Link(NAME, domain_id=domain))
         recorder = Recorder(link, f'/{system}')
-        lockstep = LockStep(link, f'/{system}', recorder=recorder, trouble=node.trouble)
+        lockstep: LockStep | Chain = LockStep(
+            link, f'/{system}', recorder=recorder, trouble=node.trouble
+        )
+        before: NodeProcess | None = None
+        if fed:
+            name = FEEDERS[system]
+            arguments = _arguments(bag, fed, params_file)
+            for entry in fed.values():
+                arguments += _losing_nothing(f'{entry.makes}.publisher')
+            before = stack.enter_context(
+                NodeProcess(
+                    name,
+                    domain_id=domain,
+                    arguments=arguments,
+                    module=f'{__package__}.{name}',
+                )
+            )
+            first = FirstStep(link, f'/{name}', trouble=before.trouble)
+            lockstep = Chain(first, lockstep, {f'/{entry.name}' for entry in fed.values()})
         player = Player(
             bag,
             link,
@@ -106,14 +129,16 @@ def run_lockstep(
             lockstep,
         )
         player.run(progress, START_LIMIT)
-        exit_code = node.stop()
+        exit_code, log = node.stop(), node.log()
+        if before is not None:
+            exit_code, log = before.stop() or exit_code, log + before.log()
         result = player.result()
         return LockstepResult(
             recorder.estimates(),
             lockstep.counts,
             result.delays,
             exit_code,
-            node.log(),
+            log,
             result.problems,
         )
 
@@ -218,19 +243,21 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
             os.environ[name] = value
 
 
+def _losing_nothing(endpoint: str) -> list[str]:
+    """ROS arguments for an endpoint, e.g. ``detections.publisher``, that drops nothing."""
+    name = f'qos_overrides./{endpoint.removeprefix("/")}'
+    return ['-p', f'{name}.history:=keep_all', '-p', f'{name}.reliability:=reliable']
+
+
 def _arguments(
-    bag: BagReader, system: str, inputs: Mapping[str, InputTopic], params_file: Path | str | None
+    bag: BagReader, inputs: Mapping[str, InputTopic], params_file: Path | str | None
 ) -> list[str]:
-    """Write the ROS arguments of a node that loses nothing and expects the types of the bag."""
-    parameters = {
-        f'qos_overrides./{system}/estimate.publisher.history': 'keep_all',
-        'max_wait': '0.0',
-        'max_revisions': '0',
-    }
+    """Write the ROS arguments of a node that loses no input and expects the types of the bag."""
+    parameters: dict[str, str] = {}
+    inputs_lossless: list[str] = []
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():
-        parameters[f'qos_overrides./{entry.name}.subscription.history'] = 'keep_all'
-        parameters[f'qos_overrides./{entry.name}.subscription.reliability'] = 'reliable'
+        inputs_lossless += _losing_nothing(f'{entry.name}.subscription')
         if len(entry.readers) == 1:
             continue
         known = parameters.setdefault(f'{entry.name.split("/")[-1]}_type', types[topic])
@@ -240,6 +267,8 @@ def _arguments(
                 f'{types[topic]}: a node can hear only one of them'
             )
     arguments = ['--params-file', str(params_file)] if params_file else []
-    return arguments + [
-        word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')
-    ]
+    return (
+        arguments
+        + inputs_lossless
+        + [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+    )

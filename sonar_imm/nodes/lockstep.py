@@ -103,6 +103,7 @@ class LockStep:
         self._counts: Counts | None = None
         self._start = Counts(0, 0, 0)
         self._sent = 0
+        self._told_estimates = 0
         self.delays: list[float] = []
         link.node.create_subscription(
             PointCloud2, node_name + _ANSWERS, self._answered, latched_qos()
@@ -139,26 +140,38 @@ class LockStep:
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
             raise LinkError(self._silence(publishers, heard))
         self._start = self._counts
+        self._told_estimates = self._counts.estimates
         return heard
 
     def step(self, publisher: Publisher, message: Any) -> None:
         """Publish `message` and wait for its answer. Raises `LinkError` when there is none."""
-        estimates_before = self._counts.estimates
         sent = time.monotonic()
         publisher.publish(message)
-        self._sent += 1
-        if not self._link.wait_for(self._caught_up, ANSWER_LIMIT, self._lost):
+        self.follow(1, publisher.topic_name, sent)
+
+    def follow(self, messages: int, topic: str, sent: float) -> None:
+        """Wait for the answers to `messages` that were published for the node because of what went
+        out on `topic` at `sent`, in seconds of `time.monotonic`. Raises `LinkError` without
+        one."""
+        self._sent += messages
+        if not self.wait_for(self._caught_up, ANSWER_LIMIT):
             raise LinkError(
                 f"node '{self._name}' did not answer message {self._sent} on "
-                f'{publisher.topic_name} within {ANSWER_LIMIT:g} s'
+                f'{topic} within {ANSWER_LIMIT:g} s'
             )
-        if self._counts.estimates > estimates_before:
+        if self._counts.estimates > self._told_estimates:
             self.delays.append(time.monotonic() - sent)
+        self._told_estimates = self._counts.estimates
         if self.counts.messages > self._sent:
             raise LinkError(
                 f"something else publishes to the node '{self._name}': it took "
                 f'{self.counts.messages} messages and {self._sent} were sent'
             )
+
+    def wait_for(self, predicate: Callable[[], Any], limit: float = MATCH_LIMIT) -> bool:
+        """Serve the link until `predicate` holds: True, or False after `limit` seconds. Raises
+        `LinkError` when the node ends."""
+        return self._link.wait_for(predicate, limit, self._lost)
 
     def _answered(self, message: PointCloud2) -> None:
         columns = decode_table(message)

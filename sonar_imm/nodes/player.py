@@ -19,6 +19,7 @@ from std_srvs.srv import Trigger
 from ..parameters import ConfigError, did_you_mean
 from ..recordings.messages import typestore
 from ..recordings.reader import BagError, BagMessage, BagReader
+from .chain import Chain
 from .link import Link, MATCH_LIMIT
 from .lockstep import LockStep, only_node
 from .messages import make, message_class
@@ -95,7 +96,11 @@ class Player:
     """One playing of one open bag over one link."""
 
     def __init__(
-        self, bag: BagReader, link: Link, options: PlayOptions, lockstep: LockStep | None = None
+        self,
+        bag: BagReader,
+        link: Link,
+        options: PlayOptions,
+        lockstep: LockStep | Chain | None = None,
     ):
         """Advertise the topics. `lockstep` replaces the one that `options` would make."""
         self._bag = bag

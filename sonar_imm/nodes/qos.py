@@ -87,12 +87,20 @@ class Endpoints:
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
-    def advertise(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
-        """Offer a topic, naming listeners that cannot be reached."""
+    def advertise(
+        self,
+        message_type: type,
+        topic: str,
+        qos: QoSProfile,
+        matched: Callable[[], None] | None = None,
+    ) -> Publisher:
+        """Offer a topic, naming listeners that cannot be reached; `matched` is called when a
+        listener comes or goes."""
         events = PublisherEventCallbacks(
             incompatible_qos=lambda event: self._mismatch(
                 topic, event, 'cannot be reached', 'publisher'
-            )
+            ),
+            matched=(lambda event: matched()) if matched else None,
         )
         return self._node.create_publisher(
             message_type,

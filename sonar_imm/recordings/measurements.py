@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 
 from ..measurements import Rejection
 from ..parameters import did_you_mean
+from .detected import DetectedImages
 from .reader import BagReader
 from .sources import BagError, TopicInfo
 
@@ -22,7 +23,8 @@ DOUBTS = {
 
 
 class Heard(NamedTuple):
-    """What one message gave: a measurement, or the `Rejection` that says why there is none."""
+    """What one message gave: a measurement, the `Rejection` that says why there is none, or None
+    when it takes more messages to make one."""
 
     topic: str
     measurement: Any
@@ -36,9 +38,10 @@ def fitting_topics(
 
     A topic fits when its type can be read and its name ends in the input's name; where several
     inputs fit, the later one counts. Topics below ``/truth`` never fit, and companions alone are
-    not enough. `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``.
-    Raises `BagError` when nothing fits, with a list of what is there, and when several topics fit
-    an input that is one instrument.
+    not enough. Where an input is missing, a topic fits of which a node before the tracker makes it
+    (images of a sonar for detections). `topics` maps topic names to input names instead, e.g.
+    ``{'/usbl/pose': 'fix'}``. Raises `BagError` when nothing fits, with a list of what is there,
+    and when several topics fit an input that is one instrument.
     """
     if topics is not None:
         return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
@@ -50,10 +53,14 @@ def fitting_topics(
         and f'/{topic.name}'.endswith(f'/{entry.name}')
         and 'truth' not in topic.name.split('/')[:-1]
     }
+    there = {entry.name for entry in fitting.values()}
+    fitting |= {
+        name: entry for name, entry in made_topics(bag, system).items() if entry.makes not in there
+    }
     fitting = _of_use(bag, fitting)
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
-    for entry in inputs_of(system):
+    for entry in (*inputs_of(system), *made_inputs(system)):
         names = [name for name, its in fitting.items() if its is entry]
         if entry.one_topic and len(names) > 1:
             raise BagError(
@@ -71,17 +78,23 @@ def measurements_of(
     world_frame: str = 'enu',
     order: str = 'recorded',
     settings: Mapping[str, Any] | None = None,
+    detector: Mapping[str, Any] | None = None,
 ) -> Iterator[Heard]:
     """Yield the measurements for the tracker `system` in an open recording, in replay order.
 
     `topics` is as in `fitting_topics`, `world_frame` (``'enu'`` or ``'ned'``) is what the
     recording uses, `order` is as in `BagReader.messages`. `settings` holds the parameters of the
-    tracker by name; readers take those that concern them. Messages that deserve a warning are
+    tracker by name; readers take those that concern them. `detector` holds the parameters of the
+    detector of images that are not the default. Messages that deserve a warning are
     counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
     """
     chosen = fitting_topics(bag, system, topics)
+    told = settings or {}
+    images = DetectedImages(system, detector or {}, told)
     readers = {
-        (name, type_name): entry.reader(type_name, world_frame, settings or {}, name)
+        (name, type_name): images.reader(entry, type_name)
+        if entry.makes
+        else entry.reader(type_name, world_frame, told, name)
         for name, entry in chosen.items()
         for type_name in entry.readers
     }
@@ -120,7 +133,7 @@ def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, Inpu
         )
         if sentence not in bag.problems:
             bag.add_problem(sentence)
-    inputs = {entry.name for entry in kept.values()}
+    inputs = {entry.makes or entry.name for entry in kept.values()}
     return {
         name: entry
         for name, entry in kept.items()
@@ -130,7 +143,7 @@ def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, Inpu
 
 def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
     """Check one entry of a topic map."""
-    entries = {entry.name: entry for entry in inputs_of(system)}
+    entries = {entry.name: entry for entry in (*inputs_of(system), *made_inputs(system))}
     if wanted not in entries:
         raise BagError(
             f"the {system} tracker has no input '{wanted}'"
@@ -150,6 +163,17 @@ def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
 
 def _can_read(topic: TopicInfo, entry: InputTopic) -> bool:
     return topic.type_name in entry.readers
+
+
+def made_topics(bag: BagReader, system: str) -> dict[str, InputTopic]:
+    """Topics of which a node before the tracker makes an input: by their type, or by their name
+    too where the type holds other things as well."""
+    return {
+        topic.name: entry
+        for entry in made_inputs(system)
+        for topic in bag.topics
+        if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')[:-1]
+    }
 
 
 def _nothing_fits(bag: BagReader, system: str) -> str:

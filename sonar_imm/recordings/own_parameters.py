@@ -31,13 +31,20 @@ def unusual(told: Mapping[str, Any], tracker: type[Config]) -> dict[str, Any]:
     return {name: value for name, value in told.items() if value != defaults[name]}
 
 
-def write_own_parameters(bag: Path, node_name: str, values: Mapping[str, Any]) -> Path | None:
-    """Write `values` as a ROS 2 parameter file of the node into the folder of a recording; without
-    values nothing is written."""
-    if not values:
+def write_own_parameters(bag: Path, nodes: Mapping[str, Mapping[str, Any]]) -> Path | None:
+    """Write parameters by the names of their nodes as a ROS 2 parameter file into the folder of a
+    recording; without any nothing is written."""
+    tree = {
+        name: {
+            'ros__parameters': {
+                key: list(v) if isinstance(v, tuple) else v for key, v in values.items()
+            }
+        }
+        for name, values in nodes.items()
+        if values
+    }
+    if not tree:
         return None
-    plain = {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
     path = bag / NAME
-    tree = {node_name: {'ros__parameters': plain}}
     path.write_text(_HEAD + yaml.safe_dump(tree, sort_keys=False), encoding='utf-8')
     return path

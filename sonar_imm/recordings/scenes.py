@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 
 from ..simulation.scene import Scene
 from ..trackers import SYSTEMS
@@ -21,7 +21,7 @@ def write_scene(
     report = ConversionReport(Path(out))
     inputs: dict[type, InputTopic] = {}
     for system in SYSTEMS:
-        for entry in inputs_of(system):
+        for entry in (*inputs_of(system), *made_inputs(system)):
             for measurement in (entry.measurement, *entry.also):
                 inputs.setdefault(measurement, entry)
     records: list[Record] = []
@@ -31,7 +31,8 @@ def write_scene(
         records.append((one.received_ns, topic, entry.write(one.measurement, ros_message)))
     for true in scene.truth:
         records += records_of(true, scene.frame_id)
-    with BagWriter(out, compressed=compressed, custom_data=provenance) as bag:
+    images = any(inputs[type(one.measurement)].makes for one in scene.measurements)
+    with BagWriter(out, compressed=compressed or images, custom_data=provenance) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)
             report.messages[topic] = report.messages.get(topic, 0) + 1

@@ -61,7 +61,7 @@ def naming(path: Path) -> Iterator[None]:
 class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
-    compressed: mcap only, by chunks, as ``ros2 bag record`` does with the profile zstd_fast.
+    compressed: by zstd, an mcap by chunks, as ``ros2 bag record`` does with the profile zstd_fast.
     custom_data: notes kept in the metadata of the bag, e.g. where the data come from. What was
     written before an exception is still a whole bag. Raises `BagError` when the bag cannot be
     made.
@@ -84,10 +84,11 @@ class BagWriter:
             self._writer = Writer(
                 self.path, version=8, storage_plugin=StoragePlugin[storage.upper()]
             )
-            if compressed:
-                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             for key, note in sorted((custom_data or {}).items()):
                 self._writer.set_custom_data(key, str(note))
+            if compressed:
+                mode = CompressionMode.STORAGE if storage == 'mcap' else CompressionMode.MESSAGE
+                self._writer.set_compression(mode, CompressionFormat.ZSTD)
             self._writer.open()
         except WriterError:
             raise BagError(f'{path} exists already; remove it or choose another name') from None

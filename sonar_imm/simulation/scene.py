@@ -44,6 +44,10 @@ class Scenario(Config):
         """What a tracker has to know of the instruments, by the names of its parameters."""
         return {name: getattr(self, name) for name in self.INSTRUMENT}
 
+    def told_feeder(self) -> dict[str, Any]:
+        """What a node before that of the tracker has to know of the instruments."""
+        return {}
+
 
 @frozen(eq=False)
 class Received:

@@ -1,56 +1,85 @@
-"""CFAR: the rate of false alarms it promises, and echoes where they are."""
+"""CFAR: the rate of false alarms it promises, and the level it compares with."""
 
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.cfar import cfar_peaks, noise_level
-
-
-def noise(shape, seed=0, level=1.0):
-    rng = np.random.default_rng(seed)
-    return level * np.sqrt(rng.exponential(size=shape))
-
-
-def test_the_noise_level_is_that_of_a_loop():
-    power = noise((30, 3)) ** 2
-    mean, count = noise_level(power, guard=1, training=4)
-    for row in range(30):
-        cells = [k for k in range(30) if 1 < abs(k - row) <= 5]
-        assert count[row] == len(cells)
-        assert mean[row] == pytest.approx(power[cells].mean(axis=0))
-
-
-@pytest.mark.parametrize('level', [1e-3, 1.0, 1e5])
-def test_false_alarms_come_as_often_as_promised_at_any_level(level):
-    image = noise((4000, 100), level=level)
-    found = cfar_peaks(image, guard=0, training=16, false_alarm=1e-3)
-    inner = found[(found[:, 0] >= 16) & (found[:, 0] < 4000 - 16)]
-    assert len(inner) == pytest.approx(1e-3 * 3968 * 100, rel=0.15)
-
-
-def test_echoes_are_found_once_each_and_strongest_first():
-    image = noise((200, 60), seed=3)
-    for row, beam, strength in ((40, 10, 30.0), (120, 50, 60.0), (5, 30, 40.0)):
-        image[row, beam] = strength
-        image[row + 1, beam] = image[row, beam + 1] = 0.8 * strength  # wider than a cell
-    assert cfar_peaks(image, false_alarm=1e-8).tolist() == [[120, 50], [5, 30], [40, 10]]
-
-
-@pytest.mark.parametrize(
-    'image',
-    [
-        np.zeros((50, 5)),
-        np.full((50, 5), 7.0),
-        np.empty((0, 5)),
-        np.full((50, 5), np.nan),
-        np.full((50, 5), np.inf),
-        np.ones((1, 1)),
-    ],
+from sonar_imm.acoustics.cfar import (
+    effective_cells,
+    false_alarm_probability,
+    noise_level,
+    threshold_factor,
 )
-def test_nothing_is_found_where_nothing_is(image):
-    assert cfar_peaks(image).shape == (0, 2)
+
+
+def level_of_loops(power, beams, training, guard):
+    """The same cell by cell, and how many sides count."""
+    R, B = power.shape
+    level, sides = np.full((R, B), np.inf), np.zeros(R)
+    for r in range(R):
+        before = [k for k in range(r - guard - training, r - guard) if k >= 0]
+        behind = [k for k in range(r + guard + 1, r + guard + 1 + training) if k < R]
+        used = [rows for rows in (before, behind) if 2 * len(rows) >= training]
+        used = used if 2 * len(before) >= training else []
+        sides[r] = len(used)
+        for b in range(B):
+            around = slice(max(0, b - beams // 2), b + beams // 2 + 1)
+            means = [power[rows, around].mean() for rows in used]
+            level[r, b] = max(means, default=np.inf)
+    return level, sides
+
+
+@pytest.mark.parametrize('shape', [(60, 9), (20, 40), (7, 3), (40, 1)])
+@pytest.mark.parametrize('training, guard, beams', [(8, 2, 5), (5, 0, 1), (16, 4, 25)])
+def test_the_level_is_that_of_a_loop(shape, training, guard, beams):
+    power = np.random.default_rng(1).exponential(size=shape)
+    level, sides = noise_level(power, beams=beams, training=training, guard=guard)
+    wanted, counted = level_of_loops(power, beams, training, guard)
+    assert sides.tolist() == counted.tolist()
+    np.testing.assert_allclose(level, wanted, rtol=1e-12)
+
+
+def test_one_huge_value_spoils_only_its_own_neighbourhood():
+    power = np.ones((200, 80))
+    power[20, 10] = 1e76
+    level, _ = noise_level(power, beams=5, training=8, guard=2)
+    assert level[100:].max() == pytest.approx(1.0)
+    assert level[10:, 20:].max() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize('sides', [1, 2])
+@pytest.mark.parametrize('cells', [2, 6, 30])
+def test_the_factor_gives_the_rate_that_sampling_finds(cells, sides):
+    rng = np.random.default_rng(2)
+    factor = threshold_factor(0.01, cells, sides)
+    means = rng.gamma(cells, 1.0 / cells, (sides, 400_000)).max(axis=0)
+    rate = (rng.exponential(size=400_000) > factor * means).mean()
+    assert rate == pytest.approx(0.01, rel=0.06)  # 4,000 events: 1.6 % each
+    assert false_alarm_probability(factor, cells, sides) == pytest.approx(0.01, rel=1e-6)
+
+
+def test_with_many_cells_the_level_is_known_and_the_law_that_of_the_noise():
+    assert threshold_factor(1e-6, 100_000) == pytest.approx(-np.log(1e-6), rel=0.01)
+    assert threshold_factor(1e-6, 3) > threshold_factor(1e-6, 20) > threshold_factor(1e-6, 300)
+    with pytest.raises(ValueError, match='between 0 and 1'):
+        threshold_factor(0.0, 20)
+
+
+@pytest.mark.parametrize('width', [1.0, 3.0, 6.0])
+def test_effective_cells_are_those_whose_mean_varies_as_much(width):
+    rng = np.random.default_rng(3)
+    lag = np.arange(-30, 31)
+    pattern = np.exp(-2.0 * np.log(2.0) * np.square(lag / width))
+    noise = rng.normal(size=(2, 4000, 25 + 60))
+    speckle = np.array([[np.convolve(row, pattern, 'valid') for row in part] for part in noise])
+    power = np.square(speckle).sum(axis=0) / (2.0 * np.square(pattern).sum())
+    assert power.mean() == pytest.approx(1.0, abs=0.05)
+    assert effective_cells(25, width) == pytest.approx(1.0 / power.mean(axis=1).var(), rel=0.12)
+
+
+def test_independent_cells_are_all_effective():
+    assert effective_cells(25, 1e-9) == 25.0 and effective_cells(1, 5.0) == 1.0
 
 
 def test_only_images_are_taken():
     with pytest.raises(ValueError, match=r'\(R, B\)'):
-        cfar_peaks(np.ones(5))
+        noise_level(np.ones(5), beams=3, training=4, guard=1)

@@ -154,7 +154,9 @@ def test_ranks_choose_in_turn(seed, targets, detections):
 def test_uncontested_choices_are_those_of_the_weighing(seed, targets, detections):
     rng = np.random.default_rng(seed)
     fit = np.where(
-        rng.uniform(size=(targets, detections)) < 0.3, rng.normal(size=(targets, detections)), -np.inf
+        rng.uniform(size=(targets, detections)) < 0.3,
+        rng.normal(size=(targets, detections)),
+        -np.inf,
     )
     tentative = rng.uniform(size=targets) < 0.5
     pd, clutter = 0.9, 0.4

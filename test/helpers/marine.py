@@ -33,8 +33,29 @@ def typestore():
     found = {}
     for name, text in DEFINITIONS.items():
         found |= get_types_from_msg(text, PACKAGE + name)
+    for name, text in OTHERS.items():
+        found |= get_types_from_msg(text, name)
     types.register(found)
     return types
+
+
+OTHERS = {
+    'oculus_interfaces/msg/Ping': 'std_msgs/Header header\nuint32 ping_id\n'
+    'uint32 ping_firing_date\nfloat64 range\nfloat64 gain_percent\nfloat64 frequency\n'
+    'float64 speed_of_sound_used\nfloat64 range_resolution\nfloat64 temperature\n'
+    'float64 pressure\nuint8 master_mode\nbool has_gains\nuint16 n_ranges\nuint16 n_beams\n'
+    'uint32 step\nuint8 sample_size\nint16[] bearings\nuint8[] ping_data',
+    'ping360_sonar_msgs/msg/SonarEcho': 'std_msgs/Header header\nfloat32 angle\nuint8 gain\n'
+    'uint16 number_of_samples\nuint16 transmit_frequency\nuint16 speed_of_sound\nuint8 range\n'
+    'uint8[] intensities',
+    'sensors/msg/SonoptixECHO': 'std_msgs/Header header\nstd_msgs/Float32MultiArray array_data',
+    'stonefish_ros2/msg/DVL': 'std_msgs/Header header\ngeometry_msgs/Vector3 velocity\n'
+    'float64[9] velocity_covariance\nfloat64 altitude',
+    'dave_interfaces/msg/DVLTarget': 'string type\nfloat64 range',
+    'dave_interfaces/msg/DVL': 'std_msgs/Header header\nstring type\nDVLTarget target\n'
+    'geometry_msgs/TwistWithCovariance velocity',
+}
+"""Messages of single drivers and simulators; of the DVL without their beams."""
 
 
 def floats(values):

@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from msg_adapters.inputs import inputs_of
 from msg_adapters.navigation import (
     doubt_navigation,
+    read_dave_dvl,
     read_dvl,
     read_navigation,
     read_range,
@@ -179,3 +181,46 @@ def test_the_altitude_of_a_doppler_log_needs_bottom_lock():
     assert read_dvl(Dvl(12.5)).altitude == 12.5 and np.isnan(read_dvl(Dvl(12.5)).variance)
     assert reason(read_dvl, Dvl(0.0)) == reason(read_dvl, Dvl(-1.0)) == 'no_bottom'
     assert reason(read_dvl, Dvl(np.nan)) == 'nan' and reason(read_dvl, Dvl(2e4)) == 'out_of_range'
+
+
+def stonefish(altitude):
+    return marine.make(
+        'stonefish_ros2/msg/DVL',
+        header=marine.header(),
+        velocity=marine.vectors([(1.0, 0.0, 0.0)])[0],
+        velocity_covariance=np.zeros(9),
+        altitude=altitude,
+    )
+
+
+def dave(distance, target='bottom'):
+    return marine.make(
+        'dave_interfaces/msg/DVL',
+        header=marine.header(),
+        type='phased_array',
+        target=marine.make('dave_interfaces/msg/DVLTarget', type=target, range=distance),
+        velocity=marine.make(
+            'geometry_msgs/msg/TwistWithCovariance',
+            twist=marine.make(
+                'geometry_msgs/msg/Twist',
+                linear=marine.vectors([(1.0, 0.0, 0.0)])[0],
+                angular=marine.vectors([(0.0, 0.0, 0.0)])[0],
+            ),
+            covariance=np.zeros(36),
+        ),
+    )
+
+
+@pytest.mark.parametrize('make', [stonefish, dave])
+def test_doppler_logs_of_simulators_give_their_altitude(make):
+    message = marine.sent(make(7.25))
+    (entry,) = (entry for entry in inputs_of('obstacle') if entry.name == 'altitude')
+    read = entry.reader(message.__msgtype__, 'enu', {})
+    found = read(message)
+    assert (found.altitude, found.stamp_ns) == (7.25, 100_000_000_005)
+    assert reason(read, make(0.0)) == reason(read, make(-1.0)) == 'no_bottom'
+    assert reason(read, make(np.nan)) == 'nan' and reason(read, make(2e4)) == 'out_of_range'
+
+
+def test_a_log_that_tracks_the_water_knows_no_altitude():
+    assert reason(read_dave_dvl, dave(30.0, 'DVL_TARGET_WATER_MASS')) == 'no_bottom'

@@ -1,19 +1,50 @@
 """The detector node on images as a driver would send them."""
 
+from diagnostic_msgs.msg import DiagnosticArray
 from helpers import marine
 import numpy as np
 import pytest
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 
 from msg_adapters.detections import read_detections
+from msg_adapters.sonar_images import write_picture
+from msg_adapters.table import decode_table
+from sonar_imm.measurements import SonarImage
 from sonar_imm.nodes import fls_detector
 from sonar_imm.nodes.fls_detector import FlsDetectorNode
+from sonar_imm.nodes.messages import make
+from sonar_imm.nodes.qos import latched_qos
 from sonar_imm.parameters import ConfigError
 
+PARAMETERS = (
+    '-p image_type:=sensor_msgs/msg/Image -p image_far_range:=50.0 -p image_fov_deg:=40.0 '
+    '-p diagnostics_period:=0.1'
+).split()
 
-def image(spoilt=False):
+
+def pixels():
     samples = np.ones((50, 9), np.uint8)
     samples[30, 2] = 250
+    return samples
+
+
+def picture(second=100, spoilt=False):
+    message = write_picture(
+        SonarImage(
+            stamp_ns=second * 10**9,
+            range=np.arange(50.0),
+            bearing=np.arange(9.0),
+            amplitude=pixels().astype(float),
+            frame_id='sonar',
+        ),
+        make,
+    )
+    if spoilt:
+        message.data = message.data[:-1]
+    return message
+
+
+def projected():
     bearing = np.radians(np.linspace(20.0, -20.0, 9))
     return marine.make(
         'ProjectedSonarImage',
@@ -28,9 +59,13 @@ def image(spoilt=False):
             is_bigendian=False,
             dtype=0,
             beam_count=9,
-            data=samples.ravel()[: 449 if spoilt else 450],
+            data=pixels().ravel(),
         ),
     )
+
+
+def counts(message):
+    return {name: int(column[0]) for name, column in decode_table(message).items()}
 
 
 def test_without_the_message_package_the_node_says_what_is_missing(make_bench):
@@ -39,7 +74,41 @@ def test_without_the_message_package_the_node_says_what_is_missing(make_bench):
         bench.add(FlsDetectorNode(context=bench.context))
 
 
-def test_every_image_is_answered_and_a_bad_one_refused(make_bench, monkeypatch):
+def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
+    bench = make_bench(*PARAMETERS)
+    answers = bench.listen(PointCloud2, '/fls_detector/processed', latched_qos())
+    heard = bench.listen(PointCloud2, '/detections')
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    node = bench.add(FlsDetectorNode(context=bench.context))
+    sender = bench.peer.create_publisher(Image, '/image', 10)
+    bench.spin_until(sender.get_subscription_count)
+    bench.spin_until(lambda: answers and counts(answers[-1])['listeners'] == 1)
+    for message in (picture(), picture(101, spoilt=True), picture(102)):
+        before = len(answers)
+        sender.publish(message)
+        bench.spin_until(lambda before=before: len(answers) > before)
+    bench.spin_until(lambda: len(heard) == 2)
+    ping = read_detections(heard[0])
+    assert ping.range == pytest.approx([30.5], abs=0.1)
+    assert ping.bearing == pytest.approx([np.radians(40.0 * (0.5 - 2.5 / 9.0))], abs=0.01)
+    assert np.isfinite([ping.var_range[0], ping.extent_bearing[0], ping.intensity[0]]).all()
+    assert [one.header.stamp.sec for one in heard] == [100, 102]
+    assert node.refused == {'short_data': 1}
+    assert counts(answers[-1]) == {
+        'messages': 3,
+        'refused': 1,
+        'estimates': 2,
+        'listeners': 1,
+    }
+    assert answers[-1].header.stamp.sec == 102
+    before = len(told)
+    bench.spin_until(lambda: len(told) > before + 1)
+    values = {pair.key: pair.value for pair in told[-1].status[0].values}
+    assert values['image received'] == '3' and values['refused: short_data'] == '1'
+    assert {pair.key: pair.value for pair in told[-1].status[1].values}['count: published'] == '2'
+
+
+def test_a_package_that_is_there_is_used(make_bench, monkeypatch):
     # The package is not installed here: any installed type subscribes, images are handed over.
     bench = make_bench()
     known = fls_detector.message_class
@@ -51,9 +120,42 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench, monkeypatch):
     node = bench.add(FlsDetectorNode(context=bench.context))
     heard = bench.listen(PointCloud2, '/detections')
     bench.spin_until(lambda: node.count_subscribers('/detections'))
-    node.receive(image(spoilt=True))
-    node.receive(image())
+    answers = bench.listen(PointCloud2, '/fls_detector/processed', latched_qos())
+    bench.spin_until(lambda: answers and counts(answers[-1])['listeners'])
+    message = projected()
+    message.header.stamp = make('builtin_interfaces/msg/Time', sec=100, nanosec=5)
+    node.receive(message)
     bench.spin_until(lambda: heard)
     ping = read_detections(heard[0])
-    assert ping.range.tolist() == [31.0] and ping.bearing == pytest.approx([np.radians(10.0)])
-    assert node.refused == {'short_data': 1} and len(heard) == 1
+    assert ping.range == pytest.approx([31.0], abs=0.1)
+    assert ping.bearing == pytest.approx([np.radians(10.0)], abs=0.02)
+
+
+def test_a_mistake_in_the_detector_ends_neither_node_nor_answers(make_bench, monkeypatch):
+    bench = make_bench(*PARAMETERS)
+    node = bench.add(FlsDetectorNode(context=bench.context))
+    answers = bench.listen(PointCloud2, '/fls_detector/processed', latched_qos())
+
+    def broken(image):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(node._detector, 'process', broken)
+    node.receive(picture())
+    bench.spin_until(lambda: answers and counts(answers[-1])['messages'] == 1)
+    node.receive(picture(101))
+    bench.spin_until(lambda: counts(answers[-1])['messages'] == 2)
+    assert counts(answers[-1])['estimates'] == 1
+
+
+@pytest.mark.parametrize(
+    'argument, word',
+    [
+        ('image_order:=sideways', 'image_order'),
+        ('image_type:=sensor_msgs/msg/LaserScan', 'image_type'),
+        ('false_alarm:=0.0', 'false_alarm'),
+    ],
+)
+def test_a_wrong_parameter_is_named(make_bench, argument, word):
+    bench = make_bench('-p', argument)
+    with pytest.raises(ConfigError, match=word):
+        bench.add(FlsDetectorNode(context=bench.context))

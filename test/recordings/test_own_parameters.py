@@ -27,10 +27,10 @@ def test_drawn_cross_spectra_have_no_window():
 
 
 def test_the_file_is_one_of_ros(tmp_path):
-    assert write_own_parameters(tmp_path, 'obstacle', {}) is None
+    assert write_own_parameters(tmp_path, {'obstacle': {}}) is None
     assert own_parameters(tmp_path) is None
     values = {'sonar_lever': (2.0, 0.0, -0.3), 'azimuth_model': 'cone', 'max_range': 50.0}
-    path = write_own_parameters(tmp_path, 'obstacle', values)
+    path = write_own_parameters(tmp_path, {'obstacle': values, 'fls_detector': {}})
     assert own_parameters(tmp_path) == path
     text = path.read_text()
     read = parameters_from_yaml(text, node_name='obstacle')

@@ -21,10 +21,10 @@ def companion_topics(bag: BagReader, wanted: Mapping[str, InputTopic]) -> dict[s
     return chosen
 
 
-def copied(entry: InputTopic, item: Any) -> Any:
+def copied(entry: InputTopic, type_name: str, message: Any) -> Any:
     """The message of a bag as our own. Raises `Rejection`."""
     # A frame that calls itself NED is turned into ENU; others stay as they are, and whoever tracks
     # the new bag states their convention.
-    ned = str(item.message.header.frame_id).endswith('_ned')
-    measurement = entry.readers[item.type_name](item.message, world_frame='ned' if ned else 'enu')
+    ned = str(message.header.frame_id).endswith('_ned')
+    measurement = entry.readers[type_name](message, world_frame='ned' if ned else 'enu')
     return entry.write(measurement, ros_message)

@@ -75,7 +75,10 @@ def convert_interferometer(
                 try:
                     if item.topic in beside:
                         name = beside[item.topic]
-                        topic, message = f'/{name}', copied(FURTHER[name], item)
+                        topic, message = (
+                            f'/{name}',
+                            copied(FURTHER[name], item.type_name, item.message),
+                        )
                     elif (images := pings.add(item)) is not None:
                         topic, message = target, write_snapshot(make(*images), ros_message)
                     else:

@@ -8,14 +8,14 @@ from attrs import frozen
 
 from ...acoustics.geometry import AZIMUTH_MODELS
 from ...parameters import parameter
-from ..scene import Scenario
+from .image_scenario import ImageScenario
 
 PLACEMENTS = ('offset', 'tether', 'seabed', 'surface')
 MOTIONS = ('fixed', 'swaying', 'swinging', 'moving')
 
 
 @frozen(kw_only=True)
-class ObstacleScenario(Scenario):
+class ObstacleScenario(ImageScenario):
     """Parameters of an obstacle scene; the defaults are the first case of docs/obstacle.md."""
 
     INSTRUMENT = (
@@ -196,6 +196,8 @@ class ObstacleScenario(Scenario):
         problems = super().check()
         if len(self.obstacle_speed) != 2 or self.obstacle_speed[0] > self.obstacle_speed[-1]:
             problems.append('obstacle_speed needs two values, the least and the greatest')
+        if self.images and self.ping_timing != 'instant':
+            problems.append('images are made at one instant: ping_timing has to be instant')
         return problems
 
 
@@ -294,6 +296,22 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
             'detection_probability': 0.9,
             'clutter': 2.0,
             'passing_distance': 12.0,
+        },
+    ),
+    'images': (
+        'an obstacle 3 m below in images of a small sonar, over a sea floor',
+        {
+            'images': True,
+            'image_beams': 128,
+            'image_bins': 330,
+            'max_range': 55.0,
+            'first_range': 52.0,
+            'last_range': 12.0,
+            'altitude': 6.0,
+            'roll_rms_deg': 3.0,
+            'target': 'float',
+            'target_size': 0.5,
+            'target_snr_db': 26.0,
         },
     ),
     'late': (

@@ -23,6 +23,7 @@ from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...measurements import Altitude, Detections, nanoseconds, Navigation
 from ..scene import Received, Scene, TruthTable
+from .images import image_pings
 from .paths import Path, paths, Swing
 from .scenario import ObstacleScenario, SCENARIOS
 
@@ -88,8 +89,12 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
     sound = 1.0 + config.sound_speed_error * rng.normal()
     received = _navigate(config, vehicle, rng)
-    echoes = [_echoes(config, vehicle, times, path, sound) for path in obstacles]
-    received += _pings(config, stamps, echoes, rng)
+    if config.images:
+        places = [path.at(times) for path in obstacles]
+        received += image_pings(config, vehicle.sonar(times), stamps, places, sound, seed)
+    else:
+        echoes = [_echoes(config, vehicle, times, path, sound) for path in obstacles]
+        received += _pings(config, stamps, echoes, rng)
     received.sort(key=lambda one: one.received_ns)
     truth = tuple(
         _truth(config, number, path, vehicle, stamps, times)

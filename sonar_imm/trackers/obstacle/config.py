@@ -148,6 +148,25 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
     vertical_fov_deg: float = parameter(
         15.0, 'full height of the beam', unit='deg', low=0.5, high=90.0
     )
+    vertical_beam_width_deg: float = parameter(
+        0.0,
+        'the intensity of detections tells the elevation by a beam this high (-3 dB, one way); 0: '
+        'it is not used. Worth it where the sonar tilts by degrees and the width is known to a '
+        'tenth; gaussian_sum only',
+        unit='deg',
+        low=0.0,
+        high=90.0,
+    )
+    fading_db: float = live(
+        6.4, 'by which echoes fade from ping to ping', unit='dB', low=0.1, high=40.0
+    )
+    intensity_weight: float = live(
+        0.5,
+        'power to which the likelihood of an intensity is raised: fading lasts, patterns are not '
+        'known well',
+        low=0.0,
+        high=1.0,
+    )
     gate_probability: float = inherited(DetectionParameters, 'gate_probability', 0.9995)
     clutter_density: float = inherited(
         DetectionParameters,
@@ -245,6 +264,8 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
             for name in ('sonar_lever', 'sonar_mount_rpy_deg')
             if len(getattr(self, name)) != 3
         ]
+        if self.vertical_beam_width_deg and self.method != 'gaussian_sum':
+            problems.append('vertical_beam_width_deg needs the method gaussian_sum')
         if not set(self.behaviours) & set(BEHAVIOURS[:3]):
             problems.append('behaviours needs one of fixed, swaying, moving at least')
         if len(set(self.behaviours)) < len(self.behaviours):

@@ -1,28 +1,43 @@
 """Echoes in images of a forward-looking sonar, as detections for the tracker.
 
-A convenience: a detector that knows the sonar is better.
+`ImageDetector` takes images in and gives detections out, one message per ping. The directions of a
+scanning sonar come one by one; it gathers a sweep of them first.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
-from ...acoustics.cfar import cfar_peaks
-from ...measurements import BEAM_AXES, Detections, IMAGE_ORDERS, SonarImage
+from ...acoustics.image_echoes import EchoRules, find_echoes
+from ...estimation.arrays import FloatArray
+from ...measurements import BEAM_AXES, Detections, IMAGE_ORDERS, Rejection, SonarImage
 from ...parameters import Config, parameter
+
+SIDES = ('port', 'starboard')
+ENDS = ('near', 'far')
+MAX_SWEEP = 1000
+"""Directions of a sweep."""
+SCALES = ('amplitude', 'power', 'decibel')
 
 
 @frozen(kw_only=True)
 class DetectorConfig(Config):
-    """How images are read and echoes found in them."""
+    """How images are read and echoes found in them. The defaults fit a Blueview P450."""
 
+    # -- how images are written ------------------------------------------------------------------
     image_order: str = parameter(
         'range_major',
         'how samples lie: all beams of a range together, or all ranges of a beam',
         choices=IMAGE_ORDERS,
+    )
+    image_scale: str = parameter(
+        'amplitude',
+        'what a sample is: an amplitude, a power, or a level in steps of decibel_step',
+        choices=SCALES,
+    )
+    decibel_step: float = parameter(
+        0.5, 'of image_scale decibel: one count', unit='dB', low=1e-3, high=100.0
     )
     beam_axes: str = parameter(
         'auto',
@@ -33,38 +48,237 @@ class DetectorConfig(Config):
     sound_speed: float = parameter(
         1500.0, 'of raw images that state none', unit='m/s', low=1300.0, high=1700.0
     )
-    guard: int = parameter(2, 'range cells around an echo that are not noise', low=0, high=100)
-    training: int = parameter(
-        12, 'range cells on either side that tell the noise', low=2, high=1000
+    image_near_range: float = parameter(
+        0.0,
+        'nearest range of images that do not say theirs (sensor_msgs/Image, SonoptixECHO)',
+        unit='m',
+        low=0.0,
+        high=1e4,
     )
+    image_far_range: float = parameter(
+        0.0, 'farthest range of such images; 0: unknown', unit='m', low=0.0, high=1e4
+    )
+    image_fov_deg: float = parameter(
+        0.0, 'sector of such images; 0: unknown', unit='deg', low=0.0, high=360.0
+    )
+    image_first_beam: str = parameter(
+        'port', 'side on which the first column of such images lies', choices=SIDES
+    )
+    image_first_range: str = parameter(
+        'near', 'end at which the first row of such images lies', choices=ENDS
+    )
+
+    # -- how echoes are found --------------------------------------------------------------------
+    beam_width_deg: float = parameter(
+        1.0, '-3 dB width of a beam; no less than a column', unit='deg', low=0.01, high=90.0
+    )
+    range_resolution: float = parameter(
+        0.3,
+        '-3 dB width of the echo of a point; no less than a row',
+        unit='m',
+        low=1e-3,
+        high=100.0,
+    )
+    training: int = parameter(
+        16, 'rows before and behind an echo that tell the noise', low=2, high=1000
+    )
+    training_beams: int = parameter(
+        25, 'columns around an echo that tell the noise', low=1, high=1000
+    )
+    guard: int = parameter(4, 'rows around an echo that are not noise', low=0, high=100)
     false_alarm: float = parameter(
-        1e-6, 'that a cell of noise is taken for an echo', low=1e-15, high=0.1
+        1e-6, 'that a cell of Rayleigh noise is taken for an echo', low=1e-15, high=0.1
+    )
+    threshold_margin_db: float = parameter(
+        3.0, 'that much higher, for noise with longer tails', unit='dB', low=0.0, high=30.0
+    )
+    growth_false_alarm: float = parameter(
+        1e-3, 'the same of the cells around that belong to the echo', low=1e-15, high=0.5
+    )
+    sidelobe_db: float = parameter(
+        17.0,
+        'cells that much below the loudest of their range are its sidelobes',
+        unit='dB',
+        low=0.0,
+        high=200.0,
+    )
+    join_distance: float = parameter(
+        1.5, 'what comes nearer to each other is one obstacle', unit='m', low=0.0, high=100.0
     )
     min_range: float = parameter(
-        1.0, 'echoes from nearer are the vehicle', unit='m', low=0.0, high=1e4
+        1.0,
+        'echoes from nearer are the vehicle; none are found either in the first rows of an image, '
+        'half of training and guard, where no nearer ones tell the noise',
+        unit='m',
+        low=0.0,
+        high=1e4,
     )
     max_detections: int = parameter(100, 'of a ping, the strongest', low=1, high=10_000)
 
-    def reading(self) -> dict[str, Any]:
-        """What `msg_adapters.sonar_images.read_sonar_image` has to be told."""
-        return {name: getattr(self, name) for name in ('image_order', 'beam_axes', 'sound_speed')}
+    # -- a scanning sonar ------------------------------------------------------------------------
+    sweep_sector_deg: float = parameter(
+        120.0,
+        'directions of a scanning sonar this far around ahead are gathered, the others are not',
+        unit='deg',
+        low=1.0,
+        high=360.0,
+    )
+    sweep_max_gap: float = parameter(
+        2.0, 'a longer silence ends a sweep', unit='s', low=0.01, high=600.0
+    )
+    sweep_speed: float = parameter(
+        1.5,
+        'by which ranges may change while a sweep lasts: a direction taken earlier or later than '
+        'the middle has an error of this for each second',
+        unit='m/s',
+        low=0.0,
+        high=50.0,
+    )
+
+    def rules(self) -> EchoRules:
+        return EchoRules(
+            beam_width=np.radians(self.beam_width_deg),
+            range_resolution=self.range_resolution,
+            false_alarm=self.false_alarm,
+            margin=10.0 ** (0.1 * self.threshold_margin_db),
+            growth=self.growth_false_alarm,
+            sidelobe=10.0 ** (-0.1 * self.sidelobe_db),
+            join_distance=self.join_distance,
+            nearest=self.min_range,
+            beams=self.training_beams,
+            training=self.training,
+            guard=self.guard,
+        )
+
+
+class ImageDetector:
+    """Detections from images in the order of their stamps."""
+
+    def __init__(self, config: DetectorConfig):
+        self.config = config
+        self._sweep: list[SonarImage] = []
+
+    def process(self, image: SonarImage) -> Detections | None:
+        """The echoes in an image; None for a direction of a sweep that goes on. Raises
+        `Rejection`."""
+        if not image.scanning:
+            return detect(image, self.config)
+        whole = self._gathered(image)
+        return None if whole is None else detect(whole, self.config)
+
+    def warm(self) -> None:
+        """Compile or load the kernels."""
+        rng = np.random.default_rng(0)
+        amplitude = rng.exponential(size=(60, 40))
+        amplitude[30, 20] = 1e3
+        detect(
+            SonarImage(
+                stamp_ns=1,
+                range=1.0 + np.arange(60.0),
+                bearing=np.linspace(0.3, -0.3, 40),
+                amplitude=amplitude,
+            ),
+            self.config,
+        )
+
+    def _gathered(self, beam: SonarImage) -> SonarImage | None:
+        """The sweep that `beam` ends, if it does; `beam` begins the next one."""
+        ahead = abs(float(beam.bearing[0])) <= np.radians(0.5 * self.config.sweep_sector_deg)
+        if ahead and self._goes_on(beam):
+            self._sweep.append(beam)
+            return None
+        done, self._sweep = self._sweep, [beam] if ahead else []
+        if len(done) >= 2 and beam.bearing[0] != done[-1].bearing[0] and ahead:
+            self._turned(done, beam)
+        return _whole(done) if len(done) >= 2 else None
+
+    def _goes_on(self, beam: SonarImage) -> bool:
+        """Whether `beam` continues the sweep: the next direction the same way round, soon, with
+        the same ranges."""
+        if not self._sweep:
+            return True
+        last = self._sweep[-1]
+        gap = (beam.stamp_ns - last.stamp_ns) * 1e-9
+        if not 0.0 <= gap <= self.config.sweep_max_gap or beam.frame_id != last.frame_id:
+            return False
+        if not np.array_equal(beam.range, last.range):
+            return False
+        turn = _turn(last, beam)
+        if turn == 0.0 or len(self._sweep) >= MAX_SWEEP:
+            return False
+        if abs(turn) * len(self._sweep) >= 2.0 * np.pi:
+            return False
+        return len(self._sweep) < 2 or turn * _turn(self._sweep[-2], last) > 0.0
+
+    def _turned(self, done: list[SonarImage], beam: SonarImage) -> None:
+        """Where a sonar turns back, the last direction belongs to the next sweep too."""
+        if _turn(done[-1], beam) * _turn(done[-2], done[-1]) < 0.0:
+            self._sweep.insert(0, done[-1])
+
+
+def _turn(first: SonarImage, second: SonarImage) -> float:
+    """Angle from one direction to the next, rad, -pi to pi."""
+    off = float(second.bearing[0] - first.bearing[0])
+    return float(np.arctan2(np.sin(off), np.cos(off)))
+
+
+def _whole(sweep: list[SonarImage]) -> SonarImage:
+    """One image of the directions of a sweep, stamped in its middle."""
+    middle = sweep[len(sweep) // 2]
+    delay = np.array([(beam.stamp_ns - middle.stamp_ns) * 1e-9 for beam in sweep])
+    return evolve(
+        middle,
+        bearing=np.array([beam.bearing[0] for beam in sweep]),
+        amplitude=np.column_stack([beam.amplitude for beam in sweep]),
+        scanning=False,
+        delay=delay,
+    )
 
 
 def detect(image: SonarImage, config: DetectorConfig) -> Detections:
     """The echoes in an image, strongest first. Raises `Rejection`."""
-    usable = np.isfinite(image.range) & (image.range >= config.min_range)
-    peaks = cfar_peaks(
-        image.amplitude,
-        guard=config.guard,
-        training=config.training,
-        false_alarm=config.false_alarm,
-    )
-    row, beam = peaks[usable[peaks[:, 0]] & np.isfinite(image.bearing[peaks[:, 1]])].T
-    row, beam = row[: config.max_detections], beam[: config.max_detections]
+    amplitude, distance, bearing, delay = _in_order(image)
+    if config.image_scale == 'power':
+        amplitude = np.sqrt(np.maximum(amplitude, 0.0))
+    elif config.image_scale == 'decibel':
+        with np.errstate(over='ignore'):
+            amplitude = 10.0 ** (amplitude * (config.decibel_step / 20.0))
+    found = find_echoes(amplitude, distance, bearing, config.rules())
+    late = np.interp(found.bearing, bearing, delay) if len(bearing) else found.bearing
+    n = slice(None, config.max_detections)
     return Detections(
         stamp_ns=image.stamp_ns,
-        range=image.range[row],
-        bearing=image.bearing[beam],
-        intensity=image.amplitude[row, beam],
+        range=found.range[n],
+        bearing=found.bearing[n],
+        var_range=(found.var_range + np.square(config.sweep_speed * late))[n],
+        var_bearing=found.var_bearing[n],
+        intensity=found.amplitude[n],
+        extent_range=found.extent_range[n],
+        extent_bearing=found.extent_bearing[n],
         frame_id=image.frame_id,
     )
+
+
+def _in_order(image: SonarImage) -> tuple[np.ndarray, ...]:
+    """Amplitudes (R, B), ranges, bearings and delays of what has a place, with ranges and bearings
+    ascending."""
+    rows, beams = _ascending(image.range), _ascending(image.bearing)
+    bearing = image.bearing[beams]
+    if len(bearing) and np.ptp(bearing) > 2.0 * np.pi:
+        raise Rejection('out_of_range', 'the beams of the image span more than a turn')
+    delay = np.zeros(len(image.bearing)) if image.delay is None else image.delay
+    amplitude = np.asarray(image.amplitude, np.float64)[rows][:, beams]
+    return amplitude, image.range[rows], bearing, delay[beams]
+
+
+def _ascending(axis: FloatArray) -> np.ndarray | slice:
+    """What puts the places of an axis that are numbers in order; a slice, which copies nothing,
+    where they are in order already."""
+    places = np.flatnonzero(np.isfinite(axis))
+    if len(places) and places[-1] - places[0] == len(places) - 1:
+        steps = np.diff(axis[places])
+        if (steps > 0.0).all():
+            return slice(places[0], places[-1] + 1)
+        if (steps < 0.0).all():
+            return slice(places[-1], places[0] - 1 if places[0] else None, -1)
+    return places[np.argsort(axis[places], kind='stable')]

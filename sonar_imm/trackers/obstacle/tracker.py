@@ -40,6 +40,7 @@ from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
+from .intensity import by_intensity, level_db, Strengths
 from .navigation import Mount
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
@@ -58,13 +59,15 @@ nothing."""
 @frozen(eq=False, kw_only=True)
 class PingState:
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
-    alike: whether most obstacles move alike (`behaviours.moving_alike`)."""
+    alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
+    each component assumes them."""
 
     stamp_ns: int
     sonar: Sonar
     life: Tracks
     mixture: Mixture
     nis: FloatArray
+    strengths: Strengths
     repairs: int = 0
     alike: bool = False
 
@@ -72,7 +75,12 @@ class PingState:
         """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
         if kept.all():
             return self
-        return evolve(self, mixture=self.mixture.rows(kept), nis=self.nis[kept])
+        return evolve(
+            self,
+            mixture=self.mixture.rows(kept),
+            nis=self.nis[kept],
+            strengths=self.strengths.rows(kept),
+        )
 
     def only(self, kept: np.ndarray) -> PingState:
         """The obstacles where `kept` (T,) is True."""
@@ -232,10 +240,16 @@ class ObstacleTracker:
         self, before: PingState | None, ping: Detections, sonar: Sonar
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R = self._detections(ping)
+        z, R, level = self._detections(ping)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
         chosen, expected = self._associate(now, z, R)
         now = self._update(now, chosen, expected, z, R)
+        if self.config.vertical_beam_width_deg and before:
+            dt, heard = (now.stamp_ns - before.stamp_ns) * 1e-9, np.append(level, np.nan)[chosen]
+            told = by_intensity(
+                *now.mixture, now.strengths, now.sonar.pose, heard, dt, self.config
+            )
+            now = evolve(now, mixture=now.mixture._replace(mu=told[0]), strengths=told[1])
         now = self._prune(now, chosen >= 0)
         free = np.ones(len(z), bool)
         free[chosen[chosen >= 0]] = False
@@ -258,9 +272,9 @@ class ObstacleTracker:
         )
         return now.only(sound), int((~sound).sum())
 
-    def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray]:
-        """z (D, 2) and R (D, 2, 2) of the rows that are echoes, azimuth positive to starboard. A
-        row that is as uncertain as it is far says nothing and is left out."""
+    def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """z (D, 2), R (D, 2, 2) and level dB (D,) of the rows that are echoes, azimuth positive to
+        starboard. A row that is as uncertain as it is far says nothing and is left out."""
         config = self.config
         z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         stated = np.column_stack([ping.var_range, ping.var_bearing])
@@ -269,7 +283,7 @@ class ObstacleTracker:
         variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, own)
         real = np.isfinite(z).all(axis=1) & (z[:, 0] > 2.0 * np.sqrt(variance[:, 0]))
         real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
-        return z[real], variance[real, :, None] * np.eye(2)
+        return z[real], variance[real, :, None] * np.eye(2), level_db(ping.intensity[real])
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray
@@ -325,13 +339,21 @@ class ObstacleTracker:
             life=now.life.born(len(z), now.stamp_ns, track_rules(self.config)),
             mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
+            strengths=now.strengths.joined(Strengths.unknown(len(z), self.filter.K)),
         )
 
     def _nobody(self, sonar: Sonar) -> PingState:
         K, n = self.filter.K, self.filter.n
         nothing = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
         life = Tracks.none(track_rules(self.config))
-        return PingState(stamp_ns=0, sonar=sonar, life=life, mixture=nothing, nis=np.empty(0))
+        return PingState(
+            stamp_ns=0,
+            sonar=sonar,
+            life=life,
+            mixture=nothing,
+            nis=np.empty(0),
+            strengths=Strengths.unknown(0, K),
+        )
 
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)

@@ -1,14 +1,19 @@
-"""Echoes in images: where they are, the strongest first, and none where the vehicle is."""
+"""The detector of images: an independent image, its parameters, sweeps of a scanning sonar."""
 
+from pathlib import Path
+
+from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm.measurements import SonarImage
-from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
+from sonar_imm.measurements import Rejection, SonarImage
+from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig, ImageDetector
 
+VECTORS = Path(__file__).resolve().parents[2] / 'vectors/obstacle_sea'
 BEARINGS = np.radians(np.linspace(20.0, -20.0, 41))  # port first
 RANGES = 2.0 + 0.25 * np.arange(120)
 ECHOES = {(40, 5): 200.0, (90, 33): 120.0}
+SHARP = DetectorConfig()
 
 
 def image(**changes):
@@ -20,16 +25,73 @@ def image(**changes):
     return SonarImage(stamp_ns=5, frame_id='sonar', **values)
 
 
-def test_echoes_are_found_where_they_are():
-    found = detect(image(), DetectorConfig())
-    assert (found.stamp_ns, found.frame_id) == (5, 'sonar')
-    assert found.range.tolist() == [RANGES[40], RANGES[90]]
-    assert found.bearing.tolist() == [BEARINGS[5], BEARINGS[33]]
-    assert found.intensity.tolist() == [200.0, 120.0]
+def study_image():
+    """The image of an independent study, with its targets and the answers of its detector."""
+    data = np.load(VECTORS / 'fls_image.npz')
+    amplitude = data['00/amplitude_x40'] / 40.0
+    return (
+        SonarImage(stamp_ns=5, range=data['range'], bearing=data['bearing'], amplitude=amplitude),
+        {name[3:]: value for name, value in data.items() if name.startswith('00/')},
+    )
+
+
+def test_five_targets_are_five_clusters_where_they_are():
+    picture, study = study_image()
+    found = detect(picture, DetectorConfig())
+    assert len(found) == 5
+    for kind, r, b in zip(study['target_kind'], study['target_range'], study['target_bearing']):
+        nearest = np.argmin(np.hypot(found.range - r, (found.bearing - b) * r))
+        if kind == 'point':
+            assert found.range[nearest] == pytest.approx(r, abs=0.1)
+            assert found.bearing[nearest] == pytest.approx(b, abs=np.radians(0.2))
+        else:
+            assert found.range[nearest] == pytest.approx(r, abs=3.0)
+        if kind == 'chain':
+            assert found.extent_bearing[nearest] * r > 0.7
+            assert found.var_bearing[nearest] * r**2 > 0.7**2
+
+
+def test_the_answers_are_those_of_an_independent_detector():
+    """Where a target is one cluster of both; the chain is not, of which the study's has one
+    glint."""
+    picture, study = study_image()
+    found = detect(picture, DetectorConfig())
+    for r, b, db in zip(study['ref_range'], study['ref_bearing'], study['ref_snr_db']):
+        i = np.argmin(np.abs(found.range - r))
+        if abs(r - 60.1) > 1.0:
+            assert found.range[i] == pytest.approx(r, abs=0.05)
+            assert found.bearing[i] == pytest.approx(b, abs=0.003)
+        level = found.intensity[i] ** 2
+        beside = 10.0 * np.log10(level) - db  # of the noise around, in dB of the image
+        assert -1.0 < beside < 14.0
+
+
+def test_the_order_of_rows_and_beams_does_not_matter():
+    expected = detect(image(), SHARP)
+    assert expected.range == pytest.approx([RANGES[40], RANGES[90]], abs=0.05)
+    assert expected.bearing == pytest.approx([BEARINGS[5], BEARINGS[33]], abs=0.003)
+    assert expected.intensity.tolist() == [200.0, 120.0]
+    assert (expected.stamp_ns, expected.frame_id) == (5, 'sonar')
+    straight = image()
+    rng = np.random.default_rng(0)
+    for rows, beams in (
+        (slice(None, None, -1), slice(None, None, -1)),
+        (rng.permutation(len(RANGES)), rng.permutation(len(BEARINGS))),
+    ):
+        turned = evolve(
+            straight,
+            range=RANGES[rows],
+            bearing=BEARINGS[beams],
+            amplitude=straight.amplitude[rows][:, beams],
+        )
+        again = detect(turned, SHARP)
+        np.testing.assert_array_equal(again.range, expected.range)
+        np.testing.assert_array_equal(again.var_bearing, expected.var_bearing)
 
 
 def test_the_vehicle_is_no_obstacle_and_the_strongest_come_first():
-    assert detect(image(), DetectorConfig(min_range=15.0)).range.tolist() == [RANGES[90]]
+    near = detect(image(), DetectorConfig(min_range=15.0))
+    assert near.range == pytest.approx([RANGES[90]], abs=0.05)
     assert detect(image(), DetectorConfig(max_detections=1)).intensity.tolist() == [200.0]
 
 
@@ -37,18 +99,119 @@ def test_the_vehicle_is_no_obstacle_and_the_strongest_come_first():
 def test_an_echo_without_a_place_is_left_out(name, place):
     axis = (RANGES if name == 'range' else BEARINGS).copy()
     axis[place] = np.nan
-    assert detect(image(**{name: axis}), DetectorConfig()).intensity.tolist() == [120.0]
+    assert detect(image(**{name: axis}), SHARP).intensity.tolist() == [120.0]
 
 
 def test_an_image_of_noise_alone_is_a_ping_without_echoes():
     noise = np.random.default_rng(6).exponential(size=(len(RANGES), len(BEARINGS)))
-    assert len(detect(image(amplitude=np.sqrt(noise)), DetectorConfig())) == 0
+    assert len(detect(image(amplitude=np.sqrt(noise)), SHARP)) == 0
 
 
-def test_what_the_reader_is_told_are_parameters_of_the_detector():
-    config = DetectorConfig(image_order='beam_major', beam_axes='marine', sound_speed=1480.0)
-    assert config.reading() == {
-        'image_order': 'beam_major',
-        'beam_axes': 'marine',
-        'sound_speed': 1480.0,
-    }
+def test_powers_and_levels_are_turned_into_amplitudes():
+    expected = detect(image(), SHARP)
+    power = detect(image(amplitude=image().amplitude ** 2), DetectorConfig(image_scale='power'))
+    np.testing.assert_allclose(power.range, expected.range, rtol=1e-12)
+    with np.errstate(divide='ignore'):
+        level = 20.0 * np.log10(image().amplitude) / 0.25
+    found = detect(
+        image(amplitude=level), DetectorConfig(image_scale='decibel', decibel_step=0.25)
+    )
+    np.testing.assert_allclose(found.range, expected.range, rtol=1e-9)
+
+
+def test_samples_that_are_no_numbers_are_silence():
+    spoilt = image().amplitude.copy()
+    spoilt[10:14, :] = np.nan
+    spoilt[20, 3] = np.inf
+    found = detect(image(amplitude=spoilt), SHARP)
+    assert found.intensity.tolist() == [200.0, 120.0]
+    assert np.isfinite(found.var_range).all()
+
+
+def test_an_image_that_contradicts_itself_is_refused():
+    with pytest.raises(Rejection, match='axes') as caught:
+        image(range=RANGES[:-1])
+    assert caught.value.reason == 'bad_shape'
+    with pytest.raises(Rejection) as caught:
+        detect(image(bearing=10.0 * BEARINGS * np.arange(41)), SHARP)
+    assert caught.value.reason == 'out_of_range'
+
+
+# -- a scanning sonar -----------------------------------------------------------------------------
+
+STEP = np.radians(1.8)
+
+
+def beams(angles, start_ns=10**9, step_ns=10**8, target=(0.1, 20.0), rows=100, **changes):
+    """Echoes of single directions with a target at (bearing, range)."""
+    rng = np.random.default_rng(3)
+    r = 0.3 * (1.0 + np.arange(rows))
+    for k, angle in enumerate(np.arctan2(np.sin(angles), np.cos(angles))):
+        amplitude = np.sqrt(rng.exponential(size=rows)) * 3.0
+        off = np.hypot((angle - target[0]) / (2.0 * STEP), (r - target[1]) / 0.5)
+        amplitude += 150.0 * np.exp(-np.square(off))
+        yield SonarImage(
+            stamp_ns=start_ns + k * step_ns,
+            range=r,
+            bearing=[angle],
+            amplitude=amplitude[:, None],
+            frame_id='sonar',
+            scanning=True,
+            **changes,
+        )
+
+
+def sweeps(images, **parameters):
+    detector = ImageDetector(DetectorConfig(beam_width_deg=2.0, **parameters))
+    return [one for image in images if (one := detector.process(image)) is not None]
+
+
+def test_directions_of_a_full_turn_are_gathered_into_what_lies_ahead():
+    angles = np.arange(0.0, 3.3 * 2.0 * np.pi, STEP)
+    found = sweeps(beams(angles))
+    assert len(found) == 4  # half of one and three whole ones, each when the sonar looks aside
+    for ping in found[1:]:
+        assert len(ping) == 1
+        assert ping.range[0] == pytest.approx(20.0, abs=0.2)
+        assert ping.bearing[0] == pytest.approx(0.1, abs=0.03)
+
+
+def test_a_sector_scanned_to_and_fro_gives_a_ping_each_way():
+    once = np.arange(-0.5, 0.5, STEP)
+    found = sweeps(beams(np.concatenate([once, once[-2::-1], once[1:], once[-2::-1]])))
+    assert len(found) == 3
+    assert [len(ping) for ping in found] == [1, 1, 1]
+    assert [ping.bearing[0] for ping in found] == pytest.approx([0.1] * 3, abs=0.03)
+
+
+def test_what_a_moving_vehicle_does_to_a_sweep_is_in_the_variance():
+    once = np.arange(-0.5, 0.5, STEP)
+    for target, late in ((0.0, 0.0), (0.35, 1.1)):
+        (ping,) = sweeps(
+            beams(np.concatenate([once, once[-2:-3:-1]]), target=(target, 20.0)), sweep_speed=2.0
+        )
+        assert np.sqrt(ping.var_range[0]) == pytest.approx(2.0 * late, abs=0.35)
+
+
+@pytest.mark.parametrize('spoil', ['silence', 'ranges', 'frame', 'back'])
+def test_a_sweep_ends_where_it_does_not_go_on(spoil):
+    first = list(beams(np.arange(-0.5, 0.0, STEP)))
+    late = 10**10 if spoil == 'silence' else 3 * 10**9
+    rows = 90 if spoil == 'ranges' else 100
+    more = list(beams(np.arange(0.0, 0.5, STEP), start_ns=late, rows=rows))
+    if spoil == 'frame':
+        more = [evolve(one, frame_id='other') for one in more]
+    if spoil == 'back':
+        more = [evolve(one, stamp_ns=one.stamp_ns - 5 * 10**9 // 2) for one in more]
+    detector = ImageDetector(DetectorConfig(beam_width_deg=2.0))
+    answers = [detector.process(one) for one in first + more]
+    assert sum(one is not None for one in answers) == 1
+    assert answers[len(first)] is not None
+
+
+def test_memory_is_bounded_whatever_comes():
+    detector = ImageDetector(DetectorConfig(sweep_sector_deg=360.0))
+    angles = 1e-5 * np.arange(3000)
+    for one in beams(angles, rows=20):
+        detector.process(one)
+    assert len(detector._sweep) <= 1000

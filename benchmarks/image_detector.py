@@ -1,0 +1,228 @@
+"""What the detector of images finds, misses and invents, and how long it takes.
+
+    python -m benchmarks.image_detector --out docs/results/image_detector.json
+
+Images are those of the simulated sonar (256 beams, 600 ranges), which knows nothing of the
+detector. `study` is what an independent prototype reached on images of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import time
+from typing import Any
+
+import numpy as np
+
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.measurements import Detections, SonarImage
+from sonar_imm.simulation.obstacle.images import ImageSonar
+from sonar_imm.simulation.obstacle.scenario import ObstacleScenario
+from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
+
+DEPTH = 20.0
+LEVEL = Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3))
+DETECTORS = {
+    'as it is': DetectorConfig(),
+    'without the margin': DetectorConfig(threshold_margin_db=0.0),
+}
+FLOORS = {
+    'Rayleigh': (1000.0, 1.0),
+    'K 4': (4.0, 1.0),
+    'K 1.5': (1.5, 1.0),
+    'K 1.5, patches of 5 m': (1.5, 5.0),
+}
+"""Shape of the power of patches of the sea floor, and their side in metres."""
+STUDY_FALSE = {
+    'without the margin': {'Rayleigh': 0.1, 'K 4': 1.7, 'K 1.5': 7.3},
+    'as it is': {'Rayleigh': 0.0, 'K 4': 0.08, 'K 1.5': 0.2},
+}
+LEVELS = (12.0, 15.0, 18.0, 21.0)
+STUDY_FOUND = {'steady': (0.33, 0.95, 1.0, 1.0), 'rayleigh': (0.36, 0.58, 0.73, 0.88)}
+STUDY_CENTROID = {
+    15.0: (0.09, 0.024),
+    18.0: (0.06, 0.017),
+    21.0: (0.04, 0.011),
+    27.0: (0.02, 0.006),
+}
+"""Degrees and metres by SNR, dB."""
+NEAR = 2.0
+
+
+def image(sonar: ImageSonar, places: list[np.ndarray]) -> SonarImage:
+    return SonarImage(
+        stamp_ns=1,
+        range=sonar.range,
+        bearing=sonar.bearing,
+        amplitude=sonar.image(LEVEL, places, 1.0).astype(float),
+    )
+
+
+def scene(**values: Any) -> ObstacleScenario:
+    return ObstacleScenario(**{'images': True, 'altitude': 6.0, 'depth': DEPTH, **values})
+
+
+def false_alarms(images: int) -> dict[str, dict[str, float]]:
+    """Detections per image without a target."""
+    table: dict[str, dict[str, float]] = {}
+    for floor, (shape, patch) in FLOORS.items():
+        config = scene(seabed_shape=shape, seabed_patch=patch)
+        sonar = ImageSonar(config, np.random.default_rng(1))
+        pictures = [image(sonar, []) for _ in range(images)]
+        for name, config in DETECTORS.items():
+            counts = [len(detect(one, config)) for one in pictures]
+            table.setdefault(name, {})[floor] = float(np.mean(counts))
+    return table
+
+
+def found(runs: int) -> dict[str, dict[str, list[float]]]:
+    """Share of images in which a point is found; it lies before the onset of the sea floor."""
+    table: dict[str, dict[str, list[float]]] = {}
+    for fading in STUDY_FOUND:
+        for level in LEVELS:
+            values = {'target_fading': fading, 'target_snr_db': level, 'altitude': 5000.0}
+            rng = np.random.default_rng(2)
+            sonar = ImageSonar(scene(**values), rng)
+            hits = dict.fromkeys(DETECTORS, 0)
+            for _ in range(runs):
+                r, b = rng.uniform(25.0, 90.0), rng.uniform(-0.3, 0.3)
+                picture = image(sonar, [place(r, b)])
+                for name, config in DETECTORS.items():
+                    hits[name] += bool(near(detect(picture, config), r, b).any())
+            for name in DETECTORS:
+                table.setdefault(name, {}).setdefault(fading, []).append(hits[name] / runs)
+    return table
+
+
+def place(r: float, b: float) -> np.ndarray:
+    """NED of a point level with the sonar."""
+    return np.array([r * np.cos(b), -r * np.sin(b), DEPTH])
+
+
+def near(ping: Detections, r: float, b: float, reach: float = NEAR) -> np.ndarray:
+    return np.hypot(ping.range - r, (ping.bearing - b) * r) < reach
+
+
+def centroids(runs: int) -> list[dict[str, float]]:
+    """Error of the place of a point, and whether its variance is believed."""
+    rows = []
+    for level in STUDY_CENTROID:
+        rng = np.random.default_rng(3)
+        sonar = ImageSonar(scene(target_snr_db=level, altitude=5000.0), rng)
+        errors, nees = [], []
+        for _ in range(runs):
+            r, b = rng.uniform(25.0, 90.0), rng.uniform(-0.3, 0.3)
+            ping = detect(image(sonar, [place(r, b)]), DetectorConfig(threshold_margin_db=0.0))
+            for i in np.flatnonzero(near(ping, r, b))[:1]:
+                error = np.array([ping.range[i] - r, ping.bearing[i] - b])
+                errors.append(error)
+                nees.append(np.square(error) / [ping.var_range[i], ping.var_bearing[i]])
+        rms = np.sqrt(np.mean(np.square(errors), axis=0))
+        rows.append(
+            {
+                'snr_db': level,
+                'found': len(errors) / runs,
+                'range_m': float(rms[0]),
+                'bearing_deg': float(np.degrees(rms[1])),
+                'nees_range': float(np.mean(nees, axis=0)[0]),
+                'nees_bearing': float(np.mean(nees, axis=0)[1]),
+            }
+        )
+    return rows
+
+
+def five_targets(scenes: int) -> dict[str, Any]:
+    """Points, chains across and along the line of sight and a float over a K sea floor: detections
+    of each, and false ones."""
+    kinds = (
+        ('point', 20.0),
+        ('point', 19.0),
+        ('point', 35.0),
+        ('chain across', 20.0),
+        ('float', 21.0),
+        ('chain along', 20.0),
+    )
+    sizes = {'point': 0.0, 'chain': 6.0, 'float': 1.0}
+    counts: dict[str, list[int]] = {}
+    false = 0
+    for seed in range(scenes):
+        rng = np.random.default_rng([4, seed])
+        base = ImageSonar(scene(), rng)
+        total = image(base, []).amplitude * np.exp(
+            2j * np.pi * rng.uniform(size=(len(base.range), len(base.bearing)))
+        )
+        spots = []
+        for k, (kind, level) in enumerate(kinds):
+            r, b = rng.uniform(26.0, 34.0) + 11.0 * k, rng.uniform(-0.3, 0.3)
+            target = kind.split()[0]
+            values = {'target': target, 'target_snr_db': level, 'target_size': sizes[target]}
+            config = scene(**values)
+            one = ImageSonar(config, rng)
+            one.heading = (0.5 * np.pi if kind.endswith('across') else 0.0) - b
+            mean = base.mean_power(LEVEL)
+            echo = one.echo(LEVEL, place(r, b), 1.0, mean)
+            if target != 'point':  # as in the study, the level is that of the loudest glint
+                around = mean[np.argmin(np.abs(base.range - r))].mean()
+                echo = echo * np.sqrt(10.0 ** (0.1 * level) * around) / np.abs(echo).max()
+            total = total + config.image_gain * echo
+            spots.append((f'{kind} {level:g} dB', r, b, NEAR + 0.5 * sizes[target]))
+        picture = np.minimum(np.round(np.abs(total)), 255.0)
+        ping = detect(
+            SonarImage(stamp_ns=1, range=base.range, bearing=base.bearing, amplitude=picture),
+            DetectorConfig(),
+        )
+        hit = np.zeros(len(ping), bool)
+        for name, r, b, reach in spots:
+            own = near(ping, r, b, reach)
+            counts.setdefault(name, []).append(int(own.sum()))
+            hit |= own
+        false += int((~hit).sum())
+    return {
+        'scenes': scenes,
+        'found': {name: float(np.mean(np.array(one) > 0)) for name, one in counts.items()},
+        'detections': {name: float(np.mean(one)) for name, one in counts.items()},
+        'false per image': false / scenes,
+    }
+
+
+def speed(rounds: int) -> dict[str, float]:
+    """Processor time of one image with five points in it, ms."""
+    sonar = ImageSonar(scene(target_snr_db=22.0), np.random.default_rng(5))
+    spots = [place(r, b) for r, b in ((30, 0.1), (44, -0.2), (60, 0.0), (75, 0.25), (90, -0.1))]
+    picture = image(sonar, spots)
+    detect(picture, DetectorConfig())
+    spent = []
+    for _ in range(rounds):
+        start = time.process_time()
+        detect(picture, DetectorConfig())
+        spent.append(1e3 * (time.process_time() - start))
+    return {'p50_ms': float(np.median(spent)), 'p90_ms': float(np.percentile(spent, 90))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--runs', type=int, default=120, help='images for each SNR')
+    parser.add_argument('--images', type=int, default=24, help='images for false alarms')
+    parser.add_argument('--scenes', type=int, default=10, help='scenes of five targets')
+    parser.add_argument('--out', type=Path, help='write the numbers as JSON here')
+    given = parser.parse_args()
+    result = {
+        'false detections per image': false_alarms(given.images),
+        'study, false': STUDY_FALSE,
+        'found': found(given.runs),
+        'study, found': STUDY_FOUND,
+        'snr_db': LEVELS,
+        'centroids': centroids(given.runs),
+        'study, centroids': STUDY_CENTROID,
+        'five targets': five_targets(given.scenes),
+        'speed': speed(60),
+    }
+    print(json.dumps(result, indent=2))
+    if given.out:
+        given.out.write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()

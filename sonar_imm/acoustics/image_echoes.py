@@ -1,0 +1,186 @@
+"""Echoes in images of a forward-looking sonar, with their place, spread and variance.
+
+    level -> threshold -> sidelobes blanked -> grown and joined -> centroid
+
+`cfar` says which cells are loud. A strong echo shows in the sidelobes of all beams of its range,
+so cells far below the loudest of their range are left out. Connected cells above a lower threshold
+are a part, and parts that come within `join_distance` of each other are one echo: a chain or a
+float is a group of glints. At least one cell of it has to be above the higher threshold. Its place
+is the centroid weighted by power.
+
+The variance of a centroid is, in range and likewise in bearing,
+
+    (w / 2)^2 / SNR + (step / 10)^2 + max(0, S - S_point)
+
+w is the -3 dB width of the echo of a point, S the second moment of the echo and S_point that of a
+point. Over something extended the centroid wanders by the *whole* spread from ping to ping,
+because the glints interfere; dividing by the number of cells would be wrong.
+"""
+
+from __future__ import annotations
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimation.arrays import FloatArray
+from .cfar import effective_cells, noise_level, threshold_factor
+from .image_echo_kernels import joined_parts
+
+MAX_CELLS = 20_000
+"""Loud cells of an image, the strongest, that are looked at."""
+_GAUSSIAN = 1.0 / (8.0 * np.log(2.0))
+"""Variance of a Gaussian pattern whose -3 dB width is 1."""
+_LARGEST = 1e38
+"""Squares of the largest float32 still fit into a float64."""
+
+
+@frozen(kw_only=True)
+class EchoRules:
+    """How echoes are told from noise.
+
+    beam_width rad and range_resolution m: -3 dB widths of the echo of a point; false_alarm: of a
+    cell of Rayleigh noise; margin: that threshold is so much higher (power), for noise with longer
+    tails; growth: false alarm probability of the other cells of an echo; sidelobe: cells below
+    this share of the loudest power of their range are left out; join_distance m; nearest m: cells
+    nearer tell noise only; beams, training, guard: see `cfar.noise_level`.
+    """
+
+    beam_width: float
+    range_resolution: float
+    false_alarm: float = 1e-6
+    margin: float = 2.0
+    growth: float = 1e-3
+    sidelobe: float = 10.0**-1.7
+    join_distance: float = 1.5
+    nearest: float = 0.0
+    beams: int = 25
+    training: int = 16
+    guard: int = 4
+
+
+@frozen(eq=False)
+class Echoes:
+    """n echoes, strongest first: range m and bearing rad of the centroids, their variances, the
+    spread (standard deviation) along both, peak amplitude and peak power over noise, each (n,)."""
+
+    range: FloatArray
+    bearing: FloatArray
+    var_range: FloatArray
+    var_bearing: FloatArray
+    extent_range: FloatArray
+    extent_bearing: FloatArray
+    amplitude: FloatArray
+    snr: FloatArray
+
+
+def find_echoes(
+    amplitude: FloatArray,
+    distance: FloatArray,
+    bearing: FloatArray,
+    rules: EchoRules,
+) -> Echoes:
+    """The echoes in `amplitude` (R, B) with rows at `distance` (R,) m and beams at `bearing` (B,)
+    rad, both finite and in order. Cells that are not finite count as silence.
+
+    Raises ValueError for an image that is not two-dimensional.
+    """
+    power = np.square(np.where(np.isfinite(amplitude), amplitude, 0.0).clip(-_LARGEST, _LARGEST))
+    step = _step(distance), _step(bearing)
+    width = max(rules.range_resolution, step[0]), max(rules.beam_width, step[1])
+    level, sides = noise_level(
+        power, beams=rules.beams, training=rules.training, guard=rules.guard
+    )
+    if not power.size:
+        return _nothing()
+    cells = effective_cells(rules.training, width[0] / step[0])
+    cells *= effective_cells(min(rules.beams, power.shape[1]), width[1] / step[1])
+    high = _thresholds(rules.false_alarm, cells, sides) * rules.margin
+    low = _thresholds(rules.growth, cells, sides)
+    low[distance < rules.nearest] = np.inf
+    with np.errstate(invalid='ignore'):  # an infinite threshold of a silent cell
+        loud = power > low[:, None] * level
+    loud &= power >= rules.sidelobe * power.max(axis=1, keepdims=True)
+    row, beam, part = _cells(loud, power)
+    if not len(row):
+        return _nothing()
+    part = joined_parts(part, distance[row], bearing[beam], rules.join_distance)
+    certain = np.bincount(part, power[row, beam] > high[row] * level[row, beam]) > 0
+    row, beam, part = row[certain[part]], beam[certain[part]], part[certain[part]]
+    if not len(row):
+        return _nothing()
+    part = (np.cumsum(certain) - 1)[part]
+    return _measured(part, row, beam, power, level, distance, bearing, step, width)
+
+
+def _step(axis: FloatArray) -> float:
+    """The usual distance of two neighbours, 1 when there are none."""
+    steps = np.abs(np.diff(axis))
+    steps = steps[steps > 0.0]
+    return float(np.median(steps)) if len(steps) else 1.0
+
+
+def _thresholds(false_alarm: float, cells: float, sides: FloatArray) -> FloatArray:
+    """Factor (R,) for each row; infinite without any noise to compare with."""
+    whole = max(1, round(cells))
+    factors = np.array(
+        [
+            np.inf,
+            threshold_factor(false_alarm, whole, 1),
+            threshold_factor(false_alarm, whole, 2),
+        ]
+    )
+    return factors[sides.astype(int)]
+
+
+def _cells(loud: NDArray[np.bool_], power: FloatArray) -> tuple[NDArray[np.intp], ...]:
+    """Row, beam and number of the connected part of the loud cells, row by row; of too many only
+    the strongest."""
+    from scipy.ndimage import label
+
+    row, beam = np.nonzero(loud)
+    if len(row) > MAX_CELLS:
+        least = np.partition(power[row, beam], len(row) - MAX_CELLS)[len(row) - MAX_CELLS]
+        loud = loud & (power >= least)
+        row, beam = np.nonzero(loud)
+    numbers, _ = label(loud, structure=np.ones((3, 3), int))
+    return row, beam, numbers[row, beam].astype(np.intp) - 1
+
+
+def _measured(
+    part: NDArray[np.intp],
+    row: NDArray[np.intp],
+    beam: NDArray[np.intp],
+    power: FloatArray,
+    level: FloatArray,
+    distance: FloatArray,
+    bearing: FloatArray,
+    step: tuple[float, float],
+    width: tuple[float, float],
+) -> Echoes:
+    weight = power[row, beam]
+    count = int(part.max()) + 1
+    total = np.bincount(part, weight, count)
+
+    def moments(value: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean = np.bincount(part, weight * value, count) / total
+        return mean, np.bincount(part, weight * np.square(value - mean[part]), count) / total
+
+    r, S_r = moments(distance[row])
+    b, S_b = moments(bearing[beam])
+    order = np.lexsort((-weight, part))  # the loudest cell of each part first
+    peak = order[np.searchsorted(part[order], np.arange(count))]
+    loudest = weight[peak]
+    noise = level[row[peak], beam[peak]]
+    snr = loudest / np.maximum(noise, np.finfo(float).tiny)
+    variances = [
+        np.square(0.5 * w) / snr + np.square(0.1 * s) + np.maximum(0.0, S - w**2 * _GAUSSIAN)
+        for w, s, S in zip(width, step, (S_r, S_b))
+    ]
+    best = np.argsort(-loudest, kind='stable')
+    columns = (r, b, *variances, np.sqrt(S_r), np.sqrt(S_b), np.sqrt(loudest), snr)
+    return Echoes(*(column[best] for column in columns))
+
+
+def _nothing() -> Echoes:
+    return Echoes(*(np.empty(0) for _ in range(8)))

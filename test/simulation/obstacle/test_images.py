@@ -1,0 +1,146 @@
+"""Simulated images: speckle, reverberation, sea floor and targets are what they claim to be."""
+
+import numpy as np
+import pytest
+from scipy.signal.windows import taylor
+
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.measurements import SonarImage
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.obstacle import scenario, simulate
+from sonar_imm.simulation.obstacle.images import ImageSonar, vertical_pattern
+
+LEVEL = Pose(np.array([0.0, 0.0, 20.0]), np.eye(3))
+NOWHERE = {'reverberation': 0.0, 'altitude': 5000.0, 'image_gain': 40.0}
+
+
+def sonar(seed=0, **values):
+    config = scenario('approach', {'images': True, **values})
+    return ImageSonar(config, np.random.default_rng(seed))
+
+
+def powers(one, count, places=(), pose=LEVEL):
+    """Mean power over images, in units of the noise."""
+    gain = one.config.image_gain
+    return np.mean(
+        [np.square(one.image(pose, list(places), 1.0) / gain) for _ in range(count)], axis=0
+    )
+
+
+def correlation(power, axis, lag):
+    """Of the power at places `lag` cells apart."""
+    first = np.take(power, np.arange(power.shape[axis] - lag), axis)
+    second = np.take(power, np.arange(lag, power.shape[axis]), axis)
+    return np.corrcoef(first.ravel(), second.ravel())[0, 1]
+
+
+def beams_correlate(lag):
+    """Correlation of the power of beams `lag` times 45 / 256 degrees apart, 1 degree wide."""
+    weight = taylor(400, nbar=6, sll=20.0)
+    place = np.arange(400) - 199.5
+    u = np.linspace(0.0, 0.01, 5001)
+    pattern = np.abs(np.exp(2j * np.pi * np.multiply.outer(u, place)) @ weight) / weight.sum()
+    half = u[np.argmax(pattern < np.sqrt(0.5))]
+    off = lag * (45.0 / 256.0) * 2.0 * half
+    together = np.exp(2j * np.pi * off * place) @ np.square(weight)
+    return np.square(np.abs(together / np.square(weight).sum()))
+
+
+def test_noise_is_rayleigh_speckle_as_wide_as_a_beam_and_as_long_as_the_pulse():
+    one = sonar(**NOWHERE)
+    images = [np.square(one.image(LEVEL, [], 1.0) / 40.0) for _ in range(6)]
+    power = np.concatenate(images, axis=0)
+    assert power.mean() == pytest.approx(1.0, abs=0.01)
+    assert power.std() == pytest.approx(1.0, abs=0.03)  # exponential
+    # Speckle of an array correlates as the transform of its squared weights, to the second power.
+    for lag in (2, 4):
+        assert correlation(images[0], 1, lag) == pytest.approx(beams_correlate(lag), abs=0.06)
+    assert correlation(images[0], 1, 12) == pytest.approx(0.0, abs=0.06)
+    assert correlation(images[0], 0, 1) == pytest.approx(0.65, abs=0.06)
+    assert correlation(images[0], 0, 4) == pytest.approx(0.0, abs=0.05)
+
+
+def test_water_scatters_back_by_the_square_of_the_range():
+    one = sonar(**{**NOWHERE, 'reverberation': 30.0, 'image_gain': 20.0})
+    mean = powers(one, 30).mean(axis=1)
+    wanted = 1.0 + 30.0 * np.square(10.0 / one.range)
+    far = one.range > 15.0
+    assert mean[far] / wanted[far] == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_point_is_as_strong_wide_and_long_as_told():
+    one = sonar(**{**NOWHERE, 'target_snr_db': 26.0, 'image_gain': 8.0})
+    d, b = one.range[300], -one.bearing[100]
+    place = np.array([d * np.cos(b), d * np.sin(b), 20.0])
+    power = powers(one, 20, [place])
+    row, beam = np.unravel_index(np.argmax(power), power.shape)
+    assert abs(one.range[row] - d) < 0.1 and beam == 100
+    peak = power[row, beam] - 1.0
+    assert 10.0 * np.log10(peak) == pytest.approx(26.0, abs=0.6)
+    step = np.degrees(one.bearing[0] - one.bearing[1])
+    wide = step * np.count_nonzero(power[row] > 0.5 * peak)
+    assert wide == pytest.approx(1.0, abs=0.2)
+    beyond = np.abs(np.arange(256) - 100) * step > 1.6
+    sidelobes = power[row, beyond].max() - 1.0
+    assert -24.0 < 10.0 * np.log10(sidelobes / peak) < -17.0
+
+
+def test_what_lies_above_or_below_the_axis_is_fainter():
+    assert vertical_pattern(np.array([0.0]), 0.26) == 1.0
+    assert vertical_pattern(np.array([0.13]), 0.26) == pytest.approx(0.25, rel=0.01)
+    one = sonar(**{**NOWHERE, 'target_snr_db': 30.0, 'image_gain': 4.0})
+    edge = np.array([np.cos(0.1309), 0.0, np.sin(0.1309)])
+    level, low = (
+        powers(one, 8, [LEVEL.position + one.range[300] * way]).max()
+        for way in (np.array([1.0, 0.0, 0.0]), edge)
+    )
+    assert 10.0 * np.log10(level / low) == pytest.approx(6.0, abs=1.0)
+
+
+def test_a_fading_point_is_rayleigh_and_glints_wander():
+    small = {**NOWHERE, 'image_bins': 240, 'image_beams': 128, 'horizontal_fov_deg': 22.5}
+    one = sonar(**{**small, 'target_fading': 'rayleigh', 'image_gain': 4.0})
+    place = [np.array([50.0, 0.0, 20.0])]
+    peaks = np.array([powers(one, 1, place)[116:124, 56:72].max() for _ in range(60)])
+    assert 0.6 < peaks.std() / peaks.mean() < 1.4
+    chain = sonar(**{**small, 'target': 'chain', 'target_size': 10.0})
+    images = [powers(chain, 1, place) for _ in range(30)]
+    weights = [np.where(image > 8.0, image, 0.0).sum(axis=0) for image in images]
+    centres = [np.average(chain.bearing, weights=one) for one in weights if one.any()]
+    assert np.std(centres) > 0.005
+
+
+def test_the_sea_floor_is_patchy_and_its_patches_stay_in_the_world():
+    values = {**NOWHERE, 'altitude': 6.0, 'seabed_shape': 0.5, 'image_gain': 8.0}
+    one = sonar(**values)
+    here = powers(one, 25)
+    moved = Pose(np.array([3.0, 0.0, 20.0]), np.eye(3))
+    there = powers(one, 25, pose=moved)
+    step = one.range[1] - one.range[0]
+    shift = round(3.0 / step)
+    ahead = slice(118, 138)  # straight ahead a patch comes nearer by 3 m
+    first, second = here[350:500, ahead], there[350 - shift : 500 - shift, ahead]
+    assert np.corrcoef(first.ravel(), second.ravel())[0, 1] > 0.5
+    unmoved = there[350:500, ahead]
+    assert np.corrcoef(first.ravel(), unmoved.ravel())[0, 1] < 0.3
+    assert here[:30].mean() == pytest.approx(1.0, abs=0.05)  # nearer than the floor
+
+
+def test_images_take_the_place_of_detections_and_the_rest_stays():
+    values = {'last_range': 80.0, 'image_bins': 200, 'image_beams': 64}
+    plain = simulate(scenario('approach', values), seed=3)
+    scene = simulate(scenario('approach', {**values, 'images': True}), seed=3)
+    again = simulate(scenario('approach', {**values, 'images': True}), seed=3)
+    images = [one.measurement for one in scene.measurements if hasattr(one.measurement, 'delay')]
+    assert len(images) == 14 and isinstance(images[0], SonarImage)
+    assert images[0].amplitude.shape == (200, 64)
+    same = [one.measurement for one in again.measurements if hasattr(one.measurement, 'delay')]
+    assert all((a.amplitude == b.amplitude).all() for a, b in zip(images, same))
+    np.testing.assert_array_equal(scene.truth[0].vertical_offset, plain.truth[0].vertical_offset)
+    others = [len(one.measurements) - 14 for one in (scene, plain)]
+    assert others[0] == others[1]
+
+
+def test_images_of_two_instants_are_refused():
+    with pytest.raises(ConfigError, match='instant'):
+        scenario('approach', {'images': True, 'ping_timing': 'two_way'})
