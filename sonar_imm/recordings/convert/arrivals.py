@@ -118,7 +118,7 @@ def convert_arrivals(
     if passive:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
     report = write_bag(out, records, report, source=Path(path).name, storage=storage)
-    write_own_parameters(report.path, 'diver', origin_parameters(origin))
+    write_own_parameters(report.path, {'diver': origin_parameters(origin)})
     return report
 
 

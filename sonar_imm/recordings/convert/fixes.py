@@ -86,7 +86,7 @@ def convert_fixes(
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
     report = write_bag(out, records, report, source=Path(path).name, storage=storage)
-    write_own_parameters(report.path, 'diver', origin_parameters(frame.origin))
+    write_own_parameters(report.path, {'diver': origin_parameters(frame.origin)})
     return report
 
 

@@ -81,7 +81,7 @@ def convert_segy(
     records += _positions(line) if records else []
     own = _instrument(report, amplitude, spacing, stack)
     report = write_bag(out, records, report, source=Path(path).name, storage=storage)
-    write_own_parameters(Path(out), 'fathometer', own)
+    write_own_parameters(Path(out), {'fathometer': own})
     return report
 
 
