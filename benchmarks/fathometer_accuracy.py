@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -35,9 +34,8 @@ PAPER_ORDERS: dict[str, Any] = {
 }
 CONVENTIONAL: dict[str, Any] = {'frequency_min': 200.0}
 FINED: dict[str, Any] = {**PAPER_ORDERS, 'amplitude_prior': 'paper'}
-OWN_PULSE: dict[str, Any] = {'pulse': 'file'}
-"""The envelope of a response has another pulse than its real part; its file is made at run
-time."""
+OWN_PULSE: dict[str, Any] = {'pulse': 'envelope'}
+"""The envelope of a response has another pulse than its real part."""
 CONFIGURATIONS: dict[str, tuple[str, dict[str, Any]]] = {
     'MVDR as the paper (envelope, bootstrap), N^-m': (
         'envelope',
@@ -65,13 +63,6 @@ CONFIGURATIONS: dict[str, tuple[str, dict[str, Any]]] = {
         {'amplitude_memory': 0.98, **CONVENTIONAL},
     ),
 }
-
-
-def write_envelope_pulse(file: Path, low: float, high: float, sound_speed: float) -> None:
-    """The pulse of the envelope of a response of the band `low` to `high`, Hz: |sinc(B tau)|."""
-    distance = np.arange(0.0, 60.0, 1.0 / 64.0)
-    value = np.abs(np.sinc((high - low) * 2.0 * distance / sound_speed))
-    np.savetxt(file, np.column_stack([distance, value]), delimiter=',')
 
 
 def responses(spectra: CrossSpectra) -> dict[str, Trace]:
@@ -212,15 +203,12 @@ def main() -> None:
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
     scores: dict[str, list[dict[str, float]]] = {}
-    with TemporaryDirectory() as folder:
-        pulse = Path(folder) / 'envelope.csv'
-        write_envelope_pulse(pulse, 50.0, 4000.0, 1500.0)
-        for seed in range(options.runs):
-            traces, truth = drift(seed, options.records, options.cache)
-            for label, (processor, values) in CONFIGURATIONS.items():
-                given = {'particles': options.particles, 'pulse_file': str(pulse), **values}
-                config = FathometerConfig(**given, seed=seed)
-                scores.setdefault(label, []).append(score(config, traces[processor], truth))
+    for seed in range(options.runs):
+        traces, truth = drift(seed, options.records, options.cache)
+        for label, (processor, values) in CONFIGURATIONS.items():
+            given = {'particles': options.particles, **values}
+            config = FathometerConfig(**given, seed=seed)
+            scores.setdefault(label, []).append(score(config, traces[processor], truth))
     table = {
         label: {name: float(np.mean([one[name] for one in each])) for name in each[0]}
         | {

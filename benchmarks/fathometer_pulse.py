@@ -13,6 +13,8 @@ five records are not scored.
 noise: the matrices are the exact ones, the layers are fitted with either pulse and taken off, and
 the largest peaks further than 0.4 m from any layer are listed, each with the nearest place
 z_i + z_j - z_k. MVDR is no linear function of the matrices, so that echoes that interfere beat.
+Then the exact echo of one layer beside the pulses of processor and band, by distance, and how much
+of it there is in each octave, against W.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from attrs import evolve
 import numpy as np
 
 from benchmarks.tables import markdown, write_json
+from sonar_imm.acoustics.fathometer import coherence_and_power, echo_spectrum, steering
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra
 from sonar_imm.simulation.fathometer.field import expected_csdm
@@ -162,6 +165,53 @@ def ghosts() -> dict[str, list[dict[str, float]]]:
     return found
 
 
+ARRAYS = {
+    '32 hydrophones, 50-4000 Hz': (FathometerScenario(snapshot_seconds=0.35), 57.0),
+    '16 hydrophones, 100-2800 Hz': (scenario('pressure', {'snapshot_seconds': 0.35}), 22.0),
+}
+"""Scene and the height of the array above a layer of amplitude 0.35."""
+
+
+def echoes() -> dict[str, dict[str, dict[str, float]]]:
+    """The echo of one layer, without noise, and the pulses that are taken for it."""
+    tables = {}
+    for name, (config, height) in ARRAYS.items():
+        one = np.array([[config.array_depth + height]])
+        where = np.array([config.array_depth])
+        floor = Drift(one, np.full((1, 1), 0.35), one > 0.0, where, where)
+        rows = np.arange(
+            np.ceil(config.frequency_min * config.snapshot_seconds),
+            np.floor(config.frequency_max * config.snapshot_seconds) + 1.0,
+        )
+        frequency = rows / config.snapshot_seconds
+        R = expected_csdm(config, floor, 0, frequency)
+        w = steering(
+            frequency, config.element_spacing * np.arange(config.phones), config.sound_speed
+        )
+        gamma, power = coherence_and_power(R, w, 'mvdr')
+        turn = np.exp(4j * np.pi * frequency * height / config.sound_speed)
+        echo = (gamma * turn).real
+        W = echo_spectrum(R, frequency, power)
+        table: dict[str, dict[str, float]] = {}
+        for away in (0.05, 0.1, 0.2, 0.3, 0.5):
+            shift = np.exp(4j * np.pi * frequency * away / config.sound_speed)
+            table[f'pulse at {away} m'] = {
+                'echo': float((gamma * turn * shift).real.mean() / echo.mean()),
+                'processor': float((W * shift).real.mean() / W.mean()),
+                'band': float(shift.real.mean()),
+            }
+        for low in (50.0, 100.0, 200.0, 400.0, 800.0, 1600.0):
+            octave = (frequency >= low) & (frequency < 2.0 * low)
+            if octave.any():
+                table[f'{low:.0f} Hz to {2 * low:.0f} Hz'] = {
+                    'echo': float(echo[octave].mean() / echo.mean()),
+                    'processor': float(W[octave].mean()),
+                    'band': 1.0,
+                }
+        tables[name] = table
+    return tables
+
+
 def _score(found: Any, depth: np.ndarray, amplitude: np.ndarray) -> list[float]:
     z = found.state[np.isfinite(found.state[:, 0])]
     order = int(found.model_names[int(found.probabilities[0].argmax())].split('_')[1])
@@ -184,12 +234,14 @@ def main() -> None:
     parser.add_argument('--records', type=int, default=300)
     parser.add_argument('--particles', type=int, default=5000)
     parser.add_argument('--scenes', nargs='*', default=['strong', 'signed', 'drift'])
-    parser.add_argument('--ghosts', action='store_true', help='only these')
+    parser.add_argument('--ghosts', action='store_true', help='only these, and echoes')
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
     options = parser.parse_args()
     if options.ghosts:
         for name, rows in ghosts().items():
             print(f'\n{markdown({f"{name} {k + 1}": row for k, row in enumerate(rows)}, 2)}')
+        for name, table in echoes().items():
+            print(f'\n{name}\n\n{markdown(table, 2)}')
         return
     made: dict[str, list[dict[str, float]]] = {}
     for name in options.scenes:
@@ -201,7 +253,7 @@ def main() -> None:
             print(
                 name, seed, {k: v[-1] for k, v in made.items() if k.startswith(name)}, flush=True
             )
-    table = {
+    summary = {
         label: {
             'runs': float(len(each)),
             **{key: float(np.mean([one[key] for one in each])) for key in each[0]},
@@ -209,8 +261,8 @@ def main() -> None:
         }
         for label, each in made.items()
     }
-    print(f'\n{markdown(table)}')
-    write_json(options.out, {'records': options.records, 'table': table})
+    print(f'\n{markdown(summary)}')
+    write_json(options.out, {'records': options.records, 'table': summary})
 
 
 if __name__ == '__main__':

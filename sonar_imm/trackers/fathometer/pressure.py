@@ -131,9 +131,9 @@ class PressureStream:
         shape = block.hydrophones, block.sample_rate
         gap_ns = block.stamp_ns - self._next_ns
         if shape != self._shape:
-            if self._shape is not None:
-                self.counts['restarted_array'] += 1
+            known = self._shape is not None
             self._begin(block, reach)
+            self.counts['restarted_array'] += known
         elif 2 * abs(gap_ns) > block.duration_ns:
             self.counts['gaps'] += 1
             self._snapshots.restart()
@@ -144,8 +144,6 @@ class PressureStream:
 
     def _begin(self, block: Pressure, reach: float) -> None:
         config, rate = self.config, block.sample_rate
-        # Nothing is kept of an array that is refused.
-        self._shape = None
         seconds = config.snapshot_seconds or automatic_snapshot(config, block.hydrophones, reach)
         length = max(2, round(seconds * rate))
         hop = max(1, round(length * (1.0 - config.overlap)))
@@ -154,9 +152,9 @@ class PressureStream:
             samples = config.record_seconds * rate
             hop = max(1, math.floor(samples / math.ceil(samples / hop - 1e-9) + 1e-9))
             length = max(2, round(hop / (1.0 - config.overlap)))
-        self._spacing = rate / length
-        first = max(1, math.ceil(config.frequency_min / self._spacing - 1e-9))
-        last = min(length // 2, math.floor(config.frequency_max / self._spacing + 1e-9))
+        spacing = rate / length
+        first = max(1, math.ceil(config.frequency_min / spacing - 1e-9))
+        last = min(length // 2, math.floor(config.frequency_max / spacing + 1e-9))
         if last - first < 1:
             raise Rejection(
                 'bad_band',
@@ -165,11 +163,13 @@ class PressureStream:
             )
         straddling = math.ceil(length / hop) - 1
         count = max(1, round(config.record_seconds * rate / hop) - straddling)
-        self._frequency = self._spacing * np.arange(first, last + 1)
-        self._snapshots = SnapshotStream(length, hop, slice(first, last + 1), config.window)
-        self._blocks = BlockAverage(count, straddling)
         step = round(config.preview_seconds * rate / hop)
         self._check_memory(block.hydrophones, length, last - first + 1, count if step else 0)
+        # An array that is refused leaves the one before as it was.
+        self._spacing = spacing
+        self._frequency = spacing * np.arange(first, last + 1)
+        self._snapshots = SnapshotStream(length, hop, slice(first, last + 1), config.window)
+        self._blocks = BlockAverage(count, straddling)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
         self._alive: NDArray[np.bool_] = np.ones(block.hydrophones, np.bool_)
         self._depths = _Depths()

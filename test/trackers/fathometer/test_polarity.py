@@ -40,7 +40,8 @@ def test_a_set_with_a_wrong_sign_is_impossible(compiled):
         sets.sign[0] = v['sign'][k, :order]
         if compiled:
             found = np.zeros(1)
-            amplitude = SetFilter(model, 1)._weigh(sets, v['response'][k], found)
+            filter_ = SetFilter(model, 1)
+            amplitude = filter_._weigh(sets, v['response'][k], found, filter_._amplitudes)
         else:
             found, amplitude = weigh(model, v['response'][k], sets)
         assert found[0] == pytest.approx(v['log_likelihood'][k], abs=1e-9)

@@ -168,6 +168,18 @@ def test_arrays_that_would_take_too_much_are_refused_and_others_go_on(rate, phon
         assert tracker.counts['bad_band'] == 1 and len(found) == 1
 
 
+def test_an_array_that_is_refused_between_good_blocks_costs_nothing():
+    good = noise(4.0)
+    wrong = evolve(good[3], sample_rate=1.0, stamp_ns=good[3].stamp_ns + 1)
+    tracker, found = run([*good[:4], wrong, *good[4:]], **SHORT)
+    assert tracker.counts['bad_band'] == 1 and len(found) == 1
+    assert not tracker.counts['restarted_array'] and not tracker.counts['gaps']
+    _, plain = run(good, **SHORT)
+    assert [one.state.tobytes() for one in found.values()] == [
+        one.state.tobytes() for one in plain.values()
+    ]
+
+
 def test_a_long_block_is_taken_in_pieces_with_the_same_result(monkeypatch):
     from sonar_imm.trackers.fathometer import pressure
 

@@ -1,0 +1,132 @@
+"""What an error of the told depth costs, and what it is worth to track it.
+
+    python -m benchmarks.fathometer_heave --out docs/results/fathometer_heave.json
+
+Traces of six layers of 7 to 34 sigma that walk by 0.02 m from record to record, with the pulse of
+50 to 4000 Hz; the depth of the array is told 0.5 m rms wrong, anew in each record or as an
+autoregression of 0.9, or right. 40 records, scored after 20: P, OSPA (second order, cutoff 2 m),
+the error that all layers share and the one relative to it (rms over the records with the right
+number). The bound is that of a Kalman filter for the mean of six walks of depth_std seen with
+0.5 m.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.tables import markdown, write_json
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimation.consistency import ospa
+from sonar_imm.measurements import Trace
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+
+LAYERS = np.array([46.0, 49.3, 53.1, 56.4, 60.2, 64.9])
+SIGMAS = np.array([34.0, 25.0, 18.0, 12.0, 9.0, 7.0])
+WRONG, WALK, ARRAY = 0.5, 0.02, 30.0
+RECORDS, UNSCORED = 40, 20
+DEPTH = 40.0 + np.arange(2048) / 64.0
+STATE: dict[str, Any] = {'heave': 'independent', 'array_depth_std': WRONG}
+ROWS: dict[str, tuple[str, dict[str, Any]]] = {
+    'independent, no state, depth_std 0.1': ('independent', {}),
+    'independent, no state, depth_std 0.7': ('independent', {'depth_std': 0.7}),
+    'independent, state, depth_std 0.1': ('independent', STATE),
+    'independent, state, depth_std 0.05': ('independent', {**STATE, 'depth_std': 0.05}),
+    'memory 0.9, no state': ('memory', {}),
+    'memory 0.9, state: independent': ('memory', STATE),
+    'memory 0.9, state: memory': ('memory', {**STATE, 'heave': 'memory'}),
+    'no error, no state': ('none', {}),
+    'no error, state of 0.5 m': ('none', STATE),
+}
+
+
+def scene(kind: str, seed: int) -> tuple[list[Trace], np.ndarray]:
+    """Traces, and the true depths (records, 6)."""
+    rng = np.random.default_rng(seed)
+    depth = LAYERS + np.cumsum(WALK * rng.standard_normal((RECORDS, len(LAYERS))), axis=0)
+    wrong = WRONG * rng.standard_normal(RECORDS)
+    if kind == 'memory':
+        for k in range(1, RECORDS):
+            wrong[k] = 0.9 * wrong[k - 1] + np.sqrt(1.0 - 0.81) * wrong[k]
+    if kind == 'none':
+        wrong[:] = 0.0
+    pulse = band_pulse(50.0, 4000.0, 1500.0)
+    step = float(DEPTH[1] - DEPTH[0])
+    spectrum = np.fft.rfft(pulse(step * np.minimum(np.arange(4096), 4096 - np.arange(4096))))
+    root = np.sqrt(spectrum.real.clip(min=0.0))
+    traces = []
+    for k in range(RECORDS):
+        noise = np.fft.irfft(root * np.fft.rfft(rng.standard_normal(4096)))[: len(DEPTH)]
+        traces.append(
+            Trace(
+                stamp_ns=(k + 1) * 10**9,
+                depth=DEPTH,
+                amplitude=pulse(DEPTH[:, None] - depth[k] - wrong[k]) @ SIGMAS + noise,
+                sigma=np.ones(len(DEPTH)),
+                reference_depth=ARRAY + wrong[k],
+            )
+        )
+    return traces, depth
+
+
+def run(kind: str, options: dict[str, Any], seed: int, particles: int) -> dict[str, float]:
+    traces, truth = scene(kind, seed)
+    tracker = FathometerTracker(
+        FathometerConfig(**{'particles': particles, 'seed': seed, **options})
+    )
+    right, distance, common, relative, stated = [], [], [], [], []
+    for k, trace in enumerate(traces):
+        (estimate,) = tracker.process(trace)
+        if k < UNSCORED:
+            continue
+        z = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
+        order = 1 + int(estimate.probabilities[0].argmax())
+        right.append(order == len(LAYERS))
+        distance.append(ospa(z, truth[k][:, None], cutoff=2.0, order=2.0))
+        if len(z) == len(LAYERS):
+            error = z[:, 0] - truth[k]
+            common.append(error.mean())
+            relative += list(error - error.mean())
+            stated.append(abs(error.mean()) <= 2.0 * estimate.extras['heave_std'][0])
+    rms = [
+        float(np.sqrt(np.mean(np.square(one)))) if one else np.nan for one in (common, relative)
+    ]
+    return {
+        'P': float(np.mean(right)),
+        'OSPA': float(np.mean(distance)),
+        'common, m': rms[0],
+        'relative, m': rms[1],
+        'common within 2 heave_std': float(np.mean(stated)) if 'heave' in options else np.nan,
+    }
+
+
+def bound(depth_std: float) -> float:
+    """Standard deviation of the common depth in the steady state."""
+    q, r = depth_std**2 / len(LAYERS), WRONG**2
+    before = 0.5 * (q + np.sqrt(q * q + 4.0 * q * r))
+    return float(np.sqrt(before * r / (before + r)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--runs', type=int, default=6)
+    parser.add_argument('--particles', type=int, default=3000)
+    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
+    options = parser.parse_args()
+    table = {}
+    for label, (kind, values) in ROWS.items():
+        runs = [run(kind, values, seed, options.particles) for seed in range(options.runs)]
+        table[label] = {name: float(np.nanmean([one[name] for one in runs])) for name in runs[0]}
+    print(f'{options.runs} runs of {RECORDS} records, {options.particles} particles')
+    print(f'bound: {bound(0.1):.3f} m for depth_std 0.1, {bound(0.05):.3f} m for 0.05\n')
+    print(markdown(table))
+    write_json(options.out, {'runs': options.runs, 'table': table})
+
+
+if __name__ == '__main__':
+    main()
