@@ -104,5 +104,6 @@ def coherence_beside(form: InterferenceForm, spacing: float) -> FloatArray:
     waves = np.exp(-1j * np.arange(staves)[:, None] * phase)
     beam, spread = (form.beam @ waves).real, (form.spread @ waves).real
     usable = np.isfinite(form.base) & (form.base > 0.0)
-    share = (beam / np.maximum(spread, 1e-300)).max(axis=1) / np.where(usable, form.base, 1.0)
+    with np.errstate(over='ignore'):
+        share = (beam / np.maximum(spread, 1e-300)).max(axis=1) / np.where(usable, form.base, 1.0)
     return np.where(usable, np.minimum(share, 1.0), np.nan)

@@ -69,7 +69,7 @@ def test_help_loads_no_heavy_module():
     [
         (['trakc'], "there is no command 'trakc' (did you mean 'track'?)"),
         (['--bad'], '--bad'),
-        (['track'], "Missing argument 'BAG'"),
+        (['track'], "Missing argument 'BAG...'"),
         (['track', 'nowhere.bag', 'out'], 'nowhere.bag does not exist'),
         (['info', 'nowhere.bag'], 'nowhere.bag does not exist'),
         (['evaluate', 'nowhere'], 'holds no finished run'),

@@ -212,3 +212,14 @@ def test_with_navigation_soundings_and_shares_are_published(make_bench):
         labels = estimate.extras['label'][estimate.extras['valid'] > 0]
         assert share.position[1] == pytest.approx(labels.mean())
     assert {int(read_soundings(cloud).columns['side'][0]) for cloud in clouds} == {0, 1}
+
+
+def test_with_coupled_labels_an_estimate_comes_with_the_next_ping(make_bench):
+    coupled = {'engine': 'grid', 'smoothing': 'states', 'grid_extent': 3.0, 'ping_coupling': 0.35}
+    told = [part for pair in coupled.items() for part in ('-p', '{}:={}'.format(*pair))]
+    rig = Rig(make_bench('-p', 'max_wait:=0.0', *told))
+    snapshots, _ = pings()
+    rig.send(*[write_snapshot(one, make) for one in snapshots])
+    found = [read_estimate(message).stamp_ns for message in rig.tables]
+    assert found == [one.stamp_ns for one in snapshots[:2]]
+    assert rig.node.tracker.health()['pings_held'] == 1 and not rig.node._errors

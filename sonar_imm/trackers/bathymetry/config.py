@@ -223,8 +223,8 @@ class BathymetryConfig(SeaParameters):
     )
     ping_coupling: float = parameter(
         0.0,
-        'how strongly the labels of neighbouring pings lean on each other, 0 for not at all; 0.35 '
-        'suits most; needs smoothing; estimates come one ping late; heights are never coupled',
+        'how strongly the labels of neighbouring pings lean on each other, 0 for not at all; 0.15 '
+        'to 0.35 suit most; needs smoothing; estimates come one ping late; heights are left alone',
         low=0.0,
         high=5.0,
     )

@@ -23,6 +23,9 @@ WATER_COLUMN = 0.8
 """Bins nearer than this share of the sonar's height, or of the first return, hold no echo of the
 floor."""
 FEWEST_QUIET_BINS = 16
+LEAST_NOISE = 1e-12
+"""Noise is taken to be at least this share of surface echoes, whose covariance has no inverse
+without."""
 
 
 def spacing_of(
@@ -156,6 +159,7 @@ def _beside_surface(
     sines = swath.surface_sines(floor_below, config.sonar_depth)
     signal = _signal(snapshot, noise, 1.0 + level * np.isfinite(sines).sum(axis=1))
     signal, noise = _split(signal, noise, config)
+    noise = np.maximum(noise, LEAST_NOISE * level * signal)
     step = 2.0 * math.pi * spacing
     R = interference.noise_covariance(sines, level * signal[:, None], noise, P, step)
     form = interference.interference_form(iq, R)

@@ -4,6 +4,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from sonar_imm.measurements import Snapshot
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
@@ -120,3 +121,13 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
     same = BathymetryTracker(evolve(told, decorrelation=0.0)).process(stated)[0]
     assert one.state == pytest.approx(same.state, abs=1e-9)
     assert one.covariance == pytest.approx(same.covariance, abs=1e-9)
+
+
+@pytest.mark.parametrize('staves', [3, 8])
+def test_a_ping_without_any_noise_is_answered(staves):
+    """All samples the same: blind noise is zero but for rounding."""
+    iq = np.ones((200, staves), complex)
+    ping = Snapshot(stamp_ns=1, range=16.0 + 0.05 * np.arange(200), iq=iq)
+    for values in ({}, {'multipath': True}, {'multipath': True, 'noise_variance': 1e-30}):
+        tracker = BathymetryTracker(BathymetryConfig(particles_per_model=10, **values))
+        assert np.isfinite(tracker.process(ping)[0].state).all()
