@@ -24,8 +24,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import gammaln
 
 from ..estimation.arrays import FloatArray
 from .cfar_kernels import greatest_of_level
@@ -44,6 +42,8 @@ def effective_cells(cells: int, width: float) -> float:
 def false_alarm_probability(factor: float, cells: int, sides: int = 2) -> float:
     """That a cell of noise exceeds `factor` times the greater of `sides` (1 or 2) means, each of
     `cells` independent values."""
+    from scipy.special import gammaln
+
     t = factor / cells
     alone = (1.0 + t) ** -cells
     if sides == 1:
@@ -62,6 +62,8 @@ def threshold_factor(false_alarm: float, cells: int, sides: int = 2) -> float:
         raise ValueError(f'a false alarm probability lies between 0 and 1, got {false_alarm}')
     if sides == 1:
         return float(cells * np.expm1(-np.log(false_alarm) / cells))
+
+    from scipy.optimize import brentq
 
     def excess(factor: float) -> float:
         return false_alarm_probability(factor, cells) - false_alarm

@@ -160,6 +160,8 @@ def load_detector(
 
     Raises `ConfigError` with one sentence for each mistake.
     """
+    if not params and not overrides:
+        return {}
     specs = _detector_specs(system)
     if not specs:
         return {}

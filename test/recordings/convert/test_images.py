@@ -99,3 +99,101 @@ def test_a_bag_without_images_and_a_wrong_setting_are_one_sentence(bag, tmp_path
     assert main(['convert', 'images', first, out]) in (1, 2)
     error = capsys.readouterr().err
     assert 'has no topic with' in error and len(error.splitlines()) == 1
+
+
+def write(path, messages):
+    """A bag with the messages of (topic, message, log time)."""
+    types = marine.typestore()
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        links = {}
+        for topic, message, log_ns in messages:
+            name = message.__msgtype__
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, name, typestore=types)
+            writer.write(links[topic], log_ns, types.serialize_cdr(message, name))
+    return path
+
+
+def oculus(second):
+    rng = np.random.default_rng(second)
+    samples = np.round(3.0 * np.sqrt(rng.exponential(size=(100, 41)))).astype('u1')
+    samples[50, 30] = 200
+    return marine.make(
+        'oculus_interfaces/msg/Ping',
+        header=marine.header(sec=second),
+        **dict.fromkeys(('ping_id', 'ping_firing_date', 'master_mode'), 1),
+        **dict.fromkeys(('range', 'gain_percent', 'frequency', 'speed_of_sound_used'), 1.0),
+        **dict.fromkeys(('temperature', 'pressure'), 1.0),
+        range_resolution=0.5,
+        has_gains=False,
+        n_ranges=100,
+        n_beams=41,
+        step=41,
+        sample_size=1,
+        bearings=np.linspace(-2000, 2000, 41).astype(np.int16),
+        ping_data=samples.ravel(),
+    )
+
+
+def ping360(angle, second):
+    rng = np.random.default_rng([1, round(1000 * second)])
+    samples = 3.0 * np.sqrt(rng.exponential(size=200))
+    samples += (
+        200.0
+        * np.exp(-np.square((np.arange(200) - 100) / 2.0))
+        * (np.exp(-np.square((angle - 0.2) / 0.04)))
+    )
+    message = marine.make(
+        'ping360_sonar_msgs/msg/SonarEcho',
+        header=marine.header(sec=int(second)),
+        angle=float(angle % (2.0 * np.pi)),
+        gain=1,
+        number_of_samples=200,
+        transmit_frequency=740,
+        speed_of_sound=1500,
+        range=20,
+        intensities=np.minimum(samples, 255).astype('u1'),
+    )
+    message.header.stamp.nanosec = round(second % 1.0 * 1e9)
+    return message
+
+
+def test_pings_of_an_oculus_in_a_bag_become_detections(tmp_path, capsys):
+    pings = [('/oculus/ping', oculus(k), k * 10**9) for k in range(1, 4)]
+    bag, out = write(tmp_path / 'bag', pings), tmp_path / 'out'
+    assert main(['convert', 'images', str(bag), str(out), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['messages'] == {'/detections': 3}
+    with BagReader(out) as reader:
+        found = [one.measurement for one in measurements_of(reader, 'obstacle')]
+    for ping in found:
+        assert ping.range == pytest.approx([25.25], abs=0.1)
+        assert ping.bearing == pytest.approx([-np.radians(10.0)], abs=0.01)
+
+
+def test_directions_of_a_ping360_in_a_bag_are_gathered_into_sweeps(tmp_path, capsys):
+    angles = np.arange(-0.6, 0.6, np.radians(1.8))
+    scan = np.concatenate([angles, angles[-2::-1], angles[1:]])
+    echoes = [
+        ('/scan_echo', ping360(angle, 10.0 + 0.1 * k), int((10.0 + 0.1 * k) * 1e9))
+        for k, angle in enumerate(scan)
+    ]
+    bag, out = write(tmp_path / 'bag', echoes), tmp_path / 'out'
+    settings = ['--set', 'beam_width_deg=2', '--set', 'range_resolution=0.4']
+    assert main(['convert', 'images', str(bag), str(out), *settings, '--json']) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told['messages'] == {'/detections': 2} and told['rows'] == len(scan)
+    with BagReader(out) as reader:
+        found = [one.measurement for one in measurements_of(reader, 'obstacle')]
+    for ping in found:
+        assert ping.range == pytest.approx([10.1], abs=0.2)
+        assert ping.bearing == pytest.approx([0.2], abs=0.02)
+
+
+def test_several_topics_of_images_have_to_be_chosen_from(tmp_path, capsys):
+    pings = [(f'/{side}/ping', oculus(1), 10**9) for side in ('port', 'starboard')]
+    bag = write(tmp_path / 'bag', pings)
+    assert main(['convert', 'images', str(bag), str(tmp_path / 'out')]) in (1, 2)
+    assert '--topic /port/ping' in capsys.readouterr().err
+    arguments = ['convert', 'images', str(bag), str(tmp_path / 'one'), '--topic']
+    assert main([*arguments, '/starboard/ping']) == 0
+    assert main([*arguments[:-2], str(tmp_path / 'none'), '--topic', '/nowhere']) in (1, 2)
