@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2, multivariate_normal
 
-from sonar_imm.estimation.association_kernels import choose
 from sonar_imm.estimation.association import (
     assign,
     assign_by_rank,
@@ -20,6 +19,7 @@ from sonar_imm.estimation.association import (
     Tracks,
     TrackStatus,
 )
+from sonar_imm.estimation.association_kernels import choose
 from sonar_imm.estimation.kalman import CovarianceError
 
 RULES = TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
@@ -154,7 +154,9 @@ def test_ranks_choose_in_turn(seed, targets, detections):
 def test_uncontested_choices_are_those_of_the_weighing(seed, targets, detections):
     rng = np.random.default_rng(seed)
     fit = np.where(
-        rng.uniform(size=(targets, detections)) < 0.3, rng.normal(size=(targets, detections)), -np.inf
+        rng.uniform(size=(targets, detections)) < 0.3,
+        rng.normal(size=(targets, detections)),
+        -np.inf,
     )
     tentative = rng.uniform(size=targets) < 0.5
     pd, clutter = 0.9, 0.4
