@@ -2,10 +2,11 @@
 
     python -m benchmarks.diver_node --scans 600
 
-Four divers in clutter (`simulate diver --scenario crossing --set clutter=3`), a scan a second. Each scan
-goes to ``diver_node``, and then to a plain rclpy node that answers with a PointCloud2 without
-fields, of as many bytes as the estimate had: what is left is the cost of the middleware and of
-Python. Needs ROS 2. The second table is where the node's own time goes, measured in this process.
+Four divers in clutter (`simulate diver --scenario crossing --set clutter=3`), a scan a second.
+Each scan goes to ``diver_node``, and then to a plain rclpy node that answers with a PointCloud2
+without fields, of as many bytes as the estimate had: what is left is the cost of the middleware
+and of Python. Needs ROS 2. The second table is where the node's own time goes, measured in this
+process.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def parts(messages: list[PointCloud2], config: DiverConfig) -> dict[str, float]:
         scan = timed('read', read_scan, message)
         timed('look for doubts', doubt_scan, message)
         estimate = timed('track', tracker.process, scan)[-1]
-        answer = timed('write', lambda: write_estimate(estimate, make))
+        answer = timed('write', write_estimate, estimate, make)
         timed('serialise', serialize_message, answer)
     return {name: float(np.median(values)) for name, values in spent.items()}
 

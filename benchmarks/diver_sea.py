@@ -55,9 +55,9 @@ def score(scene: Scene, config: DiverConfig) -> np.ndarray:
     return np.array(rows)
 
 
-def study(scene: Values, config: Values, runs: int, name: str = 'multistatic') -> dict[str, float]:
+def study(scene: Values, config: Values, runs: int, name: str = 'multistatic') -> dict[str, Any]:
     """RMSE and NEES over `runs` scenes. `scene` and `config` may hold functions of the run."""
-    rows = []
+    rows: list[np.ndarray] = []
     for seed in range(1000, 1000 + runs):
         made = simulate(scenario(name, scene), seed)
         values = {key: v(made) if callable(v) else v for key, v in config.items()}
@@ -70,17 +70,23 @@ def study(scene: Values, config: Values, runs: int, name: str = 'multistatic') -
         'nees': float(mean[1]),
         'rmse_depth': float(np.sqrt(mean[2])),
         'nees_3d': float(mean[3]),
+        'rmse_depth_of_runs': np.sqrt([np.nanmean(one[:, 2]) for one in rows]).round(3).tolist()
+        if np.isfinite(mean[2])
+        else [],
         'without_track': float(1.0 - seen.mean()),
     }
 
 
-def cell(found: Mapping[str, float]) -> str:
+def cell(found: Mapping[str, Any]) -> str:
     text = f'{found["rmse"]:.2f}'
     if np.isfinite(found['rmse_depth']):
         text += f' / {found["rmse_depth"]:.2f}'
     text += f', {found["nees"]:.2g}'
     if np.isfinite(found['nees_3d']):
         text += f' / {found["nees_3d"]:.2g}'
+    if depths := found.get('rmse_depth_of_runs'):
+        text += f' (depth: half of the runs below {np.median(depths):.2f}'
+        text += f', nine tenths below {np.percentile(depths, 90):.2f})'
     if found['without_track'] > 0.005:
         text += f' ({found["without_track"]:.0%} no track)'
     return text
@@ -107,13 +113,26 @@ def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
         'pressure, .2 m': ({'depth_std': 0.2}, {'dimensions': 3}),
         'depth bank': ({}, {'dimensions': 3}),
     }
-    return [
+    cells = [
         (f'{row}, diver {diver}', column, 'multistatic', {'receiver_depths': at, **swims, **more},
          config)
         for row, at in rows.items()
         for diver, swims in divers.items()
         for column, (more, config) in configs.items()
     ]  # fmt: skip
+    # How well depth is seen hangs on where the diver swims: not turned about the transmitter, from
+    # the middle of the receivers, and along a line that passes near the transmitter.
+    for where, start in {
+        'from the middle': (10.0, 30.0),
+        'past the transmitter': (-40.0, 40.0),
+    }.items():
+        for row, at in rows.items():
+            scene = {'receiver_depths': at, **divers['U(1, 19) m, swell']}
+            scene |= {'random_rotation': False, 'start': start}
+            cells.append(
+                (f'{row}, {where}', 'depth bank', 'multistatic', scene, {'dimensions': 3})
+            )
+    return cells
 
 
 def systematic_cells() -> list[tuple[str, str, str, Values, Values]]:
@@ -166,7 +185,7 @@ def main() -> None:
     parser.add_argument('--only', help='columns or rows whose name holds this')
     parser.add_argument('--out', type=Path)
     options = parser.parse_args()
-    results: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    results: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
     for name in options.table or TABLES:
         table = results.setdefault(name, {})
         for row, column, scene_name, scene, config in TABLES[name]():

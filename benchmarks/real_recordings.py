@@ -2,9 +2,9 @@
 
     SONAR_IMM_DATA=../shared/data python -m benchmarks.real_recordings
 
-Prints docs/results/real_recordings.md, from which docs/real_recordings.md quotes. Truth of the tag is a hand-held GPS, itself good to
-a few metres and ahead of the tag, which is towed: errors are given against GPS as it is and
-against GPS 3.4 s later.
+Prints docs/results/real_recordings.md, from which docs/real_recordings.md quotes. Truth of the tag
+is a hand-held GPS, itself good to a few metres and ahead of the tag, which is towed: errors are
+given against GPS as it is and against GPS 3.4 s later.
 """
 
 from __future__ import annotations

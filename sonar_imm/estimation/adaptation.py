@@ -123,8 +123,8 @@ def adapt_counts(
     posterior: FloatArray,
     nominal: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal matrix predicts for
-    the same step.
+    """Oracle for tests: Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal
+    matrix predicts for the same step.
 
     All (..., M, M); gives the new (counts, expected). See `counts_correction`.
     """

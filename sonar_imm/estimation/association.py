@@ -283,7 +283,7 @@ class Tracks:
         that the caller keeps beside them.
         """
         looked = np.ones(len(self), np.bool_) if looked is None else looked
-        *counted, kept = count(
+        status, age, seen, misses, last_hit_ns, kept = count(
             self.age,
             _window(self.seen, rules.confirm_window),
             self.misses,
@@ -296,7 +296,8 @@ class Tracks:
             rules.delete_misses,
             rules.max_coast_ns,
         )
-        return Tracks(self.track_id[kept], *counted, self.next_id), kept
+        track_id = self.track_id[kept]
+        return Tracks(track_id, status, age, seen, misses, last_hit_ns, self.next_id), kept
 
     def none_left(self) -> Tracks:
         """No tracks any more; identities go on."""

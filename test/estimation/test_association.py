@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2, multivariate_normal
 
-from sonar_imm.estimation.association_kernels import choose
 from sonar_imm.estimation.association import (
     assign,
     assign_by_rank,
@@ -20,6 +19,7 @@ from sonar_imm.estimation.association import (
     Tracks,
     TrackStatus,
 )
+from sonar_imm.estimation.association_kernels import choose
 from sonar_imm.estimation.kalman import CovarianceError
 
 RULES = TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)

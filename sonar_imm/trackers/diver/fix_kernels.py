@@ -1,7 +1,7 @@
 """What a fix does to its track, compiled: many fixes are few numbers each.
 
-All floats are float64, all arrays C-contiguous; T tracks of M models with n states. `warm` compiles
-or loads every kernel.
+All floats are float64, all arrays C-contiguous; T tracks of M models with n states. `warm`
+compiles or loads every kernel.
 """
 
 from __future__ import annotations

@@ -127,11 +127,9 @@ class Scan:
         if self.named.any():
             fit[self.named] = -np.inf  # they know their own
         chosen = self._associate(fit, group.clutter)
-        p_detection = self.config.detection_probability
-        missed, gain = np.log1p(-p_detection), np.log(p_detection / (1.0 - p_detection))
-        fix_kernels.keep_score(
-            self.score, fit, chosen, self.named, missed, gain, np.log(group.clutter)
-        )
+        p = self.config.detection_probability
+        logs = np.log1p(-p), np.log(p / (1.0 - p)), np.log(group.clutter)
+        fix_kernels.keep_score(self.score, fit, chosen, self.named, *logs)
         tracks = np.flatnonzero(chosen >= 0)
         taken = np.zeros(len(group.z), bool)
         if len(tracks):
@@ -155,13 +153,14 @@ class Scan:
 
     def _associate(self, fit: FloatArray, clutter: float) -> IntArray:
         """The detection of each track (T,), -1 for none; confirmed tracks choose first."""
-        missed = math.log1p(-self.config.detection_probability)
-        missed -= math.log(self.config.detection_probability)
-        chosen, clear = choose(fit, self.tentative, missed, math.log(clutter))
+        p = self.config.detection_probability
+        chosen, clear = choose(
+            fit, self.tentative, math.log1p(-p) - math.log(p), math.log(clutter)
+        )
         if clear:
             return chosen
         target, detection = imm.pairs_inside(fit)
-        cost = association_cost(fit[target, detection], self.config.detection_probability, clutter)
+        cost = association_cost(fit[target, detection], p, clutter)
         rank = self.tentative.astype(np.int64)
         return assign_by_rank(target, detection, cost, rank, fit.shape[1])
 
@@ -340,17 +339,13 @@ class Scan:
 
     def _near(self, track: int, after: PingUpdate) -> bool:
         """Whether the diver after a ping is where the prediction allows it to be."""
-        E = self._position_matrix()
+        E = np.zeros((self.x.shape[1], 2, self.layout.size))
+        E[:, 0, 0] = E[:, 1, 1] = 1.0
         mean, covariance = imm_kernels.combine(*(one[None] for one in self._one(track)), E)
         there, _ = imm_kernels.combine(after.x[None], after.P[None], after.mu[None], E)
         gap = there[0] - mean[0]
         distance = float(gap @ np.linalg.solve(covariance[0], gap))
         return distance <= gate_threshold(self.config.gate_probability, 2)
-
-    def _position_matrix(self) -> FloatArray:
-        E = np.zeros((self.x.shape[1], 2, self.layout.size))
-        E[:, 0, 0] = E[:, 1, 1] = 1.0
-        return E
 
     def _one(self, track: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self.x[track], self.P[track], self.mu[track]
