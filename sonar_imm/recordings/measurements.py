@@ -36,12 +36,11 @@ def fitting_topics(
 
     A topic fits when its type can be read and its name ends in the input's name; where several
     inputs fit, the later one counts. Topics below ``/truth`` never fit, and companions alone are
-    not enough. `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``.
+    not enough. `topics` maps topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``;
+    what belongs beside those, and has its name, comes along.
     Raises `BagError` when nothing fits, with a list of what is there, and when several topics fit
     an input that is one instrument.
     """
-    if topics is not None:
-        return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
     fitting = {
         topic.name: entry
         for topic in bag.topics
@@ -50,6 +49,15 @@ def fitting_topics(
         and f'/{topic.name}'.endswith(f'/{entry.name}')
         and 'truth' not in topic.name.split('/')[:-1]
     }
+    if topics is not None:
+        chosen = {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
+        wanted = {entry.name for entry in chosen.values()}
+        beside = {
+            name: entry
+            for name, entry in fitting.items()
+            if wanted & set(entry.beside) and entry.name not in wanted and name not in chosen
+        }
+        return chosen | beside
     fitting = _of_use(bag, fitting)
     if all(entry.companion for entry in fitting.values()):
         raise BagError(_nothing_fits(bag, system))
