@@ -42,28 +42,29 @@ def position_groups(
     fixes = [item for item in items if isinstance(item, Fix)]
     for sensor in sorted({fix.sensor for fix in fixes}):
         own = [fix for fix in fixes if fix.sensor == sensor]
-        named = [scan_of(fix) for fix in own if fix.target_id != NOBODY]
-        for scan in named:
-            groups.append(_group(scan, [0], config, factor, whole=False))
-        nameless = [scan_of(fix) for fix in own if fix.target_id == NOBODY]
+        for fix in own:
+            if fix.target_id != NOBODY:
+                groups.append(_group(scan_of(fix), [0], config, factor, whole=False))
+        nameless = [fix for fix in own if fix.target_id == NOBODY]
         if nameless:
             groups.append(_together(nameless, config, factor))
     for scan in (item for item in items if isinstance(item, Fixes)):
-        said = np.empty(0, np.intp)
-        if scan.target_id is not None:
-            said = np.flatnonzero(scan.target_id != NOBODY)
-            _, first = np.unique(scan.target_id[said], return_index=True)
-            if len(said):
-                groups.append(_group(scan, said[first], config, factor, whole=False))
+        if scan.target_id is None:
+            groups.append(_group(scan, slice(None), config, factor))
+            continue
+        said = np.flatnonzero(scan.target_id != NOBODY)
+        _, first = np.unique(scan.target_id[said], return_index=True)
+        if len(said):
+            groups.append(_group(scan, said[first], config, factor, whole=False))
         if len(said) < len(scan) or not len(scan):
-            rows = np.setdiff1d(np.arange(len(scan)), said)
+            rows = np.flatnonzero(scan.target_id == NOBODY)
             groups.append(_group(scan, rows, config, factor, named=False))
     return groups
 
 
 def _group(
     scan: Fixes,
-    rows: Sequence[int] | IntArray,
+    rows: Sequence[int] | IntArray | slice,
     config: DiverConfig,
     factor: float,
     *,
@@ -83,18 +84,19 @@ def _group(
     )
 
 
-def _together(scans: Sequence[Fixes], config: DiverConfig, factor: float) -> Positions:
-    """Scans of one fix of one sensor as one group."""
-    config = config.of_sensor(scans[0].sensor)
-    R = np.concatenate([_covariances(scan, config) for scan in scans])
+def _together(fixes: Sequence[Fix], config: DiverConfig, factor: float) -> Positions:
+    """Single fixes of one sensor as one group."""
+    config = config.of_sensor(fixes[0].sensor)
+    unknown = np.eye(2) * config.fix_std**2
+    R = np.array([unknown if fix.covariance is None else fix.covariance for fix in fixes])
     return Positions(
-        np.ascontiguousarray(np.concatenate([scan.position for scan in scans])[:, :2]),
+        np.array([fix.position[:2] for fix in fixes]),
         R * factor,
         config.clutter_density,
         factor,
         None,
         config.fixes_are_scans,
-        scans[0].sensor,
+        fixes[0].sensor,
     )
 
 
