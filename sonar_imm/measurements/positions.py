@@ -15,6 +15,8 @@ from .obstacle import Navigation
 
 FARTHEST_OFFSET = 1e5
 """Most metres from a transceiver to what it has located."""
+MOST_VARIANCE = 1e16
+"""Square metres; arithmetic with more breaks down."""
 
 
 def _symmetric(covariance: FloatArray | None, what: str) -> FloatArray | None:
@@ -22,6 +24,10 @@ def _symmetric(covariance: FloatArray | None, what: str) -> FloatArray | None:
     if covariance is None:
         return None
     given = floats(3, 3)(covariance)
+    if np.isfinite(given).all() and np.abs(given).max() > MOST_VARIANCE:
+        raise Rejection(
+            'out_of_range', f'the covariance of {what} reaches {np.abs(given).max():g}'
+        )
     check_covariance(given, what)
     symmetric = 0.5 * given + 0.5 * given.T
     symmetric.flags.writeable = False
@@ -97,7 +103,7 @@ class VesselHeading:
         check_stamp(self.stamp_ns)
         if not np.isfinite(self.orientation).all():
             raise Rejection('nan', 'the orientation of the vessel is not finite')
-        length = float(np.linalg.norm(self.orientation))
+        length = float(np.linalg.norm(np.clip(self.orientation, -1e3, 1e3)))
         if abs(length - 1.0) > 0.01:
             raise Rejection(
                 'bad_orientation',

@@ -40,11 +40,10 @@ def fitting_topics(
     inputs fit, the later one counts. Topics below ``/truth`` never fit, and companions alone are
     not enough. Where an input is missing, a topic fits of which a node before the tracker makes it
     (images of a sonar for detections). `topics` maps topic names to input names instead, e.g.
-    ``{'/usbl/pose': 'fix'}``. Raises `BagError` when nothing fits, with a list of what is there,
-    and when several topics fit an input that is one instrument.
+    ``{'/usbl/pose': 'fix'}``; what belongs beside those, and has its name, comes along. Raises
+    `BagError` when nothing fits, with a list of what is there, and when several topics fit an input
+    that is one instrument.
     """
-    if topics is not None:
-        return {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
     fitting = {
         topic.name: entry
         for topic in bag.topics
@@ -53,6 +52,15 @@ def fitting_topics(
         and f'/{topic.name}'.endswith(f'/{entry.name}')
         and 'truth' not in topic.name.split('/')[:-1]
     }
+    if topics is not None:
+        chosen = {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
+        wanted = {entry.name for entry in chosen.values()}
+        beside = {
+            name: entry
+            for name, entry in fitting.items()
+            if wanted & set(entry.beside) and entry.name not in wanted and name not in chosen
+        }
+        return chosen | beside
     there = {entry.name for entry in fitting.values()}
     fitting |= {
         name: entry for name, entry in made_topics(bag, system).items() if entry.makes not in there

@@ -224,3 +224,13 @@ def test_metres_and_latitudes_without_an_origin_are_said(tmp_path):
     run, _ = tracked(write_bag(tmp_path / 'bag', records), tmp_path / 'run', chosen)
     assert run['counts']['no_origin'] == 4
     assert 'origin_latitude' in run['warnings'][0]
+
+
+def test_the_navigation_comes_along_with_a_chosen_topic(tmp_path):
+    kind = 'stonefish_ros2/msg/BeaconInfo'
+    records = [vessel(k - 0.4) for k in range(1, 8)]
+    records += [((START + k) * SECOND, '/usbl_info', beacon(kind, k)) for k in range(2, 6)]
+    bag = write_bag(tmp_path / 'bag', records)
+    run, estimates = tracked(bag, tmp_path / 'run', {'/usbl_info': 'relative'})
+    assert run['topics'] == {'/usbl_info': 'relative', '/nav': 'nav'}
+    assert estimates[-1].state[0, :2] == pytest.approx([10.0, 20.0], abs=0.3)

@@ -83,7 +83,12 @@ def remembered(
     """With the names that were said at this stamp, and without those that are said no more."""
     last = dict(before.said)
     last.update((name, now.stamp_ns) for name in said)
-    last = {name: at for name, at in last.items() if now.stamp_ns - at <= max_coast * 1e9}
+    tracked = set(now.target_id.tolist())
+    last = {
+        name: at
+        for name, at in last.items()
+        if now.stamp_ns - at <= max_coast * 1e9 and (name in tracked or at == now.stamp_ns)
+    }
     if not last and not before.said:
         return now
     known = np.isin(now.target_id, np.array(list(last), np.int64))

@@ -96,6 +96,16 @@ def test_a_name_that_is_said_no_more_is_forgotten_and_the_track_goes_on(associat
     assert estimate.extras['track_id'].tolist() == [1]
 
 
+def test_names_without_a_track_are_not_kept():
+    """A source that makes up names must not fill the memory."""
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    for second in range(1, 30):
+        ids = [1, *range(1000 * second, 1000 * second + 50)]
+        places = [(float(k), 0.0) for k in range(len(ids))]
+        tracker.process(scan(second, *places, target_id=ids))
+    assert len(tracker._stream.state.said) < 100
+
+
 @pytest.mark.parametrize('association', BOTH)
 def test_order_inside_the_window_changes_no_bit_with_names(association):
     rng = np.random.default_rng(8)
