@@ -34,7 +34,7 @@ from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: 
 OUT = ROOT / 'docs' / 'images'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'
-COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN)
+COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN, '#56B4E9')
 SEED = 3
 
 
