@@ -192,7 +192,7 @@ def draw_readings(above: Axes, below: Axes) -> None:
         above.plot(found.best, found.least, 'o', color=colour)
     above.axvline(8.0, color=INK, ls='--', lw=1)
     above.set(
-        title=f'Figure 5: one encounter of {len(told["by eye"])}, chosen',
+        title=f'Figure 5: one of {len(told["by eye"])}, chosen',
         xlabel='offset tried, m below the sonar',
         ylabel='RMSD, pixels',
         ylim=(0.0, None),
