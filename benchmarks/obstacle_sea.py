@@ -8,7 +8,7 @@ vertical offset when the range first falls to 50, 30 and 20 m, of the track that
 nearest, at most 5 m off; `lost` counts the runs without one. P is the mean probability of each
 behaviour at 30 m, v the RMSE of the velocity of each axis there.
 `velocity` is the RMSE of the velocity of each axis at times after an obstacle is seen first or,
-while it is followed, begins to move or stops.
+while it is followed, begins to move or stops, of those in the beam.
 `movers` has three movers in clutter at once, over their whole way.
 `calibration` compares stated probabilities of a collision with what happened, at 60, 40 and 25 m
 and for as many runs of a fixed, a swaying and a moving obstacle each: `over the beam` draws the
@@ -135,7 +135,7 @@ def velocity(runs: int) -> dict[str, dict[str, float]]:
             for seconds, off in errors.items():
                 ping = int(np.argmin(np.abs(t - seen - seconds)))
                 found = nearest(truth, final, ping)
-                if found is not None:
+                if found is not None and truth.in_beam[ping]:
                     off += off_velocity(truth, ping, found)
         table[name] = {
             f'{s:.0f} s': float(np.sqrt(np.mean(np.square(e)))) for s, e in errors.items()

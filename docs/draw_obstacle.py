@@ -34,7 +34,7 @@ from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: 
 OUT = ROOT / 'docs' / 'images'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
 BLUE, RED, GREEN, INK = '#0072B2', '#D55E00', '#009E73', '#1b2733'
-COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN)
+COLOURS = (BLUE, RED, '#CC79A7', '#E69F00', GREEN, '#56B4E9')
 SEED = 3
 
 
@@ -192,7 +192,7 @@ def draw_readings(above: Axes, below: Axes) -> None:
         above.plot(found.best, found.least, 'o', color=colour)
     above.axvline(8.0, color=INK, ls='--', lw=1)
     above.set(
-        title=f'Figure 5: one encounter of {len(told["by eye"])}, chosen',
+        title=f'Figure 5: one of {len(told["by eye"])}, chosen',
         xlabel='offset tried, m below the sonar',
         ylabel='RMSD, pixels',
         ylim=(0.0, None),

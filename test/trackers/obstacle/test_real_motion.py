@@ -14,4 +14,6 @@ def test_the_band_holds_the_offset_under_real_motion():
     assert found['tracked'] == 20
     assert found['band_coverage'] >= 0.8
     assert found['nees'] < 2.0
-    assert found['rmse_m'] < 1.5
+    # It knows more than where obstacles are drawn, and than its own first answer.
+    assert found['rmse_m'] < 0.9 * min(found['answering_zero_rmse_m'], found['spread_of_truth_m'])
+    assert found['rmse_m'] < 0.9 * found['first_answer_rmse_m']
