@@ -1,16 +1,17 @@
 """How well the floor is followed on envelopes of sub-bottom profilers, with and without the model
 of volume scatter: python -m benchmarks.fathometer_profilers [--out FILE]
 
-Real lines (SONAR_IMM_DATA, needs segyio), converted and tracked by the command as docs/fathometer.md
-says, and the simulated scene ``diffuse``. On the real lines the floor is picked without a tracker:
-the first of three successive samples above an eighth of what loud traces reach, and the greatest of
-the four from there on. A record is followed when a reflector lies within 1 m of that. The older
-rule beside it picks the first peak above half of the greatest of its record; below weak floors that
-is another layer, so `rules_agree` says how often both pick the same.
+Real lines (SONAR_IMM_DATA, needs segyio), converted and tracked by the command as
+docs/fathometer.md says, and the simulated scene ``diffuse``. On the real lines the floor is picked
+without a tracker: the first of three successive samples above an eighth of what loud traces reach,
+and the greatest of the four from there on. A record is followed when a reflector lies within 1 m
+of that. The older rule beside it picks the first peak above half of the greatest of its record;
+below weak floors that is another layer, so `rules_agree` says how often both pick the same.
 
 The parameters that are not measured (scatter_spread, depth_std, the form of the likelihood) were
-chosen on lines L2 and L9 and on seeds 1 and 2 of the scene; L1 and L3 had no part in that. Seeds of
-the scene here begin at 11.
+chosen on lines L2 and L9 and on seeds 1 and 2 of the scene; L1 and L3 had no part in that, but the
+rule by which the first return keeps its name was made with all four in view. Seeds of the scene
+here begin at 11.
 """
 
 from __future__ import annotations
