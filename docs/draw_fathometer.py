@@ -13,6 +13,7 @@ import tempfile
 
 import matplotlib
 import numpy as np
+import yaml
 
 matplotlib.use('Agg')
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,18 +37,11 @@ from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTr
 
 IMAGES = ROOT / 'docs' / 'images'
 DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'
-LINES = ('MET_NS-SN_SBP_L9_SN_20180313161627.seg', 'MET_EW-WE_SBP_L2_EW_20180313171011.seg')
-PROFILER = FathometerConfig(
-    pulse='gaussian',
-    pulse_width=0.8,
-    noise_sigma=2500.0,
-    depth_min=4.5,
-    depth_max=32.0,
-    order_max=4,
-    depth_std=0.2,
-    min_separation=2.4,
-    amplitude_std_sigmas=8.0,
-    particles=5000,
+LINES = (
+    'MET_EW-WE_SBP_L1_WE_20180313165838.seg',
+    'MET_EW-WE_SBP_L2_EW_20180313171011.seg',
+    'MET_EW-WE_SBP_L3_WE_20180313172145.seg',
+    'MET_NS-SN_SBP_L9_SN_20180313161627.seg',
 )
 BLUE, RED, GREEN, AMBER, INK = '#0072B2', '#D55E00', '#009E73', '#E69F00', '#1b2733'
 COLOURS = (BLUE, RED, GREEN, '#CC79A7', AMBER, '#56B4E9')
@@ -301,8 +295,8 @@ def draw_fixed_orders(processed) -> None:
 
 
 def draw_lines() -> None:
-    """The tracks over the two real lines, and how much of the bottom they follow."""
-    figure, axes = plt.subplots(2, 1, figsize=(10, 7))
+    """The tracks over all four real lines."""
+    figure, axes = plt.subplots(4, 1, figsize=(10, 13))
     for name, one in zip(LINES, axes):
         with tempfile.TemporaryDirectory() as folder:
             convert_segy(
@@ -310,38 +304,20 @@ def draw_lines() -> None:
                 Path(folder) / 'bag',
                 sample_spacing=0.376,
                 first_sample=12,
-                samples=108,
+                samples=74,
                 stack=4,
             )
+            own = yaml.safe_load((Path(folder) / 'bag' / 'parameters.yaml').read_text())
+            own = {**own['fathometer']['ros__parameters'], 'particles': 5000}
+            config = FathometerConfig.from_mapping(own)
             with BagReader(Path(folder) / 'bag') as bag:
                 traces = [heard.measurement for heard in measurements_of(bag, 'fathometer')]
-        records, value, depth = track(traces, PROFILER)
-        _draw_image(one, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]), 10.0)
+        records, value, depth = track(traces, config)
+        _draw_image(one, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]), 20.0)
         _draw_found(one, records, 4.0)
-        one.set(
-            ylabel='depth [m]', title=f'{name.split("_")[3]}: {_followed(records, value, depth)}'
-        )
-    axes[1].set_xlabel('trace, four averaged to one')
+        one.set(ylabel='depth [m]', title=name.split('_')[3])
+    axes[-1].set_xlabel('trace, four averaged to one')
     save(figure, 'fathometer_chiapas.png')
-
-
-def _followed(records, value, depth) -> str:
-    """How many records have a reflector at the first arrival, which is picked without a tracker:
-    the first local maximum above half of the greatest response of the record."""
-    hits, ids, below = 0, set(), 0
-    for column, record in zip(value.T, records):
-        strong = column > 0.5 * column.max()
-        first = int(np.argmax(strong))
-        peak = first + int(np.argmax(column[first : first + round(1.5 / (depth[1] - depth[0]))]))
-        away = np.abs(record.found.depth - depth[peak])
-        if len(away) and away.min() < 1.0:
-            hits += 1
-            ids.add(int(record.found.track_id[np.argmin(away)]))
-            below += bool((record.found.depth > depth[peak] + 1.5).any())
-    return (
-        f'bottom followed in {100 * hits / len(records):.0f} % of the records under '
-        f'{len(ids)} ids, one or more below it in {100 * below / len(records):.0f} %'
-    )
 
 
 if __name__ == '__main__':

@@ -47,6 +47,8 @@ PEERS = {
     'sonar_imm.evaluation.sweep': {'distributed'},
     'sonar_imm.recordings.convert.segy': {'segyio'},
     'sonar_imm.recordings.export.grid': {'rasterio'},
+    'sonar_imm.recordings.export.horizons': {'rasterio'},
+    'sonar_imm.recordings.export.picks': {'segyio'},
     'sonar_imm.recordings.export.points': {'laspy', 'rasterio'},
 }
 

@@ -56,7 +56,7 @@ from .common import BAG, example, json_option, print_json, say
 @click.option(
     '--crossing',
     is_flag=True,
-    help='Compare the horizons of two fathometer runs, OUT_DIR and OTHER, where their lines cross.',
+    help='Compare the horizons of two fathometer runs, OUT_DIR and OTHER, where they cross.',
 )
 @click.option(
     '--position-std',

@@ -105,12 +105,11 @@ class SetFilter:
         gram (n,): of this record, where it is not the model's."""
         answer = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
         fit = fit_scatter(self.model.scatter, b)
-        g = gains(self.model, b, fit)
         if before is None:
-            before = self._start(g, key)
-        sets, log_ratio = self._propagate(before.sets, g, _uniform(key, _STEP))
+            before = self._start(b, key, fit)
+        sets, log_ratio = self._propagate(before.sets, b, _uniform(key, _STEP), fit)
         log_weight = before.log_weight + log_ratio
-        amplitude = self._weigh(sets, b, fit, log_weight, answer)
+        amplitude = self._weigh(sets, b, log_weight, answer, fit)
         w, log_sum = normalise(log_weight)
         _, log_before = normalise(before.log_weight)
         ok = bool(np.isfinite(log_sum))
@@ -147,13 +146,15 @@ class SetFilter:
         spread = float(np.sqrt(w @ np.square(sets.shift - mean)))
         return mean - self.model.pad, spread
 
-    def _start(self, g: FloatArray, key: tuple[int, int]) -> Weighted:
+    def _start(
+        self, b: FloatArray, key: tuple[int, int], fit: ScatterFit | None = None
+    ) -> Weighted:
         model, sets = self.model, Sets.empty(self.model, self.particles)
         uniform = _uniform(key, _START).random(
             (self.particles, 1 + model.order_max + (model.shift is not None))
         )
         log_ratio = np.zeros(self.particles)
-        proposals = self._proposals(g)
+        proposals = self._proposals(self._gains(b, fit))
         self._split(
             lambda first, last: kernels.start(
                 first, last, self._motion, self._charge, proposals, uniform, sets, log_ratio
@@ -164,17 +165,26 @@ class SetFilter:
         # The sets are draws from the prior in disguise: as many particles as if they were.
         return Weighted(sets, log_ratio)
 
+    def _gains(self, b: FloatArray, fit: ScatterFit | None) -> FloatArray:
+        background = fit_scatter(self.model.scatter, b) if fit is None else fit
+        return gains(self.model, b, background)
+
     def _proposals(self, g: FloatArray) -> Proposals:
         """The tables of one record of gains g (S, n), moves not filled in."""
         births = propose_births(self.model, g)
         return Proposals(self._move, self._move_ratio, *births, self._shifts)
 
     def _propagate(
-        self, old: Sets, g: FloatArray, rng: np.random.Generator
+        self,
+        old: Sets,
+        b: FloatArray,
+        rng: np.random.Generator,
+        fit: ScatterFit | None = None,
     ) -> tuple[Sets, FloatArray]:
         model, new = self.model, Sets.empty(self.model, self.particles)
         log_ratio = np.empty(self.particles)
         uniform = rng.random((self.particles, model.uniforms))
+        g = self._gains(b, fit)
         proposals = self._proposals(g)
         if model.shift:
             kernels.fill_all_moves(g, model.move, model.move_share, proposals)
@@ -200,14 +210,15 @@ class SetFilter:
         self,
         sets: Sets,
         b: FloatArray,
-        fit: ScatterFit,
         log_weight: FloatArray,
         answer: amplitudes.AmplitudeModel,
+        fit: ScatterFit | None = None,
     ) -> FloatArray:
+        background = fit_scatter(self.model.scatter, b) if fit is None else fit
         amplitude = np.zeros(sets.cell.shape)
         self._split(
             lambda first, last: amplitudes.weigh(
-                first, last, b, answer, fit, sets, log_weight, amplitude
+                first, last, b, answer, background, sets, log_weight, amplitude
             )
         )
         return amplitude

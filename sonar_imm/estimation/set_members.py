@@ -22,10 +22,11 @@ _VALLEY, _ASIDE = 0.05, 0.1
 
 
 class Members(NamedTuple):
-    """K members by place: place (K,) in cells, mean over the hill or its greatest hump; amplitude (K,) mean in units of
-    the noise; covariance (K, 2, 2) of both, the spread of the particles; prior_variance (K,) of
-    the amplitude before the record, given the place; foremost (K,), the probability that it is the
-    first of its set; existence (K,), the probability that it is there, at most 1."""
+    """K members by place: place (K,) in cells, mean over the hill or its greatest hump; amplitude
+    (K,) mean in units of the noise; covariance (K, 2, 2) of both, the spread of the particles;
+    prior_variance (K,) of the amplitude before the record, given the place; foremost (K,), the
+    probability that it is the first of its set; existence (K,), the probability that it is there,
+    at most 1."""
 
     place: FloatArray
     amplitude: FloatArray

@@ -6,10 +6,10 @@ fluctuation is a share of that mean:
 
     mean of the background:  v D(z - k),    its deviation:  spread v D(z - k)
 
-D is ``exp(-lag / decay)`` from lag 0 on, smoothed by the pulse. What remains of the record when all
-that stands out is cut off (`without_peaks`) has this background alone, and noise. An envelope of
-scatter is never near zero where its mean is not: it has a gamma distribution, of shape
-1 / spread^2. With x = that record plus one, the noise, and mu = v D + 1, against noise alone,
+D is ``exp(-lag / decay)`` from lag 0 on, smoothed by the pulse. What remains of the record when
+all that stands out is cut off (`without_peaks`) has this background alone, and noise. An envelope
+of scatter is never near zero where its mean is not: it has a gamma distribution, of shape 1 /
+spread^2. With x = that record plus one, the noise, and mu = v D + 1, against noise alone,
 
     F(k, v, decay) = share / spread^2 * sum_z [x (1 - 1 / mu) - log mu]
 
@@ -46,9 +46,9 @@ _CERTAIN = 5.0
 
 @frozen(eq=False, kw_only=True)
 class Scatter:
-    """profile (D, 2 n - 1) by lag -(n - 1) .. n - 1 in cells, a row for each decay; spread: standard
-    deviation over mean; share: independent samples for each cell, at most 1; window: cells of which
-    `without_peaks` takes the median."""
+    """profile (D, 2 n - 1) by lag -(n - 1) .. n - 1 in cells, a row for each decay; spread:
+    standard deviation over mean; share: independent samples for each cell, at most 1; window:
+    cells of which `without_peaks` takes the median."""
 
     profile: FloatArray = field(repr=False)
     spread: float

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.estimation import set_particles_kernels as kernels
+from sonar_imm.estimation import set_amplitudes
 from sonar_imm.estimation.set_filter import SetFilter
 from sonar_imm.estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
 from sonar_imm.estimation.set_particles import weigh
@@ -106,7 +106,7 @@ def test_the_kernel_weighs_as_the_readable_form():
     expected, amplitude = weigh(its, b, sets)
     log_weight, found = np.zeros(N), np.zeros((N, 4))
     fit = fit_scatter(SCATTER, b)
-    kernels.weigh(0, N, b, SetFilter(its, 8)._amplitudes, fit, sets, log_weight, found)
+    set_amplitudes.weigh(0, N, b, SetFilter(its, 8)._amplitudes, fit, sets, log_weight, found)
     assert np.isfinite(expected).sum() > 20
     assert log_weight == pytest.approx(expected, rel=1e-9)
     good = np.isfinite(expected)

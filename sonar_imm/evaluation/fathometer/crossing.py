@@ -99,10 +99,10 @@ def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
             f'{one["only_a"]} and {one["only_b"]} seen by one line only'
         )
         for h in one['horizons']:
+            depths = f'{h["depth_a_m"]:8.2f} m and {h["depth_b_m"]:8.2f} m'
             lines.append(
-                f'  {h["depth_a_m"]:8.2f} m and {h["depth_b_m"]:8.2f} m: {h["difference_m"]:+.2f} m'
-                f' = {h["sigmas"]:+.1f} stated sigma of {h["std_m"]:.2f} m'
-                + (', bottom' if h['bottom'] else '')
+                f'  {depths}: {h["difference_m"]:+.2f} m = {h["sigmas"]:+.1f} stated sigma of '
+                f'{h["std_m"]:.2f} m' + (', bottom' if h['bottom'] else '')
             )
     if metrics['matched']:
         lines.append(

@@ -26,7 +26,8 @@ def is_envelope(amplitude: FloatArray) -> bool:
 
 def first_arrivals(amplitude: FloatArray) -> IntArray:
     """Sample of the first arrival of each trace (T, n), -1 where there is none: from the first of
-    three successive samples above an eighth of what the loud traces reach, the greatest of four."""
+    three successive samples above an eighth of what the loud traces reach, the greatest of
+    four."""
     loud = float(np.quantile(amplitude.max(axis=1), 0.99)) / _LOUD
     above = amplitude > loud
     count = amplitude.shape[1] - _RUN + 1
@@ -84,8 +85,8 @@ def doubted_spacing(
     amplitude: FloatArray, spacing: float, offset: float, stated: NDArray
 ) -> str | None:
     """A sentence when samples `spacing` m apart, the first of the traces (T, n) `offset` m down,
-    cannot be right; None otherwise. stated (T,): depth of the water by the headers, m, 0 where they
-    say nothing."""
+    cannot be right; None otherwise. stated (T,): depth of the water by the headers, m, 0 where
+    they say nothing."""
     span = offset + spacing * amplitude.shape[1]
     if not 1.0 <= span <= 12_000.0:
         return f'the sample interval of the headers makes the traces end at {span:g} m'
@@ -98,8 +99,8 @@ def doubted_spacing(
     if fits / _NEAR <= spacing <= fits * _NEAR:
         return None
     return (
-        f'the sample interval of the headers ({spacing:.3g} m a sample) puts the first arrivals at '
-        f'{np.median(spacing * sample):.1f} m, where the headers themselves state '
+        f'the sample interval of the headers ({spacing:.3g} m a sample) puts the first arrivals '
+        f'at {np.median(spacing * sample):.1f} m, where the headers themselves state '
         f'{np.median(stated[known]):.1f} m of water: {fits:.3g} m a sample would fit; '
         'give the sample spacing'
     )

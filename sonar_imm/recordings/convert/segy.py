@@ -70,13 +70,13 @@ def convert_segy(
     depth, amplitude = depth[part], line.amplitude[:, part]
     if amplitude.shape[1] < 2:
         raise BagError(f'{path}: fewer than two samples of a trace are left')
-    report.notes['sample_spacing'] = f'{spacing!r} m'
+    report.notes['sample_spacing'] = f'{spacing:.9g} m'
     report.notes['stack'] = str(stack)
-    report.notes['depth_of_sample_0'] = f'{depth_offset + start!r} m'
+    report.notes['depth_of_sample_0'] = f'{depth_offset + start:.9g} m'
     if not sample_spacing:
         offset = start + spacing * first_sample
         if doubt := doubted_spacing(amplitude, spacing, offset, line.water_depth):
-            report.problems.append(doubt)
+            report.notes['sample_interval'] = doubt
     records = _records(report, Path(path), line.stamps, depth, amplitude, stack, frame_id)
     records += _positions(line) if records else []
     own = _instrument(report, amplitude, spacing, stack)
@@ -164,7 +164,7 @@ def _instrument(
         return {}
     measured = measured_instrument(amplitude, spacing, stack)
     if measured is None:
-        report.problems.append(
+        report.notes['pulse'] = (
             'the traces are envelopes, but no first arrival stands free to measure the pulse; '
             'leave out the transmit pulse (--first-sample) or give the tracker parameters'
         )

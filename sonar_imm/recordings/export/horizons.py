@@ -1,8 +1,8 @@
 """Tracked reflectors as horizons: picks in a CSV for interpretation packages, and GeoJSON.
 
 The CSV has one line per pick, horizon after horizon, with a header: import wizards of seismic
-interpretation packages ask which column is what. Two-way times count from the array where its depth
-is known, else from depth 0, and belong to the water's speed of sound.
+interpretation packages ask which column is what. Two-way times count from the array where its
+depth is known, else from depth 0, and belong to the water's speed of sound.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _COPIED = ('existence', 'is_bottom', 'multiple_probability')
 
 @frozen(eq=False)
 class Picks:
-    """K picks by horizon, then time: horizon (K,) its number; record (K,) from 1 on; stamp_ns (K,);
-    two_way_time (K,) s; depth and depth_std (K,) m; columns (K,) by name; longitude and latitude
-    (K,) degrees, NaN where unknown."""
+    """K picks by horizon, then time: horizon (K,) its number; record (K,) from 1 on; stamp_ns
+    (K,); two_way_time (K,) s; depth and depth_std (K,) m; columns (K,) by name; longitude and
+    latitude (K,) degrees, NaN where unknown."""
 
     horizon: IntArray
     record: IntArray

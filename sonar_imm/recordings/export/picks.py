@@ -26,9 +26,9 @@ _LARGEST = {2: 2**31 - 1, 3: 2**15 - 1, 8: 2**7 - 1, 10: 2**32 - 1, 11: 2**16 - 
 
 
 def write_picks(out: Path, picks: Picks, original: Path, notes: Mapping[str, str]) -> int:
-    """Write `out` from the SEG-Y file `original`; notes: what its conversion kept in the bag. Gives
-    how many picks lie outside of the traces. Raises `BagError`, and ModuleNotFoundError without
-    segyio."""
+    """Write `out` from the SEG-Y file `original`; notes: what its conversion kept in the bag.
+    Gives how many picks lie outside of the traces. Raises `BagError`, and ModuleNotFoundError
+    without segyio."""
     import segyio
 
     try:

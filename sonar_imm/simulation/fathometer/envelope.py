@@ -1,11 +1,11 @@
 """Envelopes as a sub-bottom profiler records them, over a floor that scatters in its volume.
 
 The pressure behind an envelope is complex. Each layer answers with the pulse, in a phase that is
-drawn anew for each ping, because the layers are rough. Below the first layer everything scatters: a
-complex Gaussian field, seen through the same pulse, whose rms value falls as
-``exp(-depth below / scatter_decay)``. Where both overlap they interfere, so that an echo comes and
-goes with the speckle around it. The magnitude is averaged over `stack` pings, and what lies below
-three standard deviations of the receiver's noise is written as zero, as instruments do.
+drawn anew for each ping, because the layers are rough. Below the first layer everything scatters:
+a complex Gaussian field, seen through the same pulse, whose rms value falls as ``exp(-depth below
+/ scatter_decay)``. Where both overlap they interfere, so that an echo comes and goes with the
+speckle around it. The magnitude is averaged over `stack` pings, and what lies below three standard
+deviations of the receiver's noise is written as zero, as instruments do.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What the tracker has to be told of envelopes, such as sub-bottom profilers record.
 
-An envelope has the pulse of an envelope, is never negative, and stands in the volume scatter of the
-floor. How wide the pulse is and what noise there is depend on the instrument; the rest is common.
+An envelope has the pulse of an envelope, is never negative, and stands in the volume scatter of
+the floor. How wide the pulse is and what noise there is depend on the instrument; the rest is
+common.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def envelope_parameters(pulse_width: float, noise_sigma: float) -> dict[str, Any
 
 
 def scatter_of(config: FathometerConfig, lattice: Lattice) -> Scatter | None:
-    """The background below the first reflector, on the cells of a record. Raises ValueError for too
-    many of them."""
+    """The background below the first reflector, on the cells of a record. Raises ValueError for
+    too many of them."""
     if not config.scatter_decay:
         return None
     pulse, step = pulse_of(config), lattice.step
@@ -46,8 +47,8 @@ def scatter_of(config: FathometerConfig, lattice: Lattice) -> Scatter | None:
     cells = lattice.cells + (2 * shift.pad if shift else 0)
     if cells > MAX_CELLS:
         raise ValueError(
-            f'volume scatter is looked for on up to {MAX_CELLS} steps of depth, not {cells}: use a '
-            'greater depth_step or fewer depths'
+            f'volume scatter is looked for on up to {MAX_CELLS} steps of depth, not {cells}: use '
+            'a greater depth_step or fewer depths'
         )
     independent = independent_samples(pulse, step * cells, 0.25 * step) / cells
     decays = np.asarray(config.scatter_decay) / step

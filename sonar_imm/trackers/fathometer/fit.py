@@ -1,8 +1,8 @@
 """Whether the records go with what the tracker was told of them.
 
-A filter that was given another pulse, or a noise that is too low, does not fail: it fills the record
-with reflectors up to its limit, or finds no set that explains the record. Both are counted, and
-said once they are common.
+A filter that was given another pulse, or a noise that is too low, does not fail: it fills the
+record with reflectors up to its limit, or finds no set that explains the record. Both are counted,
+and said once they are common.
 """
 
 from __future__ import annotations

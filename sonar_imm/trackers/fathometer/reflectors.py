@@ -69,7 +69,8 @@ class Identities:
     def _follow_bottom(
         self, depth: FloatArray, is_bottom: FloatArray, ids: IdArray, config: FathometerConfig
     ) -> int:
-        """Give the first return the id of the one before, and say which it has now, 0 for a new one.
+        """Give the first return the id of the one before, and say which it has now, 0 for a new
+        one.
 
         Within the reach of a reflector it has that id before any other looks for the nearest.
         Further away, on a slope or a wall, it has it when it would get a new one, also where what

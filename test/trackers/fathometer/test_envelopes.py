@@ -1,4 +1,5 @@
-"""Envelopes over a floor that scatters: the scene, the first return, its identity, the warnings."""
+"""Envelopes over a floor that scatters: the scene, the first return, its identity, the
+warnings."""
 
 from attrs import evolve
 import numpy as np
