@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from .topic import InputTopic, needed
+from .topic import DOUBTS, InputTopic, needed
 
-__all__ = ['InputTopic', 'inputs_of', 'needed']
+__all__ = ['DOUBTS', 'InputTopic', 'inputs_of', 'needed']
 
 
 def inputs_of(system: str) -> tuple[InputTopic, ...]:

@@ -6,18 +6,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from msg_adapters.inputs import inputs_of, InputTopic
+from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic
 
 from ..measurements import Rejection
 from ..parameters import did_you_mean
 from .reader import BagReader
 from .sources import BagError, TopicInfo
-
-DOUBTS = {
-    'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
-    'no_frame': 'have no frame_id',
-    'unusable_rows': 'have rows that cannot be used, which are left out',
-}
 
 
 class Heard(NamedTuple):
