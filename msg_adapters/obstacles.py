@@ -28,6 +28,8 @@ _ABOVE, _BELOW, _UNKNOWN = (0.84, 0.37, 0.0), (0.0, 0.45, 0.7), (0.6, 0.6, 0.6)
 _CLEAR, _NEAR, _DANGER = (0.3, 0.75, 0.4), (0.95, 0.75, 0.1), (0.85, 0.1, 0.1)
 DANGERS = (0.05, 0.2)
 """Probabilities of a collision from which a ball is yellow, and red."""
+COARSE = 2.0
+"""Half width of the band, m, from which a label leaves out decimetres."""
 SURE = 0.9
 """Probability of above or below from which an obstacle has its colour."""
 
@@ -91,10 +93,12 @@ def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
     bottom, top = band(estimate, row)
     track_id = int(estimate.extras['track_id'][row])
     colour = _colour(float(estimate.probabilities[row, estimate.model_names.index('above')]))
+    half = 0.5 * (top - bottom)
+    digits = 0 if half >= COARSE else 1
     label = (
-        f'{track_id}: {estimate.state[row, 0]:.0f} m ahead, {estimate.state[row, 2]:+.1f} m down'
+        f'{track_id}: {estimate.state[row, 0]:.0f} m ahead, '
+        f'{estimate.state[row, 2]:+.{digits}f} \N{PLUS-MINUS SIGN} {half:.{digits}f} m down'
     )
-
     risk = float(estimate.extras.get('collision_probability', np.full(len(estimate), np.nan))[row])
     if np.isfinite(risk):
         label += f', collision {100.0 * risk:.0f} %'

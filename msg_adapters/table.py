@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from functools import lru_cache
+from itertools import chain
 import math
 from typing import Any
 
@@ -90,39 +91,19 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
     u1). x, y, z come first when present, the rest keeps its order. Raises ValueError for columns
     that no PointCloud2 can hold: a programming error, not bad input.
     """
-    order = [name for name in 'xyz' if name in columns]
-    order += [name for name in columns if name not in order]
-    arrays = {name: _encodable(name, columns[name]) for name in order}
-    rows = len(next(iter(arrays.values()))) if arrays else 0
-    if uneven := [name for name, array in arrays.items() if len(array) != rows]:
-        raise ValueError(
-            f"column '{uneven[0]}' has {len(arrays[uneven[0]])} rows, '{order[0]}' has {rows}"
-        )
-    packed = np.empty(
-        rows,
-        np.dtype(
-            [
-                (name, array.dtype.newbyteorder('<'), array.shape[1:])
-                for name, array in arrays.items()
-            ]
-        ),
+    arrays = [np.asarray(columns[name]) for name in _xyz_first(tuple(columns))]
+    layout = tuple(
+        (name, array.dtype, array.shape[1:] if array.ndim else None)
+        for name, array in zip(_xyz_first(tuple(columns)), arrays)
     )
-    for name, array in arrays.items():
+    dtype, fields = _layout_of(make, layout)
+    rows = len(arrays[0]) if arrays else 0
+    packed = np.empty(rows, dtype)
+    for (name, _, _), array in zip(layout, arrays):
+        if len(array) != rows:
+            raise ValueError(f"column '{name}' has {len(array)} rows, '{layout[0][0]}' has {rows}")
         packed[name] = array
-    fields = _point_fields(
-        make,
-        tuple(
-            (
-                name,
-                packed.dtype.fields[name][1],
-                _CODES[array.dtype.str[1:]],
-                math.prod(array.shape[1:]),
-            )
-            for name, array in arrays.items()
-        ),
-    )
-    step = packed.dtype.itemsize if arrays else 0
-    finite = all(np.isfinite(array).all() for array in arrays.values())
+    step = dtype.itemsize if arrays else 0
     return make(
         'sensor_msgs/msg/PointCloud2',
         header=make_header(stamp_ns, frame_id, make),
@@ -132,20 +113,55 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
         is_bigendian=False,
         point_step=step,
         row_step=step * rows,
-        data=np.frombuffer(packed.tobytes(), np.uint8),
-        is_dense=bool(finite),
+        data=packed.tobytes(),
+        is_dense=_is_finite(packed, arrays),
     )
 
 
 @lru_cache(maxsize=64)
-def _point_fields(make: Make, layout: tuple[tuple[str, int, int, int], ...]) -> tuple[Any, ...]:
-    """Build the PointFields of a layout once: they are most of the work of a small live table."""
-    return tuple(
+def _xyz_first(names: tuple[str, ...]) -> tuple[str, ...]:
+    """x, y, z where they are among the names, then the others in their order."""
+    first = tuple(name for name in 'xyz' if name in names)
+    return first + tuple(name for name in names if name not in first)
+
+
+@lru_cache(maxsize=64)
+def _layout_of(
+    make: Make, layout: tuple[tuple[str, np.dtype, tuple[int, ...] | None], ...]
+) -> tuple[np.dtype, tuple[Any, ...]]:
+    """The packed dtype and the PointFields of columns (name, dtype, shape of a row): most of the
+    work of a small live table, done once. Raises ValueError for what a PointField cannot name."""
+    kinds = []
+    for name, dtype, shape in layout:
+        kind = np.dtype(np.uint8) if dtype == np.bool_ else dtype
+        if kind.str[1:] not in _CODES:
+            raise ValueError(
+                f"column '{name}' has the dtype {dtype}, which a PointField cannot name"
+            )
+        if shape is None or len(shape) > 1 or 0 in shape:
+            raise ValueError(
+                f"column '{name}' has rows of the shape {shape}, () or (count,) is needed"
+            )
+        kinds.append((name, kind.newbyteorder('<'), shape))
+    packed = np.dtype(kinds)
+    fields = tuple(
         make(
-            'sensor_msgs/msg/PointField', name=name, offset=offset, datatype=datatype, count=count
+            'sensor_msgs/msg/PointField',
+            name=name,
+            offset=packed.fields[name][1],
+            datatype=_CODES[kind.str[1:]],
+            count=math.prod(shape),
         )
-        for name, offset, datatype, count in layout
+        for name, kind, shape in kinds
     )
+    return packed, fields
+
+
+def _is_finite(packed: NDArray, arrays: list[NDArray]) -> bool:
+    """Whether no number is NaN or infinite. For few rows Python is quicker than numpy."""
+    if len(packed) <= 4 and all(array.ndim == 1 for array in arrays):
+        return all(map(math.isfinite, chain.from_iterable(packed.tolist())))
+    return all(bool(np.isfinite(array).all()) for array in arrays)
 
 
 def scalar_column(columns: Mapping[str, NDArray], name: str) -> NDArray[np.float64]:
@@ -225,19 +241,3 @@ def _checked_fields(fields: Any, point_step: int) -> list[tuple[str, int, np.dty
             )
         checked[name] = (name, offset, dtype, count)
     return list(checked.values())
-
-
-def _encodable(name: str, values: Any) -> NDArray:
-    """Bring one column into a dtype that a PointField can name."""
-    array = np.asarray(values)
-    if array.dtype == np.bool_:
-        array = array.astype(np.uint8)
-    if array.dtype.str[1:] not in _CODES:
-        raise ValueError(
-            f"column '{name}' has the dtype {array.dtype}, which a PointField cannot name"
-        )
-    if array.ndim not in (1, 2) or 0 in array.shape[1:]:
-        raise ValueError(
-            f"column '{name}' has the shape {array.shape}, (rows,) or (rows, count) is needed"
-        )
-    return array

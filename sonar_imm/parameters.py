@@ -96,6 +96,12 @@ class ParameterSpec:
             return f'{name} must be {self.range_text()}, got {value!r} {self.unit}'.rstrip()
         return None
 
+    @property
+    def ros_kind(self) -> str:
+        """The kind in the words of ROS, e.g. ``double`` or ``double[]``."""
+        names = {'float': 'double', 'int': 'integer', 'str': 'string', 'bool': 'bool'}
+        return names[self.kind.removesuffix('[]')] + ('[]' if self.kind.endswith('[]') else '')
+
     def range_text(self) -> str:
         """The range in words, e.g. ``at least 0`` or ``between 0 and 1``; empty without limits."""
         if self.low is not None and self.high is not None:
@@ -304,9 +310,10 @@ def markdown_table(specs: Iterable[ParameterSpec]) -> str:
     for spec in specs:
         limits = ', '.join(f'`{choice}`' for choice in spec.choices) or spec.range_text()
         default = list(spec.default) if isinstance(spec.default, tuple) else spec.default
+        default = str(default).lower() if isinstance(default, bool) else default
         text = spec.description + ('' if spec.read_only else ' (may change while running)')
         rows.append(
-            f'| `{spec.name}` | {spec.kind} | `{default}` | {spec.unit} | {limits} | {text} |'
+            f'| `{spec.name}` | {spec.ros_kind} | `{default}` | {spec.unit} | {limits} | {text} |'
         )
     return '\n'.join(rows) + '\n'
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from .topic import InputTopic, needed
+from .topic import DOUBTS, InputTopic, needed
 
-__all__ = ['FEEDERS', 'InputTopic', 'inputs_of', 'made_inputs', 'needed']
+__all__ = ['DOUBTS', 'FEEDERS', 'InputTopic', 'inputs_of', 'made_inputs', 'needed']
 
 FEEDERS = {'obstacle': 'fls_detector'}
 """Systems whose node has another one before it, by name: it makes one of their inputs."""

@@ -12,6 +12,14 @@ from ..labels import Labels
 
 Reader = Callable[..., Any]
 
+DOUBTS = {
+    'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
+    'no_frame': 'have no frame_id',
+    'flagged_invalid': 'have rows flagged as invalid, which are left out',
+    'unusable_rows': 'have rows that cannot be used, which are left out',
+}
+"""What messages have that are used but deserve a look, by the code they are counted under."""
+
 
 @frozen
 class InputTopic:

@@ -9,12 +9,33 @@ import click
 from .common import BAG, example, progress, say
 
 
+class ManyWords(click.Command):
+    """Lets options that may be repeated take several words at once, as ``ros2 bag play`` does."""
+
+    GREEDY = ('--topics', '--exclude-topics', '--remap', '-m')
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Repeat such an option before each of its words; an existing file is not one of them."""
+        words: list[str] = []
+        option, first = '', False
+        for word in args:
+            if word.startswith('-'):
+                option, first = word if word in self.GREEDY else '', True
+            elif option and not first and not Path(word).exists():
+                words.append(option)
+            else:
+                first = False
+            words.append(word)
+        return super().parse_args(ctx, words)
+
+
 @click.command(
+    cls=ManyWords,
     epilog=example(
         'sonar-imm play dive.bag --clock',
         'sonar-imm play dive.bag --lockstep /diver',
         'sonar-imm play dive.bag --remap /usbl/pose:=/fix --rate 5',
-    )
+    ),
 )
 @click.argument('bag', type=BAG)
 @click.option(
@@ -32,6 +53,13 @@ from .common import BAG, example, progress, say
     default=0.0,
     metavar='SECONDS',
     help='Skip so much of the recording.',
+)
+@click.option(
+    '--playback-duration',
+    type=float,
+    default=-1.0,
+    metavar='SECONDS',
+    help='Play so much of the recording; negative, the default: to its end.',
 )
 @click.option(
     '-d',
@@ -53,16 +81,21 @@ from .common import BAG, example, progress, say
     metavar='[HZ]',
     help='Publish /clock, at 40 Hz by default.',
 )
+@click.option('--topics', multiple=True, metavar='TOPIC...', help='Only these topics.')
+@click.option('--exclude-topics', multiple=True, metavar='TOPIC...', help='Not these topics.')
 @click.option(
-    '--topics', multiple=True, metavar='TOPIC', help='Only this topic; may be given several times.'
+    '--qos-profile-overrides-path',
+    'qos_file',
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    help='YAML file with history, depth, reliability and durability by topic.',
 )
 @click.option(
     '-m',
     '--remap',
     'remaps',
     multiple=True,
-    metavar='OLD:=NEW',
-    help='Publish under another name; may be given several times.',
+    metavar='OLD:=NEW...',
+    help='Publish under other names.',
 )
 @click.option(
     '--lockstep',
@@ -72,19 +105,29 @@ from .common import BAG, example, progress, say
     metavar='[NODE]',
     help='Send the next message only when NODE, by default the only one, has answered.',
 )
-def command(bag: Path, remaps: tuple[str, ...], **options: object) -> None:
+def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options: object) -> None:
     """Publish the recording BAG to live nodes, byte for byte, stamps included.
 
-    The options have the names of those of `ros2 bag play`. In lock-step no message is lost: each
+    These options are those of `ros2 bag play`, with its names and words; others of it are not
+    there, and --lockstep is ours. In lock-step no message is lost: each
     one waits until NODE (a node of this package, e.g. /diver) has processed the one before.
     """
     from ..nodes.player import play, PlayOptions
+    from ..nodes.qos import profiles_of
+    from ..parameters import ConfigError
     from ..recordings.reader import BagReader
 
+    qos = {}
+    if qos_file is not None:
+        try:
+            qos = profiles_of(qos_file.read_text(encoding='utf-8'))
+        except (ConfigError, UnicodeDecodeError) as error:
+            raise ConfigError(f'{qos_file}: {error}') from None
+    settings = PlayOptions(remap=dict(_old_and_new(remap) for remap in remaps), qos=qos, **options)
     with BagReader(bag) as reader:
-        chosen = options['topics'] or [topic.name for topic in reader.topics]
+        chosen = settings.topics or [topic.name for topic in reader.topics]
+        chosen = [name for name in chosen if name not in settings.exclude_topics]
         total = sum(topic.count for topic in reader.topics if topic.name in chosen)
-    settings = PlayOptions(remap=dict(_old_and_new(remap) for remap in remaps), **options)
     with progress('playing', None if settings.loop else total) as advance:
         result = play(bag, settings, progress=advance)
     say(f'{result.published} messages published')

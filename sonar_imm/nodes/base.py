@@ -36,7 +36,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
-from msg_adapters.inputs import inputs_of, InputTopic, needed
+from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
 from ..measurements import FrameGuard, Rejection, RepeatGuard
@@ -244,8 +244,8 @@ class TrackerNode(Node):
     def _doubt(self, topic: InputTopic, reason: str) -> None:
         if reason not in self._meter.doubted:
             self.get_logger().warning(
-                f"a message on '{topic.name}' is used but deserves a look: {reason} "
-                '(said once, counted in /diagnostics)'
+                f"messages on '{topic.name}' {DOUBTS.get(reason, reason)} "
+                f"(said once; '{reason}' is counted in /diagnostics)"
             )
         self._meter.doubted[reason] += 1
 

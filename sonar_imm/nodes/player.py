@@ -13,6 +13,7 @@ import time
 
 from attrs import field, frozen
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -46,9 +47,11 @@ class PlayOptions:
     """How to play. Raises `ConfigError` for a number that makes no sense.
 
     rate: speed, 2 is twice as fast; loop: start over at the end; start_offset: seconds of the
-    recording to skip; delay: seconds to wait before the first message; start_paused: wait for the
-    service ``/sonar_imm_player/resume``; clock: Hz of /clock, None for none; topics: only these
-    (recorded names), empty for all; remap: recorded to published topic names; lockstep: full name
+    recording to skip; playback_duration: seconds of the recording to play after that, all where
+    negative; delay: seconds to wait before the first message; start_paused: wait for the service
+    ``/sonar_imm_player/resume``; clock: Hz of /clock, None for none; topics: only these (recorded
+    names), empty for all; exclude_topics: not these; qos: quality of service by recorded name;
+    remap: recorded to published topic names; lockstep: full name
     of the node to keep step with (``/diver``), ``auto`` for the only one that runs, empty to keep
     the recorded pace.
     """
@@ -56,10 +59,13 @@ class PlayOptions:
     rate: float = field(default=1.0, validator=_positive)
     loop: bool = False
     start_offset: float = field(default=0.0, validator=_not_negative)
+    playback_duration: float = -1.0
     delay: float = field(default=0.0, validator=_not_negative)
     start_paused: bool = False
     clock: float | None = field(default=None, validator=_positive)
     topics: tuple[str, ...] = ()
+    exclude_topics: tuple[str, ...] = ()
+    qos: Mapping[str, QoSProfile] = field(factory=dict)
     remap: Mapping[str, str] = field(factory=dict)
     lockstep: str = ''
 
@@ -141,7 +147,9 @@ class Player:
     def _advertise(self) -> dict[str, Publisher]:
         """Make a publisher for each topic to play: {recorded name: publisher}."""
         recorded = {topic.name: topic.type_name for topic in self._bag.topics}
-        for name in (*self._options.topics, *self._options.remap):
+        options = self._options
+        named = (*options.topics, *options.exclude_topics, *options.remap, *options.qos)
+        for name in named:
             if name not in recorded:
                 raise ConfigError(
                     f"{self._bag.path} has no topic '{name}'{did_you_mean(name, recorded)}"
@@ -150,15 +158,15 @@ class Player:
         qos = lockstep_qos() if self._options.lockstep else output_qos(_DEPTH)
         publishers = {}
         for name in self._options.topics or recorded:
-            if name == '/clock' and self._options.clock:
-                continue  # ours replaces the recorded one
+            if name in options.exclude_topics or (name == '/clock' and options.clock):
+                continue  # our clock replaces the recorded one
             try:
                 cls = message_class(recorded[name])
             except ImportError as error:
                 self._problems.append(f'topic {name} is not published: {error}')
                 continue
             publishers[name] = self._link.node.create_publisher(
-                cls, self._options.remap.get(name, name), qos
+                cls, options.remap.get(name, name), options.qos.get(name, qos)
             )
         if not publishers:
             raise BagError(f'{self._bag.path} has nothing to publish')
@@ -185,11 +193,14 @@ class Player:
     def _play_once(self, stepped: set[str], progress: Callable[[int], None]) -> None:
         first: int | None = None
         skipped = round(self._options.start_offset * _NANO)
+        length = self._options.playback_duration
         pace: Pace | None = None
         for item in self._bag.messages(list(self._publishers)):
             first = item.log_ns if first is None else first
             if item.log_ns - first < skipped:
                 continue
+            if 0.0 <= length * _NANO < item.log_ns - first - skipped:
+                return
             pace = pace or Pace(item.log_ns, self._options.rate)
             self._wait(pace, item.log_ns, paced=not stepped)
             publisher = self._publishers[item.topic]

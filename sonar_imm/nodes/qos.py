@@ -25,6 +25,15 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+import yaml
+
+from ..parameters import ConfigError
+
+_POLICIES = {
+    'history': HistoryPolicy,
+    'reliability': ReliabilityPolicy,
+    'durability': DurabilityPolicy,
+}
 
 
 def input_qos(depth: int) -> QoSProfile:
@@ -127,3 +136,36 @@ class Endpoints:
                 'or slow the sender down (said once, counted in /diagnostics)'
             )
         self.lost[topic] = event.total_count
+
+
+def profiles_of(text: str) -> dict[str, QoSProfile]:
+    """Qualities of service by topic, from a file as ``ros2 bag play`` takes it.
+
+    A topic has ``history``, ``depth``, ``reliability`` and ``durability``, each may be left out.
+    Raises `ConfigError` for anything else.
+    """
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f'not a YAML file: {" ".join(str(error).split())}') from None
+    if not isinstance(tree, dict) or not all(isinstance(one, dict) for one in tree.values()):
+        raise ConfigError('it must hold a mapping of policies for each topic')
+    return {str(topic): _profile(str(topic), policies) for topic, policies in tree.items()}
+
+
+def _profile(topic: str, policies: dict[str, Any]) -> QoSProfile:
+    profile = lockstep_qos() if policies.get('history') == 'keep_all' else output_qos()
+    for name, value in policies.items():
+        if name == 'depth':
+            if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 10**6:
+                raise ConfigError(f"{topic}: depth must be a whole number, got '{value}'")
+            profile.depth = value
+            continue
+        if name not in _POLICIES:
+            raise ConfigError(f"{topic}: '{name}' is none of depth, {', '.join(_POLICIES)}")
+        try:
+            setattr(profile, name, _POLICIES[name].get_from_short_key(str(value)))
+        except KeyError:
+            known = ', '.join(_POLICIES[name].short_keys())
+            raise ConfigError(f"{topic}: {name} is one of {known}, got '{value}'") from None
+    return profile

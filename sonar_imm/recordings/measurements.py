@@ -6,20 +6,13 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
+from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, made_inputs
 
 from ..measurements import Rejection
 from ..parameters import did_you_mean
 from .detected import DetectedImages
 from .reader import BagReader
 from .sources import BagError, TopicInfo
-
-DOUBTS = {
-    'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
-    'no_frame': 'have no frame_id',
-    'flagged_invalid': 'have rows flagged as invalid, which are left out',
-    'unusable_rows': 'have rows that cannot be used, which are left out',
-}
 
 
 class Heard(NamedTuple):

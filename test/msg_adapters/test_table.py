@@ -309,3 +309,33 @@ class TestBounds:
         fields = [(f'f{i}', i % 7, 2, 1000) for i in range(1000)] + [('a', 0, 7, 1)]
         message = cloud(fields, bytes(1010 * rows), width=rows, point_step=1010)
         assert peak_bytes(lambda: decode_table(message, ('a',))) < 2_000_000
+
+
+def test_equal_names_with_other_kinds_of_columns_are_other_tables():
+    """Layouts are remembered: what is remembered must depend on all of it."""
+    kinds = (np.float64, np.float32, np.int16, np.bool_)
+    for values in (np.arange(3), np.ones((3, 2))):
+        for kind in (*kinds, np.dtype('>f8')):
+            message = encode_table(
+                {'b': np.ones(3), 'a': values.astype(kind), 'x': np.zeros(3)},
+                stamp_ns=10**18,
+                frame_id='',
+                make=ros_message,
+            )
+            columns = decode_table(message)
+            assert list(columns) == ['x', 'b', 'a']
+            np.testing.assert_array_equal(columns['a'], values.astype(kind))
+
+
+@pytest.mark.parametrize('rows', [1, 4, 5, 300])
+@pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
+def test_a_table_says_whether_all_of_it_is_finite(rows, bad):
+    def is_dense(columns):
+        return encode_table(columns, stamp_ns=10**18, frame_id='', make=ros_message).is_dense
+
+    good = {'a': np.ones(rows), 'n': np.full(rows, 7, np.uint32)}
+    assert is_dense(good) and is_dense({**good, 'v': np.ones((rows, 2))})
+    spoilt = np.ones(rows)
+    spoilt[-1] = bad
+    assert not is_dense({**good, 'b': spoilt})
+    assert not is_dense({**good, 'v': np.column_stack([np.ones(rows), spoilt])})

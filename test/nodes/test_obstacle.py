@@ -91,7 +91,8 @@ def test_the_bar_reaches_as_far_as_the_band_and_the_right_way_up():
     assert (bar.ns, bar.type, bar.id, bar.action) == ('band', Marker.CUBE, 7, Marker.ADD)
     assert bar.scale.z == 3.5 and bar.pose.position.z == -22.75
     assert ball.type == Marker.SPHERE and ball.pose.position.z == -23.0
-    assert label.type == Marker.TEXT_VIEW_FACING and label.text == '7: 40 m ahead, +3.0 m down'
+    assert label.type == Marker.TEXT_VIEW_FACING
+    assert label.text == '7: 40 m ahead, +3.0 \N{PLUS-MINUS SIGN} 1.8 m down'
     assert all(
         marker.lifetime.sec > 0 and marker.header.frame_id == 'odom'
         for marker in (bar, ball, label)

@@ -20,7 +20,7 @@ from sonar_imm.nodes.harness import reserved_domain_id
 from sonar_imm.nodes.link import Link, LinkError
 from sonar_imm.nodes.lockstep import LockStep, Recorder
 from sonar_imm.nodes.player import NAME, Pace, play, Player, PlayOptions
-from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm.nodes.qos import lockstep_qos, profiles_of
 from sonar_imm.parameters import ConfigError
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagError, BagReader
@@ -100,6 +100,26 @@ def test_topics_remapping_and_offset(bag, link, domain):
     )
     assert result.published == COUNT - 10
     assert ear.positions(COUNT - 10) == list(range(10, COUNT))
+
+
+def test_a_stretch_without_a_topic_and_with_another_quality_of_service(bag, link, domain):
+    ear = Ear(link, PoseWithCovarianceStamped, '/fix')
+    text = '/fix:\n  reliability: reliable\n  durability: transient_local\n  depth: 7\n'
+    options = PlayOptions(
+        rate=100.0,
+        start_offset=0.05,
+        playback_duration=0.1,
+        exclude_topics=('/other',),
+        qos=profiles_of(text),
+    )
+    with BagReader(bag) as reader, Link(NAME, domain_id=domain) as peer:
+        player = Player(reader, peer, options)
+        (profile,) = (one.qos_profile for one in player._publishers.values())
+        assert profile.durability.name == 'TRANSIENT_LOCAL' and profile.depth == 7
+        player.run()
+        assert player.result().published == 11
+    link.wait_for(lambda: len(ear.heard) == 11, 5.0)
+    assert [round(one.pose.pose.position.x) for one in ear.heard] == list(range(5, 16))
 
 
 def test_the_pace_follows_the_log_times(bag, link, domain):

@@ -1,0 +1,55 @@
+"""The words on the command line of ``play``, and its file of qualities of service."""
+
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.nodes import player as player_module
+from sonar_imm.nodes.qos import profiles_of
+from sonar_imm.parameters import ConfigError
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.writer import BagWriter
+
+
+@pytest.mark.parametrize(
+    'text, sentence',
+    [
+        ('/fix: {depth: many}', "depth must be a whole number, got 'many'"),
+        ('/fix: {reliability: often}', "reliability is one of .*, got 'often'"),
+        ('/fix: {deadline: 1}', "'deadline' is none of depth, history"),
+        ('/fix: 5', 'a mapping of policies for each topic'),
+        ('{[', 'not a YAML file'),
+    ],
+)
+def test_files_of_qualities_of_service_are_checked(text, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        profiles_of(text)
+
+
+@pytest.mark.parametrize(
+    'words, topics, excluded, remaps',
+    [
+        (('--topics', '/a', '/b'), ('/a', '/b'), (), {}),
+        (('--topics', '/a', '--topics', '/b'), ('/a', '/b'), (), {}),
+        (('--exclude-topics', '/a', '/b', '-l'), (), ('/a', '/b'), {}),
+        (('-m', '/a:=/c', '/b:=/d', '--rate', '2'), (), (), {'/a': '/c', '/b': '/d'}),
+    ],
+)
+@pytest.mark.parametrize('bag_first', [True, False])
+def test_options_take_several_words_as_those_of_ros2_bag_play(
+    tmp_path, monkeypatch, words, topics, excluded, remaps, bag_first
+):
+    asked = []
+
+    def played(path, options, progress):
+        asked.append(options)
+        return player_module.PlayResult(0, ())
+
+    monkeypatch.setattr(player_module, 'play', played)
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as writer:
+        writer.write('/a', ros_message('std_msgs/msg/String', data='x'), 10**9)
+    arguments = [str(bag), *words] if bag_first else [*words, str(bag)]
+    assert main(['play', *arguments]) == 0
+    (options,) = asked
+    assert (options.topics, options.exclude_topics) == (topics, excluded)
+    assert options.remap == remaps
