@@ -90,7 +90,7 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
         config, floor, rng = drift(seed, records)
     else:
         config, floor, rng = layers(seed, records, SIGNS[name])
-    told = {key: value for key, value in config.told().items()}
+    told = dict(config.told())
     told |= {'window': 'rectangular', 'overlap': 0.0, 'particles': particles, 'seed': seed}
     told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     if name != 'drift':

@@ -38,8 +38,8 @@ class InputOptions:
 
     topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
     later input too, which takes memory in proportion to the recording. jobs: processes that share
-    the work where a tracker can share it; the estimates do not depend on it. detector: parameters of
-    the detector of images that are not the default.
+    the work where a tracker can share it; the estimates do not depend on it. detector: parameters
+    of the detector of images that are not the default.
     """
 
     topics: Mapping[str, str] | None = None

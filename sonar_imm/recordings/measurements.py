@@ -34,8 +34,8 @@ def fitting_topics(
     not enough. Where an input is missing, a topic fits of which a node before the tracker makes it
     (images of a sonar for detections). `topics` maps topic names to input names instead, e.g.
     ``{'/usbl/pose': 'fix'}``; what belongs beside those, and has its name, comes along. Raises
-    `BagError` when nothing fits, with a list of what is there, and when several topics fit an input
-    that is one instrument.
+    `BagError` when nothing fits, with a list of what is there, and when several topics fit an
+    input that is one instrument.
     """
     fitting = {
         topic.name: entry

@@ -23,15 +23,15 @@ SCATTER = Scatter(profile=decaying_profile(PULSE, DECAYS), spread=0.4, share=0.4
 
 
 def model(**overrides):
-    values = dict(
-        cells=CELLS,
-        separation=4,
-        order_min=1,
-        transition=banded_transition(4, 0.05),
-        move=gaussian_move(0.9),
-        gram=PULSE,
-        scatter=SCATTER,
-    )
+    values = {
+        'cells': CELLS,
+        'separation': 4,
+        'order_min': 1,
+        'transition': banded_transition(4, 0.05),
+        'move': gaussian_move(0.9),
+        'gram': PULSE,
+        'scatter': SCATTER,
+    }
     return SetModel(**{**values, **overrides})
 
 
@@ -134,7 +134,7 @@ def test_the_filter_follows_a_floor_that_is_no_sum_of_echoes():
 
 def test_what_cannot_be_is_refused():
     for wrong in ({'spread': -1.0}, {'share': 0.0}, {'profile': np.ones((1, 4))}):
-        values = dict(profile=SCATTER.profile, spread=0.4, share=0.45, window=9)
+        values = {'profile': SCATTER.profile, 'spread': 0.4, 'share': 0.45, 'window': 9}
         with pytest.raises(ValueError):
             Scatter(**{**values, **wrong})
     with pytest.raises(ValueError, match='memory'):
