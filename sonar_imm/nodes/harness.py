@@ -31,6 +31,7 @@ from .chain import Chain, FirstStep
 from .link import Link, LinkError
 from .lockstep import Counts, LockStep, Recorder
 from .player import NAME, Player, PlayOptions
+from .stopping import ENDING
 
 START_LIMIT = 90.0
 """Seconds a node may take to appear, with nothing compiled yet, on a slow or busy machine."""
@@ -160,20 +161,31 @@ class NodeProcess:
             PYTHONPATH=os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])),
         )
         self._log = tempfile.NamedTemporaryFile(mode='ab', prefix=f'sonar_imm_{system}_')
-        self.process = subprocess.Popen(
-            [
-                sys.executable,
-                '-m',
-                module or SYSTEMS[system].node,
-                '--ros-args',
-                '-r',
-                f'__node:={system}',
-                *arguments,
-            ],
-            env=environment,
-            stdout=self._log,
-            stderr=subprocess.STDOUT,
-        )
+        # A signal that unwinds this program must not come before it knows the process. The node
+        # inherits the mask, and lifts it when it takes its signals.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+        try:
+            self.process = subprocess.Popen(
+                [
+                    sys.executable,
+                    '-m',
+                    module or SYSTEMS[system].node,
+                    '--ros-args',
+                    '-r',
+                    f'__node:={system}',
+                    *arguments,
+                ],
+                env=environment,
+                stdout=self._log,
+                stderr=subprocess.STDOUT,
+            )
+        finally:
+            try:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            except BaseException:  # what the signal raised
+                if hasattr(self, 'process'):
+                    self.stop()
+                raise
 
     def __enter__(self) -> NodeProcess:
         return self

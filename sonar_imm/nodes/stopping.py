@@ -18,7 +18,7 @@ import sys
 import threading
 from typing import Any
 
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 PATIENCE = 5.0
 """Seconds after which a node that was told to stop, and is still busy, ends as it is."""
@@ -56,10 +56,12 @@ class Stopper:
         thread = threading.Thread(target=self._read, args=(reading,), name='signals', daemon=True)
         thread.start()
         self._wakeup = signal.set_wakeup_fd(self._pipe, warn_on_full_buffer=False)
-        for number in _ENDING:
+        for number in ENDING:
             before = signal.getsignal(number)
             if before is not signal.SIG_IGN:
                 self._before[number] = signal.signal(number, _nothing)
+        # Who starts a node may hold signals back until it has the process in hand.
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
         return True
 
     def on_stop(self, stop: Callable[[], Any], patience: float = PATIENCE) -> None:
@@ -87,7 +89,7 @@ class Stopper:
     def _read(self, reading: int) -> None:
         with os.fdopen(reading, 'rb', buffering=0) as pipe:
             while said := pipe.read(1):
-                if said[0] in _ENDING:
+                if said[0] in ENDING:
                     self._told()
 
     def _told(self) -> None:
