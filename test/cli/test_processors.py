@@ -17,10 +17,19 @@ import pytest
 
 BAGS = sorted((Path(__file__).parents[2] / 'bags').iterdir())
 
-PROMISE = {'bathymetry': 1e-12, 'diver': 1e-10, 'obstacle': 1e-7, 'fathometer': 1e-9}
-"""Largest difference of any number, as a share of the largest magnitude in its column. Measured
-between Prescott and SkylakeX, with numpy's AVX2 and AVX-512 loops off and on: bathymetry 4e-16,
-diver 3e-13, obstacle 2e-9, fathometer 8e-12."""
+PROMISE = {
+    'bathymetry': 1e-12,
+    'diver': 1e-10,
+    'obstacle': 1e-7,
+    'fathometer': 1e-9,
+    'fathometer_pressure': 0.05,
+}
+"""By recording, else by system: largest difference of any number, as a share of the largest
+magnitude in its column. Measured between Prescott and SkylakeX, with numpy's AVX2 and AVX-512 loops
+off and on: bathymetry 4e-16,
+diver 3e-13, obstacle 2e-9, fathometer 8e-12. Spectra of pressure are computed in single precision,
+which the inverse of their matrix makes 6e-6: that moves some particles to other cells, a depth by
+3e-6 and a covariance by .015."""
 
 EXACT = {'stamp_ns', 'track_id', 'track_state', 'valid', 'label', 'nis_dof'}
 """Columns of counts and names: equal everywhere."""
@@ -83,7 +92,7 @@ def test_another_processor_gives_the_same_estimates_to_the_promised_digits(bag, 
     assert list(old) == list(new)
     assert len(old['stamp_ns']) == len(new['stamp_ns']) > 20
     differences = {name: apart(old[name], new[name]) for name in old}
-    promise = PROMISE[bag.name.split('_')[0]]
+    promise = PROMISE.get(bag.name, PROMISE[bag.name.split('_')[0]])
     wrong = {
         name: difference
         for name, difference in differences.items()

@@ -113,7 +113,7 @@ def test_what_is_not_needed_is_missed_once_it_was_heard_and_not_when_it_is_slow(
 @pytest.mark.parametrize(
     'system, settings, required, one_of',
     [
-        ('diver', {}, [], ['fix', 'fixes', 'arrivals']),
+        ('diver', {}, [], ['fix', 'fixes', 'relative', 'arrivals']),
         ('obstacle', {}, ['detections', 'nav'], []),
         ('bathymetry', {}, [], ['snapshot', 'port/snapshot', 'starboard/snapshot']),
         (
@@ -205,7 +205,7 @@ def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker
     ]
     values = {pair.key: pair.value for pair in heard[-1].status[0].values}
     assert values['fix topic'] == '/auv1/fix'
-    told = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/arrivals'
+    told = 'no message yet on /auv1/fix or /auv1/fixes or /auv1/relative or /auv1/arrivals'
     assert heard[-1].status[0].message == told
 
 

@@ -43,7 +43,7 @@ def line(folder, name, places, shift=0.0, positions=True):
     bag = folder / f'{name}.bag'
     write_bag(bag, records, ConversionReport(bag), source=name)
     own = {**envelope_parameters(0.5, 0.05), 'particles': 400, 'depth_std': 0.1}
-    write_own_parameters(bag, 'fathometer', own)
+    write_own_parameters(bag, {'fathometer': own})
     assert main(['track', str(bag), str(folder / name)]) == 0
     return folder / name
 
