@@ -1,3 +1,17 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The package keeps its promises: one version, one list of dependencies, floors, fresh docs."""
 
 from __future__ import annotations
@@ -52,6 +66,21 @@ PEERS = {
     'sonar_imm.recordings.export.points': {'laspy', 'rasterio'},
 }
 
+HEADER = """\
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
 # Path below the root: why it may exceed 400 lines.
 LONG_FILES: dict[str, str] = {
     'test/acoustics/test_localisation.py': 'every doubt of one function, to be read together',
@@ -125,15 +154,21 @@ def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element
     assert texts(manifest, 'depend') <= COMMON_INTERFACES | COME_WITH_RCLPY
 
 
-def test_no_file_is_too_long() -> None:
+def test_files_begin_with_the_licence_and_are_not_too_long() -> None:
     files = [
         path
         for room in ('sonar_imm', 'msg_adapters', 'test', 'benchmarks', 'docs')
         for path in (ROOT / room).rglob('*.py')
     ]
+    texts_of = {
+        str(path.relative_to(ROOT)): path.read_text(encoding='utf-8')
+        for path in (*files, ROOT / 'setup.py')
+    }
+    bare = [name for name, text in texts_of.items() if text and not text.startswith(HEADER)]
+    assert not bare, 'the licence is missing at the top'
     lengths = {
-        str(path.relative_to(ROOT)): len(path.read_text(encoding='utf-8').splitlines())
-        for path in files
+        name: len(text.removeprefix(HEADER).strip().splitlines())
+        for name, text in texts_of.items()
     }
     too_long = {name for name, lines in lengths.items() if lines > 400}
     assert too_long == set(LONG_FILES), 'over 400 lines, or listed without need'

@@ -1,3 +1,17 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The estimates of the shipped recordings on another processor: the promise of
 docs/architecture.md.
 
@@ -25,11 +39,10 @@ PROMISE = {
     'fathometer_pressure': 0.05,
 }
 """By recording, else by system: largest difference of any number, as a share of the largest
-magnitude in its column. Measured between Prescott and SkylakeX, with numpy's AVX2 and AVX-512 loops
-off and on: bathymetry 4e-16,
-diver 3e-13, obstacle 2e-9, fathometer 8e-12. Spectra of pressure are computed in single precision,
-which the inverse of their matrix makes 6e-6: that moves some particles to other cells, a depth by
-3e-6 and a covariance by .015."""
+magnitude in its column. Measured between Prescott and SkylakeX, with numpy's AVX2 and AVX-512
+loops off and on: bathymetry 4e-16, diver 3e-13, obstacle 2e-9, fathometer 8e-12. Spectra of
+pressure are computed in single precision, which the inverse of their matrix makes 6e-6: that moves
+some particles to other cells, a depth by 3e-6 and a covariance by .015."""
 
 EXACT = {'stamp_ns', 'track_id', 'track_state', 'valid', 'label', 'nis_dof'}
 """Columns of counts and names: equal everywhere."""
