@@ -41,9 +41,11 @@ from benchmarks.obstacle_accuracy import config_of, track  # noqa: E402
 from benchmarks.obstacle_section5 import echoes, encounter, OFFSETS, read  # noqa: E402
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
-from sonar_imm.measurements import Altitude, Detections, Navigation  # noqa: E402
+from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
+from sonar_imm.simulation.obstacle.images import ImageSonar  # noqa: E402
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
 from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: E402
+from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'
@@ -152,44 +154,54 @@ def draw_sphere(above: Axes, below: Axes) -> None:
 
 
 def draw_image(above: Axes, below: Axes) -> None:
-    """Figure 4: a large obstacle, three floats, their chains and a bar. Not an image but the
-    detections that one ping of our scene gives, and those of a whole approach."""
+    """Figure 4: a large obstacle, three floats, their chains and a bar: the image of one ping with
+    what the detector finds in it, and what it finds in a whole approach."""
     setting, scene = encounter('large', {}, SEED)
     _, poses = echoes(setting, scene)
     middle = geometry.flip_world(scene.truth[0].position[0])
     course = np.arctan2(*(poses.position[-1] - poses.position[0])[1::-1])
     across = np.array([-np.sin(course), np.cos(course), 0.0])
-    rng = np.random.default_rng(SEED)
-    parts: list[tuple[str, str, np.ndarray]] = []
     floats = [middle + side * across - [0.0, 0.0, 4.0] for side in (-5.0, 0.0, 5.0)]
-    parts.append(('floats', RED, np.array(floats)))
-    down = np.arange(1.0, 9.0, 0.5)[:, None] * [0.0, 0.0, 1.0]
-    parts.append(('chains', BLUE, np.concatenate([one + down for one in floats])))
+    down = np.arange(1.0, 9.0, 1.0)[:, None] * [0.0, 0.0, 1.0]
     bar = middle + [0.0, 0.0, 5.0] + np.arange(-5.0, 5.1, 0.5)[:, None] * across
-    parts.append(('bar', GREEN, bar))
-    one = 40
-    for ax, pings in ((above, [one]), (below, range(0, len(poses.position), 4))):
-        for name, colour, points in parts:
-            seen = []
-            for k in pings:
-                at = Pose(poses.position[k], poses.R[k])
-                d, azimuth = geometry.project(geometry.to_body(at, points))
-                # A chain echoes where it stands across the beam, here and there.
-                echoing = rng.uniform(size=len(points)) < (0.9 if name == 'floats' else 0.4)
-                d = d + rng.normal(0.0, 0.15, len(d))
-                azimuth = azimuth + rng.normal(0.0, np.radians(0.25), len(d))
-                seen.append(np.column_stack([azimuth, d])[echoing])
-            azimuth, d = np.concatenate(seen).T
-            ax.plot(d * np.sin(azimuth), d * np.cos(azimuth), '.', color=colour, ms=4, label=name)
+    places = [*floats, *(place for one in floats for place in one + down), *bar]
+    looks = scenario('images', {'target_fading': 'rayleigh', 'max_range': 100.0})
+    sonar = ImageSonar(looks, np.random.default_rng(SEED))
+    config = DetectorConfig.from_mapping(looks.told_feeder(), ignore_unknown=True)
+    one, found = 40, []
+    for k in {one, *range(0, len(poses.position), 4)}:
+        pixels = sonar.image(Pose(poses.position[k], poses.R[k]), places, 1.0)
+        image = SonarImage(
+            stamp_ns=k + 1,
+            range=sonar.range,
+            bearing=sonar.bearing,
+            amplitude=pixels.astype(float),
+            frame_id='sonar',
+        )
+        echo = detect(image, config)
+        found.append(np.column_stack([echo.range, -echo.bearing]))
+        if k == one:
+            d, azimuth = sonar.range[:, None], -sonar.bearing
+            above.pcolormesh(
+                d * np.sin(azimuth), d * np.cos(azimuth), pixels, cmap='Greys', rasterized=True
+            )
+            show(above, found[-1], 'o', mfc='none', ms=7)
+    show(below, np.concatenate(found), '.', ms=3)
+    for ax in (above, below):
         edge = np.radians(22.5)
         ax.plot([0.0, 100 * np.sin(edge)], [0.0, 100 * np.cos(edge)], color=INK, lw=0.5)
         ax.plot([0.0, -100 * np.sin(edge)], [0.0, 100 * np.cos(edge)], color=INK, lw=0.5)
         ax.set(xlim=(-25.0, 25.0), xlabel='m to starboard', ylabel='m ahead')
-    above.set(title='Figure 4: detections of a large obstacle', ylim=(50.0, 85.0))
+    above.set(title='Figure 4: image of a large obstacle', ylim=(50.0, 85.0))
     below.set(ylim=(40.0, 100.0))
-    above.text(-24.0, 51.0, f'ping {one}')
-    below.text(-24.0, 41.5, 'every fourth ping')
-    above.legend(frameon=False, loc='upper right')
+    above.text(-24.0, 51.0, f'ping {one}, detections circled')
+    below.text(-24.0, 41.5, 'detections of every fourth ping')
+
+
+def show(ax: Axes, found: np.ndarray, marker: str, **style: object) -> None:
+    """Draw detections (n, 2), range and azimuth to starboard, as seen from above."""
+    d, azimuth = found.T
+    ax.plot(d * np.sin(azimuth), d * np.cos(azimuth), marker, color=RED, **style)
 
 
 def draw_readings(above: Axes, below: Axes) -> None:
