@@ -122,5 +122,7 @@ def needed(
     required = [topic for topic in topics if topic.required(settings)]
     if any(not topic.companion for topic in required):
         return [topic.name for topic in required], []
-    one_of = [topic.name for topic in topics if not topic.companion]
+    one_of = [
+        name for topic in topics if not topic.companion for name in topic.instances(settings)
+    ]
     return [topic.name for topic in required], one_of

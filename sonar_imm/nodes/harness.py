@@ -99,7 +99,6 @@ def run_lockstep(
             name: evolve(entry, name=entry.instance(name, settings or {}))
             for name, entry in fitting_topics(bag, system, topics).items()
         }
-        inputs = fitting_topics(bag, system, topics)
         fed = {topic: entry for topic, entry in inputs.items() if entry.makes}
         direct = {topic: entry for topic, entry in inputs.items() if not entry.makes}
         domain = stack.enter_context(reserved_domain_id())

@@ -128,6 +128,12 @@ def test_what_is_not_needed_is_missed_once_it_was_heard_and_not_when_it_is_slow(
     'system, settings, required, one_of',
     [
         ('diver', {}, [], ['fix', 'fixes', 'relative', 'arrivals']),
+        (
+            'diver',
+            {'tags': ('amy',)},
+            [],
+            ['fix', 'amy/fix', 'fixes', 'relative', 'amy/relative', 'arrivals'],
+        ),
         ('obstacle', {}, ['detections', 'nav'], []),
         ('bathymetry', {}, [], ['snapshot', 'port/snapshot', 'starboard/snapshot']),
         (
