@@ -28,7 +28,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
 
-from .headers import Make, make_header, stamp_ns
+from .headers import Make, make_header, make_pose, stamp_ns
 from .table import decode_table, encode_table, require_columns
 
 NOT_ESTIMATED = 1.0
@@ -75,11 +75,7 @@ def write_odometry(estimate: Estimate, row: int, make: Make) -> Any:
         place[2] = estimate.xyz[row, 2]
     covariance = estimate.covariance[row]
     track_id = int(estimate.extras['track_id'][row]) if 'track_id' in estimate.extras else row
-    pose = make(
-        'geometry_msgs/msg/Pose',
-        position=make('geometry_msgs/msg/Point', **dict(zip('xyz', place.tolist()))),
-        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-    )
+    pose = make_pose(place.tolist(), make)
     twist = make(
         'geometry_msgs/msg/Twist',
         linear=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', velocity.tolist()))),

@@ -28,9 +28,10 @@ from attrs import evolve
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import Fix, Rejection
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Fix, Rejection, RelativeFix
 
-from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
+from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
 
 UNKNOWN_VARIANCE = 1e6
 """Variance written for what is not estimated (m^2 or rad^2); zero would claim certainty."""
@@ -91,17 +92,21 @@ def write_fix(fix: Fix, make: Make) -> Any:
     else:
         np.fill_diagonal(covariance, UNKNOWN_VARIANCE)
         covariance[:2, :2] = fix.covariance
-    x, y, z = (float(value) for value in fix.position)
-    pose = make(
-        'geometry_msgs/msg/Pose',
-        position=make('geometry_msgs/msg/Point', x=x, y=y, z=z),
-        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-    )
+    return make_position(fix, fix.position, covariance, make)
+
+
+def make_position(
+    fix: Fix | RelativeFix, position: FloatArray, covariance: FloatArray, make: Make
+) -> Any:
+    """Make a PoseWithCovarianceStamped with stamp and frame of `fix`, at `position` (3,) m, not
+    turned, with `covariance` (6, 6)."""
     return make(
         'geometry_msgs/msg/PoseWithCovarianceStamped',
         header=make_header(fix.stamp_ns, fix.frame_id, make),
         pose=make(
-            'geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=covariance.ravel()
+            'geometry_msgs/msg/PoseWithCovariance',
+            pose=make_pose(position, make),
+            covariance=covariance.ravel(),
         ),
     )
 

@@ -23,7 +23,7 @@ other axes, as its paper does, turns them where measurements come in and estimat
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 from attrs import evolve
@@ -61,6 +61,19 @@ def make_header(stamp: int, frame_id: str, make: Make) -> Any:
         raise ValueError(f'a ROS 2 header cannot hold the stamp {stamp} ns')
     time = make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
     return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
+
+
+def make_pose(
+    position: Iterable[float], make: Make, orientation: Iterable[float] = (0.0, 0.0, 0.0, 1.0)
+) -> Any:
+    """Make a Pose. position: x, y, z, m; orientation: x, y, z, w, by default not turned."""
+    place = (float(value) for value in position)
+    turn = (float(value) for value in orientation)
+    return make(
+        'geometry_msgs/msg/Pose',
+        position=make('geometry_msgs/msg/Point', **dict(zip('xyz', place))),
+        orientation=make('geometry_msgs/msg/Quaternion', **dict(zip('xyzw', turn))),
+    )
 
 
 def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:

@@ -31,7 +31,7 @@ from sonar_imm.acoustics.geometry import flip_quaternion
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Altitude, Navigation, Rejection
 
-from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
+from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
 
 TWIST_FRAMES = ('child', 'world')
 _FRD = np.array([1.0, -1.0, -1.0])
@@ -100,12 +100,7 @@ def read_dave_dvl(message: Any, **_: Any) -> Altitude:
 
 def write_navigation(navigation: Navigation, make: Make) -> Any:
     """Write an Odometry; unknown covariances start with -1, unknown velocities are NaN."""
-    x, y, z, w = (float(value) for value in navigation.orientation)
-    pose = make(
-        'geometry_msgs/msg/Pose',
-        position=_named(navigation.position, 'Point', make),
-        orientation=make('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w),
-    )
+    pose = make_pose(navigation.position, make, navigation.orientation)
     twist = make(
         'geometry_msgs/msg/Twist',
         linear=_named(navigation.velocity, 'Vector3', make),

@@ -30,7 +30,7 @@ import numpy as np
 
 from sonar_imm.estimates import Estimate
 
-from .headers import Make, make_header
+from .headers import Make, make_header, make_pose
 
 _ADD, _DELETE, _DELETE_ALL = 0, 2, 3
 NAMES = ('band', 'obstacle', 'label')
@@ -168,8 +168,4 @@ def _danger(risk: float) -> tuple[float, float, float]:
 
 def _pose(make: Make, x: float, y: float, z: float) -> Any:
     finite = [value if np.isfinite(value) else 0.0 for value in (x, y, z)]
-    return make(
-        'geometry_msgs/msg/Pose',
-        position=make('geometry_msgs/msg/Point', **dict(zip('xyz', finite))),
-        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-    )
+    return make_pose(finite, make)

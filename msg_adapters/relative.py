@@ -40,7 +40,8 @@ import numpy as np
 
 from sonar_imm.measurements import nanoseconds, NOBODY, Rejection, RelativeFix
 
-from .headers import Make, make_header, stamp_ns, swap_axes
+from .fixes import make_position
+from .headers import Make, stamp_ns, swap_axes
 
 AXES = ('flu', 'frd', 'enu', 'ned')
 _FRD = np.array([1.0, -1.0, -1.0])
@@ -133,19 +134,7 @@ def write_relative(fix: RelativeFix, make: Make) -> Any:
     if fix.covariance is not None:
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = fix.covariance
-    x, y, z = (float(value) for value in fix.offset)
-    pose = make(
-        'geometry_msgs/msg/Pose',
-        position=make('geometry_msgs/msg/Point', x=x, y=y, z=z),
-        orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-    )
-    return make(
-        'geometry_msgs/msg/PoseWithCovarianceStamped',
-        header=make_header(fix.stamp_ns, fix.frame_id, make),
-        pose=make(
-            'geometry_msgs/msg/PoseWithCovariance', pose=pose, covariance=covariance.ravel()
-        ),
-    )
+    return make_position(fix, fix.offset, covariance, make)
 
 
 def _fix(

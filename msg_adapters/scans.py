@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from sonar_imm.measurements import Fixes, NOBODY, Rejection, usable_fixes
 
 from .fixes import LEAST_VARIANCE, MOST_VARIANCE
-from .headers import Make, make_header, stamp_ns, swap_axes, to_enu
+from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
 from .table import decode_table, encode_table, require_columns, scalar_column
 
 REQUIRED = ('x', 'y', 'cov_x_x', 'cov_x_y', 'cov_y_y')
@@ -109,14 +109,7 @@ def write_scan(scan: Fixes, make: Make) -> Any:
 
 def write_poses(scan: Fixes, make: Make) -> Any:
     """Write a PoseArray, which has no room for covariances and identities."""
-    poses = [
-        make(
-            'geometry_msgs/msg/Pose',
-            position=make('geometry_msgs/msg/Point', x=float(x), y=float(y), z=float(z)),
-            orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-        )
-        for x, y, z in scan.position
-    ]
+    poses = [make_pose(position, make) for position in scan.position]
     header = make_header(scan.stamp_ns, scan.frame_id, make)
     return make('geometry_msgs/msg/PoseArray', header=header, poses=poses)
 

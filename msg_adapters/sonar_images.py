@@ -62,14 +62,7 @@ def read_projected_image(
     beams = np.array(
         [[beam.x, beam.y, beam.z] for beam in message.beam_directions], np.float64
     ).reshape(-1, 3)
-    bearing = beam_bearings(beams, beam_axes)
-    return SonarImage(
-        stamp_ns=stamp_ns(message),
-        range=distance,
-        bearing=bearing,
-        amplitude=image_samples(message.image, len(distance), len(bearing), image_order),
-        frame_id=str(message.header.frame_id),
-    )
+    return _image(message, distance, beam_bearings(beams, beam_axes), image_order)
 
 
 def read_raw_image(
@@ -79,6 +72,13 @@ def read_raw_image(
     `Rejection`."""
     distance = _raw_ranges(message, sound_speed)
     bearing = -np.array(message.rx_angles, np.float64)  # receive angles count to starboard
+    return _image(message, distance, bearing, image_order)
+
+
+def _image(
+    message: Any, distance: FloatArray, bearing: FloatArray, image_order: str
+) -> SonarImage:
+    """The SonarImageData of a message, with its axes."""
     return SonarImage(
         stamp_ns=stamp_ns(message),
         range=distance,
