@@ -90,7 +90,10 @@ class FlsDetectorNode(Node):
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
         )
         heard = self._endpoints.subscribe(
-            image_class, topic.name, self.receive, input_qos(self._node_config.queue_depth)
+            image_class,
+            topic.name,
+            lambda image, _: self.receive(image),
+            input_qos(self._node_config.queue_depth),
         )
         self._reporter = Reporter(
             self.get_fully_qualified_name().lstrip('/'),
