@@ -42,11 +42,13 @@ REQUIRES = [
 ]
 EXTRAS = {
     'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],
+    'parquet': ['pyarrow>=14'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
         'filterpy',
         'hypothesis',
         'laspy[lazrs]>=2.5',
+        'pyarrow>=14',
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',

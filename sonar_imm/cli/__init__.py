@@ -154,6 +154,7 @@ def missing_package(name: str) -> str | None:
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
         'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
+        'pyarrow': "pyarrow, which writes Parquet, is not here: pip install 'sonar_imm[parquet]'",
         'filterpy': "FilterPy is not installed: pip install 'sonar_imm[test]'",
     }
     return remedies.get(name)
