@@ -64,6 +64,24 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def on_post_build(config: Any) -> None:
+    """Called by mkdocs at the end. Raises RuntimeError when a page loads from another server."""
+    found = {
+        f'{path.relative_to(config.site_dir)}: {address}'
+        for path in Path(config.site_dir).rglob('*.html')
+        for address in loaded_from_afar(path.read_text(encoding='utf-8'))
+    }
+    if found:
+        raise RuntimeError('pages load from other servers: ' + ', '.join(sorted(found)))
+
+
+def loaded_from_afar(page: str) -> list[str]:
+    """Addresses on other servers that a browser asks for when it shows `page`; links are none."""
+    tags = re.findall(r'<(?:script|link|img|iframe|source|video|audio)\b[^>]*>', page)
+    kept = (tag for tag in tags if not re.search(r'\brel="?(?:canonical|next|prev)\b', tag))
+    return re.findall(r'\b(?:src|href)="?((?:https?:)?//[^"\s>]+)', ' '.join(kept))
+
+
 def made_pages() -> dict[str, str]:
     """The text of each page that is made, by its path in the site."""
     pages = {page: at_the_root(name) for name, page in OUTSIDE.items()}
