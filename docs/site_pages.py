@@ -15,8 +15,8 @@
 """Pages of the site that are made when it is built, because something else holds their text.
 
 mkdocs calls `on_files` (see mkdocs.yml). The home page is README.md; the pages of the API list the
-modules of each package, which mkdocstrings then describes; the page of interfaces comes from the
-inputs and the estimates of the trackers.
+modules of each package, which mkdocstrings then describes; the pages of options and of inputs come
+from the command and from the trackers.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ API = {
     'trackers': ('sonar_imm.trackers', 'The trackers'),
     'recordings': ('sonar_imm.recordings', 'Bags in and out, other formats'),
     'evaluation': ('sonar_imm.evaluation', 'Scores and reports'),
+    'viewing': ('sonar_imm.viewing', 'Recordings, runs and nodes in Foxglove and Rerun'),
     'simulation': ('sonar_imm.simulation', 'Scenes'),
     'msg_adapters': ('msg_adapters', 'ROS messages to measurements and estimates, and back'),
 }
@@ -90,6 +91,7 @@ def made_pages() -> dict[str, str]:
         for page, (package, title) in API.items()
     }
     pages['reference/interfaces.md'] = interfaces()
+    pages['reference/options.md'] = options()
     return pages
 
 
@@ -127,6 +129,23 @@ def modules(package: str) -> list[str]:
         for name in names
         if not any(part.startswith('_') for part in name.removesuffix('.__init__').split('.'))
     ]
+
+
+def options() -> str:
+    """What `--help` of every command and of every kind of conversion says."""
+    import click
+
+    from sonar_imm.cli import command, PROGRAM
+
+    def helps(one: click.Command, name: str, parent: click.Context | None) -> list[str]:
+        context = click.Context(one, parent, info_name=name, max_content_width=100)
+        parts = [f'## {context.command_path}', f'```text\n{one.get_help(context)}\n```']
+        if isinstance(one, click.Group):
+            for sub in one.list_commands(context):
+                parts += helps(one.get_command(context, sub), sub, context)
+        return parts
+
+    return '\n\n'.join(['# Options of every command', *helps(command, PROGRAM, None)]) + '\n'
 
 
 def interfaces() -> str:

@@ -52,7 +52,10 @@ def test_every_page_is_in_the_navigation(made) -> None:
     config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
     pages = {path.relative_to(ROOT / 'docs').as_posix() for path in (ROOT / 'docs').rglob('*.md')}
     pages |= {*made.OUTSIDE.values(), *(f'reference/api/{name}.md' for name in made.API)}
-    assert in_navigation(config['nav']) == pages | {'reference/interfaces.md'}
+    assert in_navigation(config['nav']) == pages | {
+        'reference/interfaces.md',
+        'reference/options.md',
+    }
 
 
 def test_the_api_has_every_public_module(made) -> None:
