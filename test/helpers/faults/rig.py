@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A real node as a process, what is sent to it, and what it says: the bench on which faults run."""
+"""A real node as a process, what is sent to it and what it says: where faults happen."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from attrs import define, field, frozen
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
@@ -48,9 +48,7 @@ from .cases import Action, Case, Message, SECOND, Step
 from .closeness import agrees
 
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
-NO_LOSS = re.compile(
-    r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*'
-)
+NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
 """Counts of what was not lost."""
 
 
@@ -58,15 +56,15 @@ NO_LOSS = re.compile(
 class Outcome:
     """What a fault did. recovered: messages on the primary input until all later estimates agree
     with the undisturbed run, None for never; losses: counted in /diagnostics, by reason; levels
-    and words: of /diagnostics and the log while it lasted; estimates: in the rest, of how many."""
+    and words: of /diagnostics and the log while it lasted; estimates: in the rest, of how many;
+    answered: whether the node goes on answering messages."""
 
     recovered: int | None
     estimates: tuple[int, int]
     losses: dict[str, int]
     levels: frozenset[str]
     words: str
-    seconds: float
-    unanswered: int
+    answered: bool
 
 
 @define
@@ -121,9 +119,7 @@ class Rig:
         arguments += ['-p', 'diagnostics_period:=0.05']
         self.domain = enter(reserved_domain_id())
         with local_discovery():
-            self.node = enter(
-                NodeProcess(case.system, domain_id=self.domain, arguments=arguments)
-            )
+            self.node = enter(NodeProcess(case.system, domain_id=self.domain, arguments=arguments))
             self.link = enter(Link('rig', domain_id=self.domain))
         self.recorder = Recorder(self.link, f'/{case.system}')
         self.diagnostics = Diagnostics()
@@ -145,7 +141,7 @@ class Rig:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    # -- what a fault may do -----------------------------------------------------------------------
+    # -- what a fault may do ---------------------------------------------------------------------
 
     def send(self, message: Message) -> None:
         """Send one message, and wait for its answer."""
@@ -183,7 +179,7 @@ class Rig:
         )
 
     def wait_for_clock(self, stamp_ns: int, *, back: bool) -> None:
-        """Publish on /clock until the node lives at that time; back: a jump that it has to tell."""
+        """Publish on /clock until the node lives at that time; back: until it said so."""
         logged = self.node.log().count('/clock is back')
 
         def there() -> bool:
@@ -196,21 +192,17 @@ class Rig:
         """Set parameters from outside; gives a result each, or one when `atomically`."""
         told = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         if atomically:
-            request = SetParametersAtomically.Request(parameters=told)
-            return [
-                self.call(
-                    SetParametersAtomically, 'set_parameters_atomically', request
-                ).result
-            ]
-        return list(
-            self.call(SetParameters, 'set_parameters', SetParameters.Request(parameters=told)).results
-        )
+            atomic = SetParametersAtomically.Request(parameters=told)
+            name = 'set_parameters_atomically'
+            return [self.call(SetParametersAtomically, name, atomic).result]
+        request = SetParameters.Request(parameters=told)
+        return list(self.call(SetParameters, 'set_parameters', request).results)
 
     def parameters(self, *names: str) -> list[Any]:
         """The values of parameters."""
         request = GetParameters.Request(names=list(names))
         answer = self.call(GetParameters, 'get_parameters', request)
-        return [Parameter.from_parameter_msg(_named(value)).value for value in answer.values]
+        return [parameter_value_to_python(value) for value in answer.values]
 
     def call(self, service: Any, name: str, request: Any) -> Any:
         """Call a service of the node."""
@@ -232,7 +224,7 @@ class Rig:
         """Wait until /diagnostics says `words`."""
         assert self.lockstep.wait_for(lambda: words in ' '.join(self.diagnostics.words))
 
-    # -- a whole run -------------------------------------------------------------------------------
+    # -- a whole run -----------------------------------------------------------------------------
 
     def play(self, steps: Iterable[Step]) -> list[Estimate]:
         """Send messages and do actions; gives the estimates that were published meanwhile."""
@@ -245,7 +237,7 @@ class Rig:
         return self.recorder.estimates(start)
 
     def undisturbed(self) -> dict[int, Estimate]:
-        """What the node makes of the recording from a fresh start: the first word for each stamp."""
+        """What a fresh node makes of the recording: the first word for each stamp."""
         self.reset()
         return first_words(self.play(self.case.messages()))
 
@@ -255,19 +247,15 @@ class Rig:
         self.enable(True)
         self.fresh_diagnostics()
         before, logged = self.diagnostics.counts(), len(self.node.log())
-        answers = self.lockstep.counts.messages
+        messages = self.lockstep.counts.messages
         self.diagnostics.forget()
         disturbed, rest = disturb(*self.case.thirds())
-        start = time.monotonic()
         self.play(disturbed)
         self.fresh_diagnostics()
         found = first_words(self.play(rest))
-        seconds = time.monotonic() - start
         self.fresh_diagnostics()
         origins = {
-            one.stamp_ns: one.origin_ns
-            for one in rest
-            if isinstance(one, Message) and one.primary
+            one.stamp_ns: one.origin_ns for one in rest if isinstance(one, Message) and one.primary
         }
         held = [
             stamp in found and agrees(found[stamp], expected[origin])
@@ -283,8 +271,7 @@ class Rig:
             losses={k: n for k, n in sorted(lost.items()) if n > 0 and not NO_LOSS.match(k)},
             levels=frozenset(self.diagnostics.levels),
             words='\n'.join([*sorted(self.diagnostics.words), self.node.log()[logged:]]),
-            seconds=seconds,
-            unanswered=max(0, answers - self.lockstep.counts.messages),
+            answered=self.lockstep.counts.messages > messages,
         )
 
     def _advertise(self) -> None:
@@ -309,10 +296,3 @@ def _until_held(held: list[bool]) -> int | None:
     if not held or not held[-1]:
         return None
     return len(held) - int(np.argmin([*held[::-1], False]))
-
-
-def _named(value: Any) -> Any:
-    from rcl_interfaces.msg import Parameter as Message_
-
-    return Message_(name='it', value=value)
-

@@ -32,9 +32,7 @@ def middle(change: Callable[..., list[Step]]) -> Callable[..., Disturbance]:
     """Make a disturbance of a function of the messages during it; what it was given else stays."""
 
     def told(*arguments: Any) -> Disturbance:
-        def disturb(
-            before: list[Message], during: list[Message], after: list[Message]
-        ) -> Parts:
+        def disturb(before: list[Message], during: list[Message], after: list[Message]) -> Parts:
             return [*before, *change(during, *arguments)], list(after)
 
         return disturb

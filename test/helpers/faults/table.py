@@ -129,7 +129,6 @@ FAULTS = (
         name='a second publisher, its clock late',
         disturb=lambda case: streams.second_publisher(case.window + 3.0),
         counted=['too_late'],
-        level='WARN',
         settle=0,
     ),
     Fault(
