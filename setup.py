@@ -45,6 +45,7 @@ EXTRAS = {
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
         'filterpy',
+        'foxglove-sdk>=0.20',
         'hypothesis',
         'laspy[lazrs]>=2.5',
         'pytest>=7.4',
@@ -53,9 +54,12 @@ EXTRAS = {
         'rasterio>=1.3',
         'segyio>=1.9',
         'stonesoup',
+        'websockets>=15',
     ],
     'lint': ['mypy', 'ruff'],
+    'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
+    'view': ['foxglove-sdk>=0.20'],
     'sweep': ['dask[distributed]>=2024.1'],
 }
 

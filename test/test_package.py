@@ -49,6 +49,7 @@ PYPI_OF_KEY = {
     'python3-rosbags-pip': 'rosbags',
     'python3-scipy': 'scipy',
     'python3-stonesoup-pip': 'stonesoup',
+    'python3-websockets': 'websockets',
     'python3-yaml': 'PyYAML',
 }
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
@@ -56,6 +57,8 @@ IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
 # those that some commands need, each with an extra of its own.
 PEERS = {
+    'sonar_imm.viewing.rerun_file': {'rerun'},
+    'sonar_imm.viewing.server': {'foxglove'},
     'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
     'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'},
     'sonar_imm.evaluation.sweep': {'distributed'},
@@ -132,7 +135,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
-    without_key = {'laspy', 'segyio'}
+    without_key = {'foxglove-sdk', 'laspy', 'segyio'}
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 

@@ -143,6 +143,21 @@ class Plan:
     overwrite: bool
     strict: bool
 
+    @classmethod
+    def of_defaults(cls) -> Plan:
+        """What the command does without options."""
+        return cls(
+            system=None,
+            params=None,
+            overrides={},
+            topics={},
+            order='recorded',
+            smooth=False,
+            jobs=1,
+            overwrite=False,
+            strict=False,
+        )
+
     def parameters_of(self, bag: Path) -> Path | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
         from ..recordings.own_parameters import own_parameters
