@@ -85,6 +85,13 @@ class BathymetryNodeConfig(NodeConfig):
 
 
 @frozen(kw_only=True)
+class ReplayNodeConfig(NodeConfig):
+    """A late message has its window computed again: up to a second, while others go on coming."""
+
+    queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
+
+
+@frozen(kw_only=True)
 class DetectorNodeConfig(Config):
     """What the node of the detector of images can be told besides the detector."""
 

@@ -51,10 +51,16 @@ FLOORS = {
     'sonar_imm.node_config': 4,
     'sonar_imm.recordings': 5,
     'sonar_imm.evaluation': 6,
+    'sonar_imm.viewing': 7,
     'sonar_imm.nodes': 7,
     'sonar_imm.cli': 8,
 }
-SIDE_BY_SIDE = {('msg_adapters', 'sonar_imm.trackers'), ('sonar_imm.trackers', 'msg_adapters')}
+SIDE_BY_SIDE = {
+    ('sonar_imm.viewing', 'sonar_imm.nodes'),
+    ('sonar_imm.nodes', 'sonar_imm.viewing'),
+    ('msg_adapters', 'sonar_imm.trackers'),
+    ('sonar_imm.trackers', 'msg_adapters'),
+}
 ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
 
 

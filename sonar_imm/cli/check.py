@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     type=click.FloatRange(min=0.0),
     metavar='ERROR',
     help='Largest error allowed, of the kind and in the unit that the check prints, e.g. '
-    'position RMSE in metres for the diver.',
+    'position RMSE in metres for the diver. By default that of the recording (check.yaml in its '
+    'folder), or else of the system.',
 )
 @click.option(
     '--out',

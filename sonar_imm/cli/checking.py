@@ -32,6 +32,7 @@ from ..evaluation.run_folder import BAG, CSV, RunFolder
 from ..evaluation.tracking import final_estimates, InputOptions
 from ..nodes.harness import LockstepResult, run_lockstep
 from ..parameters import Config
+from ..recordings.own_limit import own_limit
 from ..recordings.own_parameters import own_parameters
 from ..recordings.reader import BagReader
 from ..recordings.topics import instruments
@@ -105,11 +106,12 @@ def check_recording(
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
     params: parameter file; None for the one that comes with the recording, if any. limit: largest
-    error allowed, in the unit of the system; None for the limit of the shipped recordings. topics:
-    input by topic name; None for those that fit.
+    error allowed, in the unit of the system; None for that of the recording, if it states one, or
+    else of the system. topics: input by topic name; None for those that fit.
     Raises `BagError`, `ConfigError` and `LinkError`.
     """
     params = params or own_parameters(bag)
+    limit = own_limit(bag) if limit is None else limit
     config, node = load_config(SYSTEMS[system], params, {})
     options = InputOptions(
         topics=topics,

@@ -22,7 +22,7 @@ import contextlib
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from attrs import evolve, frozen
+from attrs import evolve, field, frozen
 import click
 
 from ..trackers import System, SYSTEMS
@@ -151,15 +151,15 @@ def command(
 class Plan:
     """What the options of the command ask for, for any bag."""
 
-    system: str | None
-    params: Path | None
-    overrides: dict[str, str]
-    topics: dict[str, str]
-    order: str
-    smooth: bool
-    overwrite: bool
-    strict: bool
-    parquet: bool
+    system: str | None = None
+    params: Path | None = None
+    overrides: dict[str, str] = field(factory=dict)
+    topics: dict[str, str] = field(factory=dict)
+    order: str = 'recorded'
+    smooth: bool = False
+    overwrite: bool = False
+    strict: bool = False
+    parquet: bool = False
 
     def parameters_of(self, bag: Path) -> Path | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""

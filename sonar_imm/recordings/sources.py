@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, Protocol
 from attrs import frozen
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
 from .mcap_scan import McapScan, oversized_chunk, unpack
 from .messages import decode_cdr, typestore
@@ -68,13 +69,17 @@ class RawMessage(NamedTuple):
 
 
 class Source(Protocol):
-    """One storage that yields its messages by log time."""
+    """One storage that yields its messages by log time. `types` are those it can decode."""
+
+    types: Typestore
 
     def topics(self) -> list[TopicInfo]: ...
 
     def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]: ...
 
     def decode(self, type_name: str, raw: bytes) -> Any: ...
+
+    def span(self) -> tuple[int, int] | None: ...
 
     def close(self) -> None: ...
 
@@ -102,9 +107,8 @@ class RosbagsSource:
             self._reader.close()
             raise BagError(f'metadata.yaml has {trouble}')
         # rosbags ignores its default types as soon as the bag defines a single one
-        _add_known_types(
-            self._reader.typestore, [link.msgtype for link in self._reader.connections]
-        )
+        self.types = self._reader.typestore
+        _add_known_types(self.types, [link.msgtype for link in self._reader.connections])
 
     def _trouble(self) -> str:
         """What of the metadata is of a wrong kind, empty when nothing is; rosbags does not ask."""
@@ -142,7 +146,7 @@ class RosbagsSource:
                 link.topic,
                 link.msgtype,
                 link.msgcount,
-                link.msgtype in self._reader.typestore.fielddefs,
+                link.msgtype in self.types.fielddefs,
                 tuple(getattr(link.ext, 'offered_qos_profiles', ())),
             )
             for link in self._reader.connections
@@ -158,8 +162,14 @@ class RosbagsSource:
 
     def decode(self, type_name: str, raw: bytes) -> Any:
         if self._reader.is2:
-            return decode_cdr(self._reader.typestore, type_name, raw)
+            return decode_cdr(self.types, type_name, raw)
         return self._reader.deserialize(raw, type_name)
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns, by the index of the storage."""
+        if not self._reader.message_count:
+            return None
+        return self._reader.start_time, self._reader.end_time - 1
 
     def close(self) -> None:
         self._reader.close()
@@ -171,14 +181,14 @@ class ScanSource:
     def __init__(self, path: Path):
         self._scan = McapScan(path)
         self.lost = self._scan.lost
-        self._types = get_typestore(Stores.EMPTY)
+        self.types = get_typestore(Stores.EMPTY)
         for channel in self._scan.channels.values():
             if channel.definition and 'idl' in channel.definition_encoding:
-                self._types.register(get_types_from_idl(channel.definition))
+                self.types.register(get_types_from_idl(channel.definition))
             elif channel.definition:
-                self._types.register(get_types_from_msg(channel.definition, channel.type_name))
+                self.types.register(get_types_from_msg(channel.definition, channel.type_name))
         _add_known_types(
-            self._types, [channel.type_name for channel in self._scan.channels.values()]
+            self.types, [channel.type_name for channel in self._scan.channels.values()]
         )
 
     def topics(self) -> list[TopicInfo]:
@@ -187,7 +197,7 @@ class ScanSource:
                 channel.topic,
                 channel.type_name,
                 self._scan.counts[number],
-                channel.type_name in self._types.fielddefs,
+                channel.type_name in self.types.fielddefs,
             )
             for number, channel in self._scan.channels.items()
         ]
@@ -202,7 +212,12 @@ class ScanSource:
             yield RawMessage(chosen[number].topic, chosen[number].type_name, log_ns, raw)
 
     def decode(self, type_name: str, raw: bytes) -> Any:
-        return decode_cdr(self._types, type_name, raw)
+        return decode_cdr(self.types, type_name, raw)
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns, by reading the file."""
+        times = [item.log_ns for item in self.messages(None)]
+        return (min(times), max(times)) if times else None
 
     def close(self) -> None:
         self._scan.close()

@@ -164,6 +164,7 @@ SYSTEMS = {
             config='config.DiverConfig',
             tracker='tracker.DiverTracker',
             smoother='smoothing.SmoothingDiverTracker',
+            node_config='ReplayNodeConfig',
         ),
         System(
             name='fathometer',
@@ -178,6 +179,7 @@ SYSTEMS = {
             'and navigation, Gaussian sum over depth',
             config='config.ObstacleConfig',
             tracker='tracker.ObstacleTracker',
+            node_config='ReplayNodeConfig',
         ),
     )
 }

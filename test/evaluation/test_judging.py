@@ -58,7 +58,7 @@ def test_benches_have_names_of_their_own(system):
 
 
 def test_a_limit_is_met_or_missed():
-    limit = Limit(0.5, 'm', 'height RMSE')
+    limit = Limit(0.5, 'm', 'height RMSE', 'height.all.rmse_m')
     check = limit.check(0.5, remark=' (flat floor 1.20 m)')
     assert check.good and check.wanted == 'at most 0.5 m'
     assert check.name == 'height RMSE against truth'
