@@ -57,6 +57,8 @@ IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
 # those that some commands need, each with an extra of its own.
 PEERS = {
+    'sonar_imm.evaluation.jobs': {'distributed'},
+    'sonar_imm.evaluation.tables': {'pyarrow'},
     'sonar_imm.viewing.rerun_file': {'rerun'},
     'sonar_imm.viewing.server': {'foxglove'},
     'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},

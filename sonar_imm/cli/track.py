@@ -121,8 +121,9 @@ def command(
     if scheduler is not None and jobs > 1:
         raise click.UsageError('--jobs and --scheduler exclude each other')
     if parquet:
-        import pyarrow  # noqa: F401  # says now, not after an hour, that it is not installed
+        from ..evaluation.tables import require_parquet
 
+        require_parquet()
     plan = Plan(
         system=system,
         params=params,

@@ -68,6 +68,11 @@ class CsvTable:
                 self._writer.writerow([stamp_ns, *row])
 
 
+def require_parquet() -> None:
+    """Raise ModuleNotFoundError when Parquet cannot be written; to say so before the work."""
+    import pyarrow.parquet  # noqa: F401
+
+
 class ParquetTable:
     """A table as Parquet, with the types of the columns: stamp_ns is int64.
 
