@@ -93,18 +93,11 @@ if TYPE_CHECKING:
 def command(
     bags: tuple[Path, ...],
     out_dir: Path,
-    system: str | None,
-    params: Path | None,
-    overrides: dict[str, str],
-    topics: dict[str, str],
-    order: str,
-    smooth: bool,
     jobs: int,
     scheduler: str | None,
     parquet: bool,
-    overwrite: bool,
-    strict: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
@@ -124,17 +117,7 @@ def command(
         from ..evaluation.tables import require_parquet
 
         require_parquet()
-    plan = Plan(
-        system=system,
-        params=params,
-        overrides=overrides,
-        topics=topics,
-        order=order,
-        smooth=smooth,
-        overwrite=overwrite,
-        strict=strict,
-        parquet=parquet,
-    )
+    plan = Plan(parquet=parquet, **options)
     if len(bags) == 1:
         runs = plan.jobs(bags[0], out_dir)
         say_parameters(bags[0], plan, quiet=as_json)
