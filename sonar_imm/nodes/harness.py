@@ -105,7 +105,7 @@ def run_lockstep(
         stack.enter_context(
             _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
         )
-        arguments = _arguments(bag, direct, params_file)
+        arguments = _arguments(bag, system, direct, params_file)
         arguments += _losing_nothing(f'/{system}/estimate.publisher')
         arguments += ['-p', 'max_wait:=0.0', '-p', 'max_revisions:=0']
         for entry in fed.values():
@@ -119,7 +119,7 @@ def run_lockstep(
         before: NodeProcess | None = None
         if fed:
             name = FEEDERS[system]
-            arguments = _arguments(bag, fed, params_file)
+            arguments = _arguments(bag, name, fed, params_file)
             for entry in fed.values():
                 arguments += _losing_nothing(f'{entry.makes}.publisher')
             before = stack.enter_context(
@@ -138,7 +138,7 @@ def run_lockstep(
             PlayOptions(
                 topics=tuple(inputs),
                 lockstep=f'/{system}',
-                remap={name: f'/{entry.name}' for name, entry in inputs.items()},
+                remap={name: entry.full_name(system) for name, entry in inputs.items()},
             ),
             lockstep,
         )
@@ -275,14 +275,17 @@ def _losing_nothing(endpoint: str) -> list[str]:
 
 
 def _arguments(
-    bag: BagReader, inputs: Mapping[str, InputTopic], params_file: Path | str | None
+    bag: BagReader,
+    node: str,
+    inputs: Mapping[str, InputTopic],
+    params_file: Path | str | None,
 ) -> list[str]:
     """Write the ROS arguments of a node that loses no input and expects the types of the bag."""
     parameters: dict[str, str] = {}
     inputs_lossless: list[str] = []
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():
-        inputs_lossless += _losing_nothing(f'{entry.name}.subscription')
+        inputs_lossless += _losing_nothing(f'{entry.full_name(node)}.subscription')
         if len(entry.readers) == 1:
             continue
         known = parameters.setdefault(f'{entry.name.split("/")[-1]}_type', types[topic])
