@@ -38,8 +38,8 @@ import numpy as np
 from msg_adapters.inputs import FEEDERS, InputTopic
 
 from ..estimates import Estimate
-from ..recordings.measurements import fitting_topics
 from ..recordings.reader import BagReader
+from ..recordings.topics import fitting_topics
 from ..trackers import SYSTEMS
 from .chain import Chain, FirstStep
 from .link import Link, LinkError
