@@ -69,6 +69,8 @@ __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 class DiverTracker:
     """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`."""
 
+    STATE = ('_stream', '_placer')
+
     def __init__(self, config: DiverConfig):
         self.config = config
         self.models = build_models(config)
