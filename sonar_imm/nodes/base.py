@@ -191,7 +191,7 @@ class TrackerNode(Node):
         )
         subscription = self._endpoints.subscribe(
             message_class(type_name),
-            name,
+            topic.prefix + name,
             functools.partial(self._receive, evolve(topic, name=name), reader),
             input_qos(self._node_config.queue_depth),
         )
