@@ -60,7 +60,7 @@ TOPICS = (
         measurement=Navigation,
         readers={'nav_msgs/msg/Odometry': read_navigation},
         write=write_navigation,
-        doubt=doubt_navigation,
+        doubt=lambda message, navigation: doubt_navigation(message),
         companion=True,
         required=lambda settings: settings.get('navigation') == 'required',
     ),

@@ -58,7 +58,7 @@ RELATIVE = (
 )
 
 
-def _doubt(message: Any) -> str | None:
+def _doubt(message: Any, fix: Fix | GeodeticFix) -> str | None:
     return doubt_geodetic(message) if is_geodetic(message) else doubt_fix(message)
 
 
@@ -133,7 +133,7 @@ TOPICS = (
         measurement=VesselFix,
         readers=dict.fromkeys(GEODETIC, read_vessel_fix),
         write=write_geodetic,
-        doubt=doubt_geodetic,
+        doubt=lambda message, fix: doubt_geodetic(message),
         companion=True,
         beside=('relative',),
     ),

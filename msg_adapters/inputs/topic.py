@@ -25,6 +25,7 @@ from attrs import field, frozen
 from ..labels import Labels
 
 Reader = Callable[..., Any]
+Doubt = Callable[[Any, Any], str | None]
 
 DOUBTS = {
     'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
@@ -42,7 +43,8 @@ class InputTopic:
     name: relative topic name. measurement: the class that its readers give. readers: by message
     type; a reader takes ``(message, *, world_frame='enu')`` and raises `Rejection` for a message
     that it cannot use. write: ``(measurement, make) -> message``.
-    doubt: gives a reason code to count when a message can be used but deserves a warning.
+    doubt: ``(message, measurement)`` -> a reason code to count when a message can be used but
+    deserves a warning, given what its reader made of it.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     one_topic: several topics are several instruments, each for a tracker of its own.
     settings: parameters of the tracker that its readers take as keywords too: what messages do not
@@ -68,7 +70,7 @@ class InputTopic:
     measurement: type = field(kw_only=True)
     readers: Mapping[str, Reader] = field(kw_only=True)
     write: Callable[..., Any] = field(kw_only=True)
-    doubt: Callable[[Any], str | None] = field(default=lambda message: None, kw_only=True)
+    doubt: Doubt = field(default=lambda message, measurement: None, kw_only=True)
     scans: bool = field(default=False, kw_only=True)
     one_topic: bool = field(default=False, kw_only=True)
     settings: tuple[str, ...] = field(default=(), kw_only=True)

@@ -43,7 +43,7 @@ import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidParameterTypeException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import InvalidQoSProfileException
 from rclpy.signals import SignalHandlerOptions
@@ -57,13 +57,15 @@ from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
-from .answers import answer
+from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
+from .executor import MessagesFirst
 from .messages import make, message_class
 from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
 from .stopping import START_PATIENCE, stopper
+from .tables import TablePublisher
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 _PATIENCE = 3.0
@@ -160,9 +162,9 @@ class TrackerNode(Node):
             notice.cancel()
 
     def _advertise(self) -> None:
-        self._estimates = self.advertise(TABLE, '~/estimate')
-        self._processed = self._endpoints.advertise(
-            message_class(TABLE), '~/processed', latched_qos()
+        self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
+        self._answers = Answers(
+            self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
         )
         self._diagnostics = self._endpoints.advertise(
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
@@ -230,12 +232,13 @@ class TrackerNode(Node):
 
     def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         measurement = reader(message)
+        doubt = topic.doubt(message, measurement)
         self._guard.check(measurement)
         rows = self._repeats.rows
         measurement = self._repeats.fresh(measurement)
         if self._repeats.rows > rows:
             self._doubt(topic, 'repeated_rows')
-        if (doubt := topic.doubt(message)) is not None:
+        if doubt is not None:
             self._doubt(topic, doubt)
         self._publish(self.tracker.process(measurement))
 
@@ -287,7 +290,7 @@ class TrackerNode(Node):
             'refused': self._meter.refused.total(),
             'estimates': self._published,
         }
-        self._processed.publish(answer(row, stamp))
+        self._answers.say(row, stamp)
 
     def _start_afresh(self) -> None:
         self.tracker.reset()
@@ -350,7 +353,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
             print(text)
             return 0
         stopper.on_stop(rclpy.try_shutdown, START_PATIENCE)
-        executor = SingleThreadedExecutor()
+        executor = MessagesFirst()
         node = make_node()
         warn_of_foreign_files(node, args)
         stopper.on_stop(rclpy.try_shutdown)

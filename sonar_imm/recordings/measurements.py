@@ -122,7 +122,7 @@ def measurements_of(
             continue
         try:
             measurement = readers[item.topic, item.type_name](item.message)
-            if (code := entry.doubt(item.message)) is not None:
+            if (code := entry.doubt(item.message, measurement)) is not None:
                 doubts[item.topic, code] += 1
         except Rejection as rejection:
             measurement = rejection
