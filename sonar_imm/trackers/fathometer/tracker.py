@@ -350,7 +350,7 @@ class FathometerTracker:
         members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
         if self._filter.model.shift:
-            mean, std = self._filter.shift(w, sets)
+            mean, std = self._filter.shift(step, w, sets)
             heave = self._lattice.step * mean, self._lattice.step * std
         pulse = response.pulse or self.pulse
         found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
