@@ -34,7 +34,8 @@ from attrs import frozen
 from msg_adapters.displays import DISPLAYS
 from msg_adapters.estimates import read_estimate
 
-from ..evaluation.run_folder import BAG, RUN, RunFolder
+from ..evaluation.batch import run_folders
+from ..evaluation.run_folder import BAG, RUN, RunFolder, SUMMARY
 from ..recordings.messages import cdr_of, message_definition, ros_message
 from ..recordings.reader import BagError, BagReader
 
@@ -74,17 +75,18 @@ class Part(Protocol):
 
 
 class Recording:
-    """A recording as a part; `reader` is open."""
+    """A recording as a part; `reader` is open, and `prefix` is put before the names of topics."""
 
-    def __init__(self, reader: BagReader):
+    def __init__(self, reader: BagReader, prefix: str = ''):
         self._reader = reader
+        self._prefix = prefix
 
     def channels(self) -> list[Channel]:
         found = (
             (topic, self._reader.definition(topic.type_name)) for topic in self._reader.topics
         )
         return [
-            Channel(topic.name, topic.type_name, definition)
+            Channel(self._prefix + topic.name, topic.type_name, definition)
             for topic, definition in found
             if definition is not None  # else the reader has said so already
         ]
@@ -93,8 +95,9 @@ class Recording:
         return self._reader.span()
 
     def messages(self, topics: Collection[str]) -> Iterator[Shown]:
-        for item in self._reader.messages(topics, decode=self._reader.is_ros1):
-            yield Shown(item.topic, item.log_ns, self._reader.cdr(item))
+        own = [name.removeprefix(self._prefix) for name in topics]
+        for item in self._reader.messages(own, decode=self._reader.is_ros1):
+            yield Shown(self._prefix + item.topic, item.log_ns, self._reader.cdr(item))
 
     @property
     def problems(self) -> list[str]:
@@ -104,9 +107,10 @@ class Recording:
 class Drawings:
     """What the node of `system` would draw of the estimates in a recording, as a part."""
 
-    def __init__(self, reader: BagReader, system: str):
+    def __init__(self, reader: BagReader, system: str, prefix: str = ''):
         self._reader = reader
         self._system = system
+        self._prefix = prefix
 
     def channels(self) -> list[Channel]:
         return [
@@ -119,7 +123,7 @@ class Drawings:
 
     def messages(self, topics: Collection[str]) -> Iterator[Shown]:
         displays = DISPLAYS[self._system]()
-        for item in self._reader.messages([self._topic('estimate')]):
+        for item in self._reader.messages([f'/{self._system}/estimate']):
             drawn = displays.of(
                 read_estimate(item.message),
                 ros_message,
@@ -133,7 +137,7 @@ class Drawings:
         return []
 
     def _topic(self, name: str) -> str:
-        return f'/{self._system}/{name}'
+        return f'{self._prefix}/{self._system}/{name}'
 
 
 class Material:
@@ -184,29 +188,46 @@ class Material:
         yield from sorted(earlier.values(), key=lambda item: item.log_ns)
 
 
+def _runs(source: Path) -> list[Path]:
+    """The folders of the runs at `source`, none when it is a recording."""
+    if (source / RUN).is_file() or (source / SUMMARY).is_file():
+        return run_folders(source)
+    return []
+
+
 @contextlib.contextmanager
 def opened(source: Path, topics: Collection[str] = ()) -> Iterator[tuple[Material, list[str]]]:
     """What is to be shown of a recording or of a run, open for the ``with`` statement, and
     sentences about what is missing.
 
     Of a run: its estimates, what a node would have drawn of them, and the recording they were made
-    of when that is still there. Raises `BagError` for what cannot be read.
+    of when that is still there. Of runs of several instruments in one recording: all, the name of
+    the folder before the topics. Raises `BagError` for what cannot be read.
     """
     with contextlib.ExitStack() as stack:
 
         def reader(path: Path) -> BagReader:
             return stack.enter_context(BagReader(path))
 
-        problems, parts = [], []
-        if (source / RUN).is_file():
-            run = RunFolder(source).read_run()
-            estimates, recording = reader(source / BAG), Path(run['bag'])
-            parts += [Recording(estimates), Drawings(estimates, run['system'])]
-            if recording.exists():
-                parts.append(Recording(reader(recording)))
-            else:
+        problems: list[str] = []
+        parts: list[Part] = []
+        recordings: list[Path] = []
+        folders = _runs(source)
+        for folder in folders:
+            run = RunFolder(folder).read_run()
+            estimates = reader(folder / BAG)
+            prefix = f'/{folder.relative_to(source).as_posix()}' if len(folders) > 1 else ''
+            parts += [Recording(estimates, prefix), Drawings(estimates, run['system'], prefix)]
+            recordings.append(Path(run['bag']))
+        if len(set(recordings)) > 1:
+            raise BagError(
+                f'{source} holds runs of {len(set(recordings))} recordings: show one of them, '
+                f'e.g. {folders[0]}'
+            )
+        for recording in set(recordings) if folders else {source}:
+            if folders and not recording.exists():
                 problems.append(f'{recording} is gone: only the estimates are shown')
-        else:
-            parts.append(Recording(reader(source)))
+            else:
+                parts.append(Recording(reader(recording)))
         material = Material(parts, topics)
         yield material, problems + material.problems

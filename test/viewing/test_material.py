@@ -123,10 +123,14 @@ def test_a_run_is_shown_with_its_drawings_and_its_recording(run):
         for one in messages
         if one.topic == '/diver/odometry'
     ]
-    confirmed = [one for one in estimates if (one.extras['track_state'] >= 1).any()]
-    assert [stamp_ns(one) for one in drawn] == [one.stamp_ns for one in confirmed]
-    first = drawn[0].pose.pose.position
-    assert (first.x, first.y) == tuple(confirmed[0].state[0, :2])
+    confirmed = [
+        (one.stamp_ns, *state[:2])
+        for one in estimates
+        for state in one.state[one.extras['track_state'] >= 1]
+    ]
+    places = [one.pose.pose.position for one in drawn]
+    assert [(stamp_ns(one), at.x, at.y) for one, at in zip(drawn, places)] == confirmed
+    assert len(confirmed) > 50
 
 
 def test_a_run_whose_recording_is_gone_is_shown_alone(run, tmp_path):
@@ -137,3 +141,22 @@ def test_a_run_whose_recording_is_gone_is_shown_alone(run, tmp_path):
     with opened(alone) as (material, problems):
         assert problems == [f'{tmp_path / "gone"} is gone: only the estimates are shown']
         assert '/arrivals' not in material.channels and '/diver/odometry' in material.channels
+
+
+def test_both_sides_of_a_sonar_are_shown_each_below_its_name(tmp_path):
+    scene = ['simulate', 'bathymetry', str(tmp_path / 'bag'), '--scenario', 'moving_two_sides']
+    small = ['--set', 'pings=2', '--set', 'last_range=20', '--set', 'bin_width=0.2']
+    assert main([*scene, *small]) == 0
+    told = ['--set', 'particles_per_model=20']
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *told]) == 0
+    with opened(tmp_path / 'run') as (material, problems):
+        assert problems == []
+        assert any(name.endswith('/bathymetry/estimate') for name in material.channels)
+        assert list(material.messages())
+
+
+def test_runs_of_several_recordings_are_not_mixed(run, tmp_path):
+    bags = [str(shared_file(f'bags/{name}')) for name in ('diver_table1', 'diver_multistatic')]
+    assert main(['track', *bags, str(tmp_path / 'out')]) == 0
+    with pytest.raises(BagError, match='holds runs of 2 recordings'), opened(tmp_path / 'out'):
+        pass
