@@ -49,7 +49,6 @@ from rclpy.qos import InvalidQoSProfileException
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
-from msg_adapters.displays import DISPLAYS, Drawn
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
@@ -61,6 +60,7 @@ from ..trackers import SYSTEMS
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
+from .drawing import Drawing
 from .executor import MessagesFirst
 from .keeping import StateKeeper
 from .messages import make, message_class
@@ -145,18 +145,11 @@ class TrackerNode(Node):
 
     def show(self, newest: Estimate) -> None:
         """Publish the newest state for displays."""
-        self._draw(self._displays.of(newest, make, self._watched))
+        self._drawing.show(newest)
 
     def show_all(self, estimates: list[Estimate]) -> None:
         """Publish what each of the estimates of one message is to be shown as."""
         self.show(estimates[-1])
-
-    def _watched(self, name: str) -> int:
-        return self._drawings[name].get_subscription_count()
-
-    def _draw(self, drawn: Drawn) -> None:
-        for name, message in drawn:
-            self._drawings[name].publish(message)
 
     @property
     def _node_config(self) -> NodeConfig:
@@ -186,11 +179,7 @@ class TrackerNode(Node):
         self._diagnostics = self._endpoints.advertise(
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
         )
-        self._displays = DISPLAYS[self._system]()
-        self._drawings = {
-            name: self.advertise(type_name, f'~/{name}')
-            for name, type_name in self._displays.topics.items()
-        }
+        self._drawing = Drawing(self._system, self.advertise)
         self.advertise_more()
 
     def _listen(self, topic: InputTopic, name: str) -> str:
@@ -320,7 +309,7 @@ class TrackerNode(Node):
         self.tracker.reset()
         self._guard.reset()
         self._repeats.reset()
-        self._draw(self._displays.forget(make))
+        self._drawing.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self._start_afresh()
