@@ -35,7 +35,7 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
-from msg_adapters.displays import confirmed_rows
+from msg_adapters.displays.tracks import confirmed_rows
 from msg_adapters.geodetic import write_geo
 
 from ..estimates import Estimate

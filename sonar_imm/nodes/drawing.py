@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from msg_adapters.displays import DISPLAYS, Drawn
+from msg_adapters.displays import displays_of, Drawn
 
 from ..estimates import Estimate
 from .messages import make
@@ -29,7 +29,7 @@ class Drawing:
     """The displays of `system`; `advertise` offers a topic of a type and gives its publisher."""
 
     def __init__(self, system: str, advertise: Callable[[str, str], Any]):
-        self._displays = DISPLAYS[system]()
+        self._displays = displays_of(system)
         self._publishers = {
             name: advertise(type_name, f'~/{name}')
             for name, type_name in self._displays.topics.items()

@@ -31,7 +31,7 @@ from typing import NamedTuple, Protocol
 
 from attrs import frozen
 
-from msg_adapters.displays import DISPLAYS
+from msg_adapters.displays import displays_of
 from msg_adapters.estimates import read_estimate
 
 from ..evaluation.batch import run_folders
@@ -115,14 +115,14 @@ class Drawings:
     def channels(self) -> list[Channel]:
         return [
             Channel(self._topic(name), type_name, message_definition(type_name) or '')
-            for name, type_name in DISPLAYS[self._system].topics.items()
+            for name, type_name in displays_of(self._system).topics.items()
         ]
 
     def span(self) -> tuple[int, int] | None:
         return self._reader.span()
 
     def messages(self, topics: Collection[str]) -> Iterator[Shown]:
-        displays = DISPLAYS[self._system]()
+        displays = displays_of(self._system)
         for item in self._reader.messages([f'/{self._system}/estimate']):
             drawn = displays.of(
                 read_estimate(item.message),
