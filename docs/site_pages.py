@@ -57,6 +57,12 @@ API = {
 """Packages whose modules are described, by the name of their page."""
 
 
+TYPICAL = """\
+Recordings in `bags/` are simulated. These are typical: of 31 seeds the one in the middle.
+`sonar-imm check` plays them to the live nodes and allows the error in the last column, which nine
+in ten of those seeds stay below."""
+
+
 def on_files(files: Any, config: Any) -> Any:
     """Called by mkdocs with what it found in docs/: add the pages that are made."""
     from mkdocs.structure.files import File
@@ -160,9 +166,7 @@ def recordings() -> str:
         '\n\n'.join(
             [
                 '# Shipped recordings',
-                'Recordings in `bags/` are simulated. These are typical: of 31 seeds the one in '
-                'the middle. `sonar-imm check` plays them to the live nodes and allows the error of '
-                'the last column, which nine in ten of those seeds stay below.',
+                TYPICAL,
                 '\n'.join(
                     [
                         '| recording | seed | error | of this seed | 5 to 95 % | allowed |',
