@@ -61,6 +61,7 @@ from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
 from .executor import MessagesFirst
+from .keeping import StateKeeper
 from .messages import make, message_class
 from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
@@ -86,9 +87,12 @@ class TrackerNode(Node):
         self._settings = NodeParameters(
             self, (config_type, self._node_config_type), type_specs(system)
         )
-        self.tracker = SYSTEMS[system].build(self._settings[config_type])
+        config = self._settings[config_type]
         self._guard = FrameGuard(self._node_config.frame_id)
-        self._repeats = RepeatGuard(getattr(self.tracker.config, 'repeat_time', 0.0))
+        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
+        guards = (self._guard, self._repeats)
+        self._keeper = StateKeeper(self, system, self._node_config, guards)
+        self.tracker = self._keeper.begin(config)
         self._warm()
 
         self._enabled = True
@@ -119,10 +123,16 @@ class TrackerNode(Node):
             self._report,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
+        self._keeper.save_every_now_and_then(lambda: self.tracker)
         self._settings.on_change(lambda: self.tracker.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
         self.get_logger().info(f'ready, hears {", ".join(hears.values())}')
+
+    def destroy_node(self) -> None:
+        """Save the state, then end."""
+        self._keeper.save(self.tracker, wait=True)
+        super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:
         """Offer an output; to be used by `advertise_displays`."""
@@ -183,7 +193,7 @@ class TrackerNode(Node):
         )
         subscription = self._endpoints.subscribe(
             message_class(type_name),
-            name,
+            topic.prefix + name,
             functools.partial(self._receive, evolve(topic, name=name), reader),
             input_qos(self._node_config.queue_depth),
         )
@@ -240,6 +250,8 @@ class TrackerNode(Node):
             self._doubt(topic, 'repeated_rows')
         if doubt is not None:
             self._doubt(topic, doubt)
+        if not self._keeper.goes_on(measurement.stamp_ns):
+            self._start_afresh()
         self._publish(self.tracker.process(measurement))
 
     def _publish(self, estimates: list[Estimate]) -> None:
@@ -331,7 +343,10 @@ class TrackerNode(Node):
                 stale_after=self._node_config.stale_after,
                 counts=counts,
                 health=self.tracker.health(),
-                warnings=getattr(self.tracker, 'warnings', list)(),
+                warnings=[
+                    *getattr(self.tracker, 'warnings', list)(),
+                    *filter(None, [self._keeper.trouble]),
+                ],
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
             )

@@ -49,6 +49,8 @@ class WalkerConfig(Config):
 class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
 
+    STATE = ('counts', 'fixes')
+
     def __init__(self, config):
         self.config = config
         self.counts = Counter()

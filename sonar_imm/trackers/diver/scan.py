@@ -127,6 +127,7 @@ class Scan:
             white=self.white,
             fixes=self.fixes,
             broken=before.broken,
+            not_started=before.not_started,
             repairs=before.repairs + self.repairs,
             instruments=self.instruments,
         )
