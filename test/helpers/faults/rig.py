@@ -100,8 +100,10 @@ class Diagnostics:
 class Rig:
     """A node of one system in a ROS domain of its own, in lock-step; ended by ``with``."""
 
-    def __init__(self, case: Case, arguments: Sequence[str] = ()):
-        self.case = case
+    def __init__(self, case: Case, arguments: Sequence[str] = (), *, lossless: bool = True):
+        """Start it. lossless: whether inputs are reliable and of any length, as lock-step needs
+        for many messages; else they are as the node has them."""
+        self.case, self._lossless = case, lossless
         self._stack = contextlib.ExitStack()
         try:
             self._start([*arguments])
@@ -112,7 +114,7 @@ class Rig:
     def _start(self, arguments: list[str]) -> None:
         case, enter = self.case, self._stack.enter_context
         topics = dict.fromkeys(one.topic for one in case.messages())
-        for name in (*topics, f'{case.system}/estimate'):
+        for name in (*(topics if self._lossless else ()), f'{case.system}/estimate'):
             end = 'publisher' if name.endswith('estimate') else 'subscription'
             for policy in ('history:=keep_all', 'reliability:=reliable'):
                 arguments += ['-p', f'qos_overrides./{name}.{end}.{policy}']
