@@ -56,8 +56,8 @@ NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|do
 class Outcome:
     """What a fault did. recovered: messages on the primary input until all later estimates agree
     with the undisturbed run, None for never; losses: counted in /diagnostics, by reason; levels
-    and words: of /diagnostics and the log while it lasted; estimates: in the rest, of how many;
-    answered: whether the node goes on answering messages."""
+    and words: of /diagnostics while it lasted, and of the log, where some are said once;
+    estimates: in the rest, of how many; answered: whether the node goes on answering messages."""
 
     recovered: int | None
     estimates: tuple[int, int]
@@ -248,7 +248,7 @@ class Rig:
         self.reset()
         self.enable(True)
         self.fresh_diagnostics()
-        before, logged = self.diagnostics.counts(), len(self.node.log())
+        before = self.diagnostics.counts()
         messages = self.lockstep.counts.messages
         self.diagnostics.forget()
         disturbed, rest = disturb(*self.case.thirds())
@@ -272,7 +272,7 @@ class Rig:
             estimates=(answered, len(held)),
             losses={k: n for k, n in sorted(lost.items()) if n > 0 and not NO_LOSS.match(k)},
             levels=frozenset(self.diagnostics.levels),
-            words='\n'.join([*sorted(self.diagnostics.words), self.node.log()[logged:]]),
+            words='\n'.join([*sorted(self.diagnostics.words), self.node.log()]),
             answered=self.lockstep.counts.messages > messages,
         )
 

@@ -49,8 +49,9 @@ class Fault:
     arguments: Sequence[str] = ()
 
 
-KEEPS_LATE = ('diver', 'obstacle')
-ONCE = ('bathymetry', 'fathometer')
+ANY_ORDER = ('diver', 'obstacle', 'bathymetry')
+ONCE = ('fathometer',)
+IN_ORDER = ('diver', 'obstacle', 'fathometer')
 SIMULATED = ('-p', 'use_sim_time:=true')
 
 FAULTS = (
@@ -67,12 +68,19 @@ FAULTS = (
         disturb=lambda case: streams.twice(),
         counted=['duplicate', 'repeated'],
         settle=0,
+        systems=IN_ORDER,
+    ),
+    Fault(
+        name='every ping twice, no ping needs another',
+        disturb=lambda case: streams.twice(),
+        settle=0,
+        systems=['bathymetry'],
     ),
     Fault(
         name='late messages, inside the window',
         disturb=lambda case: streams.late(),
         settle=0,
-        systems=KEEPS_LATE,
+        systems=ANY_ORDER,
     ),
     Fault(
         name='late messages, no window',
@@ -84,7 +92,7 @@ FAULTS = (
         name='shuffled inside the window',
         disturb=lambda case: streams.shuffled(),
         settle=0,
-        systems=KEEPS_LATE,
+        systems=ANY_ORDER,
     ),
     Fault(
         name='shuffled, no window',
@@ -132,6 +140,7 @@ FAULTS = (
         level='WARN',
         says='not used: too_late',
         settle=0,
+        systems=IN_ORDER,
     ),
     Fault(
         name='bearings in degrees',
@@ -187,5 +196,13 @@ FAULTS = (
         disturb=lambda case: actions.parameter_storm(),
         says='parameters changed',
         settle=0,
+    ),
+    Fault(
+        name='the state cannot be saved (read-only disk)',
+        disturb=lambda case: actions.long_enough(),
+        level='WARN',
+        says='the state cannot be saved',
+        settle=0,
+        arguments=('-p', 'state_file:=/sys/sonar_imm_state', '-p', 'state_interval:=0.2'),
     ),
 )
