@@ -39,7 +39,7 @@ from rosbags.rosbag2 import (
 )
 
 from ..files import whole
-from .messages import ros_message, typestore
+from .messages import cdr_of, ros_message, typestore
 from .own_parameters import write_own_parameters
 from .sources import BagError
 
@@ -135,8 +135,7 @@ class BagWriter:
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""
-        name = message.__msgtype__
-        self.write_raw(topic, name, typestore().serialize_cdr(message, name), log_ns)
+        self.write_raw(topic, message.__msgtype__, cdr_of(message), log_ns)
 
     def write_raw(self, topic: str, type_name: str, raw: bytes | memoryview, log_ns: int) -> None:
         """Append a message that is CDR already. Raises ValueError for a log time before 1970."""
