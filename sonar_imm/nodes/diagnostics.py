@@ -32,20 +32,11 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
-from .health import ERROR, FALL, Finding, Hysteresis, RISE, Shares, STALE, summary, told, WARN
+from .health import ERROR, FALL, Finding, Hysteresis, RISE, STALE, summary, told, WARN
 from .qos import Endpoints, latched_qos, output_qos
+from .unused import Unused
 
-USELESS = {
-    'too_late': 'are older than what can still be used, and dropped: publishers whose clocks '
-    'disagree, or a delay beyond the history',
-    'doubted': 'have stamps that do not go on from those before, and are dropped',
-    'other_frame': 'are in another frame, and dropped',
-    'navigation_gap': 'fall in gaps of the navigation, and are dropped',
-    'navigation_missing': 'waited for navigation that did not come, and are dropped',
-    'vessel_pose_missing': 'waited for a pose of the vessel that did not come, and are dropped',
-}
-"""What a tracker drops by reason, and what is said when that is more than `MUCH_USELESS`."""
-MUCH_USELESS = MUCH_LOST = 0.1
+MUCH_LOST = 0.1
 _WINDOW = 1000
 _PATIENCE = 5.0
 """Mean intervals after which an input that is not needed is said to be gone."""
@@ -111,7 +102,7 @@ class Reporter:
         self._meter = meter
         self._before = (None, Counter(), Counter(), 0, Counter())
         self._of_input, self._of_tracker = Hysteresis(rise, fall), Hysteresis(rise, fall)
-        self._shares = Shares()
+        self._unused = Unused()
 
     def report(
         self,
@@ -145,7 +136,6 @@ class Reporter:
         stale = self._stale(now, stale_after)
         message = DiagnosticArray()
         message.header.stamp = stamp
-        useless = self._shares.add(fresh.total(), {name: counts.get(name, 0) for name in USELESS})
         message.status = [
             self._input_status(
                 now,
@@ -161,13 +151,15 @@ class Reporter:
             ),
             self._tracker_status(
                 fresh.total() == 0,
-                useless,
                 (fresh + missing).total() / elapsed,
                 dropped - dropped_before,
                 enabled,
                 counts,
                 health,
-                warnings,
+                [
+                    *warnings,
+                    *filter(None, [self._unused.sentence(now, meter.received.total(), counts)]),
+                ],
                 stale,
             ),
         ]
@@ -252,7 +244,6 @@ class Reporter:
     def _tracker_status(
         self,
         quiet: bool,
-        useless: Mapping[str, float],
         rate: float,
         dropped: int,
         enabled: bool,
@@ -265,7 +256,7 @@ class Reporter:
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
-        found = [Finding(f'warning {k}', WARN, one) for k, one in enumerate(warnings)]
+        found = [Finding(_wording(one), WARN, one) for one in warnings]
         if stale and enabled:
             sentence = f'waiting for input: {stale[0]}'
             found.append(Finding('stale', STALE, sentence, at_once=True, passing=True))
@@ -278,11 +269,6 @@ class Reporter:
         if health.get('moving_alike'):
             sentence = 'most obstacles move alike: navigation may drift'
             found.append(Finding('moving_alike', WARN, sentence))
-        found += [
-            Finding(name, WARN, f'{share:.0%} of the messages {USELESS[name]} ({name})')
-            for name, share in useless.items()
-            if share > MUCH_USELESS
-        ]
         if counts.get('internal_error'):
             sentence = 'an internal error was caught, see the log'
             found.append(Finding('internal_error', ERROR, sentence, at_once=True))
@@ -327,6 +313,11 @@ def _share_lost(missing: Counter[str], fresh: Counter[str]) -> str:
         f'{100 * n / (n + fresh[topic]):.1f} % on {topic}' for topic, n in missing.most_common(3)
     )
     return f'messages are lost before they can be read: {shares}'
+
+
+def _wording(sentence: str) -> str:
+    """What stays of a sentence whose numbers change."""
+    return ''.join(letter for letter in sentence if letter.isalpha())[:60]
 
 
 def _most(refused: Counter[str]) -> str:

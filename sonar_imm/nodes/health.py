@@ -23,7 +23,7 @@ A period without a message says nothing of what only messages show, so that slow
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
@@ -108,27 +108,3 @@ def summary(name: str, parts: Iterable[DiagnosticStatus]) -> DiagnosticStatus:
         hardware_id='sonar_imm',
         values=[KeyValue(key=key, value=value) for key, value in pairs],
     )
-
-
-class Shares:
-    """How much of the last messages met some fate, over more than one period: at one message a
-    second a single one would be all of it."""
-
-    def __init__(self, periods: int = 10):
-        self._periods = periods
-        self._before: dict[str, int] | None = None
-        self._past: list[tuple[int, dict[str, int]]] = []
-
-    def add(self, messages: int, counts: Any) -> dict[str, float]:
-        """Take one period in, with the messages since the last one and counts since the start;
-        gives the share of each count that rose by three at least."""
-        before, self._before = self._before, dict(counts)
-        if before is not None:
-            fresh = {name: n - before.get(name, 0) for name, n in counts.items()}
-            self._past = [*self._past, (messages, fresh)][-self._periods :]
-        total = sum(one for one, _ in self._past)
-        sums: dict[str, int] = {}
-        for _, fresh in self._past:
-            for name, n in fresh.items():
-                sums[name] = sums.get(name, 0) + n
-        return {name: min(1.0, n / total) for name, n in sums.items() if n >= 3 and total}
