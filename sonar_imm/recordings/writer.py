@@ -39,6 +39,7 @@ from rosbags.rosbag2 import (
     WriterError,
 )
 
+from .mcap_sums import seal
 from .messages import ros_message, typestore
 from .sources import BagError
 
@@ -116,9 +117,11 @@ class BagWriter:
         self.close()
 
     def close(self) -> None:
-        """Finish the bag: index and metadata."""
+        """Finish the bag: index, metadata and checksums."""
         with naming(self.path):
             self._writer.close()
+            for file in self.path.glob('*.mcap'):
+                seal(file)
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""
