@@ -40,6 +40,8 @@ END = _FOOTER.size + len(MAGIC)
 """Bytes of the footer and what follows it."""
 MAX_UNPACKED = 1 << 27
 """Most bytes that a chunk or a message may unpack to: a few hundred bytes can claim gigabytes."""
+MAX_RATIO = 1000
+"""Most that a whole packed file may grow, once beyond that."""
 TOO_LARGE = f'unpacks to more than {MAX_UNPACKED >> 20} MiB'
 
 
@@ -133,6 +135,23 @@ def oversized_chunk(path: Path) -> str:
             if code == CHUNK and _unpacks_to_too_much(file.read(min(length, size))):
                 return f'a chunk at byte {position} {TOO_LARGE}'
     return ''
+
+
+def oversized_file(path: Path) -> str:
+    """A sentence about a whole file, packed with zstd, that unpacks to more than `MAX_RATIO` times
+    its size; empty when it does not. What it says of its own size is looked at first."""
+    limit = max(MAX_UNPACKED, MAX_RATIO * path.stat().st_size)
+    with path.open('rb') as file:
+        try:
+            stated = zstd.get_frame_info(file.read(64)).decompressed_size
+        except zstd.ZstdError:
+            return ''  # left to the reader
+    size = stated or 0
+    if stated is None:
+        with zstd.open(path) as unpacked:
+            while size <= limit and (block := unpacked.read(1 << 20)):
+                size += len(block)
+    return f'it unpacks to more than {limit >> 20} MiB' if size > limit else ''
 
 
 def _unpacks_to_too_much(chunk: bytes) -> bool:

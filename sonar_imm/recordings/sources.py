@@ -26,10 +26,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from attrs import frozen
+from backports.zstd import ZstdError
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 
-from .mcap_records import oversized_chunk, unpack
+from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
 from .mcap_scan import Channel, McapScan
 from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
@@ -104,6 +105,9 @@ class RosbagsSource:
                 raise BagError(oversized)
             if wrong := wrong_sums(file):
                 raise BagError(f'the checksum of {" and of ".join(wrong)} in {file.name} is wrong')
+        for file in path.glob('*.zstd') if path.is_dir() else []:
+            if oversized := oversized_file(file):
+                raise BagError(f'{file.name} cannot be unpacked: {oversized}')
         place = _FolderPath(path) if path.is_dir() else path
         self._reader = AnyReader([place], default_typestore=typestore())
         self._reader.open()
@@ -186,6 +190,8 @@ class RosbagsSource:
                 yield RawMessage(link.topic, link.msgtype, log_ns, _unpacked(raw))
 
     def decode(self, type_name: str, raw: bytes) -> Any:
+        if raw[:4] == _ZSTD_MAGIC:
+            unpack(raw, 'zstd')  # says why it is still packed
         if self._reader.is2:
             return decode_cdr(self._reader.typestore, type_name, raw)
         return self._reader.deserialize(raw, type_name)
@@ -327,8 +333,13 @@ def _open_file(file: Path) -> tuple[Source, list[str]]:
 
 
 def _unpacked(raw: bytes) -> bytes:
-    """Undo message compression, which only a missing metadata.yaml would have told about."""
-    return unpack(raw, 'zstd') if raw[:4] == _ZSTD_MAGIC else bytes(raw)
+    """Undo the compression of a message; one that cannot be unpacked stays as it is."""
+    if raw[:4] != _ZSTD_MAGIC:
+        return bytes(raw)
+    try:
+        return unpack(raw, 'zstd')
+    except (TooLargeError, ZstdError):
+        return bytes(raw)
 
 
 def _leftovers(path: Path) -> list[str]:

@@ -29,7 +29,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from sonar_imm.recordings import mcap_records
 from sonar_imm.recordings.mcap_scan import McapScan
 from sonar_imm.recordings.messages import ros_message, typestore
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.reader import BagError, BagReader
 
 TEXT = 'std_msgs/msg/String'
 
@@ -256,3 +256,41 @@ def test_an_honest_size_below_the_limit_is_unpacked():
     assert mcap_records.unpack(lz4.frame.compress(bytes(1000)), 'lz4') == bytes(1000)
     with pytest.raises(mcap_records.TooLargeError):
         mcap_records.unpack(zstd.compress(bytes(mcap_records.MAX_UNPACKED + 1)), 'zstd')
+
+
+@pytest.mark.parametrize('with_size', [True, False])
+def test_a_packed_file_of_zeros_is_not_written_to_disk(tmp_path, with_size, monkeypatch):
+    """rosbags unpacks a bag that is packed as a whole into a folder, without a limit."""
+    monkeypatch.setattr(mcap_records, 'MAX_UNPACKED', 1 << 20)
+    path = tmp_path / 'bag'
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        link = writer.add_connection('/a', TEXT, typestore=typestore())
+        writer.write(link, 1, typestore().serialize_cdr(ros_message(TEXT, data='x'), TEXT))
+    metadata = path / 'metadata.yaml'
+    told = metadata.read_text().replace("compression_mode: ''", 'compression_mode: file')
+    told = told.replace("compression_format: ''", 'compression_format: zstd')
+    metadata.write_text(told.replace('bag.mcap', 'bag.mcap.zstd'))
+    plain = (path / 'bag.mcap').read_bytes()
+    (path / 'bag.mcap').unlink()
+    packed = path / 'bag.mcap.zstd'
+    packed.write_bytes(zstd.compress(plain))
+    with BagReader(path) as bag:
+        assert len(list(bag.messages())) == 1 and not bag.problems
+    packed.write_bytes(zeros(b'zstd', 40 << 20, with_size=with_size))
+    with pytest.raises(BagError, match='unpacks to more than 1 MiB'), BagReader(path):
+        pass
+
+
+def test_a_packed_message_of_zeros_costs_itself(tmp_path, monkeypatch):
+    path = tmp_path / 'bag'
+    monkeypatch.setattr(mcap_records, 'MAX_UNPACKED', 1 << 20)
+    writer = Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        link = writer.add_connection('/a', TEXT, typestore=typestore())
+        raw = bytes(typestore().serialize_cdr(ros_message(TEXT, data='x'), TEXT))
+        for i, data in enumerate([raw, bytes(4 << 20), raw]):
+            writer.write(link, i, data)
+    with BagReader(path) as bag:
+        assert [item.log_ns for item in bag.messages()] == [0, 2]
+        assert 'message 1, it unpacks to more than' in bag.problems[0]
