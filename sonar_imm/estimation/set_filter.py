@@ -152,7 +152,8 @@ class SetFilter:
         rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
         sums = np.zeros((rows, self.model.record_cells))
         kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
-        return pmf, sums
+        # Weights add up to one but for rounding: no probability may pass it for that.
+        return np.minimum(pmf, 1.0), sums
 
     def shift(self, w: FloatArray, sets: Sets) -> tuple[float, float]:
         """Mean and standard deviation of the shift, cells."""

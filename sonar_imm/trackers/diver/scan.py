@@ -93,6 +93,8 @@ class Scan:
         self.tentative = before.life.status == TENTATIVE
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
+        # An error of the sound speed is there before the first arrival has been heard.
+        self.x, self.P = self.layout.widened(self.x, self.P)
         self.named = before.target_id != NOBODY
         self.existence = before.existence * math.exp(-self.dt / config.survival_time)
         self.evidence = before.evidence
