@@ -44,7 +44,7 @@ def test_no_message_breaks_a_tracker(system):
     search()
     assert tally.cases >= 2000
     # Most get past the reader, or nothing behind it would be tried.
-    assert tally.read > 0.5 * tally.cases and len(tally.refused) > 8 and tally.counted
+    assert tally.read > 0.5 * tally.cases and len(tally.refused) >= 5 and tally.counted
 
 
 @pytest.mark.parametrize('system', SYSTEMS)

@@ -37,7 +37,7 @@ from sonar_imm.measurements import (
     Trace,
 )
 
-from .schema import blank, is_many, leaves, make, number_type
+from .schema import blank, clone, is_many, leaves, make, number_type
 
 T0 = 1_700_000_000 * 10**9
 SECOND = 10**9
@@ -228,14 +228,14 @@ def templates(system):
     found = {}
     for variant in range(len(VARIANTS[system])):
         for name, type_name, message in stream(system, variant):
-            found.setdefault((name, type_name), message)
+            found.setdefault((name, type_name), clone(message))
     for entry in (*inputs_of(system), *made_inputs(system)):
         for type_name in entry.readers:
             if (entry.name, type_name) in found:
                 continue
             table = type_name.endswith('PointCloud2')
             message = (
-                next(one for (_, kind), one in found.items() if kind == type_name)
+                clone(next(one for (_, kind), one in found.items() if kind == type_name))
                 if table
                 else plausible(type_name)
             )
