@@ -44,7 +44,8 @@ if TYPE_CHECKING:
     type=click.FloatRange(min=0.0),
     metavar='ERROR',
     help='Largest error allowed, of the kind and in the unit that the check prints, e.g. '
-    'position RMSE in metres for the diver.',
+    'position RMSE in metres for the diver. By default that of the recording (check.yaml in its '
+    'folder), or else of the system.',
 )
 @click.option(
     '--out',
@@ -95,12 +96,21 @@ def run_checks(
     quiet: bool = False,
 ) -> list[CheckedRecording]:
     """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`."""
-    from .checking import check_recording, shipped_bags
+    from .checking import check_recording, instruments_in, shipped_bags
 
     return [
-        check_recording(path, system, folder / path.stem, params=params, limit=limit, quiet=quiet)
+        check_recording(
+            path,
+            system,
+            folder / path.stem / name,
+            params=params,
+            limit=limit,
+            topics=topics,
+            quiet=quiet,
+        )
         for system in systems
         for path in ([bag] if bag else shipped_bags(system))
+        for name, topics in instruments_in(path, system).items()
     ]
 
 

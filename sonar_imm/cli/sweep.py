@@ -19,7 +19,7 @@ from __future__ import annotations
 from importlib import import_module
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from attrs import evolve
 import click
@@ -37,6 +37,9 @@ from .common import (
     topic_option,
     typed_overrides,
 )
+
+if TYPE_CHECKING:
+    from ..evaluation.sweep import Sweep
 
 
 @click.command(
@@ -109,28 +112,8 @@ def command(
     if scheduler is not None and workers is not None:
         raise click.UsageError('--workers and --scheduler exclude each other')
     from ..evaluation import sweep as sweeps
-    from ..evaluation.tracking import InputOptions
-    from ..recordings.own_parameters import unusual
-    from .track import inputs_by_topic
 
-    scenes = import_module(SYSTEMS[system].scenes)
-    name = scenario or next(iter(scenes.SCENARIOS))
-    scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
-    config, node = load_config(SYSTEMS[system], params, {})
-    if params is None:
-        config = evolve(config, **unusual(scene.told(), type(config)))
-    sweep = sweeps.Sweep(
-        system=system,
-        scenario=name,
-        scene=scene,
-        config=config,
-        options=InputOptions(
-            topics=inputs_by_topic(topics),
-            frame_id=node.frame_id,
-            world_frame=node.world_frame_convention,
-            detector=load_detector(SYSTEMS[system], params, {}) if params else scene.told_feeder(),
-        ),
-    )
+    sweep = planned(system, scenario, overrides, params, topics)
     if out is not None:
         sweeps.prepare(out, overwrite=overwrite)
     seeds = range(seed, seed + runs)
@@ -153,6 +136,39 @@ def command(
     print_json(content) if as_json else _print(content, out)
     if 2 * len(content['failures']) > runs:
         raise click.exceptions.Exit(1)
+
+
+def planned(
+    system: str,
+    scenario: str | None,
+    overrides: dict[str, str],
+    params: Path | None = None,
+    topics: dict[str, str] | None = None,
+) -> Sweep:
+    """What all runs have in common, from the texts of a command line. Raises `ConfigError`."""
+    from ..evaluation.sweep import Sweep
+    from ..evaluation.tracking import InputOptions
+    from ..recordings.own_parameters import unusual
+    from .track import inputs_by_topic
+
+    scenes = import_module(SYSTEMS[system].scenes)
+    name = scenario or next(iter(scenes.SCENARIOS))
+    scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
+    config, node = load_config(SYSTEMS[system], params, {})
+    if params is None:
+        config = evolve(config, **unusual(scene.told(), type(config)))
+    return Sweep(
+        system=system,
+        scenario=name,
+        scene=scene,
+        config=config,
+        options=InputOptions(
+            topics=inputs_by_topic(topics or {}),
+            frame_id=node.frame_id,
+            world_frame=node.world_frame_convention,
+            detector=load_detector(SYSTEMS[system], params, {}) if params else scene.told_feeder(),
+        ),
+    )
 
 
 def _print(content: dict[str, Any], out: Path | None) -> None:

@@ -53,11 +53,13 @@ class Check:
 
 @frozen
 class Limit:
-    """What an error may be at most: `meaning` names the error, e.g. 'position RMSE'."""
+    """What an error may be at most: `meaning` names the error, e.g. 'position RMSE', and `metric`
+    is its dotted name in ``metrics.json``."""
 
     value: float
     unit: str
     meaning: str
+    metric: str
 
     def check(self, error: float, *, at_most: float | None = None, remark: str = '') -> Check:
         """Compare `error` with the limit, or with `at_most` instead; `remark` follows it."""

@@ -29,6 +29,7 @@ from attrs import frozen
 from backports.zstd import ZstdError
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
 
 from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
 from .mcap_scan import Channel, McapScan
@@ -72,7 +73,9 @@ class RawMessage(NamedTuple):
 
 
 class Source(Protocol):
-    """One storage that yields its messages by log time."""
+    """One storage that yields its messages by log time. `types` are those it can decode."""
+
+    types: Typestore
 
     def topics(self) -> list[TopicInfo]: ...
 
@@ -83,6 +86,8 @@ class Source(Protocol):
     def rescue(self) -> ScanSource | None:
         """What can still be read after damage stopped `messages`, from the first one again."""
         ...
+
+    def span(self) -> tuple[int, int] | None: ...
 
     def close(self) -> None: ...
 
@@ -116,9 +121,8 @@ class RosbagsSource:
             self._reader.close()
             raise BagError(f'metadata.yaml has {trouble}')
         # rosbags ignores its default types as soon as the bag defines a single one
-        _add_known_types(
-            self._reader.typestore, [link.msgtype for link in self._reader.connections]
-        )
+        self.types = self._reader.typestore
+        _add_known_types(self.types, [link.msgtype for link in self._reader.connections])
 
     def _unpack_here(self) -> None:
         """Have compressed messages handed out as they are: rosbags unpacks without a limit."""
@@ -175,7 +179,7 @@ class RosbagsSource:
                 link.topic,
                 link.msgtype,
                 link.msgcount,
-                link.msgtype in self._reader.typestore.fielddefs,
+                link.msgtype in self.types.fielddefs,
                 tuple(getattr(link.ext, 'offered_qos_profiles', ())),
             )
             for link in self._reader.connections
@@ -193,8 +197,14 @@ class RosbagsSource:
         if raw[:4] == _ZSTD_MAGIC:
             unpack(raw, 'zstd')  # says why it is still packed
         if self._reader.is2:
-            return decode_cdr(self._reader.typestore, type_name, raw)
+            return decode_cdr(self.types, type_name, raw)
         return self._reader.deserialize(raw, type_name)
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns, by the index of the storage."""
+        if not self._reader.message_count:
+            return None
+        return self._reader.start_time, self._reader.end_time - 1
 
     def close(self) -> None:
         self._reader.close()
@@ -206,7 +216,7 @@ class ScanSource:
     def __init__(self, path: Path):
         self._file = path
         self._scan = McapScan(path)
-        self._types = _types_of(frozenset(self._scan.channels.values()))
+        self.types = _types_of(frozenset(self._scan.channels.values()))
 
     def rescue(self) -> None:
         return None
@@ -231,7 +241,7 @@ class ScanSource:
                 channel.topic,
                 channel.type_name,
                 self._scan.counts[number],
-                channel.type_name in self._types.fielddefs,
+                channel.type_name in self.types.fielddefs,
             )
             for number, channel in self._scan.channels.items()
         ]
@@ -246,7 +256,12 @@ class ScanSource:
             yield RawMessage(chosen[number].topic, chosen[number].type_name, log_ns, raw)
 
     def decode(self, type_name: str, raw: bytes) -> Any:
-        return decode_cdr(self._types, type_name, raw)
+        return decode_cdr(self.types, type_name, raw)
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns, by reading the file."""
+        times = [item.log_ns for item in self.messages(None)]
+        return (min(times), max(times)) if times else None
 
     def close(self) -> None:
         self._scan.close()

@@ -108,3 +108,16 @@ def test_a_node_that_does_otherwise_is_found_out(check, change, rows):
 def test_a_node_that_loses_messages_or_dies_is_found_out(check, said, name):
     checks, good = check(**said)
     assert not good and [one.name for one in checks.values() if not one.good] == [name]
+
+
+def test_a_recording_may_state_its_own_limit(check, dive):
+    from sonar_imm.recordings.own_limit import write_own_limit
+
+    try:
+        write_own_limit(dive, 0.001)
+        checks, good = check()
+    finally:
+        (dive / 'check.yaml').unlink()
+    accuracy = checks['position RMSE against truth']
+    assert not good and accuracy.wanted == 'at most 0.001 m'
+    assert check()[0]['position RMSE against truth'].wanted == 'at most 1.25 m'

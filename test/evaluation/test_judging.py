@@ -29,7 +29,7 @@ from sonar_imm.trackers import SYSTEMS
 
 def folder_of(tmp_path, estimates=(), **run):
     folder = RunFolder(tmp_path / 'run')
-    folder.prepare()
+    folder.path.mkdir()
     folder.write_estimates(estimates, 'diver')
     folder.write_json(
         'run.json',
@@ -58,7 +58,7 @@ def test_benches_have_names_of_their_own(system):
 
 
 def test_a_limit_is_met_or_missed():
-    limit = Limit(0.5, 'm', 'height RMSE')
+    limit = Limit(0.5, 'm', 'height RMSE', 'height.all.rmse_m')
     check = limit.check(0.5, remark=' (flat floor 1.20 m)')
     assert check.good and check.wanted == 'at most 0.5 m'
     assert check.name == 'height RMSE against truth'

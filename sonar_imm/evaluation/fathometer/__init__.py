@@ -34,8 +34,9 @@ from .summary import lines, summary_sentence
 if TYPE_CHECKING:
     from ..page import Part
 
-LIMIT = Limit(0.08, 'm', 'OSPA')
-"""Limit for the shipped recordings. The best configuration has 0.05 m on average over long drifts;
+LIMIT = Limit(0.08, 'm', 'OSPA', 'ospa_m')
+"""Limit for recordings without one of their own. The best configuration has 0.05 m on average over
+long drifts;
 one recording can be worse than the average."""
 
 

@@ -122,6 +122,8 @@ class ObstacleTracker:
     """The tracker of `trackers.Tracker` for obstacles: `process` takes `Detections`, `Navigation`
     and `Altitude`."""
 
+    STATE = ('_stream',)
+
     def __init__(self, config: ObstacleConfig):
         self.config = config
         self.filter = build_filter(config)

@@ -1,0 +1,218 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Which seed makes a typical recording of a scene, and what `check` may allow on it.
+
+    python -m benchmarks.typical_seed obstacle movers --runs 31
+    python -m benchmarks.typical_seed obstacle movers --runs 31 --write bags/obstacle_movers
+
+A recording that is shipped is one draw of many, and a lucky one would promise too much. So the
+scene is simulated, tracked and scored under many seeds, as `sonar-imm sweep` does, and the seed is
+taken whose error is the median. With several metrics (``--metric``, dotted names of
+``metrics.json``; by default the one that `check` compares) it is the seed whose rank is nearest to
+the middle in all of them; errors with a sign are ranked by their size. The limit of `check` is
+what nine in ten of these runs stay below, rounded up to two digits.
+
+``--write`` makes the recording of that seed with its limit (``check.yaml``) and a README.md that
+says all this. ``--seed`` begins the runs, ``--set`` changes the scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+import math
+import os
+from pathlib import Path
+import shutil
+import sys
+
+from attrs import frozen
+import numpy as np
+
+from benchmarks.tables import markdown
+from sonar_imm.cli import main as sonar_imm
+from sonar_imm.cli.sweep import planned
+from sonar_imm.evaluation.judging import Limit
+from sonar_imm.evaluation.sweep import Outcome, run_here, run_on_processes
+from sonar_imm.recordings.own_limit import write_own_limit
+from sonar_imm.trackers import SYSTEMS
+
+SHARE = 0.9
+"""Of the runs that are within the limit of `check`."""
+
+
+@frozen
+class Typical:
+    """seed: whose errors are in the middle; limit: for `check`; spread: of each metric."""
+
+    seed: int
+    limit: float
+    spread: dict[str, dict[str, float]]
+
+
+def typical(outcomes: Sequence[Outcome], metrics: Sequence[str]) -> Typical:
+    """The typical one of runs; the first of the metrics has the limit.
+
+    Raises ValueError when a metric is missing in more than half of the runs.
+    """
+    runs = sorted(outcomes, key=lambda one: one.seed)
+    error = np.array([[abs(one.metrics.get(name, math.inf)) for name in metrics] for one in runs])
+    for name, column in zip(metrics, error.T):
+        if 2 * np.isinf(column).sum() >= len(runs):
+            known = sorted({name for one in runs for name in one.metrics})
+            raise ValueError(f'most runs have no {name}; there are: {", ".join(known)}')
+    rank = np.argsort(np.argsort(error, axis=0, kind='stable'), axis=0)
+    off = np.abs(rank - (len(runs) - 1) // 2)
+    # The worst rank decides, then the sum of all, then the first metric.
+    best = np.lexsort((off[:, 0], off.sum(axis=1), off.max(axis=1)))[0]
+    spread = {}
+    for name, column in zip(metrics, error.T):
+        finite = column[np.isfinite(column)]
+        low, middle, upper, share, high = np.percentile(finite, [5, 50, 75, 100 * SHARE, 95])
+        spread[name] = {
+            'of the seed': float(column[best]),
+            'median': float(middle),
+            '5 %': float(low),
+            '75 %': float(upper),
+            f'{100 * SHARE:.0f} %': float(share),
+            '95 %': float(high),
+            'worst': float(finite.max()),
+            'runs': float(len(finite)),
+        }
+    return Typical(runs[best].seed, rounded_up(spread[metrics[0]][f'{100 * SHARE:.0f} %']), spread)
+
+
+def rounded_up(value: float, digits: int = 2) -> float:
+    """The next number of so many digits that is not below `value`."""
+    if value <= 0.0:
+        return 0.0
+    places = digits - 1 - math.floor(math.log10(value))
+    return round(math.ceil(value * 10**places - 1e-9) / 10**places, max(places, 0))
+
+
+def simulated(given: argparse.Namespace, seed: int) -> list[str]:
+    """The command that makes the recording, without the name of the program and of the bag."""
+    pairs = [text for pair in given.set for text in ('--set', pair)]
+    return ['--scenario', given.scene, '--seed', str(seed), *pairs, *given.compress]
+
+
+def readme(given: argparse.Namespace, found: Typical, limit: Limit, failed: int) -> str:
+    """What README.md of the recording says."""
+    name = Path(given.write).name
+    command = [
+        'sonar-imm',
+        'simulate',
+        given.system,
+        f'bags/{name}',
+        *simulated(given, found.seed),
+    ]
+    again = ['python', '-m', 'benchmarks.typical_seed', given.system, given.scene]
+    again += ['--runs', str(given.runs), '--seed', str(given.seed)]
+    again += [text for pair in given.set for text in ('--set', pair)]
+    again += [text for metric in given.metric for text in ('--metric', metric)]
+    again += [*given.compress, '--write', f'bags/{name}']
+    first = next(iter(found.spread))
+    own = found.spread[first]['of the seed']
+    what = limit.meaning if first == limit.metric else f'`{first}`'
+    return '\n'.join(
+        [
+            f'# {name}',
+            '',
+            'A simulated recording with its truth:',
+            '',
+            f'    {" ".join(command)}',
+            '',
+            f'Its seed is typical: of seeds {given.seed} to {given.seed + given.runs - 1} the one '
+            'in the middle'
+            + (
+                f' by {what}, {own:.2f} {limit.unit}.'
+                if len(found.spread) == 1
+                else ' by all errors below.'
+            )
+            + (f' {failed} runs failed.' if failed else ''),
+            f'`sonar-imm check {given.system}` allows {found.limit:g} {limit.unit} ({what}), '
+            f'which {100 * SHARE:.0f} % of these runs stay below.',
+            '',
+            markdown(found.spread),
+            '',
+            f'    {" ".join(again)}',
+            '',
+        ]
+    )
+
+
+def outcomes_of(given: argparse.Namespace) -> list[Outcome]:
+    overrides = dict(pair.split('=', 1) for pair in given.set)
+    sweep = planned(given.system, given.scene, overrides)
+    seeds = range(given.seed, given.seed + given.runs)
+    workers = min(given.workers or len(os.sched_getaffinity(0)), given.runs)
+    coming = run_here(sweep, seeds) if workers == 1 else run_on_processes(sweep, seeds, workers)
+    found = []
+    for outcome in coming:
+        found.append(outcome)
+        told = outcome.failure or ', '.join(
+            f'{name} {outcome.metrics.get(name, math.nan):.3f}' for name in given.metric
+        )
+        print(f'seed {outcome.seed}: {told}', file=sys.stderr, flush=True)
+    return found
+
+
+def write(given: argparse.Namespace, found: Typical, text: str) -> None:
+    """Make the recording, its limit and README.md, in place of those there are."""
+    folder = Path(given.write)
+    if folder.exists():
+        shutil.rmtree(folder)
+    status = sonar_imm(['simulate', given.system, str(folder), *simulated(given, found.seed)])
+    if status:
+        sys.exit(status)
+    write_own_limit(folder, found.limit)
+    (folder / 'README.md').write_text(text, encoding='utf-8')
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('system', choices=list(SYSTEMS))
+    parser.add_argument('scene', help='one of `sonar-imm simulate SYSTEM --list`')
+    parser.add_argument('--runs', type=int, default=31)
+    parser.add_argument('--seed', type=int, default=1, help='of the first run')
+    parser.add_argument('--set', action='append', default=[], metavar='NAME=VALUE')
+    parser.add_argument('--metric', action='append', default=[], help='the first has the limit')
+    parser.add_argument('--workers', type=int, help='processes; by default one per core')
+    parser.add_argument('--write', type=Path, metavar='BAG', help='make the recording here')
+    parser.add_argument(
+        '--compress', action='store_const', const=['--compress'], default=[], help='the recording'
+    )
+    given = parser.parse_args()
+    limit = import_module(SYSTEMS[given.system].judge).LIMIT
+    given.metric = given.metric or [limit.metric]
+    outcomes = outcomes_of(given)
+    failed = [one for one in outcomes if one.failure]
+    try:
+        found = typical(outcomes, given.metric)
+    except ValueError as error:
+        reasons = sorted({one.failure for one in failed})
+        sys.exit(' '.join([str(error), *reasons]))
+    print(markdown(found.spread))
+    print(f'seed {found.seed}, limit for check {found.limit:g} {limit.unit}, {len(failed)} failed')
+    if given.write:
+        write(given, found, readme(given, found, limit, len(failed)))
+
+
+if __name__ == '__main__':
+    main()
