@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
@@ -56,6 +56,7 @@ from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
 from .navigation import Mount
+from .state import identities, ObstacleState, PingState
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -68,56 +69,6 @@ approach: at 0.5, one in five obstacles that leave the beam above or below would
 _TINY, _WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
 nothing."""
-
-
-@frozen(eq=False, kw_only=True)
-class PingState:
-    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
-    alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them."""
-
-    stamp_ns: int
-    sonar: Sonar
-    life: Tracks
-    mixture: Mixture
-    nis: FloatArray
-    strengths: Strengths
-    repairs: int = 0
-    alike: bool = False
-
-    def rows(self, kept: np.ndarray) -> PingState:
-        """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
-        if kept.all():
-            return self
-        return evolve(
-            self,
-            mixture=self.mixture.rows(kept),
-            nis=self.nis[kept],
-            strengths=self.strengths.rows(kept),
-        )
-
-    def only(self, kept: np.ndarray) -> PingState:
-        """The obstacles where `kept` (T,) is True."""
-        return self if kept.all() else evolve(self.rows(kept), life=self.life.only(kept))
-
-
-@frozen(eq=False, kw_only=True)
-class ObstacleState:
-    """All that is known at a stamp. last: after the newest ping used, None before the first; done:
-    the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
-    skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
-    because too many waited; broken: tracks ended so far because their numbers were not finite;
-    alike: pings so far in which most obstacles moved alike."""
-
-    last: PingState | None = None
-    done: tuple[PingState, ...] = ()
-    navigation: NavigationBuffer = NavigationBuffer()
-    altitude: Altitude | None = None
-    waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
-    skipped: int = 0
-    missing: int = 0
-    broken: int = 0
-    alike: int = 0
 
 
 class ObstacleTracker:
@@ -139,7 +90,7 @@ class ObstacleTracker:
             StreamRules.of(self.config),
             step=self._step,
             initial=ObstacleState(),
-            survivor=_identities,
+            survivor=identities,
         )
         self.counts = self._stream.counts
 
@@ -169,6 +120,7 @@ class ObstacleTracker:
             'tracks': len(status),
             'confirmed': int((status != TrackStatus.TENTATIVE).sum()),
             'nis_mean': float(nis.mean() / 2.0) if len(nis) else float('nan'),
+            'nis_memory': state.innovations.mean,
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
             'navigation_missing': state.missing,
@@ -177,6 +129,11 @@ class ObstacleTracker:
             'pings_moving_alike': state.alike,
             'covariance_repairs': state.last.repairs if state.last else 0,
         }
+
+    def warnings(self) -> list[str]:
+        """What the sonar states and cannot be true, in a sentence for the user."""
+        advice = 'check range_std, bearing_std_deg and the variances of the detections'
+        return self._stream.state.innovations.warnings('detections', advice)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         revised = self._stream.revise(measurement)
@@ -200,7 +157,7 @@ class ObstacleTracker:
         given_up = max(0, len(waiting) - MOST_WAITING)
         del waiting[:given_up]
         last, done, skipped, broken = before.last, [], before.skipped, before.broken
-        alike = before.alike
+        alike, innovations = before.alike, before.innovations
         while waiting:
             ready = self._readiness(buffer, waiting[0][0])
             if ready == 'wait':
@@ -212,6 +169,8 @@ class ObstacleTracker:
             last, lost = self._ping(last, ping, self._sonar(buffer, ping, height))
             broken += lost
             alike += last.alike
+            sure = np.isfinite(last.nis) & (last.life.status != TrackStatus.TENTATIVE)
+            innovations = innovations.after(last.nis[sure], 2)
             done.append(last)
         oldest = waiting[0][0].stamp_ns if waiting else stamp_ns
         return ObstacleState(
@@ -224,6 +183,7 @@ class ObstacleTracker:
             missing=before.missing + given_up,
             broken=broken,
             alike=alike,
+            innovations=innovations,
         )
 
     def _readiness(self, buffer: NavigationBuffer, ping: Detections) -> str:
@@ -404,11 +364,3 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
-
-
-def _identities(state: ObstacleState) -> ObstacleState:
-    """What outlives a restarted clock: the identities that are used up."""
-    if state.last is None:
-        return ObstacleState()
-    nobody = np.zeros(len(state.last.life), bool)
-    return ObstacleState(last=evolve(state.last, stamp_ns=0).only(nobody))
