@@ -30,6 +30,7 @@ from ..navigation import (
 )
 from ..snapshots import read_snapshot, write_snapshot
 from .topic import InputTopic
+from .transforms import TF_STATIC
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 
@@ -79,4 +80,5 @@ TOPICS = (
         write=write_range,
         companion=True,
     ),
+    TF_STATIC,
 )

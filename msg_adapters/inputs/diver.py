@@ -46,6 +46,7 @@ from ..scans import doubt_scan, read_poses, read_scan, write_scan
 from ..starts import read_start, write_start
 from ..vessel import read_heading, read_vessel_pose, write_heading
 from .topic import InputTopic
+from .transforms import TF_STATIC
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 GEODETIC = (
@@ -162,4 +163,5 @@ TOPICS = (
         prefix='~/',
         by_name=frozenset({POSE}),
     ),
+    TF_STATIC,
 )

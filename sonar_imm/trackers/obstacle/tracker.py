@@ -146,6 +146,10 @@ class ObstacleTracker:
         self.config = config
         self.filter = build_filter(config)
 
+    def remount(self, config: ObstacleConfig) -> None:
+        """Take another place of the sonar on the vehicle, for all pings from now on."""
+        self.config, self.mount = config, Mount(config)
+
     def warm(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
         tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0))
