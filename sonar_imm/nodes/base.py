@@ -59,6 +59,7 @@ from ..trackers.frames import FrameDoor
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
+from .drawing import Drawing
 from .executor import MessagesFirst
 from .keeping import StateKeeper
 from .messages import make, message_class
@@ -72,7 +73,7 @@ _PATIENCE = 3.0
 
 
 class TrackerNode(Node):
-    """One tracker as a ROS 2 node. A system's own node adds its displays by `show`."""
+    """One tracker as a ROS 2 node. A system's own node may publish more by `show`."""
 
     def __init__(self, system: str, **options: Any):
         """Declare, compile, then subscribe: the first message meets a warm tracker.
@@ -80,6 +81,7 @@ class TrackerNode(Node):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(system, **options)
+        self._system = system
         self._topics = inputs_of(system)
         config_type = SYSTEMS[system].config_type()
         self._node_config_type = node_config_type(SYSTEMS[system])
@@ -137,21 +139,19 @@ class TrackerNode(Node):
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:
-        """Offer an output; to be used by `advertise_displays`."""
+        """Offer an output; to be used by `advertise_more`."""
         return self._endpoints.advertise(message_class(type_name), topic, output_qos())
 
-    def advertise_displays(self) -> None:
-        """Offer the topics that `show` publishes."""
+    def advertise_more(self) -> None:
+        """Offer what a system's own node publishes besides the displays."""
 
     def show(self, newest: Estimate) -> None:
         """Publish the newest state for displays."""
+        self._drawing.show(newest)
 
     def show_all(self, estimates: list[Estimate]) -> None:
         """Publish what each of the estimates of one message is to be shown as."""
         self.show(estimates[-1])
-
-    def forget(self) -> None:
-        """Tell displays that all tracks are forgotten."""
 
     @property
     def _node_config(self) -> NodeConfig:
@@ -181,7 +181,8 @@ class TrackerNode(Node):
         self._diagnostics = self._endpoints.advertise(
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
         )
-        self.advertise_displays()
+        self._drawing = Drawing(self._system, self.advertise)
+        self.advertise_more()
 
     def _listen(self, topic: InputTopic, name: str) -> str:
         """Subscribe to one input on the topic `name`, and give the resolved name of that."""
@@ -313,7 +314,7 @@ class TrackerNode(Node):
         self.tracker.reset()
         self._guard.reset()
         self._repeats.reset()
-        self.forget()
+        self._drawing.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self._start_afresh()
