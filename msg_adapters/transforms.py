@@ -25,6 +25,7 @@ from sonar_imm.acoustics.geometry import Pose, rotation_of_quaternion
 from sonar_imm.measurements import Rejection, StaticTransforms
 
 from .headers import Make, make_header, stamp_ns
+from .inputs.topic import InputTopic
 
 MOST_TRANSFORMS = 10_000
 FARTHEST = 1e8
@@ -101,3 +102,19 @@ def _quaternion(R: np.ndarray) -> list[float]:
     _, vectors = np.linalg.eigh(K / 3.0)
     q = vectors[:, -1]
     return [float(value) for value in (q if q[3] >= 0.0 else -q)]
+
+
+TYPES = ('tf2_msgs/msg/TFMessage', 'geometry_msgs/msg/TransformStamped')
+
+TF_STATIC = InputTopic(
+    'tf_static',
+    'frames that are fixed to each other, with use_tf_static or sonar_frame',
+    measurement=StaticTransforms,
+    readers=dict.fromkeys(TYPES, read_transforms),
+    write=write_transforms,
+    companion=True,
+    prefix='/',
+    latched=True,
+    by_name=frozenset(TYPES),
+    wanted=lambda told: bool(told.get('use_tf_static') or told.get('sonar_frame')),
+)

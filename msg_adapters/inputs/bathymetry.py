@@ -29,8 +29,8 @@ from ..navigation import (
     write_range,
 )
 from ..snapshots import read_snapshot, write_snapshot
+from ..transforms import TF_STATIC
 from .topic import InputTopic
-from .transforms import TF_STATIC
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 

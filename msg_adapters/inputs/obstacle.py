@@ -36,9 +36,9 @@ from ..navigation import (
     write_range,
 )
 from ..sonar_images import read_picture, read_projected_image, read_raw_image, write_picture
+from ..transforms import TF_STATIC
 from ..vendor_images import read_oculus_ping, read_ping360_echo, read_sonoptix_echo
 from .topic import InputTopic
-from .transforms import TF_STATIC
 
 TOPICS = (
     InputTopic(

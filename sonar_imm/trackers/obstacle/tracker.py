@@ -145,8 +145,7 @@ class ObstacleTracker:
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
-        self.config = config
-        self.filter = build_filter(config)
+        self.config, self.filter = config, build_filter(config)
 
     def remount(self, config: ObstacleConfig) -> None:
         """Take another place of the sonar on the vehicle, for all pings from now on."""
@@ -251,11 +250,9 @@ class ObstacleTracker:
         pose = self.mount.sonar(vehicle)
         reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
         straight = geometry.flip_world(course(buffer, ping.stamp_ns, self.config.course_window))
-        height = np.nan
-        if altitude is not None:
-            age = ping.stamp_ns - altitude.stamp_ns
-            if age <= nanoseconds(self.config.max_altitude_age):
-                height = altitude.altitude
+        oldest_ns = ping.stamp_ns - nanoseconds(self.config.max_altitude_age)
+        known = altitude is not None and altitude.stamp_ns >= oldest_ns
+        height = altitude.altitude if known else np.nan
         late_ns = self._late_ns()
         if not late_ns:
             return Sonar(pose, height, reference=reference, course=straight)
@@ -354,9 +351,8 @@ class ObstacleTracker:
 
     def _spawn(self, now: PingState, z: FloatArray, R: FloatArray) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
-        room = max(0, self.config.max_tracks - len(now.life))
-        if not self.filter.ready(now.sonar):
-            room = 0
+        ready = self.filter.ready(now.sonar)
+        room = max(0, self.config.max_tracks - len(now.life)) if ready else 0
         z, R = z[:room], R[:room]
         if not len(z):
             return now
