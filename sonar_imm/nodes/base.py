@@ -58,7 +58,7 @@ from ..trackers import SYSTEMS
 from ..trackers.frames import FrameDoor
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
-from .diagnostics import Meter, Reporter
+from .diagnostics import Announcer, Meter, Reporter
 from .drawing import Drawing
 from .executor import MessagesFirst
 from .keeping import StateKeeper
@@ -178,9 +178,7 @@ class TrackerNode(Node):
         self._answers = Answers(
             self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
         )
-        self._diagnostics = self._endpoints.advertise(
-            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
-        )
+        self._announcer = Announcer(self._endpoints, self.get_fully_qualified_name().lstrip('/'))
         self._drawing = Drawing(self._system, self.advertise)
         self.advertise_more()
 
@@ -341,7 +339,7 @@ class TrackerNode(Node):
             counts['revisions_withheld'] = self._withheld
         if self._ignored:
             counts['ignored_while_disabled'] = self._ignored
-        self._diagnostics.publish(
+        self._announcer.publish(
             self._reporter.report(
                 self.get_clock().now().to_msg(),
                 time.monotonic(),
