@@ -28,7 +28,7 @@ have no estimate.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 import contextlib
 import functools
 from pathlib import Path
@@ -42,10 +42,8 @@ from attrs import evolve
 import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import InvalidQoSProfileException
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
@@ -57,14 +55,16 @@ from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
+from ..trackers.frames import FrameDoor
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
-from .diagnostics import Meter, Reporter
+from .diagnostics import Announcer, Meter, Reporter
+from .drawing import Drawing
 from .executor import MessagesFirst
 from .keeping import StateKeeper
 from .messages import make, message_class
 from .parameters import NodeParameters
-from .qos import Endpoints, input_qos, latched_qos, output_qos
+from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos
 from .stopping import START_PATIENCE, stopper
 from .tables import TablePublisher
 
@@ -73,7 +73,7 @@ _PATIENCE = 3.0
 
 
 class TrackerNode(Node):
-    """One tracker as a ROS 2 node. A system's own node adds its displays by `show`."""
+    """One tracker as a ROS 2 node. A system's own node may publish more by `show`."""
 
     def __init__(self, system: str, **options: Any):
         """Declare, compile, then subscribe: the first message meets a warm tracker.
@@ -81,6 +81,7 @@ class TrackerNode(Node):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(system, **options)
+        self._system = system
         self._topics = inputs_of(system)
         config_type = SYSTEMS[system].config_type()
         self._node_config_type = node_config_type(SYSTEMS[system])
@@ -93,6 +94,7 @@ class TrackerNode(Node):
         guards = (self._guard, self._repeats)
         self._keeper = StateKeeper(self, system, self._node_config, guards)
         self.tracker = self._keeper.begin(config)
+        self._door = FrameDoor(self.tracker, self._guard)
         self._warm()
 
         self._enabled = True
@@ -100,12 +102,14 @@ class TrackerNode(Node):
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
-        with _explained_overrides(self):
+        with explained_overrides(self):
             self._advertise()
+            told = {**self.tracker.config.as_dict(), **self._node_config.as_dict()}
             hears = {
                 name: self._listen(topic, name)
                 for topic in self._topics
-                for name in topic.instances(self.tracker.config.as_dict())
+                for name in topic.instances(told)
+                if topic.wanted(told)
             }
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)
@@ -115,7 +119,7 @@ class TrackerNode(Node):
             ),
             post_callback=self._on_clock_back,
         )
-        name, told = self.get_fully_qualified_name().lstrip('/'), self.tracker.config.as_dict()
+        name = self.get_fully_qualified_name().lstrip('/')
         required, one_of = needed(self._topics, told)
         self._reporter = Reporter(name, hears, self._meter, required=required, one_of=one_of)
         self.create_timer(
@@ -124,7 +128,7 @@ class TrackerNode(Node):
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self._keeper.save_every_now_and_then(lambda: self.tracker)
-        self._settings.on_change(lambda: self.tracker.reconfigure(self._settings[config_type]))
+        self._settings.on_change(lambda: self._door.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
         self.get_logger().info(f'ready, hears {", ".join(hears.values())}')
@@ -135,21 +139,19 @@ class TrackerNode(Node):
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:
-        """Offer an output; to be used by `advertise_displays`."""
+        """Offer an output; to be used by `advertise_more`."""
         return self._endpoints.advertise(message_class(type_name), topic, output_qos())
 
-    def advertise_displays(self) -> None:
-        """Offer the topics that `show` publishes."""
+    def advertise_more(self) -> None:
+        """Offer what a system's own node publishes besides the displays."""
 
     def show(self, newest: Estimate) -> None:
         """Publish the newest state for displays."""
+        self._drawing.show(newest)
 
     def show_all(self, estimates: list[Estimate]) -> None:
         """Publish what each of the estimates of one message is to be shown as."""
         self.show(estimates[-1])
-
-    def forget(self) -> None:
-        """Tell displays that all tracks are forgotten."""
 
     @property
     def _node_config(self) -> NodeConfig:
@@ -176,10 +178,9 @@ class TrackerNode(Node):
         self._answers = Answers(
             self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
         )
-        self._diagnostics = self._endpoints.advertise(
-            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
-        )
-        self.advertise_displays()
+        self._announcer = Announcer(self._endpoints, self.get_fully_qualified_name().lstrip('/'))
+        self._drawing = Drawing(self._system, self.advertise)
+        self.advertise_more()
 
     def _listen(self, topic: InputTopic, name: str) -> str:
         """Subscribe to one input on the topic `name`, and give the resolved name of that."""
@@ -195,7 +196,7 @@ class TrackerNode(Node):
             message_class(type_name),
             topic.prefix + name,
             functools.partial(self._receive, evolve(topic, name=name), reader),
-            input_qos(self._node_config.queue_depth),
+            latched_qos(1000) if topic.latched else input_qos(self._node_config.queue_depth),
         )
         return subscription.topic_name
 
@@ -208,9 +209,10 @@ class TrackerNode(Node):
     ) -> None:
         """Take one message all the way; whatever it holds, the node goes on."""
         start = time.monotonic()
+        stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(topic.name, start)
         if self._waited_too_long(topic, info):
-            self._acknowledge(message.header.stamp)
+            self._acknowledge(stamp)
             return
         try:
             if self._enabled:
@@ -223,7 +225,7 @@ class TrackerNode(Node):
             if not self.context.ok():
                 raise  # the middleware went away under our feet: `run` knows
             self._recover(topic)
-        self._acknowledge(message.header.stamp)
+        self._acknowledge(stamp)
         self._meter.spent(time.monotonic() - start)
 
     def _waited_too_long(self, topic: InputTopic, info: Mapping[str, Any]) -> bool:
@@ -243,7 +245,9 @@ class TrackerNode(Node):
     def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         measurement = reader(message)
         doubt = topic.doubt(message, measurement)
-        self._guard.check(measurement)
+        measurement = self._door.admit(measurement)
+        if measurement is None:
+            return
         rows = self._repeats.rows
         measurement = self._repeats.fresh(measurement)
         if self._repeats.rows > rows:
@@ -308,7 +312,7 @@ class TrackerNode(Node):
         self.tracker.reset()
         self._guard.reset()
         self._repeats.reset()
-        self.forget()
+        self._drawing.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self._start_afresh()
@@ -335,7 +339,7 @@ class TrackerNode(Node):
             counts['revisions_withheld'] = self._withheld
         if self._ignored:
             counts['ignored_while_disabled'] = self._ignored
-        self._diagnostics.publish(
+        self._announcer.publish(
             self._reporter.report(
                 self.get_clock().now().to_msg(),
                 time.monotonic(),
@@ -397,16 +401,3 @@ def _init(args: list[str] | None) -> None:
         rclpy.init(args=args, signal_handler_options=mine)
     except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
         raise ConfigError(' '.join(str(error).split())) from None
-
-
-@contextlib.contextmanager
-def _explained_overrides(node: Node) -> Iterator[None]:
-    """Turn what is raised for a bad qos_overrides or type parameter into a `ConfigError`."""
-    try:
-        yield
-    except (ImportError, InvalidParameterTypeException, InvalidQoSProfileException) as error:
-        raise ConfigError(str(error)) from None
-    except RuntimeError as error:
-        if not node.context.ok():
-            raise
-        raise ConfigError(str(error)) from None

@@ -48,7 +48,7 @@ from ...estimation.association import (
 )
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
-from ..navigation import NavigationBuffer
+from ..navigation import MOST_WAITING, NavigationBuffer
 from ..stream import ReplayStream, StreamRules
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
@@ -105,8 +105,9 @@ class PingState:
 class ObstacleState:
     """All that is known at a stamp. last: after the newest ping used, None before the first; done:
     the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
-    skipped: pings so far for which navigation had a gap; broken: tracks ended so far because their
-    numbers were not finite; alike: pings so far in which most obstacles moved alike."""
+    skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
+    because too many waited; broken: tracks ended so far because their numbers were not finite;
+    alike: pings so far in which most obstacles moved alike."""
 
     last: PingState | None = None
     done: tuple[PingState, ...] = ()
@@ -114,6 +115,7 @@ class ObstacleState:
     altitude: Altitude | None = None
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
     skipped: int = 0
+    missing: int = 0
     broken: int = 0
     alike: int = 0
 
@@ -143,8 +145,11 @@ class ObstacleTracker:
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
-        self.config = config
-        self.filter = build_filter(config)
+        self.config, self.filter = config, build_filter(config)
+
+    def remount(self, config: ObstacleConfig) -> None:
+        """Take another place of the sonar on the vehicle, for all pings from now on."""
+        self.config, self.mount = config, Mount(config)
 
     def warm(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
@@ -169,6 +174,7 @@ class ObstacleTracker:
             'nis_mean': float(nis.mean() / 2.0) if len(nis) else float('nan'),
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
+            'navigation_missing': state.missing,
             'broken_tracks': state.broken,
             'moving_alike': int(state.last.alike) if state.last else 0,
             'pings_moving_alike': state.alike,
@@ -194,6 +200,8 @@ class ObstacleTracker:
                 altitude = item
         pings = [item for item in items if isinstance(item, Detections)]
         waiting = [*before.waiting, *((ping, altitude) for ping in pings)]
+        given_up = max(0, len(waiting) - MOST_WAITING)
+        del waiting[:given_up]
         last, done, skipped, broken = before.last, [], before.skipped, before.broken
         alike = before.alike
         while waiting:
@@ -216,6 +224,7 @@ class ObstacleTracker:
             altitude=altitude,
             waiting=tuple(waiting),
             skipped=skipped,
+            missing=before.missing + given_up,
             broken=broken,
             alike=alike,
         )
@@ -241,11 +250,9 @@ class ObstacleTracker:
         pose = self.mount.sonar(vehicle)
         reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
         straight = geometry.flip_world(course(buffer, ping.stamp_ns, self.config.course_window))
-        height = np.nan
-        if altitude is not None:
-            age = ping.stamp_ns - altitude.stamp_ns
-            if age <= nanoseconds(self.config.max_altitude_age):
-                height = altitude.altitude
+        oldest_ns = ping.stamp_ns - nanoseconds(self.config.max_altitude_age)
+        known = altitude is not None and altitude.stamp_ns >= oldest_ns
+        height = altitude.altitude if known else np.nan
         late_ns = self._late_ns()
         if not late_ns:
             return Sonar(pose, height, reference=reference, course=straight)
@@ -344,9 +351,8 @@ class ObstacleTracker:
 
     def _spawn(self, now: PingState, z: FloatArray, R: FloatArray) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
-        room = max(0, self.config.max_tracks - len(now.life))
-        if not self.filter.ready(now.sonar):
-            room = 0
+        ready = self.filter.ready(now.sonar)
+        room = max(0, self.config.max_tracks - len(now.life)) if ready else 0
         z, R = z[:room], R[:room]
         if not len(z):
             return now
