@@ -237,7 +237,7 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
         if path.suffix not in SUFFIXES:
             raise BagError(
                 f'{path} is not a recording: the names of recordings end in '
-                f'{", ".join(SUFFIXES)}{_packed_hint([path])}'
+                f'{", ".join(SUFFIXES)}{_packed_hint([path])}{_convert_hint(path)}'
             )
         return _open_files([path], [])
     return _open_directory(path)
@@ -325,6 +325,15 @@ def _leftovers(path: Path) -> list[str]:
 
 def _advice(file: Path) -> str:
     return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
+
+
+def _convert_hint(path: Path) -> str:
+    """Which conversion makes a recording of a file of another kind."""
+    kinds = {'fixes': ('.csv', '.txt'), 'snapshots': ('.npz',), 'segy': ('.sgy', '.segy', '.seg')}
+    found = [kind for kind, suffixes in kinds.items() if path.suffix.lower() in suffixes]
+    if not found:
+        return ''
+    return f'; sonar-imm convert makes one, e.g. sonar-imm convert {found[0]} {path} OUT_BAG'
 
 
 def _packed_hint(files: Iterable[Path]) -> str:
