@@ -60,7 +60,9 @@ def playing(tmp_path, monkeypatch):
 def test_estimates_are_found_and_shown(playing):
     echoes = {
         'lines': command(playing, 'echo', '--once', '--timeout', '60'),
-        'json': command(playing, 'echo', 'diver/estimate', '--json', '--count', '3'),
+        'json': command(
+            playing, 'echo', 'diver/estimate', '--json', '--count', '3', '--timeout', '60'
+        ),
         'truth': command(playing, 'echo', '/truth/estimate', '--once', '--timeout', '60'),
         'other': command(playing, 'echo', '/fix', '--timeout', '60'),
     }
@@ -81,12 +83,12 @@ def test_estimates_are_found_and_shown(playing):
 def test_silence_is_told(monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
-        alone = command(domain, 'echo', '/divr/estimate', '--timeout', '5')
-        silent = command(domain, 'echo', '--timeout', '8')
-        said = alone.communicate(timeout=60)[1]
-        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 5 s' in said
+        alone = command(domain, 'echo', '/divr/estimate', '--timeout', '25')
+        silent = command(domain, 'echo', '--timeout', '25')
+        said = alone.communicate(timeout=90)[1]
+        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 25 s' in said
         assert "did you mean '/diver/estimate'" in said
-        said = silent.communicate(timeout=60)[1]
+        said = silent.communicate(timeout=90)[1]
         assert silent.returncode == 1
-        assert said == 'sonar-imm: nothing was published on /diver/estimate within 8 s\n'
+        assert said == 'sonar-imm: nothing was published on /diver/estimate within 25 s\n'
         assert node.process.poll() is None
