@@ -300,8 +300,9 @@ def test_topics_page_names_every_input() -> None:
     for system in SYSTEMS:
         for topic in inputs_of(system):
             for type_name in topic.readers:
-                row = rf'^\| `{topic.name}` \| .*{re.escape(type_name.split("/")[-1])}'
-                assert re.search(row, page, re.MULTILINE), f'{topic.name} {type_name}'
+                heard = f'{topic.prefix}{topic.name}'
+                row = rf'^\| `{heard}` \| .*{re.escape(type_name.split("/")[-1])}'
+                assert re.search(row, page, re.MULTILINE), f'{heard} {type_name}'
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,8 @@ class InputTopic:
     topic or its frame.
     required: whether the tracker makes nothing without it, by the parameters of the tracker. Of
     the inputs that are neither required nor companions, one is enough.
+    prefix: ``'~/'`` for a topic below the name of the node, ``'/'`` for one that no namespace
+    changes; '' for a relative topic.
     words: words in a topic's name, any of which says that it is this input rather than the one of
     the same last name: ``/sidescan_port/snapshot`` is a ``port/snapshot``.
     makes: the input of a tracker that a node before it makes of this one; '' for an input of the
@@ -91,6 +93,7 @@ class InputTopic:
     required: Callable[[Mapping[str, Any]], bool] = field(
         default=lambda settings: False, kw_only=True
     )
+    prefix: str = field(default='', kw_only=True)
     words: frozenset[str] = field(default=frozenset(), kw_only=True)
     makes: str = field(default='', kw_only=True)
 
@@ -127,6 +130,10 @@ class InputTopic:
         parts = topic.split('/')
         names = [name for key in self.named_by for name in settings.get(key, ()) if name in parts]
         return f'{names[0]}/{self.name}' if names else self.name
+
+    def full_name(self, node: str) -> str:
+        """Where the node called `node` hears it when it is in no namespace."""
+        return f'/{node}/{self.name}' if self.prefix == '~/' else f'/{self.name}'
 
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any], topic: str = ''

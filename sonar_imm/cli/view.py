@@ -122,14 +122,12 @@ def _show_recorded(
     layout_file: Path | None,
     playing: dict[str, Any],
 ) -> None:
-    from ..viewing.material import Material
+    from ..viewing.material import opened
     from ..viewing.playback import Playback
     from ..viewing.server import ViewServer
-    from ..viewing.sources import paths_of
 
-    paths, problems = paths_of(source)
-    with Material(paths, topics) as material:
-        for sentence in problems + material.problems:
+    with opened(source, topics) as (material, problems):
+        for sentence in problems:
             say(f'  problem: {sentence}')
         playback = Playback(
             material.first_ns, material.last_ns, rate=playing['rate'], loop=playing['loop']

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from heapq import merge
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from attrs import evolve, frozen
 from msg_adapters.headers import stamp_ns
 
 from ..measurements import Rejection
-from .messages import message_definition, typestore
+from .messages import cdr_of, message_definition
 from .sources import BagError, one_line, open_sources, RawMessage, Source, TopicInfo
 
 __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
@@ -147,7 +148,7 @@ class BagReader:
     def cdr(self, item: BagMessage) -> bytes:
         """The decoded message `item` as ROS 2 sends it; ROS 1 bags hold another serialization."""
         if self.is_ros1:
-            return bytes(typestore().serialize_cdr(item.message, item.type_name))
+            return cdr_of(item.message)
         return bytes(item.raw)
 
     def messages(
@@ -186,17 +187,26 @@ class BagReader:
     def _guarded(
         self, source: Source, topics: Collection[str] | None
     ) -> Iterator[tuple[Source, RawMessage]]:
-        """Read one source up to its end or its first damage."""
+        """Read one source up to its end or, where nothing else helps, its first damage."""
+        given = 0
         try:
             for item in source.messages(topics):
                 yield source, item
+                given += 1
         except GeneratorExit:
             raise
         except Exception as error:  # rosbags raises nearly anything on damaged files
-            self.add_problem(
-                f'{self.path} is damaged: {one_line(error)}; the messages after the '
-                'damage are lost'
-            )
+            rest = source.rescue()
+            if rest is None:
+                self.add_problem(
+                    f'{self.path} is damaged: {one_line(error)}; the messages after the '
+                    'damage are lost'
+                )
+                return
+            self._sources.append(rest)
+            self.add_problem(rest.damage)
+            for item in islice(rest.messages(topics), given, None):
+                yield rest, item
 
     def _cannot_decode(self, item: RawMessage, index: int, error: Exception) -> None:
         reason = f'message {index}, {one_line(error)}'

@@ -39,7 +39,8 @@ from rosbags.rosbag2 import (
 )
 
 from ..files import whole
-from .messages import ros_message, typestore
+from .mcap_sums import seal
+from .messages import cdr_of, ros_message, typestore
 from .own_parameters import write_own_parameters
 from .sources import BagError
 
@@ -128,15 +129,16 @@ class BagWriter:
         self._place.__exit__(kind, error, trace)
 
     def close(self) -> None:
-        """Finish the bag: index, metadata and parameters; then move it to its place."""
+        """Finish the bag: index, metadata, checksums and parameters; then move it to its place."""
         with naming(self.path), self._place:
             self._writer.close()
+            for file in self._unfinished.glob('*.mcap'):
+                seal(file)
             write_own_parameters(self._unfinished, self._parameters)
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""
-        name = message.__msgtype__
-        self.write_raw(topic, name, typestore().serialize_cdr(message, name), log_ns)
+        self.write_raw(topic, message.__msgtype__, cdr_of(message), log_ns)
 
     def write_raw(self, topic: str, type_name: str, raw: bytes | memoryview, log_ns: int) -> None:
         """Append a message that is CDR already. Raises ValueError for a log time before 1970."""
