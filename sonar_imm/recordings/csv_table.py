@@ -23,18 +23,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import contextlib
 import csv
-from datetime import datetime, timedelta, timezone, tzinfo
 from decimal import Decimal
 import itertools
 import math
 from pathlib import Path
 import re
 from typing import Any, TextIO
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from attrs import field, frozen
 
 from ..parameters import did_you_mean
+from .csv_times import BadRow, dated, iso_ns, TIME_OF_DAY, TIME_TEXT, zone_of
 from .sources import BagError
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
@@ -119,28 +118,10 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'std_depth': ('std_depth', 'sigma_depth'),
 }
 _UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
-_TIME = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
 
-
-_CLOCK = re.compile(r'\d\d?:\d\d(:\d\d)?([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
-_DATES = (
-    (re.compile(r'(\d{4})[-/.](\d\d?)[-/.](\d\d?)$'), (1, 2, 3)),
-    (re.compile(r'(\d{4})(\d\d)(\d\d)$'), (1, 2, 3)),
-    (re.compile(r'(\d\d?)\.(\d\d?)\.(\d{4})$'), (3, 2, 1)),
-)
-"""Forms of a date that can be read in one way only, with the places of year, month and day."""
 
 _YES = ('1', '1.0', 'true', 't', 'yes', 'y', 'valid', 'ok')
 _NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
-
-
-class BadRow(ValueError):
-    """A row that cannot be used; the text says why, `reason` is a code where rows are counted by
-    reason."""
-
-    def __init__(self, why: str, reason: str = ''):
-        super().__init__(why)
-        self.reason = reason
 
 
 @frozen(kw_only=True)
@@ -241,10 +222,10 @@ class Row:
 
     def stamp_ns(self, name: str = 'stamp') -> int:
         """A time since 1970 in integer nanoseconds, with the offset of the options added."""
-        parts = _TIME.match(self._moment(name))
+        parts = TIME_TEXT.match(self._moment(name))
         if parts:
             *moment, zone = parts.groups()
-            stamp = _iso_ns(*moment, zone_of(zone or self._zone(name)))
+            stamp = iso_ns(*moment, zone_of(zone or self._zone(name)))
         else:
             stamp = self.seconds_ns(name)
         stamp += self.table.options.time_offset_ns
@@ -260,23 +241,14 @@ class Row:
     def _moment(self, name: str) -> str:
         """The text of a time, with the date of its own column where it has only a time of day."""
         text = self.text(name)
-        if not _CLOCK.match(text):
+        if not TIME_OF_DAY.match(text):
             return text
         if not self.table.has('date'):
             raise BadRow(
                 f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
                 'the date'
             )
-        date = self.text('date')
-        for form, places in _DATES:
-            if found := form.match(date):
-                year, month, day = (int(found.group(place)) for place in places)
-                clock = text if text[2] == ':' else f'0{text}'
-                return f'{year:04d}-{month:02d}-{day:02d} {clock}'
-        raise BadRow(
-            f"{self.table.header('date')} is '{date[:40]}', which can be read in several ways; "
-            'write 2024-05-31'
-        )
+        return dated(self.text('date'), text, self.table.header('date'))
 
     def _zone(self, name: str) -> str:
         """The zone of a time that does not say it."""
@@ -430,32 +402,3 @@ def _plain(header: str) -> str:
     """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
     name = re.sub(r'[\[(].*', '', header.lower()).strip()
     return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))
-
-
-def zone_of(name: str) -> tzinfo:
-    """A time zone by what stands behind a time (``Z``, ``+0200``) or by its name. Raises
-    `BagError`."""
-    if name.upper() in ('Z', 'UTC', 'GMT'):
-        return timezone.utc
-    if offset := re.match(r'([+-])(\d\d):?(\d\d)$', name):
-        hours, minutes = int(offset.group(2)), int(offset.group(3))
-        if hours < 24 and minutes < 60:
-            ahead = timedelta(hours=hours, minutes=minutes)
-            return timezone(ahead if offset.group(1) == '+' else -ahead)
-    try:
-        return ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise BagError(
-            f"there is no time zone '{name}'; write UTC, +02:00 or Europe/Berlin"
-        ) from None
-
-
-def _iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:
-    """Nanoseconds since 1970 of an ISO 8601 time."""
-    try:
-        moment = datetime.fromisoformat(f'{date}T{clock}').replace(tzinfo=zone)
-    except ValueError:
-        raise BadRow(f"'{date} {clock}' is no date and time of the calendar") from None
-    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
-    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
