@@ -116,6 +116,7 @@ class DepthSlices:
         self.seafloor = config.method == 'seafloor'
         self.K = 1 if self.seafloor else config.components
         self.moves = np.zeros(self.K, np.bool_)
+        self._still = Motion.none(self.K)
         self.cone = config.azimuth_model == 'cone'
         self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
@@ -161,7 +162,7 @@ class DepthSlices:
         to be repaired."""
         mixture = self._clamp_to_seafloor(mixture, before)
         step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixture, Motion.none(self.K), step)
+        x, P, repaired = behaviour_kernels.advance(*mixture, self._still, step)
         return Mixture(x, P, mixture.mu), int(repaired.sum())
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:

@@ -65,6 +65,7 @@ IN_BEAM = 0.9
 """A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
 echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
 approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
+_EYE = np.eye(2)
 _TINY, _WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
 nothing."""
@@ -123,11 +124,19 @@ class ObstacleTracker:
     and `Altitude`."""
 
     def __init__(self, config: ObstacleConfig):
-        self.config = config
-        self.filter = build_filter(config)
+        self._settle(config)
         self.mount = Mount(config)
         self._H = np.tile(np.eye(2), (1, self.filter.K, 1, 1))
         self.reset()
+
+    def _settle(self, config: ObstacleConfig) -> None:
+        """What follows from the parameters, once and not in every ping."""
+        self.config = config
+        self.filter = build_filter(config)
+        self.rules = track_rules(config)
+        own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
+        own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
+        self._own_variance = own
 
     def reset(self) -> None:
         self._stream = ReplayStream(
@@ -141,8 +150,7 @@ class ObstacleTracker:
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
-        self.config = config
-        self.filter = build_filter(config)
+        self._settle(config)
 
     def warm(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
@@ -254,12 +262,13 @@ class ObstacleTracker:
         self, before: PingState | None, ping: Detections, sonar: Sonar
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R, level = self._detections(ping)
+        z, R, intensity = self._detections(ping)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
         chosen, expected = self._associate(now, z, R)
         now = self._update(now, chosen, expected, z, R)
         if self.config.vertical_beam_width_deg and before:
-            dt, heard = (now.stamp_ns - before.stamp_ns) * 1e-9, np.append(level, np.nan)[chosen]
+            dt = (now.stamp_ns - before.stamp_ns) * 1e-9
+            heard = np.append(level_db(intensity), np.nan)[chosen]
             told = by_intensity(
                 *now.mixture, now.strengths, now.sonar.pose, heard, dt, self.config
             )
@@ -287,17 +296,17 @@ class ObstacleTracker:
         return now.only(sound), int((~sound).sum())
 
     def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """z (D, 2), R (D, 2, 2) and level dB (D,) of the rows that are echoes, azimuth positive to
+        """z (D, 2), R (D, 2, 2) and intensity (D,) of the rows that are echoes, azimuth positive to
         starboard. A row that is as uncertain as it is far says nothing and is left out."""
-        config = self.config
         z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         stated = np.column_stack([ping.var_range, ping.var_bearing])
-        own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
-        own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
-        variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, own)
+        variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, self._own_variance)
         real = np.isfinite(z).all(axis=1) & (z[:, 0] > 2.0 * np.sqrt(variance[:, 0]))
         real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
-        return z[real], variance[real, :, None] * np.eye(2), level_db(ping.intensity[real])
+        intensity = ping.intensity
+        if not real.all():
+            z, variance, intensity = z[real], variance[real], intensity[real]
+        return z, variance[:, :, None] * _EYE, intensity
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray
@@ -324,6 +333,11 @@ class ObstacleTracker:
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
             return evolve(now, nis=nis)
+        if len(hit) == len(chosen):
+            after, nis, repairs = self.filter.update(
+                now.mixture, h, z[chosen], R[chosen], now.sonar
+            )
+            return evolve(now, mixture=after, nis=nis, repairs=now.repairs + repairs)
         after, nis[hit], repairs = self.filter.update(
             now.mixture.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
         )
@@ -337,7 +351,7 @@ class ObstacleTracker:
         tentative = now.life.status == TrackStatus.TENTATIVE
         in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
         looked = tentative | (in_beam > IN_BEAM)
-        life, kept = now.life.scan(hit, now.stamp_ns, track_rules(self.config), looked=looked)
+        life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
         return evolve(now.rows(kept), life=life).only(ahead[kept])
 
     def _spawn(self, now: PingState, z: FloatArray, R: FloatArray) -> PingState:
@@ -350,7 +364,7 @@ class ObstacleTracker:
             return now
         return evolve(
             now,
-            life=now.life.born(len(z), now.stamp_ns, track_rules(self.config)),
+            life=now.life.born(len(z), now.stamp_ns, self.rules),
             mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
             strengths=now.strengths.joined(Strengths.unknown(len(z), self.filter.K)),
@@ -359,7 +373,7 @@ class ObstacleTracker:
     def _nobody(self, sonar: Sonar) -> PingState:
         K, n = self.filter.K, self.filter.n
         nothing = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
-        life = Tracks.none(track_rules(self.config))
+        life = Tracks.none(self.rules)
         return PingState(
             stamp_ns=0,
             sonar=sonar,
