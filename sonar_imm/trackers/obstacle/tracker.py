@@ -52,6 +52,7 @@ from ..navigation import NavigationBuffer
 from ..stream import ReplayStream, StreamRules
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
+from .bodies import Bodies, considered
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
@@ -75,7 +76,7 @@ nothing."""
 class PingState:
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
     alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them."""
+    each component assumes them; bodies: how far their echoes wander."""
 
     stamp_ns: int
     sonar: Sonar
@@ -83,6 +84,7 @@ class PingState:
     mixture: Mixture
     nis: FloatArray
     strengths: Strengths
+    bodies: Bodies
     repairs: int = 0
     alike: bool = False
 
@@ -95,6 +97,7 @@ class PingState:
             mixture=self.mixture.rows(kept),
             nis=self.nis[kept],
             strengths=self.strengths.rows(kept),
+            bodies=self.bodies.rows(kept),
         )
 
     def only(self, kept: np.ndarray) -> PingState:
@@ -262,10 +265,10 @@ class ObstacleTracker:
         self, before: PingState | None, ping: Detections, sonar: Sonar
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R, intensity = self._detections(ping)
+        z, R, intensity, extended = self._detections(ping)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
         chosen, expected = self._associate(now, z, R)
-        now = self._update(now, chosen, expected, z, R)
+        now = self._update(now, chosen, expected, z, R, extended)
         if self.config.vertical_beam_width_deg and before:
             dt = (now.stamp_ns - before.stamp_ns) * 1e-9
             heard = np.append(level_db(intensity), np.nan)[chosen]
@@ -276,7 +279,7 @@ class ObstacleTracker:
         now = self._prune(now, chosen >= 0)
         free = np.ones(len(z), bool)
         free[chosen[chosen >= 0]] = False
-        now = self._spawn(now, z[free], R[free])
+        now = self._spawn(now, z[free], R[free], extended[free])
         confirmed = now.life.status != TrackStatus.TENTATIVE
         return evolve(now, alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
@@ -295,18 +298,20 @@ class ObstacleTracker:
         )
         return now.only(sound), int((~sound).sum())
 
-    def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """z (D, 2), R (D, 2, 2) and intensity (D,) of the rows that are echoes, azimuth positive to
-        starboard. A row that is as uncertain as it is far says nothing and is left out."""
+    def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
+        """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is told (D,), of the rows
+        that are echoes, azimuth positive to starboard. A row that is as uncertain as it is far
+        says nothing and is left out."""
         z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         stated = np.column_stack([ping.var_range, ping.var_bearing])
         variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, self._own_variance)
         real = np.isfinite(z).all(axis=1) & (z[:, 0] > 2.0 * np.sqrt(variance[:, 0]))
         real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
-        intensity = ping.intensity
+        columns = z, variance, ping.intensity, np.isfinite(ping.extent_range)
         if not real.all():
-            z, variance, intensity = z[real], variance[real], intensity[real]
-        return z, variance[:, :, None] * _EYE, intensity
+            columns = tuple(column[real] for column in columns)
+        z, variance, intensity, extended = columns
+        return z, variance[:, :, None] * _EYE, intensity, extended
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray
@@ -327,24 +332,30 @@ class ObstacleTracker:
         return chosen, h
 
     def _update(
-        self, now: PingState, chosen: np.ndarray, h: FloatArray, z: FloatArray, R: FloatArray
+        self,
+        now: PingState,
+        chosen: np.ndarray,
+        h: FloatArray,
+        z: FloatArray,
+        R: FloatArray,
+        extended: np.ndarray,
     ) -> PingState:
         nis = np.full(len(chosen), np.nan)
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
             return evolve(now, nis=nis)
-        if len(hit) == len(chosen):
-            after, nis, repairs = self.filter.update(
-                now.mixture, h, z[chosen], R[chosen], now.sonar
-            )
-            return evolve(now, mixture=after, nis=nis, repairs=now.repairs + repairs)
-        after, nis[hit], repairs = self.filter.update(
-            now.mixture.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
-        )
-        mixture = Mixture(*(part.copy() for part in now.mixture))
-        for part, new in zip(mixture, after):
-            part[hit] = new
-        return evolve(now, mixture=mixture, nis=nis, repairs=now.repairs + repairs)
+        every = len(hit) == len(chosen)
+        mixture, bodies = now.mixture, now.bodies
+        if not every:
+            mixture, bodies, h, chosen = mixture.rows(hit), bodies.rows(hit), h[hit], chosen[hit]
+        z, R = z[chosen], R[chosen]
+        bodies, R = bodies.seen(extended[chosen], z, R, self._own_variance)
+        mixture, nis[hit], repairs = self.filter.update(mixture, h, z, R, now.sonar)
+        if not every:
+            mixture = Mixture(*_put(now.mixture, hit, mixture))
+            bodies = Bodies(*_put(now.bodies, hit, bodies))
+        repairs += now.repairs
+        return evolve(now, mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
 
     def _prune(self, now: PingState, hit: np.ndarray) -> PingState:
         """End the tracks that are over or passed; `hit` (T,): those that got a detection."""
@@ -354,20 +365,24 @@ class ObstacleTracker:
         life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
         return evolve(now.rows(kept), life=life).only(ahead[kept])
 
-    def _spawn(self, now: PingState, z: FloatArray, R: FloatArray) -> PingState:
+    def _spawn(
+        self, now: PingState, z: FloatArray, R: FloatArray, extended: np.ndarray
+    ) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
         room = max(0, self.config.max_tracks - len(now.life))
         if not self.filter.ready(now.sonar):
             room = 0
-        z, R = z[:room], R[:room]
+        z, R, extended = z[:room], R[:room], extended[:room]
         if not len(z):
             return now
+        bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
         return evolve(
             now,
             life=now.life.born(len(z), now.stamp_ns, self.rules),
             mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
             strengths=now.strengths.joined(Strengths.unknown(len(z), self.filter.K)),
+            bodies=now.bodies.joined(bodies),
         )
 
     def _nobody(self, sonar: Sonar) -> PingState:
@@ -381,10 +396,12 @@ class ObstacleTracker:
             mixture=nothing,
             nis=np.empty(0),
             strengths=Strengths.unknown(0, K),
+            bodies=Bodies.unknown(0),
         )
 
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
+        view = considered(view, ping.sonar, ping.bodies, self.config.range_scale_std)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
@@ -410,6 +427,16 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
+
+
+def _put(
+    parts: Sequence[FloatArray], rows: np.ndarray, new: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Copies of arrays with some of their rows replaced."""
+    copies = [part.copy() for part in parts]
+    for part, values in zip(copies, new):
+        part[rows] = values
+    return copies
 
 
 def _identities(state: ObstacleState) -> ObstacleState:
