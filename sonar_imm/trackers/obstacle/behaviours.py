@@ -43,8 +43,7 @@ from .filters import depth_slices, depth_span, DepthSlices, Filter, Landmark, Mi
 PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
 """Probability of each behaviour of a new obstacle, among those asked for."""
 DROPPED = 1e-5
-"""A slice that weighs less takes no further part. At 1e-6 the errors are the same, and a fifth more
-time is spent."""
+"""A slice that weighs less takes no further part."""
 OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
 """1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
 density as high as inside the gate of a fixed obstacle would make an outlier of the echo by which

@@ -21,14 +21,15 @@ outshines the others the echo looks like that of a point, and is as far off as e
 body stays, so its mean over the pings does tell. Detections that come with their extent, as those
 of images do, are therefore as uncertain as the echoes of their track were on average; a track
 begins with what the parameters say of a detection without variance. Standard deviations are
-averaged and not variances, in which a single echo that caught some noise would outweigh all others.
+averaged and not variances, in which a single echo that caught some noise would outweigh all
+others.
 
-Two errors are the same in every ping, so that no filter averages them out. They are *considered*,
-that is added to what is published, while the filter goes on without them:
+Two errors are the same in every ping, so that no filter averages them out. They are
+*considered*, that is added to what is published, while the filter goes on without them:
 
 - the speed of sound: all ranges are wrong by the same factor (`range_scale_std`);
-- the centre of a body: the mean of a few glints lies beside it, by a share `CENTRE` of the variance
-  by which the centroid wanders.
+- the centre of a body: the mean of a few glints lies beside it, by a share `CENTRE` of the
+  variance by which the centroid wanders.
 
 Source: docs/obstacle.md, section From images; Schmidt 1966, 'Application of state space methods to
 navigation problems', for considered errors.
@@ -50,8 +51,8 @@ MEMORY = 30.0
 
 
 class Bodies(NamedTuple):
-    """Of T tracks: count (T,) of echoes with an extent, and their mean standard deviation (T, 2), m
-    in range and across it; zeros as long as there was none."""
+    """Of T tracks: count (T,) of echoes with an extent, and their mean standard deviation (T, 2),
+    m, in range and across it; zeros as long as there was none."""
 
     count: FloatArray
     std: FloatArray
@@ -99,7 +100,10 @@ def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> Vi
         covariance[:, 0, 0] += centre[:, 0]
         covariance[:, 1, 1] += centre[:, 1] / np.square(view.state[:, 0])
         level = away[:, :2] / np.maximum(np.linalg.norm(away[:, :2], axis=1), 1e-9)[:, None]
-        for axis, variance in ((level, centre[:, 0]), (level[:, ::-1] * [-1.0, 1.0], centre[:, 1])):
+        for axis, variance in (
+            (level, centre[:, 0]),
+            (level[:, ::-1] * [-1.0, 1.0], centre[:, 1]),
+        ):
             place_covariance[:, :2, :2] += (
                 variance[:, None, None] * axis[:, :, None] * axis[:, None, :]
             )
