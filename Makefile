@@ -12,6 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python3.10; 
 
 BIN := $(abspath $(VENV))/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
 
 # Message setters check their types only when asked to before the first import. One thread for each
 # process: the tests run side by side. Compiled kernels and logs stay inside the environment.
@@ -28,6 +29,9 @@ endif
 
 # What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
 TESTS ?=
+# Hostile messages of `make fuzz` for each system.
+CASES ?= 100000
+FUZZ_JSON ?=
 # Tests that run the compiled kernels.
 KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm imm_particles \
     set_particles smoothing covariance kalman)) \
@@ -38,10 +42,10 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-bounds test-system lint docs bench clean
+.PHONY: help venv demo test test-core test-bounds test-system fuzz lint generate docs docs-numbers bench clean
 
 help: ## print this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
 venv: $(STAMP) ## build .venv from PyPI, ROS 2 included (PYTHON=... chooses the interpreter)
 
@@ -69,6 +73,10 @@ test-bounds: venv ## run the tests of the compiled kernels with every index chec
 	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
 	    $(BIN)/python -m pytest -m 'not system' -n $(JOBS) $(or $(TESTS),$(KERNEL_TESTS))
 
+fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON=...)
+	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \
+	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
+
 test-system: venv ## run the tests that start real nodes, one at a time
 	$(TEST_ENV) $(BIN)/python -m pytest -m system
 
@@ -77,13 +85,24 @@ lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: venv ## write config/*.yaml and docs/parameters/*.md anew from the code
+generate: venv ## write config/*.yaml and docs/parameters/*.md anew from the code
 	$(BIN)/python docs/generate.py
+
+docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the reference into site/
+	$(TEST_ENV) NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo 'Open site/index.html. For its search: python3 -m http.server --bind 127.0.0.1 -d site'
+
+docs-numbers: venv ## check that the tables of docs/ still hold the numbers of docs/results/
+	$(BIN)/python docs/check_numbers.py
+
+$(DOCS_STAMP): $(STAMP)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@
 
 bench: venv ## measure the speed against other libraries
 	$(BIN)/sonar-imm bench
 
 clean: ## remove everything that was built
 	@if test -e $(VENV)/pyvenv.cfg; then rm -rf $(VENV); fi
-	rm -rf build install log dist demo *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build install log dist demo site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -42,20 +42,31 @@ REQUIRES = [
 ]
 EXTRAS = {
     'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],
+    'docs': [
+        'mkdocs>=1.6,<2',
+        'mkdocs-material>=9.5',
+        'mkdocstrings[python]>=0.26',
+    ],
+    'parquet': ['pyarrow>=14'],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
         'filterpy',
+        'foxglove-sdk>=0.20',
         'hypothesis',
         'laspy[lazrs]>=2.5',
+        'pyarrow>=14',
         'pytest>=7.4',
         'pytest-benchmark',
         'pytest-xdist',
         'rasterio>=1.3',
         'segyio>=1.9',
         'stonesoup',
+        'websockets>=15',
     ],
     'lint': ['mypy', 'ruff'],
+    'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
+    'view': ['foxglove-sdk>=0.20'],
     'sweep': ['dask[distributed]>=2024.1'],
 }
 

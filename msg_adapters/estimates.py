@@ -21,15 +21,17 @@ covariance between position and velocity.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
 
 from .headers import Make, make_header, make_pose, stamp_ns
-from .table import decode_table, encode_table, require_columns
+from .table import decode_table, layout_of, packed_table, require_columns
 
 NOT_ESTIMATED = 1.0
 """Variance of a z or a vertical speed that is not estimated, m^2 and m^2/s^2: it says nothing, but
@@ -40,9 +42,74 @@ ALIGNED = 1e-9
 
 def write_estimate(estimate: Estimate, make: Make) -> Any:
     """Write the PointCloud2 table of ``~/estimate``, one row per target; it may have no rows."""
-    return encode_table(
-        estimate.columns(), stamp_ns=estimate.stamp_ns, frame_id=estimate.frame_id, make=make
+    packed, fields, is_dense = _packed(estimate, make)
+    header = make_header(estimate.stamp_ns, estimate.frame_id, make)
+    return packed_table(packed, fields, is_dense, header, make)
+
+
+def _packed(estimate: Estimate, make: Make) -> tuple[NDArray, tuple[Any, ...], bool]:
+    """The rows of `Estimate.columns` as `encode_table` packs them, their fields, and whether all
+    numbers are finite. States, covariances and probabilities go in as one block: column by column
+    a live node would spend a tenth of its time on columns of one number."""
+    extras = estimate.extras
+    told = tuple((name, one.dtype, one.shape[1:]) for name, one in extras.items())
+    plan = _plan(make, estimate.state_names, estimate.model_names, told)
+    packed = np.empty(len(estimate), plan.dtype)
+    whole = packed.view(plan.pieces)
+    upper = estimate.covariance[:, plan.upper[0], plan.upper[1]]
+    whole['xyz'] = np.asarray(estimate.xyz).reshape(-1, 3)
+    whole['block'] = np.concatenate([estimate.state, upper, estimate.probabilities], axis=1)
+    for name, column in extras.items():
+        packed[name] = column
+    finite = np.isfinite(whole['block']).all() and np.isfinite(whole['xyz']).all()
+    finite = finite and all(np.isfinite(extras[name]).all() for name in plan.inexact)
+    return packed, plan.fields, bool(finite)
+
+
+class _Plan(NamedTuple):
+    """Where the columns of estimates lie. pieces: the same rows as xyz, one block, and the rest;
+    upper: rows and columns of the covariances sent; inexact: extras that may hold NaN."""
+
+    dtype: np.dtype
+    fields: tuple[Any, ...]
+    pieces: np.dtype
+    upper: tuple[NDArray, NDArray]
+    inexact: tuple[str, ...]
+
+
+@lru_cache(maxsize=64)
+def _plan(
+    make: Make,
+    states: tuple[str, ...],
+    models: tuple[str, ...],
+    extras: tuple[tuple[str, np.dtype, tuple[int, ...]], ...],
+) -> _Plan:
+    """What does not change from one estimate of a tracker to the next."""
+    n, m = len(states), len(models)
+    upper = np.triu_indices(n)
+    empty = Estimate(
+        stamp_ns=0,
+        frame_id='',
+        xyz=np.empty((0, 3)),
+        state_names=states,
+        state=np.empty((0, n)),
+        covariance=np.empty((0, n, n)),
+        model_names=models,
+        probabilities=np.empty((0, m)),
+        extras={name: np.empty((0, *shape), dtype) for name, dtype, shape in extras},
+    ).columns()
+    layout = tuple((name, column.dtype, column.shape[1:]) for name, column in empty.items())
+    dtype, fields = layout_of(make, layout)
+    pieces = np.dtype(
+        {
+            'names': ['xyz', 'block'],
+            'formats': [('<f4', 3), ('<f8', n + len(upper[0]) + m)],
+            'offsets': [0, 12],
+            'itemsize': dtype.itemsize,
+        }
     )
+    inexact = tuple(name for name, kind, _ in extras if kind.kind == 'f')
+    return _Plan(dtype, fields, pieces, upper, inexact)
 
 
 def read_estimate(message: Any) -> Estimate:

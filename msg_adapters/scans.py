@@ -78,13 +78,9 @@ def read_poses(message: Any, *, world_frame: str = 'enu') -> Fixes:
     return _scan(message, position, None, None, world_frame)
 
 
-def doubt_scan(message: Any) -> str | None:
-    """Give ``'unusable_rows'`` for a scan of which some rows are left out, ``'flagged_invalid'``
-    where its sender flags some."""
-    try:
-        scan = read_poses(message) if hasattr(message, 'poses') else read_scan(message)
-    except Rejection:
-        return None
+def doubt_scan(message: Any, scan: Fixes) -> str | None:
+    """Give ``'unusable_rows'`` where `scan`, read from `message`, left some rows out,
+    ``'flagged_invalid'`` where its sender flags some."""
     rows = len(message.poses) if hasattr(message, 'poses') else message.height * message.width
     if len(scan) == rows:
         return None
@@ -124,19 +120,34 @@ def _scan(
     """The scan of the rows (n,) that can be used."""
     if covariance is not None:
         covariance = _known(covariance)
-    keep = usable_fixes(position, covariance) & _sized(covariance, len(position))
-    if len(keep) and not keep.any():
-        raise Rejection('nan', f'none of the {len(keep)} fixes of the scan can be used')
-    if covariance is not None and (len(keep) == 0 or np.isnan(covariance[keep]).all()):
+    sized = _sized(covariance, len(position))
+    try:
+        # A scan looks at its rows itself: where all are good, once is enough.
+        scan = _of_rows(message, position, covariance, target_id) if sized.all() else None
+    except Rejection:
+        scan = None
+    if scan is None:
+        keep = usable_fixes(position, covariance) & sized
+        if len(keep) and not keep.any():
+            raise Rejection('nan', f'none of the {len(keep)} fixes of the scan can be used')
+        kept = (None if column is None else column[keep] for column in (covariance, target_id))
+        scan = _of_rows(message, position[keep], *kept)
+    return to_enu(scan, world_frame, _turned)
+
+
+def _of_rows(
+    message: Any, position: NDArray, covariance: NDArray | None, target_id: NDArray | None
+) -> Fixes:
+    """The scan of all rows (n,); covariances that are unknown throughout are left out."""
+    if covariance is not None and np.isnan(covariance).all():
         covariance = None
-    scan = Fixes(
+    return Fixes(
         stamp_ns=stamp_ns(message),
         frame_id=str(message.header.frame_id),
-        position=position[keep],
-        covariance=None if covariance is None else covariance[keep],
-        target_id=None if target_id is None else target_id[keep],
+        position=position,
+        covariance=covariance,
+        target_id=target_id,
     )
-    return to_enu(scan, world_frame, _turned)
 
 
 def _turned(scan: Fixes) -> Fixes:

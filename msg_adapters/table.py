@@ -110,17 +110,26 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
         (name, array.dtype, array.shape[1:] if array.ndim else None)
         for name, array in zip(_xyz_first(tuple(columns)), arrays)
     )
-    dtype, fields = _layout_of(make, layout)
+    dtype, fields = layout_of(make, layout)
     rows = len(arrays[0]) if arrays else 0
     packed = np.empty(rows, dtype)
     for (name, _, _), array in zip(layout, arrays):
         if len(array) != rows:
             raise ValueError(f"column '{name}' has {len(array)} rows, '{layout[0][0]}' has {rows}")
         packed[name] = array
-    step = dtype.itemsize if arrays else 0
+    header = make_header(stamp_ns, frame_id, make)
+    return packed_table(packed, fields, _is_finite(packed, arrays), header, make)
+
+
+def packed_table(
+    packed: NDArray, fields: tuple[Any, ...], is_dense: bool, header: Any, make: Make
+) -> Any:
+    """A PointCloud2 of rows (n,) that are packed already, with the dtype and the fields of
+    `layout_of`; is_dense: whether every number is finite."""
+    rows, step = len(packed), packed.dtype.itemsize if fields else 0
     return make(
         'sensor_msgs/msg/PointCloud2',
-        header=make_header(stamp_ns, frame_id, make),
+        header=header,
         height=1,
         width=rows,
         fields=list(fields),
@@ -128,7 +137,7 @@ def encode_table(columns: Mapping[str, Any], *, stamp_ns: int, frame_id: str, ma
         point_step=step,
         row_step=step * rows,
         data=packed.tobytes(),
-        is_dense=_is_finite(packed, arrays),
+        is_dense=is_dense,
     )
 
 
@@ -140,7 +149,7 @@ def _xyz_first(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=64)
-def _layout_of(
+def layout_of(
     make: Make, layout: tuple[tuple[str, np.dtype, tuple[int, ...] | None], ...]
 ) -> tuple[np.dtype, tuple[Any, ...]]:
     """The packed dtype and the PointFields of columns (name, dtype, shape of a row): most of the

@@ -36,6 +36,7 @@ if not (ROOT / 'setup.py').is_file():
 
 # A room may import from its own floor and from lower ones.
 FLOORS = {
+    'sonar_imm.files': 0,
     'sonar_imm.resources': 0,
     'sonar_imm.threads': 0,
     'sonar_imm.estimation': 0,
@@ -50,10 +51,16 @@ FLOORS = {
     'sonar_imm.node_config': 4,
     'sonar_imm.recordings': 5,
     'sonar_imm.evaluation': 6,
+    'sonar_imm.viewing': 7,
     'sonar_imm.nodes': 7,
     'sonar_imm.cli': 8,
 }
-SIDE_BY_SIDE = {('msg_adapters', 'sonar_imm.trackers'), ('sonar_imm.trackers', 'msg_adapters')}
+SIDE_BY_SIDE = {
+    ('sonar_imm.viewing', 'sonar_imm.nodes'),
+    ('sonar_imm.nodes', 'sonar_imm.viewing'),
+    ('msg_adapters', 'sonar_imm.trackers'),
+    ('sonar_imm.trackers', 'msg_adapters'),
+}
 ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
 
 

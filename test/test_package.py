@@ -49,6 +49,7 @@ PYPI_OF_KEY = {
     'python3-rosbags-pip': 'rosbags',
     'python3-scipy': 'scipy',
     'python3-stonesoup-pip': 'stonesoup',
+    'python3-websockets': 'websockets',
     'python3-yaml': 'PyYAML',
 }
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
@@ -56,6 +57,10 @@ IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
 # those that some commands need, each with an extra of its own.
 PEERS = {
+    'sonar_imm.evaluation.jobs': {'distributed'},
+    'sonar_imm.evaluation.tables': {'pyarrow'},
+    'sonar_imm.viewing.rerun_file': {'rerun'},
+    'sonar_imm.viewing.server': {'foxglove'},
     'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
     'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'},
     'sonar_imm.evaluation.sweep': {'distributed'},
@@ -132,7 +137,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
-    without_key = {'laspy', 'segyio'}
+    without_key = {'foxglove-sdk', 'laspy', 'pyarrow', 'segyio'}
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 
@@ -201,7 +206,7 @@ def test_generated_files_are_up_to_date() -> None:
     assert files
     for name, text in files.items():
         found = (ROOT / name).read_text(encoding='utf-8') if (ROOT / name).exists() else ''
-        assert found == text, f'{name} is out of date: run `make docs`'
+        assert found == text, f'{name} is out of date: run `make generate`'
 
 
 def test_every_system_is_found_by_its_name() -> None:
@@ -272,18 +277,18 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         assert config.from_mapping(values, ignore_unknown=True) == config()
 
 
-def test_readme_names_every_subcommand() -> None:
+def test_the_page_of_commands_names_every_subcommand() -> None:
     from sonar_imm.cli import COMMANDS
 
-    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+    page = (ROOT / 'docs' / 'reference' / 'commands.md').read_text(encoding='utf-8')
     table = page.partition('| subcommand |')[2].partition('\n\n')[0]
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)
 
 
-def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+def test_the_example_of_the_library_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / 'docs' / 'howto' / 'library.md').read_text(encoding='utf-8')
     (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
-    exec(compile(example, 'README.md', 'exec'), {})
+    exec(compile(example, 'library.md', 'exec'), {})
     assert capsys.readouterr().out
 
 
@@ -295,8 +300,9 @@ def test_topics_page_names_every_input() -> None:
     for system in SYSTEMS:
         for topic in inputs_of(system):
             for type_name in topic.readers:
-                row = rf'^\| `{topic.name}` \| .*{re.escape(type_name.split("/")[-1])}'
-                assert re.search(row, page, re.MULTILINE), f'{topic.name} {type_name}'
+                heard = f'{topic.prefix}{topic.name}'
+                row = rf'^\| `{heard}` \| .*{re.escape(type_name.split("/")[-1])}'
+                assert re.search(row, page, re.MULTILINE), f'{heard} {type_name}'
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,9 @@ from .topic import InputTopic
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 
+SIDES = {'port': frozenset({'port'}), 'starboard': frozenset({'starboard', 'stbd'})}
+"""The sides, with the words that name them."""
+
 TOPICS = (
     InputTopic(
         'snapshot',
@@ -51,8 +54,9 @@ TOPICS = (
             readers={TABLE: partial(read_snapshot, side=side)},
             write=write_snapshot,
             one_topic=True,
+            words=words,
         )
-        for side in ('port', 'starboard')
+        for side, words in SIDES.items()
     ),
     InputTopic(
         'nav',
@@ -60,7 +64,7 @@ TOPICS = (
         measurement=Navigation,
         readers={'nav_msgs/msg/Odometry': read_navigation},
         write=write_navigation,
-        doubt=doubt_navigation,
+        doubt=lambda message, navigation: doubt_navigation(message),
         companion=True,
         required=lambda settings: settings.get('navigation') == 'required',
     ),

@@ -61,7 +61,7 @@ TOPICS = (
         measurement=Navigation,
         readers={'nav_msgs/msg/Odometry': read_navigation},
         write=write_navigation,
-        doubt=doubt_navigation,
+        doubt=lambda message, navigation: doubt_navigation(message),
         settings=('nav_twist_frame',),
         required=lambda settings: True,
     ),

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+import re
 from typing import Any
 
 from attrs import field, frozen
@@ -25,6 +26,7 @@ from attrs import field, frozen
 from ..labels import Labels
 
 Reader = Callable[..., Any]
+Doubt = Callable[[Any, Any], str | None]
 
 DOUBTS = {
     'zero_covariance': 'have a covariance of zeros, which is taken as unknown',
@@ -35,6 +37,11 @@ DOUBTS = {
 """What messages have that are used but deserve a look, by the code they are counted under."""
 
 
+def words_of(name: str) -> list[str]:
+    """The words of a name in small letters, and what stands between them."""
+    return re.split(r'([\W_]+)', name.lower())
+
+
 @frozen
 class InputTopic:
     """One input of a tracker.
@@ -42,7 +49,8 @@ class InputTopic:
     name: relative topic name. measurement: the class that its readers give. readers: by message
     type; a reader takes ``(message, *, world_frame='enu')`` and raises `Rejection` for a message
     that it cannot use. write: ``(measurement, make) -> message``.
-    doubt: gives a reason code to count when a message can be used but deserves a warning.
+    doubt: ``(message, measurement)`` -> a reason code to count when a message can be used but
+    deserves a warning, given what its reader made of it.
     scans: several messages with one stamp are one scan, so that equal stamps are no mistake.
     one_topic: several topics are several instruments, each for a tracker of its own.
     settings: parameters of the tracker that its readers take as keywords too: what messages do not
@@ -59,6 +67,10 @@ class InputTopic:
     topic or its frame.
     required: whether the tracker makes nothing without it, by the parameters of the tracker. Of
     the inputs that are neither required nor companions, one is enough.
+    prefix: ``'~/'`` for a topic below the name of the node, ``'/'`` for one that no namespace
+    changes; '' for a relative topic.
+    words: words in a topic's name, any of which says that it is this input rather than the one of
+    the same last name: ``/sidescan_port/snapshot`` is a ``port/snapshot``.
     makes: the input of a tracker that a node before it makes of this one; '' for an input of the
     tracker itself.
     """
@@ -68,7 +80,7 @@ class InputTopic:
     measurement: type = field(kw_only=True)
     readers: Mapping[str, Reader] = field(kw_only=True)
     write: Callable[..., Any] = field(kw_only=True)
-    doubt: Callable[[Any], str | None] = field(default=lambda message: None, kw_only=True)
+    doubt: Doubt = field(default=lambda message, measurement: None, kw_only=True)
     scans: bool = field(default=False, kw_only=True)
     one_topic: bool = field(default=False, kw_only=True)
     settings: tuple[str, ...] = field(default=(), kw_only=True)
@@ -81,7 +93,25 @@ class InputTopic:
     required: Callable[[Mapping[str, Any]], bool] = field(
         default=lambda settings: False, kw_only=True
     )
+    prefix: str = field(default='', kw_only=True)
+    words: frozenset[str] = field(default=frozenset(), kw_only=True)
     makes: str = field(default='', kw_only=True)
+
+    def is_named(self, topic: str) -> bool:
+        """Whether the name of `topic` says that it is this input."""
+        if f'/{topic}'.endswith(f'/{self.name}'):
+            return True
+        place, _, own = topic.rpartition('/')
+        same = own == self.name.rpartition('/')[2]
+        return same and not self.words.isdisjoint(words_of(place))
+
+    def namespace(self, topic: str) -> str:
+        """What stands before the name of the input in that of a topic: ``/fore`` of
+        ``/fore/port/snapshot``, ``/fore_`` of ``/fore_port/snapshot``."""
+        if f'/{topic}'.endswith(f'/{self.name}'):
+            return topic[: -len(self.name)].rstrip('/')
+        parts = words_of(topic.rpartition('/')[0])
+        return ''.join(part for part in parts if part not in self.words)
 
     def may_be(self, topic: str, type_name: str) -> bool:
         """Whether a topic of that name and type could be this input, if a user says so."""
@@ -100,6 +130,10 @@ class InputTopic:
         parts = topic.split('/')
         names = [name for key in self.named_by for name in settings.get(key, ()) if name in parts]
         return f'{names[0]}/{self.name}' if names else self.name
+
+    def full_name(self, node: str) -> str:
+        """Where the node called `node` hears it when it is in no namespace."""
+        return f'/{node}/{self.name}' if self.prefix == '~/' else f'/{self.name}'
 
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any], topic: str = ''

@@ -44,6 +44,7 @@ COMMANDS = {
     'track': 'Track a recorded bag offline: estimates as bag and CSV.',
     'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
     'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
+    'view': 'Show a recording, a run or running nodes in Foxglove.',
     'play': 'Publish a bag to live nodes.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
     'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
@@ -154,6 +155,10 @@ def missing_package(name: str) -> str | None:
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
         'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
+        'pyarrow': "pyarrow, which writes Parquet, is not here: pip install 'sonar_imm[parquet]'",
+        'foxglove': 'foxglove-sdk, which serves the view, is not here: pip install '
+        "'sonar_imm[view]', or use --browser",
+        'rerun': "rerun-sdk, which writes the file, is not here: pip install 'sonar_imm[rerun]'",
         'filterpy': "FilterPy is not installed: pip install 'sonar_imm[test]'",
     }
     return remedies.get(name)

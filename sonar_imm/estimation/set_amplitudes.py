@@ -76,9 +76,9 @@ def weigh(
         if memory:
             log_weight[i] += _explain(i, b, amplitudes, scatter, sets, amplitude, scratch)
             continue
-        slot = sets.shift[i]
+        slot = 0
         for k in range(sets.order[i]):
-            slot = (31 * slot + sets.cell[i, k]) % 1_000_003
+            slot = (31 * slot + sets.cell[i, k] + sets.shift[i]) % 1_000_003
         slot %= SLOTS
         j = owner[slot]
         if j >= 0 and _same(i, j, sets):
@@ -92,10 +92,12 @@ def weigh(
 
 @kernel
 def _same(i: int, j: int, sets: Sets) -> bool:
-    if sets.order[i] != sets.order[j] or sets.shift[i] != sets.shift[j]:
+    if sets.order[i] != sets.order[j]:
         return False
     for k in range(sets.order[i]):
-        if sets.cell[i, k] != sets.cell[j, k] or sets.sign[i, k] != sets.sign[j, k]:
+        if sets.cell[i, k] + sets.shift[i] != sets.cell[j, k] + sets.shift[j]:
+            return False
+        if sets.sign[i, k] != sets.sign[j, k]:
             return False
     return True
 

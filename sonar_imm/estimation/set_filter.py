@@ -42,16 +42,18 @@ from .resampling import systematic
 from .set_model import SetModel, Sets
 from .set_particles import gains, Proposals, propose_births
 from .set_scatter import fit_scatter, ScatterFit
-from .set_shifts import shift_tables
+from .set_shifts import shift_tables, ShiftPath
 
-_STEP, _START, _RESAMPLE = range(3)
+_STEP, _START, _RESAMPLE, _OFFSET = range(4)
 
 
 class Weighted(NamedTuple):
-    """Sets with log weights (N,) that need not be normalised: the state between records."""
+    """Sets with log weights (N,) that need not be normalised: the state between records. path: of
+    their shifts, None without."""
 
     sets: Sets
     log_weight: FloatArray
+    path: ShiftPath | None = None
 
 
 @frozen(eq=False)
@@ -61,7 +63,8 @@ class SetStep:
     sets: weighted by w (N,), summing to one; amplitude (N, J) given each set, in units of the
     noise. after: the same, resampled when needed; source (N,) the index into `sets` of each of
     them. log_evidence: log of the record's probability given those before, against that of an
-    empty record; effective: sample size; ok False when no set could explain the record.
+    empty record; effective: sample size; ok False when no set could explain the record; path: of
+    the shifts of `sets`, None without.
     """
 
     sets: Sets
@@ -72,6 +75,7 @@ class SetStep:
     log_evidence: float
     effective: float
     ok: bool
+    path: ShiftPath | None = None
 
 
 class SetFilter:
@@ -128,15 +132,19 @@ class SetFilter:
         _, log_before = normalise(before.log_weight)
         ok = bool(np.isfinite(log_sum))
         effective = float(effective_sample_size(w)) if ok else 0.0
+        path = seen = self._path(before, sets)
         source = np.arange(self.particles)
-        if ok and effective < 0.5 * self.particles:
+        resampled = ok and effective < 0.5 * self.particles
+        if resampled:
             source = systematic(w, self.particles, _uniform(key, _RESAMPLE))
             log_weight = np.zeros(self.particles)
+            path = path.take(source) if path else None
         after = self._remembered(sets.take(source), amplitude[source], answer)
+        known = Weighted(after, log_weight, path)
+        if resampled:
+            known = self._offset(known, _uniform(key, _OFFSET))
         evidence = float(log_sum - log_before)
-        return SetStep(
-            sets, w, amplitude, Weighted(after, log_weight), source, evidence, effective, ok
-        )
+        return SetStep(sets, w, amplitude, known, source, evidence, effective, ok, seen)
 
     def warm(self) -> None:
         """Compile or load the kernels."""
@@ -151,13 +159,17 @@ class SetFilter:
         pmf = np.zeros(len(self.model.transition))
         rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
         sums = np.zeros((rows, self.model.record_cells))
-        kernels.moments(w, sets, step.amplitude, self.model.order_min, pmf, sums)
-        return pmf, sums
+        offset, variance = _offset_of(step.path)
+        kernels.moments(w, sets, step.amplitude, offset, variance, self.model.order_min, pmf, sums)
+        # Weights add up to one but for rounding: no probability may pass it for that.
+        return np.minimum(pmf, 1.0), sums
 
-    def shift(self, w: FloatArray, sets: Sets) -> tuple[float, float]:
-        """Mean and standard deviation of the shift, cells."""
-        mean = float(w @ sets.shift)
-        spread = float(np.sqrt(w @ np.square(sets.shift - mean)))
+    def shift(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[float, float]:
+        """Mean and standard deviation of the shift, cells, of `sets` with weights w (N,)."""
+        offset, variance = _offset_of(step.path)
+        there = sets.shift + offset
+        mean = float(w @ there)
+        spread = math.sqrt(float(w @ np.square(there - mean)) + variance)
         return mean - self.model.pad, spread
 
     def _start(
@@ -178,6 +190,31 @@ class SetFilter:
         sets.cell[~np.isfinite(log_ratio)] = 0
         # The sets are draws from the prior in disguise: as many particles as if they were.
         return Weighted(sets, log_ratio)
+
+    def _path(self, before: Weighted, sets: Sets) -> ShiftPath | None:
+        shift = self.model.shift
+        if shift is None:
+            return None
+        if before.path is None:
+            return ShiftPath.begin(shift, sets.shift)
+        return before.path.then(shift, before.sets.shift, sets.shift)
+
+    def _offset(self, known: Weighted, rng: np.random.Generator) -> Weighted:
+        """With the offset of members and shift drawn anew, so that copies of a set differ."""
+        sets, shift = known.sets, self.model.shift
+        if shift is None or known.path is None:
+            return known
+        u = rng.random((self.particles, 2))
+        last = np.take_along_axis(sets.cell, np.maximum(sets.order - 1, 0)[:, None], 1)[:, 0]
+        # A set without members has no place that could leave the lattice.
+        some = sets.order > 0
+        low = np.where(some, last - (self.model.cells - 1), -self.model.cells)
+        high = np.where(some, sets.cell[:, 0], self.model.cells)
+        d, path = known.path.draw(shift, sets.shift, (low, high), u)
+        there = np.arange(sets.cell.shape[1]) < sets.order[:, None]
+        cell = np.where(there, sets.cell - d[:, None], sets.cell)
+        moved = sets._replace(cell=cell, shift=sets.shift + d)
+        return known._replace(sets=moved, path=path)
 
     def _gains(self, b: FloatArray, fit: ScatterFit | None) -> FloatArray:
         background = fit_scatter(self.model.scatter, b) if fit is None else fit
@@ -281,6 +318,11 @@ class LagSmoother:
 
     def clear(self) -> None:
         self._steps.clear()
+
+
+def _offset_of(path: ShiftPath | None) -> tuple[FloatArray, float]:
+    """Mean (N,) and variance of what is still to be drawn, cells."""
+    return (path.mean, 1.0 / path.precision) if path else (np.empty(0), 0.0)
 
 
 def _uniform(key: tuple[int, int], purpose: int) -> np.random.Generator:

@@ -286,6 +286,8 @@ def moments(
     w: FloatArray,
     sets: Sets,
     amplitude: FloatArray,
+    offset: FloatArray,
+    variance: float,
     order_min: int,
     pmf: FloatArray,
     sums: FloatArray,
@@ -295,7 +297,7 @@ def moments(
     of their set, that lie on each cell. Both are zero before. With a shift, cells are those of
     the record, where members that share an error are not blurred by it, and sums (8, n + 2 pad)
     has the first two moments of the cell on the lattice and its product with the amplitude
-    besides."""
+    besides, with the mean offset (N,) of the shift and its variance (see `set_shifts`)."""
     shifted = sums.shape[0] > SUMS
     for i in range(w.shape[0]):
         if w[i] > 0.0:
@@ -308,8 +310,9 @@ def moments(
                 sums[2, z] += w[i] * a * a
                 sums[3, z] += w[i] * sets.prior_variance[i, k]
                 if shifted:
-                    sums[5, z] += w[i] * place
-                    sums[6, z] += w[i] * place * place
-                    sums[7, z] += w[i] * place * a
+                    at = place - offset[i]
+                    sums[5, z] += w[i] * at
+                    sums[6, z] += w[i] * (at * at + variance)
+                    sums[7, z] += w[i] * at * a
             if sets.order[i] > 0:
                 sums[4, sets.cell[i, 0] + sets.shift[i]] += w[i]

@@ -23,6 +23,21 @@ with a memory (an autoregression of first order on the grid). Its proposal sees 
 
 where Z, by sign, is what the moves from a cell hold of the record, so that a few members that were
 followed well fix the shift before any of them moves.
+
+Records tell where members lie plus the shift, and never one of both alone. All members lower and
+all shifts since the first record higher by the same offset d explain every record as well; only
+the path of shifts has to be likely. Sets that survive a record which few of them explain, such as
+the first, share the shift of one or two, so that the particles would be far too sure of it. The
+offset is therefore drawn again for each particle, given its own path (a Gibbs move, which leaves
+the posterior as it is)::
+
+    p(d) ~ exp(-d^2 precision / 2 - d pull),  precision = 1 / std^2 + T (1 - phi)^2 / q
+    pull = s_0 / std^2 + sum_t (1 - phi) (s_t - phi s_(t-1)) / q,     q = std^2 (1 - phi^2)
+
+for shifts s_0 .. s_T of memory phi (`ShiftPath`). What is reported of shift and places has the
+mean of that offset and its variance in place of one draw.
+W. R. Gilks and C. Berzuini, *Following a moving target: Monte Carlo inference for dynamic Bayesian
+models*, J. R. Statist. Soc. B 63 (2001).
 """
 
 from __future__ import annotations
@@ -32,6 +47,7 @@ from typing import NamedTuple
 
 from attrs import frozen
 import numpy as np
+from scipy.special import log_ndtr, ndtri
 
 from .arrays import FloatArray, IntArray
 from .jit import kernel
@@ -78,6 +94,59 @@ class Shift:
         """log p(shift | before) (G, G), rows from."""
         std = self.std * math.sqrt(1.0 - self.memory**2)
         return _log_normal(self.places - self.memory * self.places[:, None], std)
+
+
+class ShiftPath(NamedTuple):
+    """What the shifts of each particle so far say of an offset that all of them share: pull (N,)
+    in 1 / cells and precision in 1 / cells^2, see the module's text."""
+
+    pull: FloatArray
+    precision: float
+
+    @classmethod
+    def begin(cls, shift: Shift, place: IntArray) -> ShiftPath:
+        """Of the shifts plus pad (N,) of the first record. Those before it, which members were
+        born with, are integrated out: it may have members anywhere."""
+        return cls((place - shift.pad) / shift.std**2, shift.std**-2)
+
+    def then(self, shift: Shift, before: IntArray, place: IntArray) -> ShiftPath:
+        """With the shifts plus pad of one more record, `before` those of the record before."""
+        phi = shift.memory
+        slope = (1.0 - phi) / (shift.std**2 * (1.0 - phi**2))
+        innovation = (place - shift.pad) - phi * (before - shift.pad)
+        return ShiftPath(self.pull + slope * innovation, self.precision + slope * (1.0 - phi))
+
+    def take(self, index: IntArray) -> ShiftPath:
+        return self._replace(pull=self.pull[index])
+
+    @property
+    def mean(self) -> FloatArray:
+        """Of the offset (N,), cells."""
+        return -self.pull / self.precision
+
+    def draw(
+        self, shift: Shift, place: IntArray, room: tuple[IntArray, IntArray], u: FloatArray
+    ) -> tuple[IntArray, ShiftPath]:
+        """Offsets (N,) in cells, multiples of the step, and the path with them. place (N,): the
+        newest shifts plus pad; room: the least and the greatest offset (N,) that leave all members
+        on the lattice; u (N, 2) uniform. Drawn from a rounded Gaussian and, by Metropolis and
+        Hastings, exact on the grid; what leads off the lattice or beyond the greatest shift
+        stays."""
+        std, middle = 1.0 / math.sqrt(self.precision), self.mean
+        drawn = middle + std * ndtri(np.clip(u[:, 0], 1e-16, 1.0 - 1e-16))
+        d = shift.step * np.rint(drawn / shift.step)
+        # log of target over proposal, there and where it is.
+        gain = _log_share(d, middle, std, shift.step) - _log_share(0.0, middle, std, shift.step)
+        inside = (place + d >= 0) & (place + d <= 2 * shift.pad) & (d >= room[0]) & (d <= room[1])
+        d = np.where(inside & (np.log1p(-u[:, 1]) < gain), d, 0.0)
+        return d.astype(np.int64), self._replace(pull=self.pull + self.precision * d)
+
+
+def _log_share(d: FloatArray | float, middle: FloatArray, std: float, step: int) -> FloatArray:
+    """log of the normal density at d over the share of it that is rounded to d."""
+    x, half = np.abs(d - middle) / std, 0.5 * step / std
+    above, below = log_ndtr(half - x), log_ndtr(-half - x)
+    return np.asarray(-0.5 * x * x - above - np.log1p(-np.exp(below - above)))
 
 
 def _log_normal(x: FloatArray, std: float) -> FloatArray:

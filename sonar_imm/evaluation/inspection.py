@@ -91,9 +91,9 @@ def _look_at(item: BagMessage, heard: _Heard, detector: Mapping[str, Any]) -> No
     for system, entry in _readers(item):
         try:
             told = detector if entry.makes else {}
-            entry.reader(item.type_name, 'enu', told)(item.message)
+            made = entry.reader(item.type_name, 'enu', told)(item.message)
             heard.good[system, entry.name] += 1
-            if (code := entry.doubt(item.message)) is not None:
+            if (code := entry.doubt(item.message, made)) is not None:
                 heard.doubts[code] += 1
         except Rejection as rejection:
             heard.refused.setdefault((system, entry.name), Counter())[rejection.reason] += 1

@@ -31,6 +31,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
+from .unused import Unused
+
 _WINDOW = 1000
 _PATIENCE = 5.0
 """Mean intervals after which an input that is not needed is said to be gone."""
@@ -91,7 +93,8 @@ class Reporter:
         self._topics = dict(topics)
         self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
-        self._before = (None, Counter(), Counter(), 0)
+        self._before = (None, Counter(), Counter(), 0, Counter())
+        self._unused = Unused()
 
     def report(
         self,
@@ -107,28 +110,47 @@ class Reporter:
         incompatible: Mapping[str, str],
     ) -> DiagnosticArray:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds."""
-        then, received_before, refused_before, dropped_before = self._before
+        then, received_before, refused_before, dropped_before, lost_before = self._before
         meter = self._meter
         elapsed = np.nan if then is None else max(now - then, 1e-9)
         fresh = meter.received - received_before
         refused = meter.refused - refused_before
         dropped = meter.dropped.total()
-        self._before = (now, meter.received.copy(), meter.refused.copy(), dropped)
+        missing = Counter(lost) - lost_before
+        self._before = (
+            now,
+            meter.received.copy(),
+            meter.refused.copy(),
+            dropped,
+            Counter(lost),
+        )
 
         stale = self._stale(now, stale_after)
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
             self._input_status(
-                now, elapsed, fresh, refused, enabled, stale_after, lost, incompatible, stale
+                now,
+                elapsed,
+                fresh,
+                refused,
+                enabled,
+                stale_after,
+                lost,
+                missing,
+                incompatible,
+                stale,
             ),
             self._tracker_status(
-                fresh.total() / elapsed,
+                (fresh + missing).total() / elapsed,
                 dropped - dropped_before,
                 enabled,
                 counts,
                 health,
-                warnings,
+                [
+                    *warnings,
+                    *filter(None, [self._unused.sentence(now, meter.received.total(), counts)]),
+                ],
                 stale,
             ),
         ]
@@ -165,6 +187,7 @@ class Reporter:
         enabled: bool,
         stale_after: float,
         lost: Mapping[str, int],
+        missing: Counter[str],
         incompatible: Mapping[str, str],
         stale: Sequence[str],
     ) -> DiagnosticStatus:
@@ -193,8 +216,8 @@ class Reporter:
             level, text = DiagnosticStatus.WARN, f'messages are refused: {_most(refused)}'
         elif incompatible:
             level, text = DiagnosticStatus.WARN, 'a peer has an incompatible quality of service'
-        elif lost:
-            level, text = DiagnosticStatus.WARN, 'messages were lost before they could be read'
+        elif missing:
+            level, text = DiagnosticStatus.WARN, _share_lost(missing, fresh)
         elif gone := self._gone(now, stale_after):
             level, text = DiagnosticStatus.WARN, '; '.join(gone)
         if not enabled:
@@ -247,6 +270,13 @@ class Reporter:
             hardware_id='sonar_imm',
             values=pairs,
         )
+
+
+def _share_lost(missing: Counter[str], fresh: Counter[str]) -> str:
+    shares = ', '.join(
+        f'{100 * n / (n + fresh[topic]):.1f} % on {topic}' for topic, n in missing.most_common(3)
+    )
+    return f'messages are lost before they can be read: {shares}'
 
 
 def _most(refused: Counter[str]) -> str:

@@ -47,7 +47,7 @@ from ..measurements import FrameGuard, Rejection
 from ..node_config import DetectorNodeConfig, type_specs
 from ..parameters import ConfigError
 from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
-from .answers import answer
+from .answers import Answers
 from .base import run
 from .diagnostics import Meter, Reporter
 from .messages import make, message_class
@@ -82,7 +82,7 @@ class FlsDetectorNode(Node):
             raise ConfigError(str(error)) from None
         self._endpoints = Endpoints(self)
         table = message_class('sensor_msgs/msg/PointCloud2')
-        self._processed = self._endpoints.advertise(table, '~/processed', latched_qos())
+        self._answers = Answers(self._endpoints.advertise(table, '~/processed', latched_qos()))
         self._detections = self._endpoints.advertise(
             table, 'detections', output_qos(), matched=lambda: self._acknowledge(None)
         )
@@ -90,7 +90,10 @@ class FlsDetectorNode(Node):
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
         )
         heard = self._endpoints.subscribe(
-            image_class, topic.name, self.receive, input_qos(self._node_config.queue_depth)
+            image_class,
+            topic.name,
+            lambda image, _: self.receive(image),
+            input_qos(self._node_config.queue_depth),
         )
         self._reporter = Reporter(
             self.get_fully_qualified_name().lstrip('/'),
@@ -150,7 +153,7 @@ class FlsDetectorNode(Node):
             'estimates': self._published,
             'listeners': self._detections.get_subscription_count(),
         }
-        self._processed.publish(answer(counts, stamp))
+        self._answers.say(counts, stamp)
 
     def _report(self) -> None:
         self._diagnostics.publish(

@@ -32,8 +32,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from ..parameters import ConfigError, did_you_mean
-from ..recordings.messages import typestore
-from ..recordings.reader import BagError, BagMessage, BagReader
+from ..recordings.reader import BagError, BagReader
 from .chain import Chain
 from .link import Link, MATCH_LIMIT
 from .lockstep import LockStep, only_node
@@ -219,9 +218,9 @@ class Player:
             self._wait(pace, item.log_ns, paced=not stepped)
             publisher = self._publishers[item.topic]
             if publisher.topic_name in stepped:
-                self._lockstep.step(publisher, self._cdr(item))
+                self._lockstep.step(publisher, self._bag.cdr(item))
             else:
-                publisher.publish(self._cdr(item))
+                publisher.publish(self._bag.cdr(item))
             self._published += 1
             progress(1)
 
@@ -239,12 +238,6 @@ class Player:
             if wait <= 0.0:
                 return
             self._link.spin(min(wait, self._clock.until_next() if self._clock else 0.1, 0.1))
-
-    def _cdr(self, item: BagMessage) -> bytes:
-        """Give the message as ROS 2 sends it; ROS 1 bags hold another serialization."""
-        if self._bag.path.is_file() and self._bag.path.suffix == '.bag':
-            return bytes(typestore().serialize_cdr(item.message, item.type_name))
-        return bytes(item.raw)
 
 
 class Pace:

@@ -24,7 +24,7 @@ refuses a best-effort driver.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -42,6 +42,7 @@ from rclpy.subscription import Subscription
 import yaml
 
 from ..parameters import ConfigError
+from .losses import SequenceGaps
 
 _POLICIES = {
     'history': HistoryPolicy,
@@ -82,33 +83,58 @@ def lockstep_qos() -> QoSProfile:
 class Endpoints:
     """Makes the publishers and subscriptions of a node and remembers what they lost.
 
-    lost: messages the middleware dropped before the node could read them, by topic.
     incompatible: the policy in question, by topic, of peers that cannot talk to this node.
     """
 
     def __init__(self, node: Node):
         self._node = node
-        self.lost: Counter[str] = Counter()
+        self._gaps: dict[str, SequenceGaps] = {}
+        self._told: Counter[str] = Counter()
+        self._warned: set[str] = set()
         self.incompatible: dict[str, str] = {}
 
+    @property
+    def lost(self) -> dict[str, int]:
+        """Messages that never reached the node, by topic; those without a loss are left out."""
+        counts = {
+            topic: gaps.lost if gaps.numbered else self._told[topic]
+            for topic, gaps in self._gaps.items()
+        }
+        return {topic: n for topic, n in counts.items() if n}
+
     def subscribe(
-        self, message_type: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile
+        self,
+        message_type: type,
+        topic: str,
+        callback: Callable[[Any, Mapping[str, Any]], None],
+        qos: QoSProfile,
     ) -> Subscription:
-        """Subscribe, counting what is lost and naming peers that cannot be heard."""
+        """Subscribe, counting what is lost and naming peers that cannot be heard.
+
+        `callback` takes a message and its info, as rclpy gives it."""
+
+        def receive(message: Any, info: Mapping[str, Any]) -> None:
+            if gaps.heard(info):
+                self._warn_of_loss(topic)
+            callback(message, info)
+
         events = SubscriptionEventCallbacks(
             incompatible_qos=lambda event: self._mismatch(
                 topic, event, 'cannot be heard', 'subscription'
             ),
             message_lost=lambda event: self._lost(topic, event),
+            matched=lambda event: event.current_count_change < 0 and gaps.publisher_left(),
         )
-        return self._node.create_subscription(
+        subscription = self._node.create_subscription(
             message_type,
             topic,
-            callback,
+            receive,
             qos,
             event_callbacks=events,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+        gaps = self._gaps[topic] = SequenceGaps(subscription.get_publisher_count)
+        return subscription
 
     def advertise(
         self,
@@ -144,12 +170,16 @@ class Endpoints:
         self.incompatible[topic] = policy
 
     def _lost(self, topic: str, event: Any) -> None:
-        if topic not in self.lost:
+        self._told[topic] = event.total_count
+        self._warn_of_loss(topic)
+
+    def _warn_of_loss(self, topic: str) -> None:
+        if topic not in self._warned:
+            self._warned.add(topic)
             self._node.get_logger().warning(
                 f"messages on '{topic}' are lost before the node can read them: raise queue_depth "
                 'or slow the sender down (said once, counted in /diagnostics)'
             )
-        self.lost[topic] = event.total_count
 
 
 def profiles_of(text: str) -> dict[str, QoSProfile]:

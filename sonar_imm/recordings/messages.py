@@ -53,6 +53,16 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+def message_definition(type_name: str, types: Typestore | None = None) -> str | None:
+    """The fields of a message type as ``.msg`` text, those of inner types below, as MCAP and
+    Foxglove want them (encoding ``ros2msg``); None when `types`, by default those of Jazzy, have
+    no such type."""
+    types = types or typestore()
+    if type_name not in types.fielddefs:
+        return None
+    return types.generate_msgdef(type_name, ros_version=2)[0]
+
+
 def ros_message(type_name: str, /, **fields: Any) -> Any:
     """Build a rosbags message; the `make` of the adapters for recordings.
 
@@ -75,6 +85,11 @@ def ros_message(type_name: str, /, **fields: Any) -> Any:
 def _layout(type_name: str) -> tuple[Any, dict[str, Any]]:
     """Look up the class of a message and the kinds of its fields, in order."""
     return typestore().types[type_name], dict(typestore().fielddefs[type_name][1])
+
+
+def cdr_of(message: Any) -> bytes:
+    """The bytes of a message that `ros_message` made, or that was read, as ROS 2 sends it."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def decode_cdr(types: Typestore, type_name: str, raw: bytes) -> Any:

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from heapq import merge
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from attrs import evolve, frozen
 from msg_adapters.headers import stamp_ns
 
 from ..measurements import Rejection
+from .messages import cdr_of, message_definition
 from .sources import BagError, one_line, open_sources, RawMessage, Source, TopicInfo
 
 __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
@@ -126,6 +128,29 @@ class BagReader:
             for key, value in getattr(source, 'custom_data', {}).items()
         }
 
+    def definition(self, type_name: str) -> str | None:
+        """The definition of a message type, see `message_definition`; None when not known."""
+        found = (message_definition(type_name, source.types) for source in self._sources)
+        return next((text for text in found if text is not None), None)
+
+    @property
+    def is_ros1(self) -> bool:
+        """Whether this is a ROS 1 bag, whose messages are not CDR."""
+        return self.path.is_file() and self.path.suffix == '.bag'
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns; None when there is no message."""
+        spans = [span for source in self._sources if (span := source.span())]
+        if not spans:
+            return None
+        return min(span[0] for span in spans), max(span[1] for span in spans)
+
+    def cdr(self, item: BagMessage) -> bytes:
+        """The decoded message `item` as ROS 2 sends it; ROS 1 bags hold another serialization."""
+        if self.is_ros1:
+            return cdr_of(item.message)
+        return bytes(item.raw)
+
     def messages(
         self,
         topics: Collection[str] | None = None,
@@ -162,17 +187,26 @@ class BagReader:
     def _guarded(
         self, source: Source, topics: Collection[str] | None
     ) -> Iterator[tuple[Source, RawMessage]]:
-        """Read one source up to its end or its first damage."""
+        """Read one source up to its end or, where nothing else helps, its first damage."""
+        given = 0
         try:
             for item in source.messages(topics):
                 yield source, item
+                given += 1
         except GeneratorExit:
             raise
         except Exception as error:  # rosbags raises nearly anything on damaged files
-            self.add_problem(
-                f'{self.path} is damaged: {one_line(error)}; the messages after the '
-                'damage are lost'
-            )
+            rest = source.rescue()
+            if rest is None:
+                self.add_problem(
+                    f'{self.path} is damaged: {one_line(error)}; the messages after the '
+                    'damage are lost'
+                )
+                return
+            self._sources.append(rest)
+            self.add_problem(rest.damage)
+            for item in islice(rest.messages(topics), given, None):
+                yield rest, item
 
     def _cannot_decode(self, item: RawMessage, index: int, error: Exception) -> None:
         reason = f'message {index}, {one_line(error)}'

@@ -41,7 +41,7 @@ def test_every_tracker_has_inputs_whose_readers_say_no_politely():
                     empty = ros_message(name)
                 with pytest.raises(Rejection):  # an empty message has no stamp
                     read(empty)
-                assert topic.doubt(empty) in (None, 'zero_covariance', 'no_frame')
+                assert topic.doubt(empty, ()) in (None, 'zero_covariance', 'no_frame')
 
 
 def test_the_adapters_load_neither_rclpy_nor_rosbags():

@@ -74,33 +74,13 @@ def test_without_the_state_they_are_lost(scene):
     assert all((one.extras['heave_std'] == 0.0).all() for one in found.values())
 
 
-def test_without_a_spread_at_the_start_the_first_error_stays(scene, monkeypatch):
-    """The depths of the layers are then what the first record, told half a metre wrong, says."""
-    from sonar_imm.estimation import set_filter
-
-    whole = set_filter.shift_tables
-
-    def sure(shift, log_sum, share):
-        tables = whole(shift, log_sum, share)
-        return tables._replace(start=np.where(shift.places < 0.0, 0.0, 1.0))
-
-    def common_error():
-        options = {'heave': 'independent', 'array_depth_std': 0.5, 'depth_std': 0.05}
-        _, found = run(scene.traces(range(40)), particles=1500, **options)
-        return rms(errors(found, scene, after=20)[0])
-
-    right = common_error()
-    monkeypatch.setattr(set_filter, 'shift_tables', sure)
-    assert common_error() > 1.5 * right
-
-
-def test_an_error_that_lasts_is_followed_with_a_memory(scene):
-    """The same layers, the errors of an autoregression put in place of the independent ones."""
-    rng = np.random.default_rng(2)
-    wrong, now = [], 0.4
-    for _ in range(40):
-        wrong.append(now)
-        now = 0.9 * now + np.sqrt(1.0 - 0.81) * 0.5 * rng.standard_normal()
+def lasting(scene, seed, records=40):
+    """The same layers, the errors of an autoregression in place of the independent ones; and these
+    errors."""
+    rng = np.random.default_rng(seed)
+    wrong = 0.5 * rng.standard_normal(records)
+    for k in range(1, records):
+        wrong[k] = 0.9 * wrong[k - 1] + np.sqrt(1.0 - 0.81) * wrong[k]
     traces = [
         Trace(
             stamp_ns=one.stamp_ns,
@@ -109,10 +89,54 @@ def test_an_error_that_lasts_is_followed_with_a_memory(scene):
             sigma=one.sigma,
             reference_depth=scene.array_depth,
         )
-        for k, one in enumerate(scene.traces(range(40)))
+        for k, one in enumerate(scene.traces(range(records)))
     ]
-    options = {'particles': 3000, 'depth_min': 42.5, 'depth_max': 69.0, 'depth_step': 1 / 64}
-    _, found = run(traces, heave='memory', array_depth_std=0.5, **options)
+    return traces, wrong
+
+
+WINDOW = {'depth_min': 42.5, 'depth_max': 69.0, 'depth_step': 1 / 64}
+
+
+def kalman(seen, layers, depth_std, std, memory):
+    """Mean and standard deviation (T, 2) of the shift whose sum with the mean depth of the layers
+    is `seen` (T,); nothing is known of that depth at first."""
+    mean, P, found = np.array([seen[0], 0.0]), np.diag([1e6, std**2]), []
+    F, Q = np.diag([1.0, memory]), np.diag([depth_std**2 / layers, std**2 * (1.0 - memory**2)])
+    for k, y in enumerate(seen):
+        if k:
+            mean, P = F @ mean, F @ P @ F.T + Q
+        gain = P.sum(axis=1) / P.sum()
+        mean, P = mean + gain * (y - mean.sum()), P - np.outer(gain, P.sum(axis=0))
+        found.append((mean[1], np.sqrt(P[1, 1])))
+    return np.array(found)
+
+
+@pytest.mark.parametrize('heave', ['independent', 'memory'])
+@pytest.mark.parametrize(('seed', 'depth_std'), [(1, 0.1), (2, 0.3)])
+def test_the_heave_is_known_as_a_kalman_filter_knows_it(scene, heave, seed, depth_std):
+    """Where the layers lie in the records is plain to see. What that says of heave and depths,
+    which no record tells apart, is then a matter of two Gaussian numbers. A filter whose particles
+    all descend from the one that explains the first record best is sure of that one's heave."""
+    traces, wrong = lasting(scene, seed)
+    if heave == 'independent':
+        traces = list(scene.traces(range(40)))
+        wrong = scene.file['array_depth_error'][:40]
+    options = {'heave': heave, 'array_depth_std': 0.5, 'depth_std': depth_std, **WINDOW}
+    _, found = run(traces, particles=3000, seed=seed, **options)
+    layers = len(scene.amplitude)
+    seen = [scene.depth_at(one.stamp_ns).mean() + w for one, w in zip(traces, wrong)]
+    expected = kalman(seen, layers, depth_std, 0.5, 0.9 if heave == 'memory' else 0.0)
+    heaves = np.array(
+        [[one.extras[k][0] for k in ('heave', 'heave_std')] for one in found.values()]
+    )
+    assert heaves[:, 1] == pytest.approx(expected[:, 1], rel=0.08)
+    away = (heaves[:, 0] - expected[:, 0]) / expected[:, 1]
+    assert rms(away) < 0.1 and np.abs(away).max() < 0.2
+
+
+def test_an_error_that_lasts_is_followed_with_a_memory(scene):
+    traces, _ = lasting(scene, 2)
+    _, found = run(traces, particles=3000, heave='memory', array_depth_std=0.5, **WINDOW)
     assert score_scene(found, scene, after=15).right >= 0.95
     _, relative, _, _ = errors(found, scene, after=15)
     assert rms(relative) <= 0.03

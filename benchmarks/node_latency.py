@@ -1,0 +1,248 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How long live nodes take from message to estimate, beside a node that only answers.
+
+    python -m benchmarks.node_latency --messages 600
+    python -m benchmarks.node_latency --messages 600 --rate 0
+
+The diver node hears scans of four divers in clutter (`simulate diver --scenario crossing --set
+clutter=3`), the obstacle node detections of two obstacles with navigation and altitudes
+(`simulate obstacle --scenario rolling --set ping_rate=10`). Each scan or ping goes to the node,
+and to a plain rclpy node that answers with a PointCloud2 without fields, of as many bytes as the
+estimate had: what is left is the cost of the middleware and of Python. Which of the two is asked
+first changes every time. `--rate` such pairs a second, or one after the other (0). Needs ROS 2.
+The second table is where the node's own time goes, measured in this process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import array
+from collections.abc import Callable, Sequence
+import os
+import signal
+import subprocess
+import sys
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+
+from msg_adapters.estimates import write_estimate
+from msg_adapters.inputs import inputs_of
+from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id
+from sonar_imm.nodes.link import Link, LinkError
+from sonar_imm.nodes.messages import make
+from sonar_imm.nodes.qos import lockstep_qos, output_qos
+from sonar_imm.simulation.diver import simulator as diver
+from sonar_imm.simulation.obstacle import simulator as obstacle
+from sonar_imm.trackers import SYSTEMS
+
+LIMIT = 90.0
+SETTLED = 20
+"""Messages at the start that are not counted: connections and caches are cold."""
+
+
+class Case(NamedTuple):
+    """One node: its parameters, the input that is timed, and all messages with their input."""
+
+    system: str
+    options: dict[str, Any]
+    timed: str
+    messages: list[tuple[str, Any]]
+
+
+def case_of(system: str, count: int) -> Case:
+    """At least `count` messages of the timed input."""
+    if system == 'diver':
+        scene: Any = diver.scenario('crossing', {'duration': count - 1.0, 'clutter': 3.0})
+        simulated, timed = diver.simulate(scene, 0), 'fixes'
+    else:
+        # Pings until the range is down to `last_range`: slow enough for as many as are wanted.
+        speed = 80.0 / (0.1 * count)
+        told = {'ping_rate': 10.0, 'obstacles': 2, 'speed': speed}
+        scene = obstacle.scenario('rolling', told)
+        simulated, timed = obstacle.simulate(scene, 0), 'detections'
+    entries = {one.measurement: one for one in inputs_of(system)}
+    messages = [
+        (entry.name, entry.write(one.measurement, make))
+        for one in simulated.measurements
+        for entry in [entries[type(one.measurement)]]
+    ]
+    return Case(system, scene.told(), timed, messages)
+
+
+class Echo(Node):
+    """Answers each PointCloud2 with one of as many bytes as its frame_id says."""
+
+    def __init__(self) -> None:
+        super().__init__('echo')
+        self._answers = self.create_publisher(PointCloud2, '/echo/estimate', output_qos())
+        self.create_subscription(PointCloud2, '/echo/input', self._answer, lockstep_qos())
+
+    def _answer(self, message: PointCloud2) -> None:
+        size = int(message.header.frame_id)
+        self._answers.publish(PointCloud2(data=array.array('B', bytes(size)), row_step=size))
+
+
+class Peer:
+    """Sends to one node and takes its answers. topics: by input."""
+
+    def __init__(self, link: Link, name: str, topics: dict[str, tuple[str, type]]):
+        self.link, self.name = link, name
+        self.heard = 0.0
+        self.last = b''
+        self.out = {
+            key: link.node.create_publisher(kind, topic, lockstep_qos())
+            for key, (topic, kind) in topics.items()
+        }
+        link.node.create_subscription(
+            PointCloud2, f'/{name}/estimate', self._take, lockstep_qos(), raw=True
+        )
+
+    def _take(self, raw: bytes) -> None:
+        self.heard, self.last = time.perf_counter(), raw
+
+    def ready(self) -> bool:
+        there = self.link.node.count_publishers(f'/{self.name}/estimate')
+        return bool(there and all(one.get_subscription_count() for one in self.out.values()))
+
+    def ask(self, key: str, message: Any) -> float:
+        """Milliseconds from sending to the answer."""
+        self.heard, begin = 0.0, time.perf_counter()
+        self.out[key].publish(message)
+        if not self.link.wait_for(lambda: self.heard, LIMIT):
+            raise LinkError(f'/{self.name} did not answer')
+        return 1e3 * (self.heard - begin)
+
+
+def latencies(case: Case, rate: float) -> np.ndarray:
+    """(K, 2) milliseconds of the node and of the echo, `rate` pairs a second."""
+    words = [word for name, value in case.options.items() for word in ('-p', _told(name, value))]
+    kinds = {key: type(message) for key, message in case.messages}
+    with reserved_domain_id() as domain:
+        environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+        os.environ.update(environment)
+        echo = subprocess.Popen(
+            [sys.executable, '-m', 'benchmarks.node_latency', '--echo'],
+            env={**environment, 'ROS_DOMAIN_ID': str(domain)},
+        )
+        try:
+            remaps = [w for key in kinds for w in ('-r', f'/{key}:=/{case.system}/{key}')]
+            with (
+                NodeProcess(case.system, domain_id=domain, arguments=[*remaps, *words]),
+                Link('bench', domain_id=domain) as link,
+            ):
+                topics = {key: (f'/{case.system}/{key}', kind) for key, kind in kinds.items()}
+                node = Peer(link, case.system, topics)
+                other = Peer(link, 'echo', {case.timed: ('/echo/input', PointCloud2)})
+                if not link.wait_for(lambda: node.ready() and other.ready(), LIMIT):
+                    raise LinkError('the nodes did not appear')
+                return _asked(case, node, other, rate)
+        finally:
+            echo.send_signal(signal.SIGINT)
+            echo.wait(10.0)
+
+
+def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
+    spent: list[tuple[float, float]] = []
+    size, due = 0, time.perf_counter()
+    for key, message in case.messages:
+        if key != case.timed:
+            node.out[key].publish(message)
+            continue
+        due = max(due + 1.0 / rate, time.perf_counter()) if rate else 0.0
+        node.link.wait_for(lambda due=due: time.perf_counter() >= due, LIMIT)
+        frame_id = message.header.frame_id
+        pair = [0.0, 0.0]
+        for which in (0, 1) if len(spent) % 2 else (1, 0):
+            message.header.frame_id = str(size) if which else frame_id
+            pair[which] = (other if which else node).ask(key, message)
+        size = len(deserialize_message(node.last, PointCloud2).data)
+        spent.append((pair[0], pair[1]))
+    return np.array(spent[SETTLED:])
+
+
+def _told(name: str, value: Any) -> str:
+    return f'{name}:={list(value) if isinstance(value, tuple) else value}'
+
+
+def parts(case: Case) -> dict[str, float]:
+    """Median milliseconds of each step of the node, without the middleware."""
+    entries = {one.name: one for one in inputs_of(case.system)}
+    system = SYSTEMS[case.system]
+    tracker = system.build(system.config_type()(**case.options))
+    tracker.warm()
+    spent: dict[str, list[float]] = {}
+
+    def timed(name: str, call: Callable[..., Any], *args: Any) -> Any:
+        begin = time.perf_counter()
+        result = call(*args)
+        spent.setdefault(name, []).append(1e3 * (time.perf_counter() - begin))
+        return result
+
+    settings = tracker.config.as_dict()
+    readers = {
+        key: entry.reader(next(iter(entry.readers)), 'enu', settings, key)
+        for key, entry in entries.items()
+    }
+    for key, message in case.messages:
+        if key != case.timed:
+            tracker.process(readers[key](message))
+            continue
+        raw = serialize_message(message)
+        message = timed('deserialise', deserialize_message, raw, type(message))
+        measurement = timed('read', readers[key], message)
+        timed('look for doubts', entries[key].doubt, message, measurement)
+        estimate = timed('track', tracker.process, measurement)[-1]
+        answer = timed('write', write_estimate, estimate, make)
+        timed('serialise', serialize_message, answer)
+    return {name: float(np.median(values)) for name, values in spent.items()}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--messages', type=int, default=600)
+    parser.add_argument('--rate', type=float, default=10.0, help='messages a second; 0: no pause')
+    parser.add_argument('--system', choices=('diver', 'obstacle'), help='only that node')
+    parser.add_argument('--echo', action='store_true', help='be the node that only answers')
+    told = parser.parse_args(args)
+    if told.echo:
+        rclpy.init()
+        try:
+            rclpy.spin(Echo())
+        except (KeyboardInterrupt, ExternalShutdownException):
+            return
+    for system in [told.system] if told.system else ['diver', 'obstacle']:
+        case = case_of(system, told.messages)
+        spent = latencies(case, told.rate)
+        p50, p99 = np.percentile(spent, (50, 99), axis=0)
+        print('| ms from message to estimate | p50 | p99 |\n|---|---|---|')
+        for k, name in enumerate((f'{system}_node', 'a node that only answers')):
+            print(f'| {name} | {p50[k]:.2f} | {p99[k]:.2f} |')
+        print(f'| ratio, of {len(spent)} | {p50[0] / p50[1]:.2f} | {p99[0] / p99[1]:.2f} |\n')
+        print(f'| step of {system}_node, in one process | median ms |\n|---|---|')
+        for name, value in parts(case_of(system, min(told.messages, 200))).items():
+            print(f'| {name} | {value:.2f} |')
+        print(flush=True)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,90 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm view``: what it refuses, the report in the browser, the file for Rerun."""
+
+import sys
+import webbrowser
+
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.resources import shared_file
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """A short dive, tracked."""
+    folder = tmp_path_factory.mktemp('view')
+    told = ['--set', 'duration=20', '--seed', '1']
+    assert main(['simulate', 'diver', str(folder / 'bag'), *told]) == 0
+    assert main(['track', str(folder / 'bag'), str(folder / 'run')]) == 0
+    return folder / 'run'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'sentence'),
+    [
+        ([], 'say either a BAG or RUN, or --live'),
+        (['somewhere', '--live'], 'say either a BAG or RUN, or --live'),
+        (['--live', '--browser'], '--browser and --rerun show what is recorded'),
+        (['nowhere.bag', '--port', '0'], 'nowhere.bag'),
+        (['nowhere.bag', '--browser'], 'nowhere.bag'),
+        (['somewhere', '--rate', '0'], '--rate'),
+        (['somewhere', '--port', '70000'], '--port'),
+    ],
+)
+def test_mistakes_are_one_sentence(arguments, sentence, capsys):
+    assert main(['view', *arguments]) == 2
+    said = capsys.readouterr().err
+    assert sentence in said and said.count('\n') == 1
+
+
+def test_a_topic_that_is_not_there(run, capsys):
+    assert main(['view', str(run), '--port', '0', '--topics', '/nowhere']) == 2
+    assert "there is no topic '/nowhere'" in capsys.readouterr().err
+
+
+def test_without_the_package_it_says_what_to_do(run, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'foxglove', None)
+    monkeypatch.delitem(sys.modules, 'sonar_imm.viewing.server', raising=False)
+    assert main(['view', str(run), '--port', '0']) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'sonar_imm[view]'" in said and '--browser' in said
+
+
+@pytest.mark.parametrize('kind', ['run', 'bag'])
+def test_the_browser_gets_the_report(run, kind, capsys, monkeypatch):
+    opened = []
+    monkeypatch.setattr(webbrowser, 'open', opened.append)
+    assert main(['view', str(run.parent / kind), '--browser']) == 0
+    (address,) = opened
+    assert address.startswith('file://') and address.endswith('/report.html')
+    assert address.removeprefix('file://') in capsys.readouterr().out
+
+
+def test_rerun_file(run, tmp_path, capsys):
+    pytest.importorskip('rerun')
+    assert main(['view', str(run), '--rerun', str(tmp_path / 'dive.rrd')]) == 0
+    count = len(RunFolder(run).read_estimates())
+    assert f'{count} estimates written' in capsys.readouterr().out
+    assert (tmp_path / 'dive.rrd').read_bytes().startswith(b'RRF')
+
+
+def test_rerun_needs_a_run(tmp_path, capsys):
+    pytest.importorskip('rerun')
+    bag = shared_file('bags/diver_table1')
+    assert main(['view', str(bag), '--rerun', str(tmp_path / 'a.rrd')]) == 2
+    assert 'holds no finished run' in capsys.readouterr().err

@@ -1,0 +1,68 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The executor of the nodes: what it leaves for later still comes."""
+
+import time
+
+import rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Empty
+
+from sonar_imm.nodes.executor import EVENT_PERIOD, MessagesFirst
+from sonar_imm.nodes.qos import Endpoints, lockstep_qos, output_qos
+
+
+def test_messages_come_at_once_and_events_within_their_period(make_bench):
+    bench = make_bench()
+    node = rclpy.node.Node('hearer', context=bench.context, use_global_arguments=False)
+    bench.nodes.append(node)
+    endpoints, heard, ticks = Endpoints(node), [], []
+    endpoints.subscribe(Empty, 'good', heard.append, output_qos())
+    endpoints.subscribe(Empty, 'bad', heard.append, lockstep_qos())
+    node.create_timer(0.05, lambda: ticks.append(time.monotonic()))
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    bench.peer.create_publisher(Empty, 'bad', best_effort)
+    good = bench.peer.create_publisher(Empty, 'good', lockstep_qos())
+    executor = MessagesFirst(context=bench.context)
+    executor.add_node(node)
+    try:
+        end = time.monotonic() + 10.0
+        while not (heard and endpoints.incompatible and len(ticks) > 3):
+            assert time.monotonic() < end, (heard, endpoints.incompatible, ticks)
+            good.publish(Empty())
+            executor.spin_once(timeout_sec=0.02)
+        assert endpoints.incompatible == {'bad': 'RELIABILITY'}
+    finally:
+        executor.shutdown()
+
+
+def test_events_are_asked_a_few_times_a_second_only(make_bench, monkeypatch):
+    bench = make_bench()
+    node = rclpy.node.Node('hearer', context=bench.context, use_global_arguments=False)
+    bench.nodes.append(node)
+    Endpoints(node).subscribe(Empty, 'good', lambda message: None, output_qos())
+    executor = MessagesFirst(context=bench.context)
+    executor.add_node(node)
+    looks = []
+    monkeypatch.setattr(executor, '_look_at_events', lambda: looks.append(time.monotonic()))
+    try:
+        begin = time.monotonic()
+        while time.monotonic() < begin + 3 * EVENT_PERIOD:
+            executor.spin_once(timeout_sec=0.01)
+    finally:
+        executor.shutdown()
+    assert 2 <= len(looks) <= 4
+    asked = [one for one in node.waitables if executor.can_execute(one)]
+    assert len(list(node.waitables)) >= 3 and not asked

@@ -1,0 +1,159 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The shipped layouts of Foxglove and RViz2 name only what the nodes really have: topics with
+their types, fields, columns of estimates, models in their order, states of the diagnostics."""
+
+from importlib import import_module
+import json
+import re
+
+from diagnostic_msgs.msg import DiagnosticArray
+import pytest
+import yaml
+
+from sonar_imm.evaluation.tracking import OfflineRun
+from sonar_imm.nodes.messages import message_class
+from sonar_imm.recordings.own_parameters import own_parameters
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.resources import shared_file
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.viewing.layouts import fitting_layouts, write_layout
+
+BAGS = {
+    'bathymetry': 'bathymetry_paper',
+    'fathometer': 'fathometer_drift',
+    'obstacle': 'obstacle_movers',
+    'diver': 'diver_multistatic',
+}
+IN_3D = {
+    'geometry_msgs/msg/PoseArray',
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    'nav_msgs/msg/Odometry',
+    'sensor_msgs/msg/PointCloud2',
+    'visualization_msgs/msg/MarkerArray',
+}
+RVIZ = {
+    'MarkerArray': 'visualization_msgs/msg/MarkerArray',
+    'Odometry': 'nav_msgs/msg/Odometry',
+    'PointCloud2': 'sensor_msgs/msg/PointCloud2',
+    'PoseArray': 'geometry_msgs/msg/PoseArray',
+    'PoseWithCovariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+}
+DIAGNOSTICS = {'/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray'}
+
+
+@pytest.fixture(params=list(SYSTEMS))
+def system(request):
+    return request.param
+
+
+@pytest.fixture
+def topics(system, make_bench):
+    """Every topic of the running node with its type."""
+    bench = make_bench()
+    module = import_module(f'sonar_imm.nodes.{system}')
+    node = bench.add(getattr(module, f'{system.capitalize()}Node')(context=bench.context))
+    heard = bench.listen(DiagnosticArray, '/diagnostics')
+    bench.spin_until(lambda: heard)
+    published = node.get_publisher_names_and_types_by_node(system, '/')
+    subscribed = node.get_subscriber_names_and_types_by_node(system, '/')
+    found = {name: types[0] for name, types in published + subscribed}
+    found['states'] = {status.name for status in heard[0].status}
+    return found
+
+
+@pytest.fixture
+def estimate(system):
+    """The first estimate with a row that the tracker makes of a shipped recording."""
+    path = shared_file(f'bags/{BAGS[system]}')
+    record = SYSTEMS[system]
+    values = yaml.safe_load(own.read_text()) if (own := own_parameters(path)) else {}
+    values = values.get('/**', {}).get('ros__parameters', values)
+    with BagReader(path) as bag:
+        config = record.config_type().from_mapping(values, ignore_unknown=True)
+        return next(one for one in OfflineRun(bag, record, config).estimates() if len(one))
+
+
+def layout_of(system):
+    return json.loads(shared_file(f'config/foxglove_{system}.json').read_text())
+
+
+def test_foxglove_layout(system, topics, estimate):
+    panels = layout_of(system)['configById']
+    columns = estimate.columns()
+    for name, panel in panels.items():
+        kind = name.partition('!')[0]
+        if kind == '3D':
+            for topic, look in panel['topics'].items():
+                assert topics[topic] in IN_3D
+                assert 'colorField' not in look or look['colorField'] in columns
+        elif kind == 'Plot':
+            for path in panel['paths']:
+                check_path(path, topics, estimate)
+        else:
+            assert topics[panel['topicToRender']] == DIAGNOSTICS['/diagnostics']
+            assert panel.get('selectedName') in {None, *topics['states']}
+    assert placed(layout_of(system)['layout']) == set(panels)
+
+
+def check_path(path, topics, estimate):
+    """One curve of a plot: its field exists, and it is the model that its label says."""
+    topic, _, fields = path['value'].partition('.')
+    cls = message_class(topics[topic])
+    for field in fields.split('.'):
+        field, index = re.fullmatch(r'(\w+)(?:\[(\d+)\])?', field).groups()
+        kind = cls.get_fields_and_field_types()[field]
+        assert (index is not None) == kind.startswith('sequence<')
+        if '/' in kind:
+            cls = message_class(kind)
+    if topic.endswith('/model_probabilities'):
+        assert estimate.model_names[int(index)] == path['label']
+
+
+def placed(tree):
+    """The panels that are placed on the screen."""
+    if isinstance(tree, str):
+        return {tree}
+    return placed(tree['first']) | placed(tree['second'])
+
+
+def test_rviz_layout(system, topics, estimate):
+    displays = yaml.safe_load(shared_file(f'config/{system}.rviz').read_text())
+    displays = displays['Visualization Manager']['Displays']
+    drawn = [one for one in displays if 'Topic' in one]
+    assert drawn
+    for display in drawn:
+        assert topics[display['Topic']['Value']] == RVIZ[display['Class'].partition('/')[2]]
+        if display['Class'].endswith('/PointCloud2'):
+            assert display['Channel Name'] in estimate.columns()
+
+
+def test_a_layout_takes_the_names_of_other_topics(tmp_path):
+    topics = ['/auv/obstacle/estimate', '/auv/obstacle/markers', '/auv/dvl/nav', '/diagnostics']
+    assert list(fitting_layouts(topics)) == ['obstacle']
+    write_layout(tmp_path / 'layout.json', 'obstacle', topics)
+    panels = json.loads((tmp_path / 'layout.json').read_text())['configById']
+    assert set(panels['3D!obstacles']['topics']) == {
+        '/auv/obstacle/markers',
+        '/auv/obstacle/estimate',
+        '/auv/obstacle/obstacles',
+        '/auv/dvl/nav',
+    }
+    value = panels['Plot!above']['paths'][1]['value']
+    assert value == '/auv/obstacle/model_probabilities.position[1]'
+
+
+def test_there_is_no_layout_for_other_topics():
+    assert fitting_layouts(['/estimate', '/diver/odometry']) == {}

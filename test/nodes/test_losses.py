@@ -1,0 +1,156 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Messages that never came, counted by the numbers of those that did."""
+
+import itertools
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
+import pytest
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from std_msgs.msg import Float64
+
+from sonar_imm.nodes.losses import SequenceGaps
+from sonar_imm.nodes.qos import Endpoints, input_qos, output_qos
+
+
+class Line:
+    """Publishers by name, each numbering what it sends, and the counter that hears them."""
+
+    def __init__(self, publishers=1):
+        self.publishers = publishers
+        self.numbers = {}
+        self.gaps = SequenceGaps(lambda: self.publishers)
+
+    def send(self, name='one', *, skip=0, received_ns=0):
+        number = self.numbers.get(name, 0) + 1 + skip
+        self.numbers[name] = number
+        return self.gaps.heard(
+            {'publication_sequence_number': number, 'received_timestamp': received_ns}
+        )
+
+
+def test_a_gap_in_the_numbers_is_what_was_lost():
+    line = Line()
+    missed = [line.send(skip=skip) for skip in (7, 0, 0, 3, 0, 1)]
+    assert missed == [0, 0, 0, 3, 0, 1]  # what came before the first was sent to others
+    assert line.gaps.lost == 4
+
+
+def test_a_publisher_that_starts_again_loses_nothing():
+    line = Line()
+    for _ in range(50):
+        line.send()
+    line.numbers.clear()
+    assert sum(line.send() for _ in range(5)) == 0
+    assert line.send(skip=2) == 2
+
+
+def test_a_middleware_without_numbers_counts_nothing():
+    gaps = SequenceGaps(lambda: 1)
+    info = {'publication_sequence_number': None, 'received_timestamp': 1}
+    assert (gaps.heard(info), gaps.heard(info), gaps.lost, gaps.numbered) == (0, 0, 0, False)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_the_losses_of_publishers_add_up(seed):
+    rng = np.random.default_rng(seed)
+    line = Line(publishers=3)
+    for name, start in zip('abc', (0, 10_000, 500_000), strict=True):
+        line.numbers[name] = start
+        line.send(name)
+    lost = 0
+    for name in rng.choice(list('abc'), 1000, p=(0.7, 0.25, 0.05)):
+        skip = int(rng.random() < 0.1) * int(rng.integers(1, 9))
+        lost += skip
+        line.send(name, skip=skip)
+    assert line.gaps.lost == lost
+
+
+def test_a_second_publisher_is_no_gap():
+    line = Line()
+    for _ in range(100):
+        line.send('old')
+    line.publishers = 2
+    line.numbers['new'] = 5000
+    line.send('new')
+    for name in ('old', 'new', 'new', 'old') * 10:
+        line.send(name)
+    assert line.gaps.lost == 0
+    assert line.send('old', skip=4) == 4
+
+
+def test_a_publisher_that_left_is_not_continued_by_another():
+    line = Line(publishers=2)
+    line.numbers['other'] = 60
+    for name in ('gone', 'other') * 20:
+        line.send(name)
+    line.publishers = 1
+    line.gaps.publisher_left()
+    queued = time.time_ns() - 10**9
+    line.send('gone', received_ns=queued)  # was still in the queue
+    assert sum(line.send('other', received_ns=time.time_ns()) for _ in range(5)) == 0
+    assert line.send('other', skip=3, received_ns=time.time_ns()) == 3
+
+
+def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_bench, capfd):
+    bench = make_bench()
+    heard = []
+    endpoints = Endpoints(bench.peer)
+    endpoints.subscribe(Float64, 'depth', lambda m, _: heard.append(m.data), input_qos(10))
+    writer = bench.add(
+        type(bench.peer)('writer', context=bench.context, use_global_arguments=False)
+    )
+    qos = QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000
+    )
+    publishers = [writer.create_publisher(Float64, 'depth', qos) for _ in range(2)]
+    bench.spin_until(lambda: all(one.get_subscription_count() for one in publishers))
+    sent = itertools.count()
+    for publisher in publishers:
+        publisher.publish(Float64(data=float(next(sent))))
+    bench.spin_until(lambda: len(heard) == 2)
+    assert not endpoints.lost
+    for publisher in publishers * 100:  # while the node is busy
+        publisher.publish(Float64(data=float(next(sent))))
+    bench.spin_until(lambda: 201.0 in heard)
+    assert endpoints.lost == {'depth': 202 - len(heard)}
+    assert len(heard) <= 2 + 10
+    assert capfd.readouterr().err.count("'depth' are lost before") == 1
+
+
+def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
+    from sonar_imm.nodes.base import TrackerNode
+    from sonar_imm.nodes.messages import message_class
+
+    bench = make_bench('-p', 'diagnostics_period:=0.05', '-p', 'queue_depth:=5')
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    told = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    kind = message_class('geometry_msgs/msg/PoseWithCovarianceStamped')
+    fix = bench.peer.create_publisher(kind, 'fix', 100)
+    bench.spin_until(fix.get_subscription_count)
+    message = kind()
+    message.header.stamp.sec = 1
+    fix.publish(message)
+    bench.spin_until(lambda: node._meter.received['fix'] == 1)
+    for _ in range(100):
+        fix.publish(message)
+    bench.spin_until(lambda: any('are lost before' in one.status[0].message for one in told))
+    said = next(one.status[0] for one in told if 'are lost before' in one.status[0].message)
+    assert said.level == DiagnosticStatus.WARN
+    assert '% on fix' in said.message
+    values = {pair.key: pair.value for pair in told[-1].status[0].values}
+    assert int(values['lost on fix']) == 101 - node._meter.received['fix'] > 90
