@@ -42,7 +42,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
-from .filters import Sonar, View
+from .filters import put, Sonar, View
 
 CENTRE = 0.1
 """That of ten glints of equal strength."""
@@ -66,6 +66,10 @@ class Bodies(NamedTuple):
 
     def joined(self, other: Bodies) -> Bodies:
         return Bodies(*(np.concatenate(both) for both in zip(self, other)))
+
+    def replaced(self, rows: np.ndarray, new: Bodies) -> Bodies:
+        """A copy with `new` in some of its rows."""
+        return Bodies(*put(self, rows, new))
 
     def seen(
         self, extended: BoolArray, z: FloatArray, R: FloatArray, own: FloatArray

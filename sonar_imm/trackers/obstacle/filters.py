@@ -30,6 +30,7 @@ Everything is in NED and FRD; T targets, K components. Component weights mu (T, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +49,16 @@ BAND = 0.9
 
 BEAM_MARGIN = 1.6
 """A new obstacle lies within this many half beams of the axis: an edge is not sharp."""
+
+
+def put(
+    parts: Sequence[FloatArray], rows: np.ndarray, new: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Copies of arrays with `new` in some of their rows."""
+    copies = [part.copy() for part in parts]
+    for part, values in zip(copies, new):
+        part[rows] = values
+    return copies
 
 
 NOWHERE = np.full(3, np.nan)
@@ -83,6 +94,10 @@ class Mixture(NamedTuple):
 
     def joined(self, other: Mixture) -> Mixture:
         return Mixture(*(np.concatenate(both) for both in zip(self, other)))
+
+    def replaced(self, rows: np.ndarray, new: Mixture) -> Mixture:
+        """A copy with `new` in some of its rows."""
+        return Mixture(*put(self, rows, new))
 
 
 class View(NamedTuple):

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
@@ -57,6 +57,7 @@ from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
 from .navigation import Mount
+from .state import ObstacleState, PingState
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -70,58 +71,6 @@ _EYE = np.eye(2)
 _TINY, _WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
 nothing."""
-
-
-@frozen(eq=False, kw_only=True)
-class PingState:
-    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
-    alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them; bodies: how far their echoes wander."""
-
-    stamp_ns: int
-    sonar: Sonar
-    life: Tracks
-    mixture: Mixture
-    nis: FloatArray
-    strengths: Strengths
-    bodies: Bodies
-    repairs: int = 0
-    alike: bool = False
-
-    def rows(self, kept: np.ndarray) -> PingState:
-        """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
-        if kept.all():
-            return self
-        return evolve(
-            self,
-            mixture=self.mixture.rows(kept),
-            nis=self.nis[kept],
-            strengths=self.strengths.rows(kept),
-            bodies=self.bodies.rows(kept),
-        )
-
-    def only(self, kept: np.ndarray) -> PingState:
-        """The obstacles where `kept` (T,) is True."""
-        return self if kept.all() else evolve(self.rows(kept), life=self.life.only(kept))
-
-
-@frozen(eq=False, kw_only=True)
-class ObstacleState:
-    """All that is known at a stamp. last: after the newest ping used, None before the first; done:
-    the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
-    skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
-    because too many waited; broken: tracks ended so far because their numbers were not finite;
-    alike: pings so far in which most obstacles moved alike."""
-
-    last: PingState | None = None
-    done: tuple[PingState, ...] = ()
-    navigation: NavigationBuffer = NavigationBuffer()
-    altitude: Altitude | None = None
-    waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
-    skipped: int = 0
-    missing: int = 0
-    broken: int = 0
-    alike: int = 0
 
 
 class ObstacleTracker:
@@ -360,8 +309,8 @@ class ObstacleTracker:
         bodies, R = bodies.seen(extended[chosen], z, R, self._own_variance)
         mixture, nis[hit], repairs = self.filter.update(mixture, h, z, R, now.sonar)
         if not every:
-            mixture = Mixture(*_put(now.mixture, hit, mixture))
-            bodies = Bodies(*_put(now.bodies, hit, bodies))
+            mixture = now.mixture.replaced(hit, mixture)
+            bodies = now.bodies.replaced(hit, bodies)
         repairs += now.repairs
         return evolve(now, mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
 
@@ -435,16 +384,6 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
-
-
-def _put(
-    parts: Sequence[FloatArray], rows: np.ndarray, new: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """Copies of arrays with some of their rows replaced."""
-    copies = [part.copy() for part in parts]
-    for part, values in zip(copies, new):
-        part[rows] = values
-    return copies
 
 
 def _identities(state: ObstacleState) -> ObstacleState:
