@@ -108,6 +108,10 @@ class ObstacleTracker:
         self.config.require_changeable(config)
         self._settle(config)
 
+    def remount(self, config: ObstacleConfig) -> None:
+        """Take another place of the sonar on the vehicle, for all pings from now on."""
+        self.config, self.mount = config, Mount(config)
+
     def warm(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
         tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0))
@@ -207,11 +211,9 @@ class ObstacleTracker:
         pose = self.mount.sonar(vehicle)
         reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
         straight = geometry.flip_world(course(buffer, ping.stamp_ns, self.config.course_window))
-        height = np.nan
-        if altitude is not None:
-            age = ping.stamp_ns - altitude.stamp_ns
-            if age <= nanoseconds(self.config.max_altitude_age):
-                height = altitude.altitude
+        oldest_ns = ping.stamp_ns - nanoseconds(self.config.max_altitude_age)
+        known = altitude is not None and altitude.stamp_ns >= oldest_ns
+        height = altitude.altitude if known else np.nan
         late_ns = self._late_ns()
         if not late_ns:
             return Sonar(pose, height, reference=reference, course=straight)
@@ -326,9 +328,8 @@ class ObstacleTracker:
         self, now: PingState, z: FloatArray, R: FloatArray, extended: np.ndarray
     ) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
-        room = max(0, self.config.max_tracks - len(now.life))
-        if not self.filter.ready(now.sonar):
-            room = 0
+        ready = self.filter.ready(now.sonar)
+        room = max(0, self.config.max_tracks - len(now.life)) if ready else 0
         z, R, extended = z[:room], R[:room], extended[:room]
         if not len(z):
             return now
