@@ -156,7 +156,7 @@ def assign(
     chosen = np.full(targets, -1, np.int64)
     worthwhile = cost < 0.0
     target, detection, cost = target[worthwhile], detection[worthwhile], cost[worthwhile]
-    if len(np.unique(target)) == len(target) and len(np.unique(detection)) == len(detection):
+    if not (_repeats(target, targets) or _repeats(detection, detections)):
         chosen[target] = detection  # nothing is contested
         return chosen
     nodes = targets + detections
@@ -174,6 +174,11 @@ def assign(
     return chosen
 
 
+def _repeats(numbers: IntArray, count: int) -> bool:
+    """Whether any of `numbers`, each below `count`, stands there twice."""
+    return bool(np.bincount(numbers, minlength=count).max(initial=0) > 1)
+
+
 def assign_by_rank(
     target: IntArray, detection: IntArray, cost: FloatArray, rank: IntArray, detections: int
 ) -> IntArray:
@@ -182,7 +187,7 @@ def assign_by_rank(
     rank: (T,) of each target; one with a negative rank gets nothing. The rest as in `assign`.
     """
     chosen, free = np.full(len(rank), -1, np.int64), np.ones(detections, np.bool_)
-    for turn in np.unique(rank[rank >= 0]):
+    for turn in sorted(set(rank[rank >= 0].tolist())):
         pairs = (rank == turn)[target] & free[detection]
         found = assign(target[pairs], detection[pairs], cost[pairs], len(rank), detections)
         chosen = np.where(found >= 0, found, chosen)
