@@ -221,6 +221,13 @@ class ObstacleConfig(
         low=0.0,
         high=0.2,
     )
+    range_scale_std: float = live(
+        0.001,
+        'scale error of ranges, from the speed of sound that the sonar believes in: no ping tells '
+        'it, so it is added to the covariance of range, offset and place',
+        low=0.0,
+        high=0.2,
+    )
     position_noise: float = parameter(
         0.01, 'random walk of the horizontal position', unit='m/sqrt(s)', low=0.0, high=10.0
     )
