@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What is known of all obstacles after a ping, and at a stamp."""
+
+"""All that the obstacle tracker knows at a stamp, as values."""
 
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
 from ...measurements import Altitude, Detections
 from ..navigation import NavigationBuffer
+from .bodies import Bodies
 from .filters import Mixture, Sonar
 from .intensity import Strengths
 
@@ -32,7 +34,7 @@ from .intensity import Strengths
 class PingState:
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
     alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them."""
+    each component assumes them; bodies: how far their echoes wander."""
 
     stamp_ns: int
     sonar: Sonar
@@ -40,6 +42,7 @@ class PingState:
     mixture: Mixture
     nis: FloatArray
     strengths: Strengths
+    bodies: Bodies
     repairs: int = 0
     alike: bool = False
 
@@ -52,6 +55,7 @@ class PingState:
             mixture=self.mixture.rows(kept),
             nis=self.nis[kept],
             strengths=self.strengths.rows(kept),
+            bodies=self.bodies.rows(kept),
         )
 
     def only(self, kept: np.ndarray) -> PingState:
