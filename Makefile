@@ -12,6 +12,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python3.10; 
 
 BIN := $(abspath $(VENV))/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
 
 # Message setters check their types only when asked to before the first import. One thread for each
 # process: the tests run side by side. Compiled kernels and logs stay inside the environment.
@@ -38,7 +39,7 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-bounds test-system lint docs bench clean
+.PHONY: help venv demo test test-core test-bounds test-system lint generate docs bench clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
@@ -77,13 +78,21 @@ lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-docs: venv ## write config/*.yaml and docs/parameters/*.md anew from the code
+generate: venv ## write config/*.yaml and docs/parameters/*.md anew from the code
 	$(BIN)/python docs/generate.py
+
+docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the reference into site/
+	$(TEST_ENV) NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo 'Open site/index.html. For its search: python3 -m http.server --bind 127.0.0.1 -d site'
+
+$(DOCS_STAMP): $(STAMP)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@touch $@
 
 bench: venv ## measure the speed against other libraries
 	$(BIN)/sonar-imm bench
 
 clean: ## remove everything that was built
 	@if test -e $(VENV)/pyvenv.cfg; then rm -rf $(VENV); fi
-	rm -rf build install log dist demo *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf build install log dist demo site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

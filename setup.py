@@ -42,6 +42,11 @@ REQUIRES = [
 ]
 EXTRAS = {
     'chart': ['laspy[lazrs]>=2.5', 'rasterio>=1.3'],
+    'docs': [
+        'mkdocs>=1.6,<2',
+        'mkdocs-material>=9.5',
+        'mkdocstrings[python]>=0.26',
+    ],
     'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
     'test': [
         'filterpy',

@@ -204,7 +204,7 @@ def test_generated_files_are_up_to_date() -> None:
     assert files
     for name, text in files.items():
         found = (ROOT / name).read_text(encoding='utf-8') if (ROOT / name).exists() else ''
-        assert found == text, f'{name} is out of date: run `make docs`'
+        assert found == text, f'{name} is out of date: run `make generate`'
 
 
 def test_every_system_is_found_by_its_name() -> None:
@@ -275,18 +275,18 @@ def test_default_parameter_file_holds_the_defaults() -> None:
         assert config.from_mapping(values, ignore_unknown=True) == config()
 
 
-def test_readme_names_every_subcommand() -> None:
+def test_the_page_of_commands_names_every_subcommand() -> None:
     from sonar_imm.cli import COMMANDS
 
-    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+    page = (ROOT / 'docs' / 'reference' / 'commands.md').read_text(encoding='utf-8')
     table = page.partition('| subcommand |')[2].partition('\n\n')[0]
     assert set(re.findall(r'^\| `([a-z]+)', table, re.MULTILINE)) == set(COMMANDS)
 
 
-def test_the_example_of_the_readme_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (ROOT / 'README.md').read_text(encoding='utf-8')
+def test_the_example_of_the_library_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / 'docs' / 'howto' / 'library.md').read_text(encoding='utf-8')
     (example,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
-    exec(compile(example, 'README.md', 'exec'), {})
+    exec(compile(example, 'library.md', 'exec'), {})
     assert capsys.readouterr().out
 
 

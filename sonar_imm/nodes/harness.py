@@ -102,9 +102,7 @@ def run_lockstep(
         fed = {topic: entry for topic, entry in inputs.items() if entry.makes}
         direct = {topic: entry for topic, entry in inputs.items() if not entry.makes}
         domain = stack.enter_context(reserved_domain_id())
-        stack.enter_context(
-            _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
-        )
+        stack.enter_context(local_discovery())
         arguments = _arguments(bag, direct, params_file)
         arguments += _losing_nothing(f'/{system}/estimate.publisher')
         arguments += ['-p', 'max_wait:=0.0', '-p', 'max_revisions:=0']
@@ -247,6 +245,11 @@ def reserved_domain_id() -> Iterator[int]:
             yield domain_id
             return
     raise LinkError('no free ROS domain on this machine')
+
+
+def local_discovery() -> contextlib.AbstractContextManager[None]:
+    """Let what is started meanwhile, nodes and links, find others on this machine only."""
+    return _environment(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_LOCALHOST_ONLY=None)
 
 
 @contextlib.contextmanager

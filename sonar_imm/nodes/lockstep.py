@@ -85,9 +85,9 @@ class Recorder:
     def __len__(self) -> int:
         return len(self._raw)
 
-    def estimates(self) -> list[Estimate]:
-        """Decode what was collected."""
-        return [read_estimate(deserialize_message(raw, PointCloud2)) for raw in self._raw]
+    def estimates(self, start: int = 0) -> list[Estimate]:
+        """Decode what was collected, from the estimate number `start` on."""
+        return [read_estimate(deserialize_message(raw, PointCloud2)) for raw in self._raw[start:]]
 
 
 class LockStep:

@@ -1,0 +1,199 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Pages of the site that are made when it is built, because something else holds their text.
+
+mkdocs calls `on_files` (see mkdocs.yml). The home page is README.md; the pages of the API list the
+modules of each package, which mkdocstrings then describes; the pages of options and of inputs come
+from the command and from the trackers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+import contextlib
+import io
+from pathlib import Path
+import re
+import tempfile
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+OUTSIDE = {
+    'README.md': 'index.md',
+    'CONTRIBUTING.md': 'contributing.md',
+    'CHANGELOG.rst': 'changelog.md',
+}
+"""Pages that lie in the root of the project, where people and tools look for them."""
+
+API = {
+    'estimation': (
+        'sonar_imm.estimation',
+        'Multiple-model estimation: no sonar, no ROS, no clock',
+    ),
+    'acoustics': ('sonar_imm.acoustics', 'Physics of arrays and sound'),
+    'measurements': ('sonar_imm.measurements', 'What a tracker takes in'),
+    'core': ('sonar_imm', 'What a tracker gives out, and its parameters'),
+    'trackers': ('sonar_imm.trackers', 'The trackers'),
+    'recordings': ('sonar_imm.recordings', 'Bags in and out, other formats'),
+    'evaluation': ('sonar_imm.evaluation', 'Scores and reports'),
+    'viewing': ('sonar_imm.viewing', 'Recordings, runs and nodes in Foxglove and Rerun'),
+    'simulation': ('sonar_imm.simulation', 'Scenes'),
+    'msg_adapters': ('msg_adapters', 'ROS messages to measurements and estimates, and back'),
+}
+"""Packages whose modules are described, by the name of their page."""
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Called by mkdocs with what it found in docs/: add the pages that are made."""
+    from mkdocs.structure.files import File
+
+    for name, text in made_pages().items():
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_post_build(config: Any) -> None:
+    """Called by mkdocs at the end. Raises RuntimeError when a page loads from another server."""
+    found = {
+        f'{path.relative_to(config.site_dir)}: {address}'
+        for path in Path(config.site_dir).rglob('*.html')
+        for address in loaded_from_afar(path.read_text(encoding='utf-8'))
+    }
+    if found:
+        raise RuntimeError('pages load from other servers: ' + ', '.join(sorted(found)))
+
+
+def loaded_from_afar(page: str) -> list[str]:
+    """Addresses on other servers that a browser asks for when it shows `page`; links are none."""
+    tags = re.findall(r'<(?:script|link|img|iframe|source|video|audio)\b[^>]*>', page)
+    kept = (tag for tag in tags if not re.search(r'\brel="?(?:canonical|next|prev)\b', tag))
+    return re.findall(r'\b(?:src|href)="?((?:https?:)?//[^"\s>]+)', ' '.join(kept))
+
+
+def made_pages() -> dict[str, str]:
+    """The text of each page that is made, by its path in the site."""
+    pages = {page: at_the_root(name) for name, page in OUTSIDE.items()}
+    pages |= {
+        f'reference/api/{page}.md': api_page(package, title)
+        for page, (package, title) in API.items()
+    }
+    pages['reference/interfaces.md'] = interfaces()
+    pages['reference/options.md'] = options()
+    return pages
+
+
+def at_the_root(name: str) -> str:
+    """A page of the root as one of docs/, with links that lead to the same places."""
+    text = (ROOT / name).read_text(encoding='utf-8')
+    if name.endswith('.rst'):  # headings and lists as Markdown has them, but for the title
+        text = re.sub(r'\A\^+\n(.+)\n\^+\n', r'# \1\n', text).replace('``', '`')
+
+    def link(found: re.Match[str]) -> str:
+        target, anchor = found['target'], found['anchor'] or ''
+        if target in OUTSIDE:
+            return f'({OUTSIDE[target]}{anchor})'
+        if target.startswith('docs/'):
+            return f'({target.removeprefix("docs/")}{anchor})'
+        raise ValueError(f'{name} links to {target}, which is no page of the site')
+
+    text = re.sub(r'\[[^\]]*\]\((?!\w+:)LICENSE\)', 'LICENSE', text)
+    return re.sub(r'(?<=\])\((?!\w+:)(?P<target>[^)#]+)(?P<anchor>#[^)]*)?\)', link, text)
+
+
+def api_page(package: str, title: str) -> str:
+    """One page for a package: every public module, compiled kernels left out."""
+    names = [name for name in modules(package) if not name.endswith('_kernels')]
+    return '\n\n'.join([f'# {title}', *(f'::: {name}' for name in names)]) + '\n'
+
+
+def modules(package: str) -> list[str]:
+    """Public modules of `package` with those of its packages, but of `sonar_imm` only its own."""
+    folder = ROOT.joinpath(*package.split('.'))
+    found = sorted(folder.glob('*.py') if package == 'sonar_imm' else folder.rglob('*.py'))
+    names = ('.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in found)
+    return [
+        name.removesuffix('.__init__')
+        for name in names
+        if not any(part.startswith('_') for part in name.removesuffix('.__init__').split('.'))
+    ]
+
+
+def options() -> str:
+    """What `--help` of every command and of every kind of conversion says."""
+    import click
+
+    from sonar_imm.cli import command, PROGRAM
+
+    def helps(one: click.Command, name: str, parent: click.Context | None) -> list[str]:
+        context = click.Context(one, parent, info_name=name, max_content_width=100)
+        parts = [f'## {context.command_path}', f'```text\n{one.get_help(context)}\n```']
+        if isinstance(one, click.Group):
+            for sub in one.list_commands(context):
+                parts += helps(one.get_command(context, sub), sub, context)
+        return parts
+
+    return '\n\n'.join(['# Options of every command', *helps(command, PROGRAM, None)]) + '\n'
+
+
+def interfaces() -> str:
+    """Inputs of each tracker with their types, and the columns of its estimates, from the code.
+
+    The columns are those of the first shipped recording, tracked with its parameters.
+    """
+    from msg_adapters.inputs import inputs_of
+    from sonar_imm.trackers import SYSTEMS
+
+    parts = [
+        '# Inputs and columns',
+        'Written from the code when the site is built: the inputs that a tracker subscribes to '
+        'and finds in recordings, and the columns of `~/estimate` and `estimate.csv`. What they '
+        'mean is in [Topics, services and columns](../topics.md).',
+    ]
+    for name in SYSTEMS:
+        inputs = [
+            f'| `{topic.name}` | {topic.description} | {types(topic.readers)} |'
+            for topic in inputs_of(name)
+        ]
+        bag = min((ROOT / 'bags').glob(f'{name}_*'))
+        columns = [f'| `{column}` | {kind} |' for column, kind in estimated_columns(bag).items()]
+        parts += [
+            f'## {name}_node',
+            '\n'.join(['| input | what | message types |', '|---|---|---|', *inputs]),
+            f'Estimates, as for `bags/{bag.name}`; models and states follow the parameters:',
+            '\n'.join(['| column | type |', '|---|---|', *columns]),
+        ]
+    return '\n\n'.join(parts) + '\n'
+
+
+def types(readers: Iterable[str]) -> str:
+    return ', '.join(f'`{name.replace("/msg/", "/")}`' for name in readers)
+
+
+def estimated_columns(bag: Path) -> dict[str, str]:
+    """Name and type of each column that the tracker gives for `bag`; runs of models in one row."""
+    from sonar_imm.cli import main
+    from sonar_imm.evaluation.run_folder import RunFolder
+
+    with tempfile.TemporaryDirectory(prefix='sonar_imm_docs_') as scratch:
+        out = Path(scratch) / 'out'
+        with contextlib.redirect_stdout(io.StringIO()):
+            if status := main(['track', str(bag), str(out)]):
+                raise RuntimeError(f'`sonar-imm track {bag}` ended with {status}')
+        estimate = next(one for one in RunFolder(out).read_estimates() if len(one.xyz))
+    return {
+        name: f'{column.dtype.kind}{column.dtype.itemsize}'
+        for name, column in estimate.columns().items()
+    }

@@ -1,0 +1,298 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A real node as a process, what is sent to it and what it says: where faults happen."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+import contextlib
+import re
+import time
+from typing import Any
+
+from attrs import define, field, frozen
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.nodes.harness import (
+    local_discovery,
+    NodeProcess,
+    reserved_domain_id,
+    START_LIMIT,
+)
+from sonar_imm.nodes.link import Link
+from sonar_imm.nodes.lockstep import LockStep, Recorder
+from sonar_imm.nodes.messages import make
+from sonar_imm.nodes.qos import lockstep_qos
+
+from .cases import Action, Case, Message, SECOND, Step
+from .closeness import agrees
+
+LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
+NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
+"""Counts of what was not lost."""
+
+
+@frozen
+class Outcome:
+    """What a fault did. recovered: messages on the primary input until all later estimates agree
+    with the undisturbed run, None for never; losses: counted in /diagnostics, by reason; levels
+    and words: of /diagnostics and the log while it lasted; estimates: in the rest, of how many;
+    answered: whether the node goes on answering messages."""
+
+    recovered: int | None
+    estimates: tuple[int, int]
+    losses: dict[str, int]
+    levels: frozenset[str]
+    words: str
+    answered: bool
+
+
+@define
+class Diagnostics:
+    """What /diagnostics said: `values` of the newest, and levels and words since `forget`."""
+
+    values: dict[str, str] = field(factory=dict)
+    newest_ns: int = 0
+    levels: set[str] = field(factory=set)
+    words: set[str] = field(factory=set)
+
+    def __call__(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+        self.newest_ns = info['source_timestamp']
+        for status in message.status:
+            self.values |= {pair.key: pair.value for pair in status.values}
+            self.levels.add(LEVELS[ord(status.level)])
+            self.words.add(f'{LEVELS[ord(status.level)]}: {status.message}')
+
+    def forget(self) -> None:
+        self.levels.clear()
+        self.words.clear()
+
+    def counts(self) -> Counter[str]:
+        """All values that count something."""
+        told: Counter[str] = Counter()
+        for key, value in self.values.items():
+            if re.match(r'(count|refused|doubtful|lost|gap|dropped)\b|.*(received|dropped)', key):
+                with contextlib.suppress(ValueError):
+                    told[key] = int(float(value))
+        return told
+
+
+class Rig:
+    """A node of one system in a ROS domain of its own, in lock-step; ended by ``with``."""
+
+    def __init__(self, case: Case, arguments: Sequence[str] = ()):
+        self.case = case
+        self._stack = contextlib.ExitStack()
+        try:
+            self._start([*arguments])
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def _start(self, arguments: list[str]) -> None:
+        case, enter = self.case, self._stack.enter_context
+        topics = dict.fromkeys(one.topic for one in case.messages())
+        for name in (*topics, f'{case.system}/estimate'):
+            end = 'publisher' if name.endswith('estimate') else 'subscription'
+            for policy in ('history:=keep_all', 'reliability:=reliable'):
+                arguments += ['-p', f'qos_overrides./{name}.{end}.{policy}']
+        arguments += ['-p', 'diagnostics_period:=0.05']
+        self.domain = enter(reserved_domain_id())
+        with local_discovery():
+            self.node = enter(NodeProcess(case.system, domain_id=self.domain, arguments=arguments))
+            self.link = enter(Link('rig', domain_id=self.domain))
+        self.recorder = Recorder(self.link, f'/{case.system}')
+        self.diagnostics = Diagnostics()
+        self.link.node.create_subscription(
+            DiagnosticArray, '/diagnostics', self.diagnostics, lockstep_qos()
+        )
+        self.clock = self.link.node.create_publisher(Clock, '/clock', 10)
+        self._classes = {one.topic: type(one.content) for one in case.messages()}
+        self.lockstep = LockStep(
+            self.link, f'/{case.system}', recorder=self.recorder, trouble=self.node.trouble
+        )
+        self.publishers: dict[str, Any] = {}
+        self._advertise()
+        self.lockstep.connect(self.publishers.values(), START_LIMIT)
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    # -- what a fault may do ---------------------------------------------------------------------
+
+    def send(self, message: Message) -> None:
+        """Send one message, and wait for its answer."""
+        self.lockstep.step(self.publishers[message.topic], message.content)
+
+    def send_at_once(self, messages: Iterable[Message]) -> None:
+        """Send messages without waiting, and then wait for all answers."""
+        sent = time.monotonic()
+        messages = list(messages)
+        for one in messages:
+            self.publishers[one.topic].publish(one.content)
+        self.lockstep.follow(len(messages), 'all', sent)
+
+    def new_publishers(self) -> None:
+        """Other publishers instead of those so far, as of a driver that was started anew."""
+        for publisher in self.publishers.values():
+            self.link.node.destroy_publisher(publisher)
+        self._advertise()
+
+    def peer(self, topic: str, qos: QoSProfile) -> Any:
+        """One more publisher on an input."""
+        return self.link.node.create_publisher(self._classes[topic], f'/{topic}', qos)
+
+    def reset(self) -> None:
+        assert self.call(Trigger, 'reset', Trigger.Request()).success
+
+    def enable(self, on: bool) -> None:
+        assert self.call(SetBool, 'enable', SetBool.Request(data=on)).success
+
+    def tell_clock(self, stamp_ns: int) -> None:
+        """Publish on /clock."""
+        seconds, nanoseconds = divmod(stamp_ns, SECOND)
+        self.clock.publish(
+            Clock(clock=make('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds))
+        )
+
+    def wait_for_clock(self, stamp_ns: int, *, back: bool) -> None:
+        """Publish on /clock until the node lives at that time; back: until it said so."""
+        logged = self.node.log().count('/clock is back')
+
+        def there() -> bool:
+            self.tell_clock(stamp_ns)
+            return not back or self.node.log().count('/clock is back') > logged
+
+        assert self.lockstep.wait_for(there)
+
+    def set_parameters(self, atomically: bool = False, **values: Any) -> list[Any]:
+        """Set parameters from outside; gives a result each, or one when `atomically`."""
+        told = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        if atomically:
+            atomic = SetParametersAtomically.Request(parameters=told)
+            name = 'set_parameters_atomically'
+            return [self.call(SetParametersAtomically, name, atomic).result]
+        request = SetParameters.Request(parameters=told)
+        return list(self.call(SetParameters, 'set_parameters', request).results)
+
+    def parameters(self, *names: str) -> list[Any]:
+        """The values of parameters."""
+        request = GetParameters.Request(names=list(names))
+        answer = self.call(GetParameters, 'get_parameters', request)
+        return [parameter_value_to_python(value) for value in answer.values]
+
+    def call(self, service: Any, name: str, request: Any) -> Any:
+        """Call a service of the node."""
+        client = self.link.node.create_client(service, f'/{self.case.system}/{name}')
+        try:
+            assert self.lockstep.wait_for(client.service_is_ready)
+            future = client.call_async(request)
+            assert self.lockstep.wait_for(future.done)
+            return future.result()
+        finally:
+            self.link.node.destroy_client(client)
+
+    def fresh_diagnostics(self) -> None:
+        """Wait for a report of what is so now."""
+        now_ns = time.time_ns()
+        assert self.lockstep.wait_for(lambda: self.diagnostics.newest_ns > now_ns)
+
+    def heard_of(self, words: str) -> None:
+        """Wait until /diagnostics says `words`."""
+        assert self.lockstep.wait_for(lambda: words in ' '.join(self.diagnostics.words))
+
+    # -- a whole run -----------------------------------------------------------------------------
+
+    def play(self, steps: Iterable[Step]) -> list[Estimate]:
+        """Send messages and do actions; gives the estimates that were published meanwhile."""
+        start = len(self.recorder)
+        for step in steps:
+            if isinstance(step, Action):
+                step.run(self)
+            else:
+                self.send(step)
+        return self.recorder.estimates(start)
+
+    def undisturbed(self) -> dict[int, Estimate]:
+        """What a fresh node makes of the recording: the first word for each stamp."""
+        self.reset()
+        return first_words(self.play(self.case.messages()))
+
+    def suffer(self, disturb: Callable[..., Any], expected: dict[int, Estimate]) -> Outcome:
+        """Let a fault happen to the node, and see how long it is felt. expected: `undisturbed`."""
+        self.reset()
+        self.enable(True)
+        self.fresh_diagnostics()
+        before, logged = self.diagnostics.counts(), len(self.node.log())
+        messages = self.lockstep.counts.messages
+        self.diagnostics.forget()
+        disturbed, rest = disturb(*self.case.thirds())
+        self.play(disturbed)
+        self.fresh_diagnostics()
+        found = first_words(self.play(rest))
+        self.fresh_diagnostics()
+        origins = {
+            one.stamp_ns: one.origin_ns for one in rest if isinstance(one, Message) and one.primary
+        }
+        held = [
+            stamp in found and agrees(found[stamp], expected[origin])
+            for stamp, origin in origins.items()
+            if origin in expected
+        ]
+        answered = sum(stamp in found for stamp in origins)
+        lost = self.diagnostics.counts()
+        lost.subtract({key: n for key, n in before.items() if lost[key] >= n})
+        return Outcome(
+            recovered=_until_held(held),
+            estimates=(answered, len(held)),
+            losses={k: n for k, n in sorted(lost.items()) if n > 0 and not NO_LOSS.match(k)},
+            levels=frozenset(self.diagnostics.levels),
+            words='\n'.join([*sorted(self.diagnostics.words), self.node.log()[logged:]]),
+            answered=self.lockstep.counts.messages > messages,
+        )
+
+    def _advertise(self) -> None:
+        self.publishers = {topic: self.peer(topic, lockstep_qos()) for topic in self._classes}
+        if self.lockstep.counts.messages:
+            heard = self.lockstep.wait_for(
+                lambda: all(p.get_subscription_count() for p in self.publishers.values())
+            )
+            assert heard
+
+
+def first_words(estimates: Iterable[Estimate]) -> dict[int, Estimate]:
+    """What was published first for each stamp: what somebody at sea acts upon."""
+    found: dict[int, Estimate] = {}
+    for one in estimates:
+        found.setdefault(one.stamp_ns, one)
+    return found
+
+
+def _until_held(held: list[bool]) -> int | None:
+    """How many messages until all later ones are good; None when the last one is not."""
+    if not held or not held[-1]:
+        return None
+    return len(held) - int(np.argmin([*held[::-1], False]))

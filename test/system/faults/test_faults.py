@@ -1,0 +1,78 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every fault of the table, done to a real node: in the short form to one node each, in turn."""
+
+from pathlib import Path
+import re
+
+from helpers.faults.cases import CASES
+from helpers.faults.figures import long_form
+from helpers.faults.rig import LEVELS, Rig
+from helpers.faults.table import FAULTS
+import pytest
+
+pytestmark = pytest.mark.system
+
+
+def pairs():
+    """Faults and systems to try."""
+    for turn, fault in enumerate(FAULTS):
+        if long_form():
+            yield from ((fault, system) for system in fault.systems)
+        else:
+            # those with arguments need a node of their own: all of one system share it
+            yield fault, fault.systems[0 if fault.arguments else turn % len(fault.systems)]
+
+
+@pytest.fixture(scope='module')
+def rigs():
+    """Nodes that all faults share, by system and arguments, and what each makes of the input
+    undisturbed."""
+    running = {}
+    yield running
+    for rig, _ in running.values():
+        pid = rig.node.process.pid
+        children = Path(f'/proc/{pid}/task/{pid}/children').read_text()
+        code, log = rig.node.stop(), rig.node.log()
+        rig.__exit__()
+        assert code == 0 and 'Traceback' not in log and not children
+
+
+@pytest.mark.parametrize('fault, system', pairs(), ids=lambda one: getattr(one, 'name', one))
+def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
+    key = system, *fault.arguments
+    if key not in rigs:
+        fresh = Rig(CASES[system], fault.arguments)
+        rigs[key] = fresh, fresh.undisturbed()
+    rig, expected = rigs[key]
+    outcome = rig.suffer(fault.disturb(CASES[system]), expected)
+    limit = CASES[system].settle if fault.settle is None else fault.settle
+    figures.add(
+        fault=fault.name,
+        system=system,
+        recovered=outcome.recovered,
+        limit=limit,
+        estimates=outcome.estimates,
+        losses=outcome.losses,
+        worst=LEVELS[max(map(LEVELS.index, outcome.levels))],
+        traceback='Traceback' in outcome.words,
+    )
+    assert 'Traceback' not in outcome.words
+    assert outcome.answered
+    assert outcome.recovered is not None and outcome.recovered <= limit, outcome
+    found = [key for key in outcome.losses for one in fault.counted if re.search(one, key)]
+    assert bool(found) == bool(fault.counted), outcome.losses
+    assert max(map(LEVELS.index, outcome.levels)) >= LEVELS.index(fault.level), outcome
+    assert re.search(fault.says, outcome.words), outcome.words

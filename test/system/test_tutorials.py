@@ -1,0 +1,140 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every command of the tutorials and how-to pages, run in a real shell in the order of the page.
+
+A fenced block `bash` is run; the lines of a block `text` have to be in what it has printed, in
+order. Numbers may differ by 5 %, or by one in the last digit; `...` stands for what is not shown.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+
+from helpers.source import ROOT
+import pytest
+
+from sonar_imm.nodes.harness import reserved_domain_id
+
+pytestmark = pytest.mark.system
+
+PAGES = sorted(
+    path
+    for folder in ('tutorials', 'howto')
+    for path in (ROOT / 'docs' / folder).glob('*.md')
+    if '\n```bash\n' in path.read_text(encoding='utf-8')
+)
+NUMBER = re.compile(r'-?\d+(?:\.\d+)?|-?\.\d+')
+LONGEST = 180.0
+"""Seconds that a page may take on a busy machine."""
+
+
+def blocks(page: str) -> list[tuple[str, str]]:
+    """Commands and what they print, which is '' where the page does not show it."""
+    found = re.findall(r'^```(bash|text)\n(.*?)^```$', page, re.MULTILINE | re.DOTALL)
+    told: list[tuple[str, str]] = []
+    for kind, text in found:
+        if kind == 'bash':
+            told.append((text, ''))
+        else:
+            assert told and not told[-1][1], 'output without the command before it'
+            told[-1] = (told[-1][0], text)
+    return told
+
+
+def same(shown: str, printed: str) -> bool:
+    """Whether a line says the same: the words are equal, the numbers nearly."""
+    if NUMBER.sub('#', ' '.join(shown.split())) not in NUMBER.sub('#', ' '.join(printed.split())):
+        return False
+    pattern = NUMBER.sub('\0', re.sub(r'\s+', ' ', shown.strip()))
+    words = r'\s+'.join(map(re.escape, pattern.split(' '))).replace(re.escape('\0'), '\0')
+    found = re.search(words.replace('\0', f'({NUMBER.pattern})'), printed)
+    return found is not None and all(map(near, NUMBER.findall(shown), found.groups()))
+
+
+def near(shown: str, printed: str) -> bool:
+    digits = len(shown.partition('.')[2])
+    return math.isclose(
+        float(shown), float(printed), rel_tol=0.05, abs_tol=1.01 * 10.0**-digits if digits else 0.0
+    )
+
+
+def missing(shown: str, printed: str) -> str | None:
+    """The first line that was shown and not printed after those before it."""
+    lines = iter(printed.splitlines())
+    for line in filter(str.strip, shown.splitlines()):
+        if line.strip() != '...' and not any(same(line, one) for one in lines):
+            return line
+    return None
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda path: f'{path.parent.name}/{path.stem}')
+def test_the_commands_of_a_page_run(page: Path, tmp_path: Path) -> None:
+    pytest.importorskip('rclpy')
+    told = blocks(page.read_text(encoding='utf-8'))
+    mark = '=== block'
+    script = '\n'.join(
+        f'echo "{mark} {number}"\n{commands}' for number, (commands, _) in enumerate(told)
+    )
+    environment = {
+        **os.environ,
+        'PATH': f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}',
+        'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+    }
+    output = tmp_path / 'output.log'
+    with reserved_domain_id() as domain, output.open('w', encoding='utf-8') as log:
+        environment['ROS_DOMAIN_ID'] = str(domain)
+        shell = subprocess.Popen(
+            ['bash', '-eu', '-o', 'pipefail', '-c', script],
+            cwd=tmp_path,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            status = shell.wait(LONGEST)
+        except subprocess.TimeoutExpired:
+            status = None
+        finally:  # what a page has left running, above all after a command that failed
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(shell.pid, signal.SIGKILL)
+    printed = output.read_text(encoding='utf-8')
+    assert status == 0, printed
+    for part, (_, shown) in zip(re.split(rf'^{mark} \d+\n', printed, flags=re.M)[1:], told):
+        assert missing(shown, part) is None, f'not printed: {missing(shown, part)}\n{part}'
+
+
+def test_a_line_that_was_not_printed_is_found() -> None:
+    printed = 'used 198\n  error 1.142 m\ndone 3\n'
+    assert missing('used 198\n...\ndone 3\n', printed) is None
+    assert missing('error 1.15 m\n', printed) is None
+    assert missing('error 1.3 m\n', printed) == 'error 1.3 m'
+    assert missing('done 3\nused 198\n', printed) == 'used 198'
+    assert missing('used 198 times\n', printed) == 'used 198 times'
+
+
+def test_all_tutorials_are_run() -> None:
+    from sonar_imm.trackers import SYSTEMS
+
+    assert {path.stem for path in PAGES if path.parent.name == 'tutorials'} >= set(SYSTEMS)

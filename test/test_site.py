@@ -1,0 +1,92 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The site: every page is in its navigation, every public module in its API, nothing from afar.
+
+Building it needs mkdocs, and `make docs` is strict itself; these tests need neither.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+
+from helpers.source import ROOT
+import pytest
+import yaml
+
+if not (ROOT / 'mkdocs.yml').is_file():
+    pytest.skip('these tests read the source tree', allow_module_level=True)
+
+NO_API = {'sonar_imm.cli', 'sonar_imm.nodes'}
+"""Packages that are no library: the command has a page, the nodes have topics."""
+
+
+@pytest.fixture(scope='module')
+def made():
+    spec = importlib.util.spec_from_file_location('site_pages', ROOT / 'docs' / 'site_pages.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def in_navigation(entry) -> set[str]:
+    if isinstance(entry, str):
+        return {entry}
+    parts = entry.values() if isinstance(entry, dict) else entry
+    return set().union(*map(in_navigation, parts))
+
+
+def test_every_page_is_in_the_navigation(made) -> None:
+    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    pages = {path.relative_to(ROOT / 'docs').as_posix() for path in (ROOT / 'docs').rglob('*.md')}
+    pages |= {*made.OUTSIDE.values(), *(f'reference/api/{name}.md' for name in made.API)}
+    assert in_navigation(config['nav']) == pages | {
+        'reference/interfaces.md',
+        'reference/options.md',
+    }
+
+
+def test_the_api_has_every_public_module(made) -> None:
+    described = set().union(*(made.modules(package) for package, _ in made.API.values()))
+    files = [*(ROOT / 'sonar_imm').rglob('*.py'), *(ROOT / 'msg_adapters').rglob('*.py')]
+    names = {'.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in files}
+    public = {name.removesuffix('.__init__') for name in names}
+    assert public - described == {
+        name for name in public if any(f'{name}.'.startswith(f'{one}.') for one in NO_API)
+    }
+    assert '::: sonar_imm.estimation.imm\n' in made.api_page('sonar_imm.estimation', 'x')
+    assert 'imm_kernels' not in made.api_page('sonar_imm.estimation', 'x')
+
+
+@pytest.mark.parametrize('name', ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst'])
+def test_links_of_pages_from_the_root_lead_to_pages(made, name: str) -> None:
+    text = made.at_the_root(name)
+    assert text.startswith('# ')
+    for target in re.findall(r'\]\(([^)#]+)', text):
+        known = target in made.OUTSIDE.values() or (ROOT / 'docs' / target).is_file()
+        assert '://' in target or known, target
+
+
+def test_what_comes_from_another_server_is_seen(made) -> None:
+    page = (
+        '<link rel="canonical" href="https://a.org/"><link rel=stylesheet href=assets/a.css>'
+        '<a href="https://b.org">b</a><script src="https://c.org/c.js"></script>'
+        '<link rel="stylesheet" href="//d.org/d.css"><img src=https://e.org/e.png>'
+    )
+    assert made.loaded_from_afar(page) == [
+        'https://c.org/c.js',
+        '//d.org/d.css',
+        'https://e.org/e.png',
+    ]
