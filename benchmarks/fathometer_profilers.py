@@ -132,6 +132,7 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         by_edge.append((np.abs(columns['depth'] - first) < NEAR).any())
         by_old.append((np.abs(columns['depth'] - older) < NEAR).any())
         number.append(np.isfinite(columns['depth']).sum())
+    lost = ~np.array(by_old)
     return {
         'records': count,
         'followed': share(hits),
@@ -140,7 +141,7 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         'followed_older_rule': share(by_old),
         'followed_edge': share(by_edge),
         'rules_agree': share(np.abs(arrival - old) < NEAR),
-        'older_missed_at_edge': share(np.array(by_edge)[~np.array(by_old)]),
+        'older_missed_at_edge': share(np.array(by_edge)[lost]) if lost.any() else None,
         'sounder': sounder(stated, edge, arrival),
         'reflectors': round(float(np.mean(number)), 2),
     }
