@@ -39,10 +39,10 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-bounds test-system lint generate docs bench clean
+.PHONY: help venv demo test test-core test-bounds test-system lint generate docs docs-numbers bench clean
 
 help: ## print this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
 venv: $(STAMP) ## build .venv from PyPI, ROS 2 included (PYTHON=... chooses the interpreter)
 
@@ -84,6 +84,9 @@ generate: venv ## write config/*.yaml and docs/parameters/*.md anew from the cod
 docs: generate $(DOCS_STAMP) ## the same, and build the pages of docs/ with the reference into site/
 	$(TEST_ENV) NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo 'Open site/index.html. For its search: python3 -m http.server --bind 127.0.0.1 -d site'
+
+docs-numbers: venv ## check that the tables of docs/ still hold the numbers of docs/results/
+	$(BIN)/python docs/check_numbers.py
 
 $(DOCS_STAMP): $(STAMP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

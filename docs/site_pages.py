@@ -26,6 +26,7 @@ import contextlib
 import io
 from pathlib import Path
 import re
+import sys
 import tempfile
 from typing import Any
 
@@ -56,6 +57,12 @@ API = {
 """Packages whose modules are described, by the name of their page."""
 
 
+TYPICAL = """\
+Recordings in `bags/` are simulated. These are typical: of 31 seeds the one in the middle.
+`sonar-imm check` plays them to the live nodes and allows the error in the last column, which nine
+in ten of those seeds stay below."""
+
+
 def on_files(files: Any, config: Any) -> Any:
     """Called by mkdocs with what it found in docs/: add the pages that are made."""
     from mkdocs.structure.files import File
@@ -63,6 +70,14 @@ def on_files(files: Any, config: Any) -> Any:
     for name, text in made_pages().items():
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Called by mkdocs with each page: show where the numbers of its tables come from."""
+    sys.path.insert(0, str(ROOT / 'docs'))
+    from check_numbers import captioned
+
+    return captioned(markdown, '../' * page.file.src_uri.count('/'))
 
 
 def on_post_build(config: Any) -> None:
@@ -92,6 +107,7 @@ def made_pages() -> dict[str, str]:
     }
     pages['reference/interfaces.md'] = interfaces()
     pages['reference/options.md'] = options()
+    pages['reference/bags.md'] = recordings()
     return pages
 
 
@@ -129,6 +145,40 @@ def modules(package: str) -> list[str]:
         for name in names
         if not any(part.startswith('_') for part in name.removesuffix('.__init__').split('.'))
     ]
+
+
+def recordings() -> str:
+    """What the recordings that are shipped say of themselves: their README.md."""
+    told = {path.parent.name: path.read_text() for path in (ROOT / 'bags').glob('*/README.md')}
+    rows = []
+    for name, text in sorted(told.items()):
+        # The table of benchmarks.typical_seed: a row for each metric, the first has the limit.
+        lines = [line for line in text.splitlines() if line.startswith('|')]
+        head, _, first = ([cell.strip() for cell in line.split('|')[1:-1]] for line in lines[:3])
+        found = dict(zip(head[1:], first[1:]))
+        seed = re.search(r'--seed (\d+)', text).group(1)
+        limit = re.search(r'allows (\S+ \S+)', text).group(1)
+        rows.append(
+            f'| [{name}](#{name}) | {seed} | `{first[0]}` | {found["of the seed"]} | '
+            f'{found["5 %"]} to {found["95 %"]} | {limit} |'
+        )
+    return (
+        '\n\n'.join(
+            [
+                '# Shipped recordings',
+                TYPICAL,
+                '\n'.join(
+                    [
+                        '| recording | seed | error | of this seed | 5 to 95 % | allowed |',
+                        '|---|---|---|---|---|---|',
+                        *rows,
+                    ]
+                ),
+                *(f'#{text.strip()}' for _, text in sorted(told.items())),
+            ]
+        )
+        + '\n'
+    )
 
 
 def options() -> str:

@@ -49,7 +49,7 @@ MAX_DETECTIONS = 10_000
 COLUMNS = ('x', 'y', 'z', 'range', 'bearing', *OPTIONAL_COLUMNS)
 SOUND_SPEEDS = (1300.0, 1700.0)
 """m/s; outside, the field was not filled in or is something else."""
-NEAREST, FARTHEST = 0.01, 1e5
+NEAREST, FARTHEST = 0.01, 1e4
 """Metres: no echo comes from nearer or farther."""
 BEARING_SIDES = ('port', 'starboard')
 LEAST_VARIANCE, MOST_VARIANCE = 1e-12, 1e6
@@ -194,6 +194,13 @@ def _detections(
         raise Rejection(
             'out_of_range',
             f'detections: a bearing of {seen.max():g} is beyond 2 pi; bearings are in radians',
+        )
+    far = distance[np.isfinite(distance)]
+    if len(far) and far.min() > FARTHEST:
+        raise Rejection(
+            'out_of_range',
+            f'detections: all ranges are beyond {FARTHEST:g}, from {far.min():g} on; '
+            'ranges are in metres',
         )
     keep = np.isfinite(distance) & np.isfinite(bearing) & (distance >= NEAREST)
     keep &= distance <= FARTHEST

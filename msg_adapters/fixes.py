@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Fix, Rejection, RelativeFix
+from sonar_imm.measurements import Fix, Rejection, RelativeFix, Start
 
 from .headers import Make, make_header, make_pose, stamp_ns, swap_axes, to_enu
 
@@ -46,7 +46,7 @@ def read_fix(message: Any, *, world_frame: str = 'enu') -> Fix:
     """
     point = message.point if hasattr(message, 'point') else message.pose.pose.position
     x, y, z = float(point.x), float(point.y), float(point.z)
-    block = _xy_covariance(message)
+    block = xy_covariance(message)
     if block is not None and (not block.any() or (np.diag(block) < 0.0).any()):
         block = None
     fix = Fix(
@@ -80,7 +80,7 @@ def check_size(fix: Fix) -> None:
 
 def doubt_fix(message: Any) -> str | None:
     """Give ``'zero_covariance'`` for a covariance that was not filled in: all zero in x and y."""
-    block = _xy_covariance(message)
+    block = xy_covariance(message)
     return 'zero_covariance' if block is not None and not block.any() else None
 
 
@@ -96,7 +96,7 @@ def write_fix(fix: Fix, make: Make) -> Any:
 
 
 def make_position(
-    fix: Fix | RelativeFix, position: FloatArray, covariance: FloatArray, make: Make
+    fix: Fix | RelativeFix | Start, position: FloatArray, covariance: FloatArray, make: Make
 ) -> Any:
     """Make a PoseWithCovarianceStamped with stamp and frame of `fix`, at `position` (3,) m, not
     turned, with `covariance` (6, 6)."""
@@ -111,7 +111,7 @@ def make_position(
     )
 
 
-def _xy_covariance(message: Any) -> NDArray[np.float64] | None:
+def xy_covariance(message: Any) -> NDArray[np.float64] | None:
     """Cut the x-y block (2, 2) out of the 6 x 6 covariance; None for a message without one."""
     if hasattr(message, 'point'):
         return None

@@ -75,6 +75,26 @@ class NodeConfig(Config):
         high=1e6,
         read_only=False,
     )
+    state_file: str = parameter(
+        '',
+        'file in which the state of the tracker is kept, so that a node that is started again '
+        'goes on with its tracks; empty: none',
+    )
+    state_interval: float = parameter(
+        10.0,
+        'time between two states saved while running; one is saved at the end in any case',
+        unit='s',
+        low=0.1,
+        high=86400.0,
+    )
+    state_max_age: float = parameter(
+        300.0,
+        'a state is not used when it was saved longer ago, or when the first measurement is '
+        'further from its last one',
+        unit='s',
+        low=0.0,
+        high=1e6,
+    )
 
 
 @frozen(kw_only=True)

@@ -57,6 +57,8 @@ IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
 # those that some commands need, each with an extra of its own.
 PEERS = {
+    'sonar_imm.evaluation.jobs': {'distributed'},
+    'sonar_imm.evaluation.tables': {'pyarrow'},
     'sonar_imm.viewing.rerun_file': {'rerun'},
     'sonar_imm.viewing.server': {'foxglove'},
     'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
@@ -135,7 +137,7 @@ def test_package_xml_and_setup_name_the_same_test_dependencies(
     # The linters of ament come with ROS 2, not from PyPI.
     keys = {key for key in texts(manifest, 'test_depend') if not key.startswith('ament_')}
     wanted = {PYPI_OF_KEY[key] for key in keys}
-    without_key = {'foxglove-sdk', 'laspy', 'segyio'}
+    without_key = {'foxglove-sdk', 'laspy', 'pyarrow', 'segyio'}
     assert wanted | without_key == {distribution(line) for line in setup_lists['EXTRAS']['test']}
 
 
@@ -298,8 +300,9 @@ def test_topics_page_names_every_input() -> None:
     for system in SYSTEMS:
         for topic in inputs_of(system):
             for type_name in topic.readers:
-                row = rf'^\| `{topic.name}` \| .*{re.escape(type_name.split("/")[-1])}'
-                assert re.search(row, page, re.MULTILINE), f'{topic.name} {type_name}'
+                heard = f'{topic.prefix}{topic.name}'
+                row = rf'^\| `{heard}` \| .*{re.escape(type_name.split("/")[-1])}'
+                assert re.search(row, page, re.MULTILINE), f'{heard} {type_name}'
 
 
 @pytest.mark.parametrize(

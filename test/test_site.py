@@ -55,6 +55,7 @@ def test_every_page_is_in_the_navigation(made) -> None:
     assert in_navigation(config['nav']) == pages | {
         'reference/interfaces.md',
         'reference/options.md',
+        'reference/bags.md',
     }
 
 

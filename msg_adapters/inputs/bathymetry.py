@@ -33,6 +33,9 @@ from .topic import InputTopic
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 
+SIDES = {'port': frozenset({'port'}), 'starboard': frozenset({'starboard', 'stbd'})}
+"""The sides, with the words that name them."""
+
 TOPICS = (
     InputTopic(
         'snapshot',
@@ -51,8 +54,9 @@ TOPICS = (
             readers={TABLE: partial(read_snapshot, side=side)},
             write=write_snapshot,
             one_topic=True,
+            words=words,
         )
-        for side in ('port', 'starboard')
+        for side, words in SIDES.items()
     ),
     InputTopic(
         'nav',

@@ -24,6 +24,7 @@ from sonar_imm.measurements import (
     Fixes,
     GeodeticFix,
     RelativeFix,
+    Start,
     VesselFix,
     VesselHeading,
     VesselPose,
@@ -42,9 +43,11 @@ from ..headers import Make
 from ..navigation import write_navigation
 from ..relative import read_beacon, read_modem, read_relative, read_usbl_data, write_relative
 from ..scans import doubt_scan, read_poses, read_scan, write_scan
+from ..starts import read_start, write_start
 from ..vessel import read_heading, read_vessel_pose, write_heading
 from .topic import InputTopic
 
+POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 GEODETIC = (
     'sensor_msgs/msg/NavSatFix',
     'geographic_msgs/msg/GeoPointStamped',
@@ -52,7 +55,7 @@ GEODETIC = (
     'geographic_msgs/msg/GeoPoseWithCovarianceStamped',
 )
 RELATIVE = (
-    'geometry_msgs/msg/PoseWithCovarianceStamped',
+    POSE,
     'geometry_msgs/msg/PointStamped',
     'geometry_msgs/msg/Vector3Stamped',
 )
@@ -73,7 +76,7 @@ TOPICS = (
         measurement=Fix,
         also=(GeodeticFix,),
         readers={
-            'geometry_msgs/msg/PoseWithCovarianceStamped': read_fix,
+            POSE: read_fix,
             'geometry_msgs/msg/PointStamped': read_fix,
             **dict.fromkeys(GEODETIC, read_geodetic),
         },
@@ -148,5 +151,15 @@ TOPICS = (
         write=write_heading,
         companion=True,
         beside=('relative',),
+    ),
+    InputTopic(
+        'initial',
+        'where a diver is, told and not measured: a confirmed track begins there',
+        measurement=Start,
+        readers={POSE: read_start},
+        write=write_start,
+        companion=True,
+        prefix='~/',
+        by_name=frozenset({POSE}),
     ),
 )

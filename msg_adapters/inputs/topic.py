@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+import re
 from typing import Any
 
 from attrs import field, frozen
@@ -34,6 +35,11 @@ DOUBTS = {
     'unusable_rows': 'have rows that cannot be used, which are left out',
 }
 """What messages have that are used but deserve a look, by the code they are counted under."""
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name in small letters, and what stands between them."""
+    return re.split(r'([\W_]+)', name.lower())
 
 
 @frozen
@@ -61,6 +67,10 @@ class InputTopic:
     topic or its frame.
     required: whether the tracker makes nothing without it, by the parameters of the tracker. Of
     the inputs that are neither required nor companions, one is enough.
+    prefix: ``'~/'`` for a topic below the name of the node, ``'/'`` for one that no namespace
+    changes; '' for a relative topic.
+    words: words in a topic's name, any of which says that it is this input rather than the one of
+    the same last name: ``/sidescan_port/snapshot`` is a ``port/snapshot``.
     makes: the input of a tracker that a node before it makes of this one; '' for an input of the
     tracker itself.
     """
@@ -83,7 +93,25 @@ class InputTopic:
     required: Callable[[Mapping[str, Any]], bool] = field(
         default=lambda settings: False, kw_only=True
     )
+    prefix: str = field(default='', kw_only=True)
+    words: frozenset[str] = field(default=frozenset(), kw_only=True)
     makes: str = field(default='', kw_only=True)
+
+    def is_named(self, topic: str) -> bool:
+        """Whether the name of `topic` says that it is this input."""
+        if f'/{topic}'.endswith(f'/{self.name}'):
+            return True
+        place, _, own = topic.rpartition('/')
+        same = own == self.name.rpartition('/')[2]
+        return same and not self.words.isdisjoint(words_of(place))
+
+    def namespace(self, topic: str) -> str:
+        """What stands before the name of the input in that of a topic: ``/fore`` of
+        ``/fore/port/snapshot``, ``/fore_`` of ``/fore_port/snapshot``."""
+        if f'/{topic}'.endswith(f'/{self.name}'):
+            return topic[: -len(self.name)].rstrip('/')
+        parts = words_of(topic.rpartition('/')[0])
+        return ''.join(part for part in parts if part not in self.words)
 
     def may_be(self, topic: str, type_name: str) -> bool:
         """Whether a topic of that name and type could be this input, if a user says so."""
@@ -102,6 +130,10 @@ class InputTopic:
         parts = topic.split('/')
         names = [name for key in self.named_by for name in settings.get(key, ()) if name in parts]
         return f'{names[0]}/{self.name}' if names else self.name
+
+    def full_name(self, node: str) -> str:
+        """Where the node called `node` hears it when it is in no namespace."""
+        return f'/{node}/{self.name}' if self.prefix == '~/' else f'/{self.name}'
 
     def reader(
         self, type_name: str, world_frame: str, settings: Mapping[str, Any], topic: str = ''

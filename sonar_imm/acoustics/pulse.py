@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from attrs import frozen
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -34,6 +35,18 @@ from ..estimation.arrays import FloatArray
 
 Pulse = Callable[[FloatArray], FloatArray]
 """Distances in m to values, one at 0, even."""
+
+
+@frozen(eq=False)
+class SampledPulse:
+    """A pulse of `value` (k,) at `distance` (k,) m, rising from 0; interpolated, zero beyond."""
+
+    distance: FloatArray
+    value: FloatArray
+
+    def __call__(self, delta: FloatArray) -> FloatArray:
+        away = np.abs(np.asarray(delta, np.float64))
+        return np.interp(away, self.distance, self.value, right=0.0)
 
 
 def band_pulse(frequency_min: float, frequency_max: float, sound_speed: float) -> Pulse:
@@ -80,7 +93,7 @@ def measured_pulse(distance: ArrayLike, value: ArrayLike) -> Pulse:
     y = np.bincount(group, weights=y) / np.bincount(group)
     if x[0] > 1e-9 or not y[0] > 0.0:
         raise ValueError('a measured pulse needs a positive value at distance 0')
-    return lambda delta: np.interp(np.abs(np.asarray(delta, np.float64)), x, y / y[0], right=0.0)
+    return SampledPulse(x, y / y[0])
 
 
 def gram(pulse: Pulse, places: ArrayLike) -> FloatArray:

@@ -155,6 +155,7 @@ def missing_package(name: str) -> str | None:
         'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
         'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
         'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
+        'pyarrow': "pyarrow, which writes Parquet, is not here: pip install 'sonar_imm[parquet]'",
         'foxglove': 'foxglove-sdk, which serves the view, is not here: pip install '
         "'sonar_imm[view]', or use --browser",
         'rerun': "rerun-sdk, which writes the file, is not here: pip install 'sonar_imm[rerun]'",

@@ -96,12 +96,21 @@ def run_checks(
     quiet: bool = False,
 ) -> list[CheckedRecording]:
     """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`."""
-    from .checking import check_recording, shipped_bags
+    from .checking import check_recording, instruments_in, shipped_bags
 
     return [
-        check_recording(path, system, folder / path.stem, params=params, limit=limit, quiet=quiet)
+        check_recording(
+            path,
+            system,
+            folder / path.stem / name,
+            params=params,
+            limit=limit,
+            topics=topics,
+            quiet=quiet,
+        )
         for system in systems
         for path in ([bag] if bag else shipped_bags(system))
+        for name, topics in instruments_in(path, system).items()
     ]
 
 

@@ -19,12 +19,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from attrs import asdict, frozen
 
+from ..evaluation.batch import Job
 from ..evaluation.judging import Check, Judgement
 from ..evaluation.run_folder import BAG, CSV, RunFolder
 from ..evaluation.tracking import final_estimates, InputOptions
@@ -32,11 +34,13 @@ from ..nodes.harness import LockstepResult, run_lockstep
 from ..parameters import Config
 from ..recordings.own_limit import own_limit
 from ..recordings.own_parameters import own_parameters
+from ..recordings.reader import BagReader
+from ..recordings.topics import instruments
 from ..resources import share_folder
 from ..trackers import SYSTEMS
 from .common import load_config, load_detector, progress
 from .evaluate import evaluate_run
-from .track import track_recording
+from .track import track_one
 
 
 @frozen
@@ -77,6 +81,18 @@ def shipped_bags(system: str) -> list[Path]:
     return found
 
 
+def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
+    """The inputs by topic of each instrument in a recording, by its name; None: all there are."""
+    with BagReader(bag) as reader:
+        found = instruments(reader, system)
+    if len(found) == 1:
+        return {'': None}
+    return {
+        name: {topic: entry.name for topic, entry in inputs.items()}
+        for name, inputs in found.items()
+    }
+
+
 def check_recording(
     bag: Path,
     system: str,
@@ -84,29 +100,45 @@ def check_recording(
     *,
     params: Path | None = None,
     limit: float | None = None,
+    topics: Mapping[str, str] | None = None,
     quiet: bool = False,
 ) -> CheckedRecording:
     """Track `bag` offline and by the live node into `folder`, compare, score.
 
     params: parameter file; None for the one that comes with the recording, if any. limit: largest
     error allowed, in the unit of the system; None for that of the recording, if it states one, or
-    else of the system.
+    else of the system. topics: input by topic name; None for those that fit.
     Raises `BagError`, `ConfigError` and `LinkError`.
     """
     params = params or own_parameters(bag)
     limit = own_limit(bag) if limit is None else limit
     config, node = load_config(SYSTEMS[system], params, {})
     options = InputOptions(
+        topics=topics,
         frame_id=node.frame_id,
         world_frame=node.world_frame_convention,
         detector=load_detector(SYSTEMS[system], params, {}),
     )
-    run = track_recording(
-        bag, folder / 'offline', SYSTEMS[system], config, options, overwrite=True, quiet=quiet
+    run = track_one(
+        Job(
+            bag=bag,
+            folder=folder / 'offline',
+            instrument='',
+            system=system,
+            config=config,
+            options=options,
+            overwrite=True,
+        ),
+        quiet,
     )
     with progress('playing to the node', run['messages'], quiet=quiet) as advance:
         live = run_lockstep(
-            bag, system, params_file=params, settings=config.as_dict(), progress=advance
+            bag,
+            system,
+            params_file=params,
+            settings=config.as_dict(),
+            topics=topics,
+            progress=advance,
         )
     _keep(live, config, system, folder / 'live')
     judgement = evaluate_run(folder / 'offline')
@@ -118,9 +150,8 @@ def check_recording(
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
     """Write the estimates that the node published in the same form as the offline run."""
-    folder = RunFolder(path)
-    folder.prepare(overwrite=True)
-    folder.write_estimates(final_estimates(live.estimates, config), system)
+    with RunFolder(path).fresh(overwrite=True) as folder:
+        folder.write_estimates(final_estimates(live.estimates, config), system)
 
 
 def _answered(live: LockstepResult, run: dict[str, Any]) -> Check:

@@ -95,26 +95,38 @@ def command(
     no_report: bool,
     as_json: bool,
 ) -> None:
-    """Score the run that `sonar-imm track` left in OUT_DIR.
+    """Score the run, or all runs, that `sonar-imm track` left in OUT_DIR.
 
-    Writes metrics.json and one self-contained HTML report. Without truth only what needs none is
-    scored: the normalised innovations (NIS) and the model probabilities. With --crossing nothing
-    is written: the depths of two lines are compared where they cross.
+    Writes metrics.json beside each run and one self-contained HTML report. Without truth only
+    what needs none is scored: the normalised innovations (NIS) and the model probabilities. With
+    --crossing nothing is written: the depths of two lines are compared where they cross.
     """
+    from ..evaluation.batch import run_folders
+
     if crossing != (other is not None):
         raise click.UsageError('--crossing compares two runs: OUT_DIR and OTHER')
     if other is not None:
         _compare_crossing(out_dir, other, position_std, as_json)
         return
-    judgement = evaluate_run(
-        out_dir, JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
-    )
+    options = JudgeOptions(truth_bag=truth_bag, lag=truth_lag, gap=truth_gap, cutoff=cutoff)
+    judgements = {folder: evaluate_run(folder, options) for folder in run_folders(out_dir)}
     page = None if no_report else report or out_dir / 'report.html'
     if page is not None:
         from ..evaluation.report import write_report
 
-        write_report(page, [judgement.part([])])
-    print_json(judgement.metrics) if as_json else _print(judgement, page)
+        write_report(page, [judgement.part([]) for judgement in judgements.values()])
+    if as_json:
+        metrics = {_name(folder, out_dir): one.metrics for folder, one in judgements.items()}
+        print_json(metrics.get('.', metrics))
+        return
+    for folder, judgement in judgements.items():
+        _print(judgement, '' if folder == out_dir else f'{_name(folder, out_dir)}: ')
+    if page is not None:
+        say(f'report: {page}')
+
+
+def _name(folder: Path, out_dir: Path) -> str:
+    return folder.relative_to(out_dir).as_posix()
 
 
 def _compare_crossing(a: Path, b: Path, position_std: float, as_json: bool) -> None:
@@ -142,9 +154,7 @@ def evaluate_run(out_dir: Path, options: JudgeOptions | None = None) -> Judgemen
     return judgement
 
 
-def _print(judgement: Judgement, page: Path | None) -> None:
-    say(judgement.summary)
-    for name, value in judgement.lines:
-        say(f'  {name:<34} {value}')
-    if page is not None:
-        say(f'report: {page}')
+def _print(judgement: Judgement, name: str) -> None:
+    say(f'{name}{judgement.summary}')
+    for title, value in judgement.lines:
+        say(f'  {title:<34} {value}')

@@ -21,6 +21,7 @@ from typing import Any
 
 import click
 
+from ..files import whole
 from .common import example, json_option, print_json, say
 
 FORMATS = ('xyz', 'las', 'laz', 'tif')
@@ -114,14 +115,15 @@ def command(
     points = read_points(run / SOUNDINGS)
     points = points.moved(origin)
     result: dict[str, Any] = {'out': str(out), 'soundings': len(points)}
-    if kind == 'tif':
-        grid = grid_of(points, cell)
-        write_geotiff(out, grid, epsg)
-        result |= {'rows': grid.height.shape[0], 'columns': grid.height.shape[1]}
-    elif kind == 'xyz':
-        write_xyz(out, points)
-    else:
-        write_las(out, points, epsg)
+    with whole(out) as unfinished:
+        if kind == 'tif':
+            grid = grid_of(points, cell)
+            write_geotiff(unfinished, grid, epsg)
+            result |= {'rows': grid.height.shape[0], 'columns': grid.height.shape[1]}
+        elif kind == 'xyz':
+            write_xyz(unfinished, points)
+        else:
+            write_las(unfinished, points, epsg)
     if as_json:
         print_json(result)
         return
@@ -165,12 +167,13 @@ def _export_horizons(
     picks = picks_of(RunFolder(run).read_estimates(), speed, positions)
     result: dict[str, Any] = {'out': str(out), 'picks': len(picks), 'left_out': 0}
     result['horizons'] = len(set(picks.horizon.tolist()))
-    if kind == 'csv':
-        write_horizons(out, picks, notes.get('source', run.name), epsg)
-    elif kind == 'geojson':
-        result['left_out'] = write_geojson(out, picks)
-    elif original is not None:
-        result['left_out'] = write_picks(out, picks, original, notes)
+    with whole(out) as unfinished:
+        if kind == 'csv':
+            write_horizons(unfinished, picks, notes.get('source', run.name), epsg)
+        elif kind == 'geojson':
+            result['left_out'] = write_geojson(unfinished, picks)
+        elif original is not None:
+            result['left_out'] = write_picks(unfinished, picks, original, notes)
     if as_json:
         print_json(result)
         return

@@ -71,17 +71,23 @@ def command(
         return
     if out_bag is None:
         raise click.UsageError("Missing argument 'OUT_BAG'")
-    from ..recordings.own_parameters import unusual, write_own_parameters
+    from ..recordings.own_parameters import own_parameters, unusual
     from ..recordings.scenes import write_scene
     from ..simulation.scene import TrueTrack
 
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
+    told = unusual(config.told(), SYSTEMS[system].config_type())
+    sections = {system: told}
+    if fed := config.told_feeder():
+        # A scene writes its images as the only type that needs no further package.
+        sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
     report = write_scene(
         scene,
         out_bag,
         compressed=compress,
+        parameters=sections,
         provenance={
             'source': f'simulated: {system} {name}',
             'seed': str(seed),
@@ -89,12 +95,7 @@ def command(
             **{f'set {key}': value for key, value in sorted(overrides.items())},
         },
     )
-    told = unusual(config.told(), SYSTEMS[system].config_type())
-    sections = {system: told}
-    if fed := config.told_feeder():
-        # A scene writes its images as the only type that needs no further package.
-        sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
-    parameters = write_own_parameters(out_bag, sections)
+    parameters = own_parameters(out_bag)
     targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
     result = {
         'bag': str(out_bag),

@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+import contextlib
 from pathlib import Path
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from attrs import frozen
+from attrs import evolve, field, frozen
 import click
 
 from ..trackers import System, SYSTEMS
@@ -38,13 +40,18 @@ from .common import (
     topic_option,
 )
 
+if TYPE_CHECKING:
+    from ..evaluation.batch import Job, Outcome
+    from ..recordings.reader import BagReader
+
 
 @click.command(
     epilog=example(
         'sonar-imm track dive.bag out',
         'sonar-imm track dive.bag out --set model_set=cv_cv',
         'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
-        'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3',
+        'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
+        'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
     )
 )
 @click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=BAG)
@@ -70,93 +77,73 @@ from .common import (
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help='Processes: for several bags, or for the pings of one where no ping needs another '
+    help='Processes: for several runs, or for the pings of one where no ping needs another '
     '(bathymetry). The estimates do not depend on it.',
 )
+@click.option(
+    '--scheduler',
+    metavar='ADDRESS',
+    help='Do the runs on the cluster of this dask scheduler instead; its workers need the same '
+    'sonar_imm, and reach BAG and OUT_DIR by the same paths.',
+)
+@click.option('--parquet', is_flag=True, help='Write the tables as Parquet too (needs pyarrow).')
 @click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
 @click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
 @json_option
 def command(
     bags: tuple[Path, ...],
     out_dir: Path,
-    system: str | None,
-    params: Path | None,
-    overrides: dict[str, str],
-    topics: dict[str, str],
-    order: str,
-    smooth: bool,
     jobs: int,
-    overwrite: bool,
-    strict: bool,
+    scheduler: str | None,
+    parquet: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Track the recording BAG offline and write the estimates to OUT_DIR.
 
     OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
     same bytes in bag and CSV. Without --params the file `parameters.yaml` in the folder of BAG is
-    used, if there is one. --set changes single parameters. Of several bags each gets a folder of
-    its name in OUT_DIR; one that fails is named and does not stop the others.
+    used, if there is one. --set changes single parameters.
+
+    Several sonars in one BAG that each need a tracker (two topics `snapshot`, say) are all
+    tracked, each into a folder of OUT_DIR named after its namespace; --topic chooses one. Of
+    several bags each gets a folder of its name. Then OUT_DIR also gets `summary.json`; a run that
+    fails is named and does not stop the others, and the same command again makes only what is
+    missing.
     """
-    plan = Plan(
-        system=system,
-        params=params,
-        overrides=overrides,
-        topics=topics,
-        order=order,
-        smooth=smooth,
-        jobs=jobs if len(bags) == 1 else 1,
-        overwrite=overwrite,
-        strict=strict,
-    )
+    if scheduler is not None and jobs > 1:
+        raise click.UsageError('--jobs and --scheduler exclude each other')
+    if parquet:
+        from ..evaluation.tables import require_parquet
+
+        require_parquet()
+    plan = Plan(parquet=parquet, **options)
     if len(bags) == 1:
+        runs = plan.jobs(bags[0], out_dir)
         say_parameters(bags[0], plan, quiet=as_json)
-        run = plan.track(bags[0], out_dir, quiet=as_json)
-        print_json(run) if as_json else _print(run, out_dir)
-        return
-    runs, failures = {}, []
-    for bag, folder, outcome in _of_each(plan, bags, out_dir, jobs):
-        if isinstance(outcome, str):
-            failures.append(outcome)
-            click.echo(f'{bag}: {outcome}', err=True)
-            continue
-        runs[str(bag)] = outcome
-        if not as_json:
-            say_parameters(bag, plan)
-            _print(outcome, folder)
-    if as_json:
-        print_json(runs)
-    if failures:
-        raise click.exceptions.Exit(1)
+        if len(runs) == 1 and scheduler is None:
+            run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
+            print_json(run) if as_json else _print(run, out_dir)
+            return
+        failures = []
+    else:
+        runs, failures = _of_all(plan, bags, out_dir)
+    _track_all(runs, failures, out_dir, jobs, scheduler, as_json)
 
 
 @frozen(kw_only=True)
 class Plan:
     """What the options of the command ask for, for any bag."""
 
-    system: str | None
-    params: Path | None
-    overrides: dict[str, str]
-    topics: dict[str, str]
-    order: str
-    smooth: bool
-    jobs: int
-    overwrite: bool
-    strict: bool
-
-    @classmethod
-    def of_defaults(cls) -> Plan:
-        """What the command does without options."""
-        return cls(
-            system=None,
-            params=None,
-            overrides={},
-            topics={},
-            order='recorded',
-            smooth=False,
-            jobs=1,
-            overwrite=False,
-            strict=False,
-        )
+    system: str | None = None
+    params: Path | None = None
+    overrides: dict[str, str] = field(factory=dict)
+    topics: dict[str, str] = field(factory=dict)
+    order: str = 'recorded'
+    smooth: bool = False
+    overwrite: bool = False
+    strict: bool = False
+    parquet: bool = False
 
     def parameters_of(self, bag: Path) -> Path | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
@@ -164,32 +151,43 @@ class Plan:
 
         return self.params if self.params is not None else own_parameters(bag)
 
-    def track(self, bag: Path, out_dir: Path, *, quiet: bool) -> dict[str, Any]:
-        """Track one bag; gives the content of run.json. Raises `BagError` and `ConfigError`."""
+    def jobs(self, bag: Path, folder: Path) -> list[Job]:
+        """The runs that one bag takes: one into `folder`, or, of several instruments, one each
+        into a folder below it. Raises `BagError` and `ConfigError`."""
+        from ..evaluation.batch import Job
         from ..evaluation.tracking import InputOptions
+        from ..recordings.reader import BagReader
+        from ..recordings.topics import instruments
 
-        chosen = choose_system(bag, self.system, self.topics)
+        wanted = inputs_by_topic(self.topics)
+        with BagReader(bag, strict=self.strict) as reader:
+            system = choose_system(reader, self.system, wanted)
+            found = instruments(reader, system.name, wanted)
         params = self.parameters_of(bag)
-        config, node = load_config(chosen, params, self.overrides)
-        options = InputOptions(
-            topics=inputs_by_topic(self.topics),
-            order=self.order,
-            frame_id=node.frame_id,
-            world_frame=node.world_frame_convention,
-            smooth=self.smooth,
-            jobs=self.jobs,
-            detector=load_detector(chosen, params, self.overrides),
-        )
-        return track_recording(
-            bag,
-            out_dir,
-            chosen,
-            config,
-            options,
-            overwrite=self.overwrite,
-            strict=self.strict,
-            quiet=quiet,
-        )
+        config, node = load_config(system, params, self.overrides)
+        detector = load_detector(system, params, self.overrides)
+        several = len(found) > 1
+        return [
+            Job(
+                bag=bag,
+                folder=folder / name,
+                instrument=name,
+                system=system.name,
+                config=config,
+                options=InputOptions(
+                    topics={t: entry.name for t, entry in inputs.items()} if several else wanted,
+                    order=self.order,
+                    frame_id=node.frame_id,
+                    world_frame=node.world_frame_convention,
+                    smooth=self.smooth,
+                    detector=detector,
+                ),
+                overwrite=self.overwrite,
+                strict=self.strict,
+                parquet=self.parquet,
+            )
+            for name, inputs in found.items()
+        ]
 
 
 def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
@@ -198,38 +196,61 @@ def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
         say(f'using the parameters of the recording, {own}', quiet=quiet)
 
 
-Outcome = dict[str, Any] | str
-"""The content of run.json, or the sentence why there is none."""
-
-
-def _of_each(
-    plan: Plan, bags: Sequence[Path], out_dir: Path, jobs: int
-) -> Iterator[tuple[Path, Path, Outcome]]:
-    """Every bag with its folder and outcome, in the order of `bags`."""
-    from ..evaluation.jobs import processes
+def _of_all(plan: Plan, bags: Sequence[Path], out_dir: Path) -> tuple[list[Job], list[Outcome]]:
+    """The runs that `bags` take, in their order, and what cannot be a run."""
+    from ..evaluation.batch import Outcome
+    from ..parameters import ConfigError
+    from ..recordings.reader import BagError
 
     folders = [out_dir / bag.name.removesuffix('.bag').removesuffix('.mcap') for bag in bags]
     for folder in folders:
         if folders.count(folder) > 1:
             raise click.UsageError(f'two bags would be tracked into {folder}')
-    if jobs == 1:
-        for bag, folder in zip(bags, folders):
-            yield bag, folder, _outcome(plan, bag, folder)
-        return
-    with processes(min(jobs, len(bags))) as pool:
-        coming = [pool.submit(_outcome, plan, bag, folder) for bag, folder in zip(bags, folders)]
-        for bag, folder, one in zip(bags, folders, coming):
-            yield bag, folder, one.result()
+    runs: list[Job] = []
+    failures = []
+    for bag, folder in zip(bags, folders):
+        try:
+            runs += plan.jobs(bag, folder)
+        except (BagError, ConfigError) as error:
+            failures.append(Outcome(bag=bag, folder=folder, failure=str(error)))
+    return runs, failures
 
 
-def _outcome(plan: Plan, bag: Path, folder: Path) -> Outcome:
-    from ..parameters import ConfigError
+def _track_all(
+    runs: Sequence[Job],
+    failures: Sequence[Outcome],
+    out_dir: Path,
+    jobs: int,
+    scheduler: str | None,
+    as_json: bool,
+) -> None:
+    """Do all runs, write and print their summary; ends with 1 when one failed."""
+    from ..evaluation.batch import run_jobs, summary_of, write_summary
+    from ..evaluation.run_folder import RUN
     from ..recordings.reader import BagError
 
-    try:
-        return plan.track(bag, folder, quiet=True)
-    except (BagError, ConfigError) as error:
-        return str(error)
+    if (out_dir / RUN).exists() and runs and runs[0].folder != out_dir:
+        raise BagError(f'{out_dir} holds a run itself; choose another folder for several')
+    outcomes = list(failures)
+    for outcome in failures:
+        click.echo(f'{outcome.bag}: {outcome.failure}', err=True)
+    todo = [evolve(job, resume=True) for job in runs]
+    if scheduler is not None:
+        todo = [evolve(job, bag=job.bag.resolve(), folder=job.folder.resolve()) for job in todo]
+    with progress('runs', len(runs), quiet=as_json) as advance:
+        for outcome in run_jobs(
+            todo, count=jobs, address=scheduler, note=lambda text: click.echo(text, err=True)
+        ):
+            if outcome.failure:
+                name = ' '.join(filter(None, (str(outcome.bag), outcome.instrument)))
+                click.echo(f'{name}: {outcome.failure}', err=True)
+            outcomes.append(outcome)
+            advance(1)
+    content = summary_of(out_dir, sorted(outcomes, key=lambda one: (str(one.bag), one.instrument)))
+    write_summary(out_dir, content)
+    print_json(content) if as_json else _print_summary(content, out_dir)
+    if any(outcome.failure for outcome in outcomes):
+        raise click.exceptions.Exit(1)
 
 
 def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
@@ -237,49 +258,33 @@ def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
     return {topic: name for name, topic in topics.items()} or None
 
 
-def choose_system(bag: Path, name: str | None, topics: dict[str, str]) -> System:
-    """The tracker called `name`, or else the first one that finds its inputs in `bag`."""
-    from ..recordings.measurements import fitting_topics
-    from ..recordings.reader import BagError, BagReader
+def choose_system(
+    reader: BagReader, name: str | None, topics: Mapping[str, str] | None = None
+) -> System:
+    """The tracker called `name`, or else the one that fits an open recording best. Raises
+    `BagError` when none does."""
+    from ..recordings.topics import fitting_systems, instruments
 
     if name is not None:
         return SYSTEMS[name]
-    failures = []
-    with BagReader(bag) as reader:
-        for system in SYSTEMS.values():
-            try:
-                fitting_topics(reader, system.name, inputs_by_topic(topics))
-                return system
-            except BagError as error:
-                failures.append(error)
-    raise failures[0]
+    found = fitting_systems(reader, topics)
+    if not found:
+        instruments(reader, next(iter(SYSTEMS)), topics)  # says what is there
+    return SYSTEMS[found[0]]
 
 
-def track_recording(
-    bag: Path,
-    out_dir: Path,
-    system: System,
-    config: Any,
-    options: Any,
-    *,
-    overwrite: bool = False,
-    strict: bool = False,
-    quiet: bool = False,
-) -> dict[str, Any]:
-    """Track `bag` into `out_dir`; gives the content of run.json. Raises `BagError`."""
-    from ..evaluation.run_folder import RunFolder
-    from ..evaluation.tracking import OfflineRun, write_run
-    from ..recordings.reader import BagReader
+def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
+    """Do one run with a progress bar; gives the content of run.json. Raises `BagError`."""
+    from ..evaluation.batch import track
 
-    with BagReader(bag, strict=strict) as reader:
-        offline = OfflineRun(reader, system, config, options)
-        folder = RunFolder(out_dir)
-        folder.prepare(overwrite=overwrite)
-        with progress('tracking', offline.total, quiet=quiet) as advance:
-            return write_run(folder, offline, advance)
+    with contextlib.ExitStack() as stack:
+        outcome = track(
+            job, lambda total: stack.enter_context(progress('tracking', total, quiet=quiet))
+        )
+    return dict(outcome.run or {})
 
 
-def _print(run: dict[str, Any], out_dir: Path) -> None:
+def _print(run: Mapping[str, Any], out_dir: Path) -> None:
     say(
         f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
         f'written to {out_dir}'
@@ -293,3 +298,24 @@ def _print(run: dict[str, Any], out_dir: Path) -> None:
         say(f'  problem: {problem}')
     if run['rows'] == 0:
         say('  no track was made; sonar-imm info may show why')
+
+
+def _print_summary(content: Mapping[str, Any], out_dir: Path) -> None:
+    """One line for each run, then what deserves a look."""
+    runs = content['runs']
+    width = max((len(run['folder']) for run in runs), default=0)
+    width = max(width, len('run'))
+    heads = ('messages', 'refused', 'estimates', 'rows')
+    say(f'{"run":<{width}} {"state":<8} {"system":<11}' + ''.join(f'{n:>10}' for n in heads))
+    for run in runs:
+        numbers = ''.join(f'{run[name]:>10}' for name in heads)
+        say(f'{run["folder"]:<{width}} {run["state"]:<8} {run["system"]:<11}{numbers}')
+    for run in runs:
+        for kind in ('warning', 'problem'):
+            for sentence in run[f'{kind}s']:
+                say(f'{run["folder"]}: {kind}: {sentence}')
+        if run['state'] != 'failed' and run['rows'] == 0:
+            say(f'{run["folder"]}: no track was made; sonar-imm info may show why')
+    counts = Counter(run['state'] for run in runs)
+    told = ', '.join(f'{counts[state]} {state}' for state in ('tracked', 'kept', 'failed'))
+    say(f'{len(runs)} runs in {out_dir}: {told}')

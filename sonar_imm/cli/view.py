@@ -122,14 +122,12 @@ def _show_recorded(
     layout_file: Path | None,
     playing: dict[str, Any],
 ) -> None:
-    from ..viewing.material import Material
+    from ..viewing.material import opened
     from ..viewing.playback import Playback
     from ..viewing.server import ViewServer
-    from ..viewing.sources import paths_of
 
-    paths, problems = paths_of(source)
-    with Material(paths, topics) as material:
-        for sentence in problems + material.problems:
+    with opened(source, topics) as (material, problems):
+        for sentence in problems:
             say(f'  problem: {sentence}')
         playback = Playback(
             material.first_ns, material.last_ns, rate=playing['rate'], loop=playing['loop']
@@ -199,20 +197,26 @@ def _announce(server: Any, topics: Sequence[str], layout_file: Path | None) -> N
 def _open_report(source: Path) -> None:
     import webbrowser
 
-    from ..evaluation.run_folder import REPORT, RUN
+    from ..evaluation.batch import run_folders
+    from ..evaluation.run_folder import REPORT, RUN, SUMMARY
     from .evaluate import evaluate_run
-    from .track import Plan
+    from .track import Plan, track_one
 
     run = source
-    if not (source / RUN).is_file():
+    if (source / RUN).is_file() or (source / SUMMARY).is_file():
+        folders = run_folders(source)
+    else:
         run = Path(tempfile.mkdtemp(prefix='sonar_imm_')) / 'run'
         say(f'tracking {source} into {run}')
-        Plan.of_defaults().track(source, run, quiet=False)
+        jobs = Plan().jobs(source, run)
+        for job in jobs:
+            track_one(job)
+        folders = [job.folder for job in jobs]
     report = run / REPORT
     if not report.is_file():
         from ..evaluation.report import write_report
 
-        write_report(report, [evaluate_run(run).part([])])
+        write_report(report, [evaluate_run(folder).part([]) for folder in folders])
     say(f'report: {report.resolve()}')
     with contextlib.suppress(webbrowser.Error):
         webbrowser.open(report.resolve().as_uri())

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..files import whole
 from .judging import Check
 from .numbers import flatten
 from .page import Card, folded, mapping_table, Part, render, Section, table
@@ -32,7 +33,8 @@ from .page import Card, folded, mapping_table, Part, render, Section, table
 
 def write_report(path: Path, parts: Sequence[Part]) -> None:
     """Write one report of one or several runs, of one or several systems, to `path`."""
-    path.write_text(report_html(parts), encoding='utf-8')
+    with whole(path) as unfinished:
+        unfinished.write_text(report_html(parts), encoding='utf-8')
 
 
 def report_html(parts: Sequence[Part]) -> str:

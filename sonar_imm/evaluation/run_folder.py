@@ -18,8 +18,11 @@ estimate/      the estimates as a bag, topic ``/<system>/estimate``
 soundings.csv  what of them goes into a chart, when a sonar with navigation was tracked; in the bag
                as the topic ``/<system>/soundings``
 estimate.csv   the same rows as text: stamp_ns, then the columns of the contract
-run.json       input, parameters, versions; written last, so a folder without it is unfinished
+run.json       input, parameters, versions; a folder without it is unfinished
 metrics.json   and report.html, once evaluated
+
+With ``--parquet`` there are estimate.parquet and soundings.parquet beside the CSV. A run is
+written elsewhere and moved to its folder when it is finished, see `sonar_imm.files`.
 
 The bag and the CSV hold nothing that depends on the time of the run: the same command writes the
 same bytes. Times and versions are in run.json.
@@ -29,7 +32,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 import contextlib
-import csv
 import hashlib
 from importlib.metadata import version
 import json
@@ -48,13 +50,15 @@ from msg_adapters.soundings import write_soundings
 
 from .. import __version__
 from ..estimates import Estimate
+from ..files import beside, whole
 from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
-from ..recordings.writer import BagWriter, naming, ros_message
+from ..recordings.writer import BagWriter, ros_message
 from ..soundings import soundings_of
 from ..trackers import SYSTEMS
+from .tables import CsvTable, ParquetTable, Table
 
 BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
     'estimate',
@@ -64,6 +68,12 @@ BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
     'metrics.json',
     'report.html',
 )
+PARQUET = {CSV: 'estimate.parquet', SOUNDINGS: 'soundings.parquet'}
+"""The same tables as Parquet."""
+SUMMARY = 'summary.json'
+"""In a folder of several runs, which are below it: where they are, see `batch`."""
+_RUN_FILES = (RUN, METRICS, REPORT, BAG, CSV, SOUNDINGS, *PARQUET.values())
+"""All that belongs to a run; without the first one there is no finished run."""
 
 
 _KINDS = {
@@ -82,58 +92,93 @@ class RunFolder:
     def __init__(self, path: Path):
         self.path = path
 
-    def prepare(self, *, overwrite: bool = False) -> None:
-        """Make the folder, without an earlier run in it.
+    @contextlib.contextmanager
+    def fresh(self, *, overwrite: bool = False) -> Iterator[RunFolder]:
+        """Yields a folder elsewhere to write a run into; at the end of the block the run is moved
+        here, as a whole where there is no folder yet. An exception leaves everything as it was.
 
-        Raises `BagError` when one is there and may not be overwritten. Other files are left alone.
+        Raises `BagError` when a run is here and may not be overwritten. Other files are left
+        alone.
         """
         if self.path.exists() and not self.path.is_dir():
             raise BagError(f'{self.path} is a file; a folder is needed')
-        old = [self.path / name for name in (BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT)]
-        old = [path for path in old if path.exists()]
+        old = [self.path / name for name in _RUN_FILES if (self.path / name).exists()]
         if old and not overwrite:
             raise BagError(
                 f'{self.path} holds a run already ({old[0].name}); choose another '
                 'folder or say --overwrite'
             )
-        for path in old:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        self.path.mkdir(parents=True, exist_ok=True)
+        if not self.path.exists():
+            with whole(self.path) as place:
+                place.mkdir()
+                yield RunFolder(place)
+            return
+        with beside(self.path / 'run') as place:
+            yield RunFolder(place)
+            for path in old:  # run.json is the first of them
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            made = [name for name in _RUN_FILES if (place / name).exists()]
+            for name in reversed(made):  # and the last one here
+                (place / name).rename(self.path / name)
 
-    def write_estimates(self, estimates: Iterable[Estimate], system: str) -> dict[str, int]:
+    def write_estimates(
+        self,
+        estimates: Iterable[Estimate],
+        system: str,
+        *,
+        parquet: Mapping[str, str] | None = None,
+    ) -> dict[str, int]:
         """Write bag and CSV while the estimates come; gives the number of estimates and rows, and
-        of soundings where there are any."""
+        of soundings where there are any. parquet: what the metadata of Parquet files say, which
+        are written beside the CSV then."""
         written = {'estimates': 0, 'rows': 0}
         with contextlib.ExitStack() as stack:
             bag = stack.enter_context(BagWriter(self.path / BAG))
-            table = stack.enter_context(CsvTable(self.path / CSV))
-            chart: CsvTable | None = None
+            tables = self._tables(stack, CSV, parquet)
+            chart: list[Table] = []
             for estimate in estimates:
                 bag.write(
                     f'/{system}/estimate', write_estimate(estimate, ros_message), estimate.stamp_ns
                 )
-                table.write(estimate.stamp_ns, estimate.columns())
+                columns = estimate.columns()
+                for table in tables:
+                    table.write(estimate.stamp_ns, columns)
                 written['estimates'] += 1
                 written['rows'] += len(estimate)
                 if (soundings := soundings_of(estimate)) is None:
                     continue
-                if chart is None:
-                    chart = stack.enter_context(CsvTable(self.path / SOUNDINGS))
+                chart = chart or self._tables(stack, SOUNDINGS, parquet)
                 message = write_soundings(soundings, ros_message)
                 bag.write(f'/{system}/soundings', message, estimate.stamp_ns)
-                chart.write(soundings.stamp_ns, soundings.columns)
+                for table in chart:
+                    table.write(soundings.stamp_ns, soundings.columns)
                 written['soundings'] = written.get('soundings', 0) + len(soundings)
         return written
+
+    def _tables(
+        self, stack: contextlib.ExitStack, name: str, parquet: Mapping[str, str] | None
+    ) -> list[Table]:
+        """The table `name` as CSV and, where wanted, as Parquet."""
+        tables: list[Table] = [CsvTable(self.path / name)]
+        if parquet is not None:
+            tables.append(ParquetTable(self.path / PARQUET[name], parquet))
+        return [stack.enter_context(table) for table in tables]
 
     def write_json(self, name: str, content: Any) -> Path:
         """Write `content` as JSON; NaN and infinity, which JSON lacks, become null."""
         path = self.path / name
-        path.write_text(json.dumps(finite(content), indent=2) + '\n', encoding='utf-8')
+        with whole(path) as unfinished:
+            text = json.dumps(finite(content), indent=2) + '\n'
+            unfinished.write_text(text, encoding='utf-8')
         return path
 
     def read_run(self) -> dict[str, Any]:
         """The content of run.json. Raises `BagError` when the folder holds no finished run."""
         path = self.path / RUN
+        if not path.is_file() and (self.path / SUMMARY).is_file():
+            raise BagError(
+                f'{self.path} holds several runs, which {SUMMARY} lists; name the folder of one'
+            )
         if not path.is_file():
             raise BagError(
                 f'{self.path} holds no finished run: {RUN} is missing; '
@@ -167,34 +212,6 @@ def _check_run(run: Any) -> None:
     for reason, entry in run.get('refused', {}).items():
         if not (isinstance(entry, dict) and {'count', 'example'} <= entry.keys()):
             raise ValueError(f"'refused' has no count and example for '{reason}'")
-
-
-class CsvTable:
-    """A table as CSV, one line per row; floats as the shortest text that reads back exactly."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._file = path.open('w', encoding='utf-8', newline='')
-        self._writer = csv.writer(self._file, lineterminator='\n')
-        self._names: list[str] | None = None
-
-    def __enter__(self) -> CsvTable:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with naming(self._path):
-            self._file.close()
-
-    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
-        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
-        if self._names is None:
-            self._names = list(columns)
-            self._writer.writerow(['stamp_ns', *columns])
-        elif self._names != list(columns):
-            raise ValueError('the columns change from one estimate to another')
-        with naming(self._path):
-            for row in zip(*(column.tolist() for column in columns.values())):
-                self._writer.writerow([stamp_ns, *row])
 
 
 def read_truth(

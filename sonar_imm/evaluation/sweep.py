@@ -23,7 +23,6 @@ A run that fails is an `Outcome` too, with a sentence instead of metrics.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import csv
 from importlib import import_module
@@ -37,13 +36,13 @@ from attrs import field, frozen
 import numpy as np
 
 from .. import __version__
-from ..measurements import Rejection
+from ..files import whole
 from ..parameters import Config, ConfigError
 from ..recordings.reader import BagReader
 from ..recordings.scenes import write_scene
 from ..recordings.sources import BagError
 from ..trackers import SYSTEMS
-from .jobs import ignore_interrupt
+from .jobs import as_they_end, cluster, ignore_interrupt, sentence_of
 from .judging import judge
 from .numbers import flatten
 from .run_folder import RunFolder
@@ -51,8 +50,6 @@ from .tracking import InputOptions, OfflineRun, write_run
 
 CSV, JSON = 'sweep.csv', 'sweep.json'
 PREFIX = 'sonar_imm_sweep_'
-CONNECT_SECONDS = 10.0
-"""How long a scheduler may take to answer."""
 ONE_THREAD = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
 """What a worker process has as 1: the runs share the cores, not the algebra inside one run. The
 kernels of numba are serial."""
@@ -98,7 +95,7 @@ def run_seed(sweep: Sweep, seed: int, within: str | None = None) -> Outcome:
             return _run(sweep, seed, Path(place))
         except Exception as error:
             # The place differs from run to run; what is told has to be the same each time.
-            return Outcome(seed, failure=_sentence(error).replace(f'{place}{os.sep}', ''))
+            return Outcome(seed, failure=sentence_of(error).replace(f'{place}{os.sep}', ''))
 
 
 def _run(sweep: Sweep, seed: int, place: Path) -> Outcome:
@@ -109,16 +106,9 @@ def _run(sweep: Sweep, seed: int, place: Path) -> Outcome:
     write_scene(scenes.simulate(sweep.scene, seed), bag, provenance={'seed': str(seed)})
     with BagReader(bag) as reader:
         offline = OfflineRun(reader, SYSTEMS[sweep.system], sweep.config, sweep.options)
-        folder.prepare()
-        run = write_run(folder, offline)
+        with folder.fresh() as unfinished:
+            run = write_run(unfinished, offline)
     return Outcome(seed, finite_numbers(judge(folder).metrics), versions=run['versions'])
-
-
-def _sentence(error: BaseException) -> str:
-    """One line; what is not a mistake of the user keeps the name of its class."""
-    told = ' '.join(str(error).split())
-    expected = isinstance(error, (ConfigError, Rejection, BagError, OSError))
-    return told if expected and told else f'{type(error).__name__}: {told}'
 
 
 def finite_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
@@ -177,48 +167,16 @@ def run_on_cluster(
 
     Raises `ConfigError` when no scheduler answers there, ModuleNotFoundError without dask.
     """
-    from distributed import Client
-
-    try:
-        identity = asyncio.run(asyncio.wait_for(_identity(address), CONNECT_SECONDS))
-    except asyncio.TimeoutError:
-        raise ConfigError(
-            f'no dask scheduler answers at {address} within {CONNECT_SECONDS:g} s'
-        ) from None
-    except Exception as error:  # whatever a program says that is no scheduler
-        raise ConfigError(f'no dask scheduler at {address}: {_sentence(error)}') from None
-    if not identity.get('workers'):
-        note(f'the scheduler at {address} has no workers yet; the runs wait for one')
-    with Client(address, timeout=CONNECT_SECONDS) as client:
+    with cluster(address, note) as client:
         yield from _distributed(client, sweep, seeds)
-
-
-async def _identity(address: str) -> dict[str, Any]:
-    """What a scheduler says of itself. `Client` would wait for ever on a port that is silent."""
-    from distributed import rpc
-    from distributed.security import Security
-
-    async with rpc(address, connection_args=Security().get_connection_args('client')) as remote:
-        return await remote.identity()
 
 
 def _distributed(
     client: Any, sweep: Sweep, seeds: Sequence[int], within: str | None = None
 ) -> Iterator[Outcome]:
-    from distributed import as_completed
-
-    futures = {client.submit(run_seed, sweep, seed, within, pure=False): seed for seed in seeds}
-    for future in as_completed(futures):
-        yield _outcome(future, futures[future])
-        future.release()
-
-
-def _outcome(future: Any, seed: int) -> Outcome:
-    """What a finished future brought; a worker may have died, or the scheduler be gone."""
-    if future.cancelled():
-        return Outcome(seed, failure='the connection to the scheduler was lost')
-    error = future.exception()
-    return future.result() if error is None else Outcome(seed, failure=_sentence(error))
+    calls = [(sweep, seed, within) for seed in seeds]
+    for number, outcome, failure in as_they_end(client, run_seed, calls):
+        yield outcome or Outcome(seeds[number], failure=failure)
 
 
 # -- what is told of them ------------------------------------------------------------------------
@@ -288,7 +246,7 @@ def prepare(out: Path, *, overwrite: bool = False) -> None:
 def write(out: Path, content: Mapping[str, Any], outcomes: Iterable[Outcome]) -> None:
     """Write sweep.json and sweep.csv: one row per run by seed, empty cells for missing metrics."""
     names = list(content['summary'])
-    with (out / CSV).open('w', encoding='utf-8', newline='') as file:
+    with whole(out / CSV) as path, path.open('w', encoding='utf-8', newline='') as file:
         table = csv.writer(file, lineterminator='\n')
         table.writerow(['seed', 'failure', *names])
         for one in sorted(outcomes, key=lambda outcome: outcome.seed):

@@ -25,21 +25,24 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
+import json
 import time
 from typing import Any
 
 from attrs import asdict, define, field, frozen
 import numpy as np
 
+from .. import __version__
 from ..estimates import Estimate
 from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..parameters import Config
-from ..recordings.measurements import fitting_topics, measurements_of
+from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagReader
+from ..recordings.topics import fitting_topics
 from ..trackers import System
 from . import SECOND
 from .jobs import processes
-from .run_folder import fingerprint, RUN, run_record, RunFolder
+from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
 
 TO_THE_END = 2**62
 AHEAD = 4
@@ -227,12 +230,28 @@ class OfflineRun:
         )
         entry.count += 1
 
+    def recipe(self) -> dict[str, Any]:
+        """What decides about the estimates, and is known before: as run.json has it."""
+        options = self.options
+        return {
+            'system': self.system.name,
+            **fingerprint(self.bag.path),
+            'topics': self.topics,
+            'order': options.order,
+            'smoothed': options.smooth,
+            'world_frame': options.world_frame,
+            'frame_id': options.frame_id,
+            'parameters': self.tracker.config.as_dict(),
+            **({'detector': dict(options.detector)} if options.detector else {}),
+        }
+
     def outcomes(self) -> dict[str, int]:
         """What happened to the messages: counts of the tracker, covariances it had to repair,
         pings in which most obstacles moved alike, and messages refused before."""
         counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
         health = self.tracker.health()
-        for name in ('covariance_repairs', 'pings_moving_alike', 'waiting_for_vessel'):
+        kept = ('covariance_repairs', 'not_started', 'pings_moving_alike', 'waiting_for_vessel')
+        for name in kept:
             if count := health.get(name):
                 counts[name] = int(count)
         if self._repeats.rows:
@@ -272,20 +291,29 @@ def _timed(work: Callable[[Any], Any], task: Any) -> tuple[Any, float]:
 
 
 def write_run(
-    folder: RunFolder, offline: OfflineRun, advance: Callable[[int], None] = lambda count: None
+    folder: RunFolder,
+    offline: OfflineRun,
+    advance: Callable[[int], None] = lambda count: None,
+    *,
+    parquet: bool = False,
 ) -> dict[str, Any]:
-    """Track into a prepared folder; gives the content of run.json, which is written last."""
+    """Track into a fresh folder; gives the content of run.json, which is written last. parquet:
+    write the tables as Parquet too."""
     begin = time.perf_counter()
-    written = folder.write_estimates(offline.estimates(advance), offline.system.name)
-    path, options = offline.bag.path, offline.options
+    system, path = offline.system.name, offline.bag.path
+    recipe = offline.recipe()
+    notes = {
+        'system': system,
+        'sonar_imm': __version__,
+        'topics': json.dumps(offline.topics),
+        'parameters': json.dumps(finite(recipe['parameters'])),
+    }
+    written = folder.write_estimates(
+        offline.estimates(advance), system, parquet=notes if parquet else None
+    )
     run = run_record(
-        system=offline.system.name,
         bag=str(path.resolve()),
-        **fingerprint(path),
-        topics=offline.topics,
-        order=options.order,
-        smoothed=options.smooth,
-        world_frame=options.world_frame,
+        **recipe,
         messages=offline.messages,
         **written,
         counts=offline.outcomes(),
@@ -293,8 +321,6 @@ def write_run(
         warnings=offline.warnings(),
         problems=list(offline.bag.problems),
         **offline.origin(),
-        parameters=offline.tracker.config.as_dict(),
-        **({'detector': dict(options.detector)} if options.detector else {}),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )
     folder.write_json(RUN, run)

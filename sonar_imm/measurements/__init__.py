@@ -38,6 +38,7 @@ from .obstacle import (
 )
 from .positions import GeodeticFix, RelativeFix, VesselFix, VesselHeading, VesselPose
 from .repeats import RepeatGuard
+from .starts import Start
 
 __all__ = [
     'Altitude',
@@ -68,6 +69,7 @@ __all__ = [
     'scan_of',
     'Snapshot',
     'SonarImage',
+    'Start',
     'Trace',
     'usable_fixes',
     'VesselFix',
@@ -84,6 +86,7 @@ Measurement = (
     | VesselPose
     | VesselFix
     | VesselHeading
+    | Start
     | Snapshot
     | Trace
     | CrossSpectra

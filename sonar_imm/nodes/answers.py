@@ -34,6 +34,7 @@ from .tables import TablePublisher
 class Answers:
     """Publishes one row of counts, always of the same names, after every message.
 
+    Counts are float64, exact to 2^53: a node that runs for years does not wrap.
     It is latched, so it is published whether or not somebody listens: who comes later has to
     find how things stand. The message is made once and costs a few microseconds.
     """
@@ -46,8 +47,8 @@ class Answers:
         """Publish `counts` since the start of the node; `stamp` is that of the message that is
         answered, None for the first word of a node."""
         if self._row is None:
-            columns = {name: np.zeros(1, np.uint32) for name in counts}
+            columns = {name: np.zeros(1) for name in counts}
             self._row = encode_table(columns, stamp_ns=0, frame_id='', make=make)
         self._row.header.stamp = Time() if stamp is None else stamp
-        self._row.data = array.array('B', struct.pack(f'<{len(counts)}I', *counts.values()))
+        self._row.data = array.array('B', struct.pack(f'<{len(counts)}d', *counts.values()))
         self._publisher.publish(self._row)

@@ -60,7 +60,9 @@ from ..trackers import SYSTEMS
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Meter, Reporter
+from .drawing import Drawing
 from .executor import MessagesFirst
+from .keeping import StateKeeper
 from .messages import make, message_class
 from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
@@ -72,7 +74,7 @@ _PATIENCE = 3.0
 
 
 class TrackerNode(Node):
-    """One tracker as a ROS 2 node. A system's own node adds its displays by `show`."""
+    """One tracker as a ROS 2 node. A system's own node may publish more by `show`."""
 
     def __init__(self, system: str, **options: Any):
         """Declare, compile, then subscribe: the first message meets a warm tracker.
@@ -80,15 +82,19 @@ class TrackerNode(Node):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(system, **options)
+        self._system = system
         self._topics = inputs_of(system)
         config_type = SYSTEMS[system].config_type()
         self._node_config_type = node_config_type(SYSTEMS[system])
         self._settings = NodeParameters(
             self, (config_type, self._node_config_type), type_specs(system)
         )
-        self.tracker = SYSTEMS[system].build(self._settings[config_type])
+        config = self._settings[config_type]
         self._guard = FrameGuard(self._node_config.frame_id)
-        self._repeats = RepeatGuard(getattr(self.tracker.config, 'repeat_time', 0.0))
+        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
+        guards = (self._guard, self._repeats)
+        self._keeper = StateKeeper(self, system, self._node_config, guards)
+        self.tracker = self._keeper.begin(config)
         self._warm()
 
         self._enabled = True
@@ -119,27 +125,31 @@ class TrackerNode(Node):
             self._report,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
+        self._keeper.save_every_now_and_then(lambda: self.tracker)
         self._settings.on_change(lambda: self.tracker.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
         self.get_logger().info(f'ready, hears {", ".join(hears.values())}')
 
+    def destroy_node(self) -> None:
+        """Save the state, then end."""
+        self._keeper.save(self.tracker, wait=True)
+        super().destroy_node()
+
     def advertise(self, type_name: str, topic: str) -> Any:
-        """Offer an output; to be used by `advertise_displays`."""
+        """Offer an output; to be used by `advertise_more`."""
         return self._endpoints.advertise(message_class(type_name), topic, output_qos())
 
-    def advertise_displays(self) -> None:
-        """Offer the topics that `show` publishes."""
+    def advertise_more(self) -> None:
+        """Offer what a system's own node publishes besides the displays."""
 
     def show(self, newest: Estimate) -> None:
         """Publish the newest state for displays."""
+        self._drawing.show(newest)
 
     def show_all(self, estimates: list[Estimate]) -> None:
         """Publish what each of the estimates of one message is to be shown as."""
         self.show(estimates[-1])
-
-    def forget(self) -> None:
-        """Tell displays that all tracks are forgotten."""
 
     @property
     def _node_config(self) -> NodeConfig:
@@ -169,7 +179,8 @@ class TrackerNode(Node):
         self._diagnostics = self._endpoints.advertise(
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
         )
-        self.advertise_displays()
+        self._drawing = Drawing(self._system, self.advertise)
+        self.advertise_more()
 
     def _listen(self, topic: InputTopic, name: str) -> str:
         """Subscribe to one input on the topic `name`, and give the resolved name of that."""
@@ -183,7 +194,7 @@ class TrackerNode(Node):
         )
         subscription = self._endpoints.subscribe(
             message_class(type_name),
-            name,
+            topic.prefix + name,
             functools.partial(self._receive, evolve(topic, name=name), reader),
             input_qos(self._node_config.queue_depth),
         )
@@ -240,6 +251,8 @@ class TrackerNode(Node):
             self._doubt(topic, 'repeated_rows')
         if doubt is not None:
             self._doubt(topic, doubt)
+        if not self._keeper.goes_on(measurement.stamp_ns):
+            self._start_afresh()
         self._publish(self.tracker.process(measurement))
 
     def _publish(self, estimates: list[Estimate]) -> None:
@@ -296,7 +309,7 @@ class TrackerNode(Node):
         self.tracker.reset()
         self._guard.reset()
         self._repeats.reset()
-        self.forget()
+        self._drawing.forget()
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         self._start_afresh()
@@ -331,7 +344,10 @@ class TrackerNode(Node):
                 stale_after=self._node_config.stale_after,
                 counts=counts,
                 health=self.tracker.health(),
-                warnings=getattr(self.tracker, 'warnings', list)(),
+                warnings=[
+                    *getattr(self.tracker, 'warnings', list)(),
+                    *filter(None, [self._keeper.trouble]),
+                ],
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
             )

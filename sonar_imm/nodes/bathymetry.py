@@ -46,7 +46,6 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
-from msg_adapters.estimates import write_model_shares
 from msg_adapters.soundings import write_soundings
 
 from ..estimates import Estimate
@@ -61,14 +60,12 @@ class BathymetryNode(TrackerNode):
     def __init__(self, **options: Any):
         super().__init__('bathymetry', **options)
 
-    def advertise_displays(self) -> None:
+    def advertise_more(self) -> None:
         self._soundings = self.advertise('sensor_msgs/msg/PointCloud2', '~/soundings')
-        self._shares = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
 
     def show_all(self, estimates: list[Estimate]) -> None:
         for estimate in estimates:
-            if self._shares.get_subscription_count():
-                self._shares.publish(write_model_shares(estimate, make))
+            self.show(estimate)
             soundings = soundings_of(estimate)
             if soundings is not None and self._soundings.get_subscription_count():
                 self._soundings.publish(write_soundings(soundings, make))

@@ -31,6 +31,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
+from .unused import Unused
+
 _WINDOW = 1000
 _PATIENCE = 5.0
 """Mean intervals after which an input that is not needed is said to be gone."""
@@ -92,6 +94,7 @@ class Reporter:
         self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
         self._before = (None, Counter(), Counter(), 0, Counter())
+        self._unused = Unused()
 
     def report(
         self,
@@ -144,7 +147,10 @@ class Reporter:
                 enabled,
                 counts,
                 health,
-                warnings,
+                [
+                    *warnings,
+                    *filter(None, [self._unused.sentence(now, meter.received.total(), counts)]),
+                ],
                 stale,
             ),
         ]

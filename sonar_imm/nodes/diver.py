@@ -20,10 +20,7 @@ Hears ``fix``, ``fixes``, ``relative``, ``arrivals``, and for ``relative`` the v
 - ``~/odometry``: one message a confirmed diver (coasting ones too), told apart by
   ``child_frame_id`` = ``diver_<track_id>``;
 - ``~/geo``: the same as NavSatFix, when it is known where the frame of the tracks lies on Earth;
-- ``~/model_probabilities``: those of the diver that has been tracked longest (the smallest
-  ``track_id`` among the confirmed). One diver, because a plotting tool draws one curve a name:
-  several divers in turn on one topic would be a zigzag between them. Those of all divers are
-  columns of ``~/estimate``.
+- ``~/model_probabilities``: those of the diver that has been tracked longest.
 """
 
 from __future__ import annotations
@@ -38,17 +35,12 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
-import numpy as np
-
-from msg_adapters.estimates import write_model_probabilities, write_odometry
+from msg_adapters.displays.tracks import confirmed_rows
 from msg_adapters.geodetic import write_geo
 
 from ..estimates import Estimate
 from .base import run, TrackerNode
 from .messages import make
-
-CONFIRMED = 1
-"""Least `track_state` of a confirmed track: 0 tentative, 1 confirmed, 2 coasting."""
 
 
 class DiverNode(TrackerNode):
@@ -57,25 +49,15 @@ class DiverNode(TrackerNode):
     def __init__(self, **options: Any):
         super().__init__('diver', **options)
 
-    def advertise_displays(self) -> None:
-        self._odometry = self.advertise('nav_msgs/msg/Odometry', '~/odometry')
+    def advertise_more(self) -> None:
         self._geo = self.advertise('sensor_msgs/msg/NavSatFix', '~/geo')
-        self._probabilities = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
 
     def show(self, newest: Estimate) -> None:
-        confirmed = np.flatnonzero(newest.extras['track_state'] >= CONFIRMED)
-        if not len(confirmed):
-            return
-        if self._odometry.get_subscription_count():
-            for row in confirmed:
-                self._odometry.publish(write_odometry(newest, row, make))
+        super().show(newest)
         origin = self.tracker.origin
         if origin is not None and self._geo.get_subscription_count():
-            for row in confirmed:
+            for row in confirmed_rows(newest):
                 self._geo.publish(write_geo(newest, row, origin, make))
-        if self._probabilities.get_subscription_count():
-            oldest = confirmed[np.argmin(newest.extras['track_id'][confirmed])]
-            self._probabilities.publish(write_model_probabilities(newest, oldest, make))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -36,7 +36,6 @@ import sys
 from typing import Any
 
 from msg_adapters.array_records import write_response
-from msg_adapters.estimates import write_model_probabilities
 
 from ..estimates import Estimate
 from .base import run, TABLE, TrackerNode
@@ -49,15 +48,13 @@ class FathometerNode(TrackerNode):
     def __init__(self, **options: Any):
         super().__init__('fathometer', **options)
 
-    def advertise_displays(self) -> None:
+    def advertise_more(self) -> None:
         self._response = self.advertise(TABLE, '~/response')
-        self._probabilities = self.advertise('sensor_msgs/msg/JointState', '~/model_probabilities')
 
     def show(self, newest: Estimate) -> None:
+        super().show(newest)
         if self._response.get_subscription_count() and self.tracker.response is not None:
             self._response.publish(write_response(self.tracker.response, make))
-        if self._probabilities.get_subscription_count():
-            self._probabilities.publish(write_model_probabilities(newest, 0, make))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -38,8 +38,8 @@ import numpy as np
 from msg_adapters.inputs import FEEDERS, InputTopic
 
 from ..estimates import Estimate
-from ..recordings.measurements import fitting_topics
 from ..recordings.reader import BagReader
+from ..recordings.topics import fitting_topics
 from ..trackers import SYSTEMS
 from .chain import Chain, FirstStep
 from .link import Link, LinkError
@@ -103,7 +103,7 @@ def run_lockstep(
         direct = {topic: entry for topic, entry in inputs.items() if not entry.makes}
         domain = stack.enter_context(reserved_domain_id())
         stack.enter_context(local_discovery())
-        arguments = _arguments(bag, direct, params_file)
+        arguments = _arguments(bag, system, direct, params_file)
         arguments += _losing_nothing(f'/{system}/estimate.publisher')
         arguments += ['-p', 'max_wait:=0.0', '-p', 'max_revisions:=0']
         for entry in fed.values():
@@ -117,7 +117,7 @@ def run_lockstep(
         before: NodeProcess | None = None
         if fed:
             name = FEEDERS[system]
-            arguments = _arguments(bag, fed, params_file)
+            arguments = _arguments(bag, name, fed, params_file)
             for entry in fed.values():
                 arguments += _losing_nothing(f'{entry.makes}.publisher')
             before = stack.enter_context(
@@ -136,7 +136,7 @@ def run_lockstep(
             PlayOptions(
                 topics=tuple(inputs),
                 lockstep=f'/{system}',
-                remap={name: f'/{entry.name}' for name, entry in inputs.items()},
+                remap={name: entry.full_name(system) for name, entry in inputs.items()},
             ),
             lockstep,
         )
@@ -278,14 +278,17 @@ def _losing_nothing(endpoint: str) -> list[str]:
 
 
 def _arguments(
-    bag: BagReader, inputs: Mapping[str, InputTopic], params_file: Path | str | None
+    bag: BagReader,
+    node: str,
+    inputs: Mapping[str, InputTopic],
+    params_file: Path | str | None,
 ) -> list[str]:
     """Write the ROS arguments of a node that loses no input and expects the types of the bag."""
     parameters: dict[str, str] = {}
     inputs_lossless: list[str] = []
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic, entry in inputs.items():
-        inputs_lossless += _losing_nothing(f'{entry.name}.subscription')
+        inputs_lossless += _losing_nothing(f'{entry.full_name(node)}.subscription')
         if len(entry.readers) == 1:
             continue
         known = parameters.setdefault(f'{entry.name.split("/")[-1]}_type', types[topic])

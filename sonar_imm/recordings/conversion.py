@@ -81,16 +81,19 @@ def write_bag(
     *,
     source: str,
     storage: str = 'mcap',
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> ConversionReport:
     """Write `records` in time order into a new bag at `out`; log time = stamp.
 
-    Raises `BagError` when there is nothing to write or the bag cannot be made.
+    parameters: those of its instruments, by the names of nodes. Raises `BagError` when there is
+    nothing to write or the bag cannot be made.
     """
     ordered = sorted(records, key=lambda record: record[0])
     if not ordered:
         first = f' (the first problem: {report.problems[0]})' if report.problems else ''
         raise BagError(f'{source} has nothing that could be converted{first}')
-    with BagWriter(out, storage=storage, custom_data=provenance(source, report.notes)) as bag:
+    notes = provenance(source, report.notes)
+    with BagWriter(out, storage=storage, custom_data=notes, parameters=parameters) as bag:
         for stamp_ns, topic, message in ordered:
             bag.write(topic, message, stamp_ns)
             report.messages[topic] = report.messages.get(topic, 0) + 1

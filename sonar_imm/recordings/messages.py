@@ -87,6 +87,11 @@ def _layout(type_name: str) -> tuple[Any, dict[str, Any]]:
     return typestore().types[type_name], dict(typestore().fielddefs[type_name][1])
 
 
+def cdr_of(message: Any) -> bytes:
+    """The bytes of a message that `ros_message` made, or that was read, as ROS 2 sends it."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
 def decode_cdr(types: Typestore, type_name: str, raw: bytes) -> Any:
     """Decode CDR bytes into a rosbags message. Raises `SerdeError` or KeyError (unknown type).
 

@@ -36,7 +36,7 @@ from attrs import evolve, frozen
 from msg_adapters.headers import stamp_ns
 
 from ..measurements import Rejection
-from .messages import message_definition, typestore
+from .messages import cdr_of, message_definition
 from .sources import BagError, one_line, open_sources, RawMessage, Source, TopicInfo
 
 __all__ = ['BagError', 'BagMessage', 'BagReader', 'TopicInfo', 'ORDERS']
@@ -147,7 +147,7 @@ class BagReader:
     def cdr(self, item: BagMessage) -> bytes:
         """The decoded message `item` as ROS 2 sends it; ROS 1 bags hold another serialization."""
         if self.is_ros1:
-            return bytes(typestore().serialize_cdr(item.message, item.type_name))
+            return cdr_of(item.message)
         return bytes(item.raw)
 
     def messages(

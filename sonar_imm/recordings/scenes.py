@@ -16,7 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 
@@ -29,9 +31,15 @@ from .writer import BagWriter
 
 
 def write_scene(
-    scene: Scene, out: str | Path, *, provenance: dict[str, str], compressed: bool = False
+    scene: Scene,
+    out: str | Path,
+    *,
+    provenance: dict[str, str],
+    compressed: bool = False,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> ConversionReport:
-    """Write measurements and truth, in the order of reception. Raises `BagError`."""
+    """Write measurements and truth, in the order of reception, and the `parameters` of the
+    instruments by the names of nodes. Raises `BagError`."""
     report = ConversionReport(Path(out))
     inputs: dict[type, InputTopic] = {}
     for system in SYSTEMS:
@@ -46,7 +54,9 @@ def write_scene(
     for true in scene.truth:
         records += records_of(true, scene.frame_id)
     images = any(inputs[type(one.measurement)].makes for one in scene.measurements)
-    with BagWriter(out, compressed=compressed or images, custom_data=provenance) as bag:
+    with BagWriter(
+        out, compressed=compressed or images, custom_data=provenance, parameters=parameters
+    ) as bag:
         for log_ns, topic, message in sorted(records, key=lambda record: record[0]):
             bag.write(topic, message, log_ns)
             report.messages[topic] = report.messages.get(topic, 0) + 1

@@ -36,10 +36,11 @@ from rosbags.rosbag2 import (
     CompressionMode,
     StoragePlugin,
     Writer,
-    WriterError,
 )
 
-from .messages import ros_message, typestore
+from ..files import whole
+from .messages import cdr_of, ros_message, typestore
+from .own_parameters import write_own_parameters
 from .sources import BagError
 
 __all__ = ['BagWriter', 'naming', 'ros_message', 'STORAGES']
@@ -76,9 +77,10 @@ class BagWriter:
     """A new recording at `path`, a directory that must not exist; use it in a ``with`` statement.
 
     compressed: by zstd, an mcap by chunks, as ``ros2 bag record`` does with the profile zstd_fast.
-    custom_data: notes kept in the metadata of the bag, e.g. where the data come from. What was
-    written before an exception is still a whole bag. Raises `BagError` when the bag cannot be
-    made.
+    custom_data: notes kept in the metadata of the bag, e.g. where the data come from. parameters:
+    what the file of parameters beside the recording says, by the names of nodes. The bag is at
+    `path` once it is closed, as a whole; an exception leaves nothing. Raises `BagError` when the
+    bag cannot be made.
     """
 
     def __init__(
@@ -88,15 +90,21 @@ class BagWriter:
         storage: str = 'mcap',
         compressed: bool = False,
         custom_data: Mapping[str, str] | None = None,
+        parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ):
         if storage not in STORAGES:
             raise ValueError(f"storage must be one of {', '.join(STORAGES)}, got '{storage}'")
         self.path = Path(path)
         self.count = 0
         self._links: dict[tuple[str, str], Connection] = {}
+        self._parameters = parameters or {}
+        self._place = contextlib.ExitStack()
+        if self.path.exists():
+            raise BagError(f'{path} exists already; remove it or choose another name')
         try:
+            self._unfinished = self._place.enter_context(whole(self.path))
             self._writer = Writer(
-                self.path, version=8, storage_plugin=StoragePlugin[storage.upper()]
+                self._unfinished, version=8, storage_plugin=StoragePlugin[storage.upper()]
             )
             for key, note in sorted((custom_data or {}).items()):
                 self._writer.set_custom_data(key, str(note))
@@ -104,26 +112,30 @@ class BagWriter:
                 mode = CompressionMode.STORAGE if storage == 'mcap' else CompressionMode.MESSAGE
                 self._writer.set_compression(mode, CompressionFormat.ZSTD)
             self._writer.open()
-        except WriterError:
-            raise BagError(f'{path} exists already; remove it or choose another name') from None
         except OSError as error:
+            self._place.close()
             raise BagError(f'{path} cannot be written: {error.strerror}') from None
 
     def __enter__(self) -> BagWriter:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        if kind is None:
+            self.close()
+            return
+        with contextlib.suppress(Exception):  # the error that is already on its way says more
+            self._writer.close()
+        self._place.__exit__(kind, error, trace)
 
     def close(self) -> None:
-        """Finish the bag: index and metadata."""
-        with naming(self.path):
+        """Finish the bag: index, metadata and parameters; then move it to its place."""
+        with naming(self.path), self._place:
             self._writer.close()
+            write_own_parameters(self._unfinished, self._parameters)
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message made by `ros_message` or read by `BagReader`."""
-        name = message.__msgtype__
-        self.write_raw(topic, name, typestore().serialize_cdr(message, name), log_ns)
+        self.write_raw(topic, message.__msgtype__, cdr_of(message), log_ns)
 
     def write_raw(self, topic: str, type_name: str, raw: bytes | memoryview, log_ns: int) -> None:
         """Append a message that is CDR already. Raises ValueError for a log time before 1970."""

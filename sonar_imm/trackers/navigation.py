@@ -33,6 +33,9 @@ from ..acoustics.geometry import Pose
 from ..estimation.arrays import IntArray
 from ..measurements import Navigation
 
+MOST_WAITING = 200
+"""Measurements that wait for a pose; the oldest is given up for one more."""
+
 Readiness = Literal['ready', 'wait', 'gap']
 
 

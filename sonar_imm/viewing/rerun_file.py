@@ -13,17 +13,19 @@
 # limitations under the License.
 
 """A run as a file of the Rerun viewer, which draws what Foxglove cannot: every track with the
-ellipsoid of its covariance, and all columns as curves.
+ellipsoid of its covariance, and its states, their standard deviations and its models as curves.
 
 Needs the package ``rerun-sdk`` (extra ``[rerun]``), which is imported here only.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import rerun
+from rerun import blueprint
 from scipy.spatial.transform import Rotation
 
 from ..estimates import Estimate
@@ -36,30 +38,61 @@ _THINNEST = 0.005
 def write_rerun(run: Path, file: Path) -> int:
     """Write the estimates of the run folder `run` to `file`; gives how many there were.
 
-    Entities: ``<system>/points``, ``<system>/covariance`` (2 sigma), a curve
-    ``<system>/track_<id>/<column>`` for each column of a track, and ``truth``. Raises `BagError`
-    for a folder that holds no run.
+    Entities: ``<system>/points``, ``<system>/covariance`` (2 sigma), ``truth``, and of every track
+    that was confirmed ``<system>/track_<id>/state/<name>``, ``.../std/<name>`` and
+    ``.../probability/<model>``. The first picture has the scene and the curves of the track that
+    lasted longest. Raises `BagError` for a folder that holds no run.
     """
     folder = RunFolder(run)
     facts = folder.read_run()
-    estimates = folder.read_estimates()
+    system, estimates = facts['system'], folder.read_estimates()
+    lasting = _confirmed(estimates)
     file.parent.mkdir(parents=True, exist_ok=True)
-    with rerun.RecordingStream(f'sonar_imm {facts["system"]}') as stream:
-        stream.save(file)
+    with rerun.RecordingStream(f'sonar_imm {system}') as stream:
+        stream.save(file, default_blueprint=_first_picture(system, lasting))
         for estimate in estimates:
-            _log(stream, facts['system'], estimate)
+            _log(stream, system, estimate, lasting)
         for true in read_truth(facts) or []:
             stream.set_time('stamp', timestamp=np.datetime64(true.stamp_ns, 'ns'))
             stream.log('truth', rerun.Points3D(_places(true), colors=(255, 255, 255)))
     return len(estimates)
 
 
-def _log(stream: rerun.RecordingStream, system: str, estimate: Estimate) -> None:
-    """Log one estimate at its stamp."""
+def _confirmed(estimates: list[Estimate]) -> Counter[int]:
+    """How often each track that was ever confirmed was estimated; without states all tracks."""
+    seen: Counter[int] = Counter()
+    confirmed: set[int] = set()
+    for estimate in estimates:
+        ids = estimate.extras.get('track_id')
+        if ids is None:
+            continue
+        seen.update(ids.tolist())
+        states = estimate.extras.get('track_state', np.ones(len(ids)))
+        confirmed.update(ids[states >= 1].tolist())
+    return Counter({track: count for track, count in seen.items() if track in confirmed})
+
+
+def _first_picture(system: str, lasting: Counter[int]) -> blueprint.Blueprint:
+    scene = blueprint.Spatial3DView(origin='/', name=system)
+    if not lasting:
+        return blueprint.Blueprint(scene)
+    (track, _), *_ = lasting.most_common(1)
+    curves = [
+        blueprint.TimeSeriesView(origin=f'/{system}/track_{track}/{kind}', name=f'{track}: {kind}')
+        for kind in ('probability', 'state', 'std')
+    ]
+    return blueprint.Blueprint(
+        blueprint.Horizontal(scene, blueprint.Vertical(*curves), column_shares=[3, 2])
+    )
+
+
+def _log(
+    stream: rerun.RecordingStream, system: str, estimate: Estimate, lasting: Counter[int]
+) -> None:
+    """Log one estimate at its stamp; curves of the tracks in `lasting`."""
     stream.set_time('stamp', timestamp=np.datetime64(estimate.stamp_ns, 'ns'))
-    columns = estimate.columns()
     places = _places(estimate)
-    ids = columns.get('track_id')
+    ids = estimate.extras.get('track_id')
     classes = None if ids is None else ids.astype(np.uint16)
     stream.log(f'{system}/points', rerun.Points3D(places, class_ids=classes))
     covariances = _place_covariances(estimate)
@@ -71,10 +104,20 @@ def _log(stream: rerun.RecordingStream, system: str, estimate: Estimate) -> None
         stream.log(f'{system}/covariance', drawn)
     if ids is None:
         return  # one row per range bin: thousands of curves would show nothing
+    stds = np.sqrt(np.maximum(np.einsum('nii->ni', estimate.covariance), 0.0))
+    tables = (
+        ('state', estimate.state_names, estimate.state),
+        ('std', estimate.state_names, stds),
+        ('probability', estimate.model_names, estimate.probabilities),
+    )
     for row, track in enumerate(ids.tolist()):
-        for name, column in columns.items():
-            if np.isfinite(column[row]):
-                stream.log(f'{system}/track_{track}/{name}', rerun.Scalars(float(column[row])))
+        if track not in lasting:
+            continue
+        for kind, names, table in tables:
+            for name, value in zip(names, table[row].tolist()):
+                if np.isfinite(value):
+                    path = f'{system}/track_{track}/{kind}/{name}'
+                    stream.log(path, rerun.Scalars(value))
 
 
 def _places(estimate: Estimate) -> np.ndarray:

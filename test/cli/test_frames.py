@@ -24,9 +24,10 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.inputs import inputs_of
 from sonar_imm.cli import main
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.recordings.measurements import fitting_topics, measurements_of
+from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.topics import fitting_topics
 from sonar_imm.recordings.writer import BagWriter
 
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'obstacle_tethers'

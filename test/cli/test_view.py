@@ -14,7 +14,6 @@
 
 """``sonar-imm view``: what it refuses, the report in the browser, the file for Rerun."""
 
-import json
 import sys
 import webbrowser
 
@@ -23,7 +22,6 @@ import pytest
 from sonar_imm.cli import main
 from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.resources import shared_file
-from sonar_imm.viewing.sources import paths_of
 
 
 @pytest.fixture(scope='module')
@@ -65,18 +63,6 @@ def test_without_the_package_it_says_what_to_do(run, capsys, monkeypatch):
     assert main(['view', str(run), '--port', '0']) == 2
     said = capsys.readouterr().err
     assert "pip install 'sonar_imm[view]'" in said and '--browser' in said
-
-
-def test_a_run_is_shown_with_its_recording(run, tmp_path):
-    assert paths_of(run) == ([run / 'estimate', run.parent / 'bag'], [])
-    assert paths_of(run.parent / 'bag') == ([run.parent / 'bag'], [])
-    alone = tmp_path / 'alone'
-    alone.mkdir()
-    told = json.loads((run / 'run.json').read_text())
-    (alone / 'run.json').write_text(json.dumps({**told, 'bag': str(tmp_path / 'gone')}))
-    paths, problems = paths_of(alone)
-    assert paths == [alone / 'estimate']
-    assert problems == [f'{tmp_path / "gone"} is gone: only the estimates are shown']
 
 
 @pytest.mark.parametrize('kind', ['run', 'bag'])

@@ -29,7 +29,7 @@ from sonar_imm.trackers import SYSTEMS
 
 def folder_of(tmp_path, estimates=(), **run):
     folder = RunFolder(tmp_path / 'run')
-    folder.prepare()
+    folder.path.mkdir()
     folder.write_estimates(estimates, 'diver')
     folder.write_json(
         'run.json',

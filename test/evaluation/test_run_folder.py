@@ -30,8 +30,16 @@ ESTIMATES = single_run(count=20)[0]
 @pytest.fixture
 def folder(tmp_path):
     folder = RunFolder(tmp_path / 'run')
-    folder.prepare()
+    folder.path.mkdir()
     return folder
+
+
+def contents(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob('*')
+        if path.is_file()
+    }
 
 
 def test_estimates_come_back_bit_for_bit(folder):
@@ -56,7 +64,7 @@ def test_the_same_estimates_make_the_same_bytes(tmp_path):
     contents = []
     for name in ('a', 'b'):
         folder = RunFolder(tmp_path / name)
-        folder.prepare()
+        folder.path.mkdir()
         folder.write_estimates(ESTIMATES, 'diver')
         contents.append(
             {path.name: path.read_bytes() for path in folder.path.rglob('*') if path.is_file()}
@@ -72,16 +80,23 @@ def test_no_estimates_leave_a_readable_run(folder):
 def test_an_earlier_run_is_kept_unless_told_otherwise(folder):
     folder.write_json('run.json', {})
     (folder.path / 'notes.txt').write_text('mine')
-    with pytest.raises(BagError, match='--overwrite'):
-        folder.prepare()
-    folder.prepare(overwrite=True)
-    assert [path.name for path in folder.path.iterdir()] == ['notes.txt']
+    with pytest.raises(BagError, match='--overwrite'), folder.fresh():
+        pytest.fail('the folder was given out')
+    with pytest.raises(KeyError), folder.fresh(overwrite=True) as unfinished:
+        unfinished.write_json('run.json', {'new': 1})
+        raise KeyError
+    assert contents(folder.path) == {'notes.txt': b'mine', 'run.json': b'{}\n'}
+    with folder.fresh(overwrite=True) as unfinished:
+        unfinished.write_json('run.json', {'new': 1})
+        assert contents(folder.path)['run.json'] == b'{}\n'
+    assert json.loads((folder.path / 'run.json').read_text()) == {'new': 1}
+    assert sorted(contents(folder.path)) == ['notes.txt', 'run.json']
 
 
 def test_a_file_is_no_folder(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(BagError, match='is a file'):
-        RunFolder(tmp_path / 'file').prepare()
+        RunFolder(tmp_path / 'file').fresh().__enter__()
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from sonar_imm.evaluation import jobs
 from sonar_imm.evaluation import sweep as sweeps
 from sonar_imm.evaluation.sweep import Outcome, Sweep
 from sonar_imm.evaluation.tracking import InputOptions
@@ -121,7 +122,7 @@ def test_a_cluster_is_found_by_its_address(diver):
 
 def test_nobody_at_the_address_is_one_sentence(diver, monkeypatch):
     pytest.importorskip('distributed')
-    monkeypatch.setattr(sweeps, 'CONNECT_SECONDS', 0.5)
+    monkeypatch.setattr(jobs, 'CONNECT_SECONDS', 0.5)
     with socket.create_server(('127.0.0.1', 0)) as silent:
         port = silent.getsockname()[1]
         with pytest.raises(ConfigError, match=f'no dask scheduler answers at 127.0.0.1:{port} '):

@@ -20,6 +20,7 @@ import sys
 import attrs
 import numpy as np
 
+import msg_adapters.displays.bathymetry
 import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
 from sonar_imm.parameters import Config, parameter
@@ -48,6 +49,8 @@ class WalkerConfig(Config):
 
 class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
+
+    STATE = ('counts', 'fixes')
 
     def __init__(self, config):
         self.config = config
@@ -113,6 +116,7 @@ def register(set_item):
     """Make the walker known by ``set_item(mapping, key, value)``; it hears what divers do."""
     walker = WalkerSystem(name='walker', summary='test system', config='', tracker='')
     set_item(SYSTEMS, 'walker', walker)
+    set_item(sys.modules, 'msg_adapters.displays.walker', msg_adapters.displays.bathymetry)
     set_item(sys.modules, 'msg_adapters.inputs.walker', msg_adapters.inputs.diver)
 
 

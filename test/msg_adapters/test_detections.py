@@ -293,3 +293,16 @@ def test_anything_gives_sound_detections_or_a_rejection(a, b, c, flags):
             continue
         assert np.isfinite(ping.range).all() and np.isfinite(ping.bearing).all()
         assert (ping.range > 0.0).all()
+
+
+def test_ranges_in_millimetres_are_refused_by_name():
+    columns = {
+        'range': np.array([56_780.0, 23_000.0]),
+        'bearing': np.array([0.1, -0.2]),
+    }
+    message = encode_table(columns, stamp_ns=1, frame_id='sonar', make=ros_message)
+    with pytest.raises(Rejection, match='all ranges are beyond 10000, from 23000 on; .* metres'):
+        read_detections(message)
+    columns['range'][0] = 50.0  # one wild echo among others is only left out
+    message = encode_table(columns, stamp_ns=1, frame_id='sonar', make=ros_message)
+    assert read_detections(message).range.tolist() == [50.0]

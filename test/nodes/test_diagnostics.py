@@ -55,6 +55,39 @@ def desk():
     return Desk()
 
 
+def test_a_share_of_messages_of_no_use_is_said_and_forgotten_after_a_while(desk):
+    counts = Counter(used=0)
+    for second in range(40):
+        now = float(second)
+        for k in range(10):
+            desk.meter.arrived('fix', now + k / 10.0)
+        # two publishers that disagree by three seconds: every other message is too late
+        counts['too_late' if 10 <= second < 20 else 'used'] += 5
+        counts['used'] += 5
+        desk.report(now + 1.0, counts=counts.copy())
+        if second < 10 or second >= 29:
+            assert desk.tracker.level == DiagnosticStatus.OK, desk.tracker.message
+        if 12 <= second < 20:
+            assert desk.tracker.level == DiagnosticStatus.WARN
+            assert 'not used: too_late' in desk.tracker.message
+    assert 'late' not in desk.tracker.message
+
+
+def test_single_messages_of_no_use_are_no_warning(desk):
+    for second in range(30):
+        for k in range(100):
+            desk.meter.arrived('fix', second + k / 100.0)
+        desk.report(second + 1.0, counts=Counter(used=95 * second, too_late=5 * second))
+        assert desk.tracker.level == DiagnosticStatus.OK
+
+
+def test_a_reset_tracker_counts_from_zero_again(desk):
+    desk.meter.arrived('fix', 0.5)
+    desk.report(1.0, counts=Counter(too_late=1000))
+    desk.report(2.0, counts=Counter(too_late=0))
+    assert desk.tracker.level == DiagnosticStatus.OK
+
+
 def test_a_silent_start_is_stale(desk):
     desk.report(1.0)
     assert desk.input.level == DiagnosticStatus.STALE

@@ -17,9 +17,10 @@ import pytest
 
 from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Fix, Rejection
-from sonar_imm.recordings.measurements import fitting_topics, measurements_of
+from sonar_imm.recordings.measurements import measurements_of
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagError, BagReader
+from sonar_imm.recordings.topics import fitting_topics
 from sonar_imm.recordings.truth import records_of
 from sonar_imm.recordings.writer import BagWriter
 from sonar_imm.simulation.scene import TrueTrack

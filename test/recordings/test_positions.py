@@ -30,9 +30,9 @@ from sonar_imm.evaluation.inspection import inspect
 from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.evaluation.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm.measurements import Fix, Fixes, GeodeticFix, VesselPose
-from sonar_imm.recordings.measurements import fitting_topics
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.topics import fitting_topics
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import DiverConfig
 
@@ -59,8 +59,8 @@ def tracked(bag, folder, topics=None, **parameters):
     with BagReader(bag) as reader:
         offline = OfflineRun(reader, SYSTEMS['diver'], config, InputOptions(topics=topics))
         run_folder = RunFolder(folder)
-        run_folder.prepare(overwrite=True)
-        write_run(run_folder, offline)
+        with run_folder.fresh(overwrite=True) as unfinished:
+            write_run(unfinished, offline)
     run = json.loads((folder / 'run.json').read_text())
     return run, run_folder.read_estimates()
 

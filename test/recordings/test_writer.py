@@ -64,10 +64,17 @@ def test_the_metadata_are_of_version_8_with_the_offered_qos(write_fixes):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_an_exception_does_not_lose_what_was_written(tmp_path, fix_message, storage):
+def test_a_bag_is_there_as_a_whole_or_not_at_all(tmp_path, fix_message, storage):
+    told = {'diver': {'gate_probability': 0.9}}
     with pytest.raises(KeyboardInterrupt), BagWriter(tmp_path / 'bag', storage=storage) as bag:
         bag.write('/fix', fix_message(0), 5)
         raise KeyboardInterrupt
+    assert not any(tmp_path.iterdir())
+    with BagWriter(tmp_path / 'bag', storage=storage, parameters=told) as bag:
+        bag.write('/fix', fix_message(0), 5)
+        assert not (tmp_path / 'bag').exists()
+    assert (tmp_path / 'bag' / 'parameters.yaml').is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ['bag']
     with BagReader(tmp_path / 'bag') as bag:
         assert len(list(bag.messages())) == 1 and not bag.problems
 

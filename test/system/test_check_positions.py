@@ -14,13 +14,19 @@
 
 """``check`` with positions from a vessel, a topic for each tag, and on Earth."""
 
+import csv
 import json
 
+from attrs import evolve
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
 from sonar_imm.cli import main  # noqa: E402
+from sonar_imm.measurements import Start  # noqa: E402
+from sonar_imm.recordings.scenes import write_scene  # noqa: E402
+from sonar_imm.simulation.diver.simulator import scenario, simulate  # noqa: E402
 
 pytestmark = pytest.mark.system
 
@@ -38,3 +44,26 @@ def test_live_equals_offline(scene, tmp_path, capsys):
     assert outcome['good'] and len(outcome['checks']) == 4
     header = (out / scene / 'offline' / 'estimate.csv').read_text().splitlines()[0]
     assert ('latitude' in header) == (scene == 'geodetic')
+
+
+def test_a_start_that_was_recorded_counts_live_and_offline(tmp_path, capsys):
+    scene = simulate(scenario('irregular', {'duration': 30.0}), 3)
+    told = []
+    for k, one in enumerate(scene.measurements):
+        if k in (4, 9):
+            place = one.measurement.position + ([0.2, 0.1, 0.0] if k == 4 else [400.0, 0.0, 0.0])
+            stamp, frame = one.measurement.stamp_ns, one.measurement.frame_id
+            start = Start(stamp_ns=stamp, position=place, covariance=np.eye(2), frame_id=frame)
+            told.append(evolve(one, measurement=start))
+        told.append(one)
+    bag, out = tmp_path / 'told', tmp_path / 'out'
+    write_scene(evolve(scene, measurements=tuple(told)), bag, provenance={})
+    wanted = ['--bag', str(bag), '--limit', '1000', '--out', str(out), '--json']
+    assert main(['check', 'diver', *wanted]) == 0
+    (outcome,) = json.loads(capsys.readouterr().out)
+    assert outcome['good']
+    run = json.loads((out / 'told' / 'offline' / 'run.json').read_text())
+    assert run['topics']['/initial'] == 'initial' and run['counts']['used'] == len(told)
+    with (out / 'told' / 'offline' / 'estimate.csv').open() as lines:
+        ids = {row['track_id']: float(row['px']) for row in csv.DictReader(lines)}
+    assert len(ids) >= 2 and max(ids.values()) > 300.0  # the second start, 400 m away

@@ -14,12 +14,19 @@
 
 """What is shown of recordings: order, jumps, definitions, what cannot be shown."""
 
+import json
+import shutil
+
 import pytest
 
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagError
+from msg_adapters.estimates import read_estimate
+from msg_adapters.headers import stamp_ns
+from sonar_imm.cli import main
+from sonar_imm.recordings.messages import decode_cdr, ros_message, typestore
+from sonar_imm.recordings.reader import BagError, BagReader
 from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.viewing.material import Material
+from sonar_imm.resources import shared_file
+from sonar_imm.viewing.material import Material, opened, Recording
 
 START = 10**18
 
@@ -42,6 +49,13 @@ def bags(tmp_path):
     return [tmp_path / name for name in written]
 
 
+@pytest.fixture
+def show(bags):
+    """Makes the material of both recordings."""
+    with BagReader(bags[0]) as one, BagReader(bags[1]) as two:
+        yield lambda *topics: Material([Recording(one), Recording(two)], topics)
+
+
 def shown(material, seconds=None):
     from_ns = None if seconds is None else START + round(seconds * 1e9)
     return [
@@ -53,37 +67,96 @@ def shown(material, seconds=None):
 ALL = [('/a', 0, 'a0'), ('/both', 1, 'one'), ('/b', 2, 'b2'), ('/a', 4, 'a4'), ('/b', 6, 'b6')]
 
 
-def test_recordings_are_merged_and_of_a_topic_the_first_counts(bags):
-    with Material(bags) as material:
-        assert shown(material) == ALL
-        assert shown(material) == ALL  # again from the start
-        assert (material.first_ns, material.last_ns) == (START, START + 6 * 10**9)
-        assert material.problems == []
+def test_recordings_are_merged_and_of_a_topic_the_first_counts(show):
+    material = show()
+    assert shown(material) == ALL
+    assert shown(material) == ALL  # again from the start
+    assert (material.first_ns, material.last_ns) == (START, START + 6 * 10**9)
+    assert material.problems == []
 
 
-def test_a_jump_begins_with_the_newest_of_each_topic(bags):
-    with Material(bags) as material:
-        assert shown(material, 3.5) == [ALL[0], ALL[1], ALL[2], *ALL[3:]]
-        assert shown(material, 5) == [ALL[1], ALL[2], ALL[3], ALL[4]]
-        assert shown(material, 99) == [ALL[1], ALL[3], ALL[4]]
+def test_a_jump_begins_with_the_newest_of_each_topic(show):
+    assert shown(show(), 3.5) == ALL
+    assert shown(show(), 5) == [ALL[1], ALL[2], ALL[3], ALL[4]]
+    assert shown(show(), 99) == [ALL[1], ALL[3], ALL[4]]
 
 
-def test_channels_have_the_whole_definition(bags):
-    with Material(bags, ['/b']) as material:
-        (channel,) = material.channels.values()
-        assert (channel.topic, channel.type_name) == ('/b', 'std_msgs/msg/String')
-        assert channel.definition.split() == ['string', 'data']
-        assert shown(material) == [ALL[2], ALL[4]]
+def test_channels_have_the_whole_definition(show):
+    material = show('/b')
+    (channel,) = material.channels.values()
+    assert (channel.topic, channel.type_name) == ('/b', 'std_msgs/msg/String')
+    assert channel.definition.split() == ['string', 'data']
+    assert shown(material) == [ALL[2], ALL[4]]
 
 
 @pytest.mark.parametrize('topics', [['/nowhere'], ['/a', '/nowhere']])
-def test_a_topic_that_is_not_there_is_said(bags, topics):
-    with pytest.raises(BagError, match="no topic '/nowhere'"), Material(bags, topics):
-        pass
+def test_a_topic_that_is_not_there_is_said(show, topics):
+    with pytest.raises(BagError, match="no topic '/nowhere'"):
+        show(*topics)
 
 
 def test_a_recording_without_a_message_is_said(tmp_path):
     with BagWriter(tmp_path / 'empty'):
         pass
-    with pytest.raises(BagError, match='nothing to show'), Material([tmp_path / 'empty']):
+    with pytest.raises(BagError, match='nothing to show'), opened(tmp_path / 'empty'):
+        pass
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    """A shipped recording with a diver, tracked."""
+    path = tmp_path_factory.mktemp('view') / 'run'
+    assert main(['track', str(shared_file('bags/diver_multistatic')), str(path)]) == 0
+    return path
+
+
+def test_a_run_is_shown_with_its_drawings_and_its_recording(run):
+    with opened(run) as (material, problems):
+        assert problems == []
+        of_the_node = {'/diver/estimate', '/diver/odometry', '/diver/model_probabilities'}
+        assert set(material.channels) >= of_the_node | {'/arrivals', '/truth/estimate'}
+        messages = list(material.messages())
+    with BagReader(run / 'estimate') as bag:
+        estimates = [read_estimate(item.message) for item in bag.messages(['/diver/estimate'])]
+    drawn = [
+        decode_cdr(typestore(), 'nav_msgs/msg/Odometry', one.raw)
+        for one in messages
+        if one.topic == '/diver/odometry'
+    ]
+    confirmed = [
+        (one.stamp_ns, *state[:2])
+        for one in estimates
+        for state in one.state[one.extras['track_state'] >= 1]
+    ]
+    places = [one.pose.pose.position for one in drawn]
+    assert [(stamp_ns(one), at.x, at.y) for one, at in zip(drawn, places)] == confirmed
+    assert len(confirmed) > 50
+
+
+def test_a_run_whose_recording_is_gone_is_shown_alone(run, tmp_path):
+    alone = tmp_path / 'alone'
+    shutil.copytree(run, alone)
+    told = json.loads((run / 'run.json').read_text())
+    (alone / 'run.json').write_text(json.dumps({**told, 'bag': str(tmp_path / 'gone')}))
+    with opened(alone) as (material, problems):
+        assert problems == [f'{tmp_path / "gone"} is gone: only the estimates are shown']
+        assert '/arrivals' not in material.channels and '/diver/odometry' in material.channels
+
+
+def test_both_sides_of_a_sonar_are_shown_each_below_its_name(tmp_path):
+    scene = ['simulate', 'bathymetry', str(tmp_path / 'bag'), '--scenario', 'moving_two_sides']
+    small = ['--set', 'pings=2', '--set', 'last_range=20', '--set', 'bin_width=0.2']
+    assert main([*scene, *small]) == 0
+    told = ['--set', 'particles_per_model=20']
+    assert main(['track', str(tmp_path / 'bag'), str(tmp_path / 'run'), *told]) == 0
+    with opened(tmp_path / 'run') as (material, problems):
+        assert problems == []
+        assert any(name.endswith('/bathymetry/estimate') for name in material.channels)
+        assert list(material.messages())
+
+
+def test_runs_of_several_recordings_are_not_mixed(run, tmp_path):
+    bags = [str(shared_file(f'bags/{name}')) for name in ('diver_table1', 'diver_multistatic')]
+    assert main(['track', *bags, str(tmp_path / 'out')]) == 0
+    with pytest.raises(BagError, match='holds runs of 2 recordings'), opened(tmp_path / 'out'):
         pass

@@ -28,7 +28,7 @@ from helpers.foxglove_client import Viewer  # noqa: E402
 from sonar_imm.recordings.messages import message_definition  # noqa: E402
 from sonar_imm.recordings.reader import BagReader  # noqa: E402
 from sonar_imm.resources import shared_file  # noqa: E402
-from sonar_imm.viewing.material import Channel, Material  # noqa: E402
+from sonar_imm.viewing.material import Channel, opened  # noqa: E402
 from sonar_imm.viewing.playback import Playback  # noqa: E402
 from sonar_imm.viewing.server import ViewServer  # noqa: E402
 
@@ -39,7 +39,7 @@ PLAYING, PAUSED, ENDED = 0, 1, 3
 @contextlib.contextmanager
 def served(**options):
     """The server of a shipped bag, and what plays it."""
-    with Material([shared_file(BAG)]) as material:
+    with opened(shared_file(BAG)) as (material, _):
         playback = Playback(material.first_ns, material.last_ns, rate=1e4)
         with ViewServer('test', '127.0.0.1', 0, playback, **options) as server:
             server.advertise(material.channels.values())

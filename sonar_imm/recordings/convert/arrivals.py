@@ -46,7 +46,6 @@ from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import BadRow, CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
-from ..own_parameters import write_own_parameters
 from ..sources import BagError
 from .truth import number_names, truth_records
 
@@ -131,9 +130,14 @@ def convert_arrivals(
         report.notes['receivers'] = ', '.join(f'{name} = {numbers[name]}' for name in numbers)
     if passive:
         report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
-    report = write_bag(out, records, report, source=Path(path).name, storage=storage)
-    write_own_parameters(report.path, {'diver': origin_parameters(origin)})
-    return report
+    return write_bag(
+        out,
+        records,
+        report,
+        source=Path(path).name,
+        storage=storage,
+        parameters={'diver': origin_parameters(origin)},
+    )
 
 
 def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:

@@ -30,7 +30,6 @@ from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
-from ..own_parameters import write_own_parameters
 from .truth import number_names, truth_records
 
 REPEAT_TIME = 5.0
@@ -99,9 +98,14 @@ def convert_fixes(
             f'{len(repeated)} rows hold a position that came before, the first in line '
             f'{repeated[0]}; the tracker leaves them out (repeat_time)'
         )
-    report = write_bag(out, records, report, source=Path(path).name, storage=storage)
-    write_own_parameters(report.path, {'diver': origin_parameters(frame.origin)})
-    return report
+    return write_bag(
+        out,
+        records,
+        report,
+        source=Path(path).name,
+        storage=storage,
+        parameters={'diver': origin_parameters(frame.origin)},
+    )
 
 
 def _names_divers(

@@ -33,10 +33,10 @@ from ...measurements import Rejection
 from ...trackers.obstacle.detector import DetectorConfig
 from ..conversion import ConversionReport, provenance
 from ..detected import DetectedImages
-from ..measurements import made_topics
 from ..messages import ros_message
 from ..reader import BagReader
 from ..sources import BagError
+from ..topics import made_topics
 from ..writer import BagWriter
 from .companions import companion_topics, copied
 

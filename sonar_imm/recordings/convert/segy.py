@@ -41,7 +41,6 @@ from ...measurements import Rejection, Trace
 from ...trackers.fathometer.envelopes import envelope_parameters
 from ..conversion import ConversionReport, Record, write_bag
 from ..messages import ros_message
-from ..own_parameters import write_own_parameters
 from ..positions import write_position
 from ..sources import BagError
 from .profiler import doubted_spacing, is_envelope, measured_instrument
@@ -94,9 +93,14 @@ def convert_segy(
     records = _records(report, Path(path), line.stamps, depth, amplitude, stack, frame_id)
     records += _positions(line) if records else []
     own = _instrument(report, amplitude, spacing, stack)
-    report = write_bag(out, records, report, source=Path(path).name, storage=storage)
-    write_own_parameters(Path(out), {'fathometer': own})
-    return report
+    return write_bag(
+        out,
+        records,
+        report,
+        source=Path(path).name,
+        storage=storage,
+        parameters={'fathometer': own},
+    )
 
 
 @frozen(eq=False)

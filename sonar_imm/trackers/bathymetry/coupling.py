@@ -41,7 +41,7 @@ import numpy as np
 
 from ...estimation.arrays import FloatArray
 from .kernels import Track
-from .ping import floor_of, Look
+from .ping import floor_of, Look, look, Ping, run
 
 NEIGHBOURS_NS = 5_000_000_000
 """Pings of one side further apart in time are no neighbours."""
@@ -64,6 +64,15 @@ class Alone:
         order = known[np.argsort(distance[known], kind='stable')]
         rough = track.probability[:, seen.models.rough].sum(axis=1)
         return cls(seen, track, distance[order], np.clip(rough[order], 0.0, 1.0))
+
+    def kept(self) -> Ping:
+        """What a saved state has of it: the rest follows from the ping."""
+        return self.seen.ping
+
+    @classmethod
+    def from_kept(cls, ping: Ping) -> Alone:
+        seen = look(ping)
+        return cls.of(seen, run(seen))
 
     @property
     def stamp_ns(self) -> int:

@@ -30,12 +30,10 @@ from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...estimation.history import StampGate
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
-from ..navigation import NavigationBuffer
+from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 
 KEPT_NS = 60_000_000_000
-MOST_WAITING = 200
-"""Pings; the oldest is given up for one more."""
 _LONGEST_PAUSE_NS = 3_600_000_000_000
 _RESTART_AFTER = 5
 ALTITUDE_AGE_NS = 5_000_000_000

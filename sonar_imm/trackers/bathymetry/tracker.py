@@ -63,6 +63,8 @@ class BathymetryTracker:
     """The tracker of `trackers.Tracker` for the sea floor: `process` takes `Snapshot`,
     `Navigation` and `Altitude`."""
 
+    STATE = ('counts', '_queue', '_coupling', '_health', '_loud')
+
     def __init__(self, config: BathymetryConfig):
         self.config = config
         self.reset()

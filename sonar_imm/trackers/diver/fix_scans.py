@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...estimation.arrays import BoolArray
-from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from . import soft
 from .births import Birth, births_from_fixes
 from .config import DiverConfig
@@ -69,7 +69,7 @@ def shows_all(item: Measurement, config: DiverConfig) -> bool:
         return item.target_id is None or not len(item) or bool((item.target_id == NOBODY).any())
     if isinstance(item, Fix) and item.target_id != NOBODY:
         return False
-    if isinstance(item, Arrivals) and is_named(item):
+    if isinstance(item, Start) or (isinstance(item, Arrivals) and is_named(item)):
         return False
     return config.fixes_are_scans
 

@@ -49,11 +49,9 @@ from ...measurements import (
     VesselHeading,
     VesselPose,
 )
-from ..navigation import NavigationBuffer, Readiness
+from ..navigation import MOST_WAITING, NavigationBuffer, Readiness
 from .config import DiverConfig
 
-MOST_WAITING = 200
-"""Relative fixes; the oldest is given up for one more."""
 KEPT_NS = 60_000_000_000
 """Poses are kept that long, and for the history of the tracker."""
 _LONGEST_PAUSE_NS = 3_600_000_000_000

@@ -93,6 +93,7 @@ class Scan:
         self.tentative = before.life.status == TENTATIVE
         self.instruments = before.instruments
         self.layout = self.instruments.layout(config, models.n)
+        self.x, self.P = self.layout.widened(self.x, self.P)  # sound speed, before any ping
         self.named = before.target_id != NOBODY
         self.existence = before.existence * math.exp(-self.dt / config.survival_time)
         self.evidence = before.evidence
@@ -127,6 +128,7 @@ class Scan:
             white=self.white,
             fixes=self.fixes,
             broken=before.broken,
+            not_started=before.not_started,
             repairs=before.repairs + self.repairs,
             instruments=self.instruments,
         )

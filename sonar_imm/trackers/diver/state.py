@@ -58,8 +58,9 @@ class DiverState:
     counted instead; evidence (T,): sum of the probabilities of its detections; target_id (T,):
     whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older track it is
     near, 0 for none, and for how many scans (`soft`, `names`); said: names and when each was said
-    last, ns; broken: tracks ended so far because their
-    numbers were not finite; repairs: covariances repaired so far (`estimation.covariance`).
+    last, ns; broken: tracks ended so far because their numbers were not finite; not_started:
+    starts so far for which there was no room; repairs: covariances repaired so far
+    (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -80,6 +81,7 @@ class DiverState:
     white: FloatArray
     fixes: FixConsistency
     broken: int = 0
+    not_started: int = 0
     repairs: int = 0
     instruments: Instruments = Instruments()
     said: tuple[tuple[int, int], ...] = ()

@@ -45,7 +45,7 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks
 from ...estimation.association_kernels import TENTATIVE
-from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
 from . import fix_kernels, soft
@@ -60,6 +60,7 @@ from .pings import begin_from_ping, FAR, ping_numbers
 from .placing import Placer
 from .scan import Scan
 from .sensing import position_groups
+from .starts import confirmed, make_room, no_room, starts_of
 from .state import DiverState
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
@@ -67,6 +68,8 @@ __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
 class DiverTracker:
     """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`."""
+
+    STATE = ('_stream', '_placer')
 
     def __init__(self, config: DiverConfig):
         self.config = config
@@ -81,7 +84,7 @@ class DiverTracker:
 
     def reset(self) -> None:
         self._stream = ReplayStream(
-            (Fix, Fixes, Arrivals),
+            (Fix, Fixes, Arrivals, Start),
             StreamRules.of(self.config),
             step=self._scan,
             initial=self._nobody(Tracks.none(track_rules(self.config))),
@@ -139,6 +142,7 @@ class DiverTracker:
             else float('nan'),
             'broken_tracks': now.broken,
             'covariance_repairs': now.repairs,
+            'not_started': now.not_started,
             'fixes_mean_nis': now.fixes.mean_nis,
             'fixes_lag_1': now.fixes.lag_1,
             'waiting_for_vessel': len(self._placer),
@@ -149,7 +153,7 @@ class DiverTracker:
     def warnings(self) -> list[str]:
         """What of the input cannot be true or used, in sentences for the user."""
         lasting = self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
-        return self._placer.warnings() + lasting
+        return self._placer.warnings() + lasting + no_room(self._stream.state, self.config)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -205,7 +209,10 @@ class DiverTracker:
         said = names_said(groups, pings)
         now = self._prune(remembered(scan.learn(), before, said, self.config.max_coast), items)
         now = merged(now, before, groups, self.config, self.models.E[:, :2])
-        return self._spawn(now, births, scan.layout)
+        now = self._spawn(now, births, scan.layout)
+        for start in starts_of(items):
+            now = self._start(now, start, scan.layout)
+        return now
 
     def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
         return Scan(self.config, self.models, self._chain, before, stamp_ns)
@@ -244,8 +251,11 @@ class DiverTracker:
         """Begin a tentative track at each birth, as long as there is room."""
         config = self.config
         births = each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
-        if not births:
-            return now
+        return self._append(now, births, layout) if births else now
+
+    def _append(self, now: DiverState, births: list[Birth], layout: Layout) -> DiverState:
+        """With a track for each birth."""
+        config = self.config
         x, P, mu = self._new_tracks(births, layout)
         count = len(births)
         return now.with_rows(
@@ -266,6 +276,14 @@ class DiverTracker:
                 'near_for': np.zeros(count, np.int64),
             },
         )
+
+    def _start(self, now: DiverState, start: Start, layout: Layout) -> DiverState:
+        """Begin a confirmed track where somebody says that a diver is, when there is room."""
+        now, room = make_room(now, start, self.config, self.models.E[:, :2])
+        if not room:
+            return now
+        birth = Birth(start.position[:2], start.covariance)
+        return confirmed(self._append(now, [birth], layout))
 
     def _new_tracks(
         self, births: list[Birth], layout: Layout

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...acoustics import fathometer
-from ...acoustics.pulse import Pulse
+from ...acoustics.pulse import Pulse, SampledPulse
 from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
 from ...measurements import CrossSpectra, Rejection
@@ -102,8 +102,7 @@ def processor_pulse(heard: ArrayCoherence, lattice: Lattice, sound_speed: float)
     value = fathometer.depth_response(
         spectrum, heard.first, heard.spacing, (0.0, step, count), 0.0, sound_speed
     )
-    lags = step * np.arange(count)
-    return lambda delta: np.interp(np.abs(delta), lags, value / value[0], right=0.0)
+    return SampledPulse(step * np.arange(count), value / value[0])
 
 
 def mirror_sigma(

@@ -95,6 +95,22 @@ class FathometerTracker:
     response: the depth response of the newest record or preview, for display; None before.
     """
 
+    STATE = (
+        'response',
+        '_stream',
+        '_ids',
+        '_depths',
+        '_hydrophones',
+        '_pressure',
+        '_multiples',
+        '_lattice',
+        '_before',
+        '_smoother',
+        '_taken',
+        '_health',
+        '_fit',
+    )
+
     def __init__(self, config: FathometerConfig):
         self.config = config
         self.pulse = pulse_of(config)
@@ -123,6 +139,11 @@ class FathometerTracker:
         self._taken: deque[_Taken] = deque(maxlen=self.config.smoothing_lag + 1)
         self._health: dict[str, float] = {}
         self._fit = Fit()
+
+    def restored(self) -> None:
+        """Build anew what follows from the lattice, after a state was put in."""
+        if self._lattice is not None:
+            self._begin(self._lattice)
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)

@@ -48,7 +48,7 @@ from ...estimation.association import (
 )
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
-from ..navigation import NavigationBuffer
+from ..navigation import MOST_WAITING, NavigationBuffer
 from ..stream import ReplayStream, StreamRules
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
@@ -105,8 +105,9 @@ class PingState:
 class ObstacleState:
     """All that is known at a stamp. last: after the newest ping used, None before the first; done:
     the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
-    skipped: pings so far for which navigation had a gap; broken: tracks ended so far because their
-    numbers were not finite; alike: pings so far in which most obstacles moved alike."""
+    skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
+    because too many waited; broken: tracks ended so far because their numbers were not finite;
+    alike: pings so far in which most obstacles moved alike."""
 
     last: PingState | None = None
     done: tuple[PingState, ...] = ()
@@ -114,6 +115,7 @@ class ObstacleState:
     altitude: Altitude | None = None
     waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
     skipped: int = 0
+    missing: int = 0
     broken: int = 0
     alike: int = 0
 
@@ -121,6 +123,8 @@ class ObstacleState:
 class ObstacleTracker:
     """The tracker of `trackers.Tracker` for obstacles: `process` takes `Detections`, `Navigation`
     and `Altitude`."""
+
+    STATE = ('_stream',)
 
     def __init__(self, config: ObstacleConfig):
         self.config = config
@@ -167,6 +171,7 @@ class ObstacleTracker:
             'nis_mean': float(nis.mean() / 2.0) if len(nis) else float('nan'),
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
+            'navigation_missing': state.missing,
             'broken_tracks': state.broken,
             'moving_alike': int(state.last.alike) if state.last else 0,
             'pings_moving_alike': state.alike,
@@ -192,6 +197,8 @@ class ObstacleTracker:
                 altitude = item
         pings = [item for item in items if isinstance(item, Detections)]
         waiting = [*before.waiting, *((ping, altitude) for ping in pings)]
+        given_up = max(0, len(waiting) - MOST_WAITING)
+        del waiting[:given_up]
         last, done, skipped, broken = before.last, [], before.skipped, before.broken
         alike = before.alike
         while waiting:
@@ -214,6 +221,7 @@ class ObstacleTracker:
             altitude=altitude,
             waiting=tuple(waiting),
             skipped=skipped,
+            missing=before.missing + given_up,
             broken=broken,
             alike=alike,
         )

@@ -87,7 +87,7 @@ def test_the_limit_of_the_shipped_recordings_holds(tracked):
 
 def test_without_truth_the_page_still_says_something(tracked, bag, tmp_path):
     folder = RunFolder(tmp_path / 'run')
-    folder.prepare()
+    folder.path.mkdir()
     folder.write_estimates(RunFolder(tracked).read_estimates(), 'bathymetry')
     folder.write_json('run.json', {**RunFolder(tracked).read_run(), 'bag': str(tmp_path / 'gone')})
     judgement = judge(folder)

@@ -221,7 +221,7 @@ def test_the_deferred_estimate_of_a_clean_run_finds_the_truth(tmp_path):
 
 def test_without_truth_and_bag_there_is_still_a_page(run, tmp_path):
     folder = RunFolder(tmp_path / 'lonely')
-    folder.prepare()
+    folder.path.mkdir()
     folder.write_estimates(RunFolder(run).read_estimates(), 'obstacle')
     record = json.loads((run / 'run.json').read_text())
     folder.write_json('run.json', {**record, 'bag': str(tmp_path / 'gone')})

@@ -105,3 +105,9 @@ def simulated_clock(seconds: float) -> Disturbance:
         )
 
     return disturb
+
+
+@middle
+def long_enough(during: list[Message]) -> list[Step]:
+    """Nothing but time, until the node says that it cannot save its state."""
+    return [*during, Action(lambda rig: rig.heard_of('the state cannot be saved'))]

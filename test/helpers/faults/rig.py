@@ -56,8 +56,8 @@ NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|do
 class Outcome:
     """What a fault did. recovered: messages on the primary input until all later estimates agree
     with the undisturbed run, None for never; losses: counted in /diagnostics, by reason; levels
-    and words: of /diagnostics and the log while it lasted; estimates: in the rest, of how many;
-    answered: whether the node goes on answering messages."""
+    and words: of /diagnostics while it lasted, and of the log, where some are said once;
+    estimates: in the rest, of how many; answered: whether the node goes on answering messages."""
 
     recovered: int | None
     estimates: tuple[int, int]
@@ -100,8 +100,10 @@ class Diagnostics:
 class Rig:
     """A node of one system in a ROS domain of its own, in lock-step; ended by ``with``."""
 
-    def __init__(self, case: Case, arguments: Sequence[str] = ()):
-        self.case = case
+    def __init__(self, case: Case, arguments: Sequence[str] = (), *, lossless: bool = True):
+        """Start it. lossless: whether inputs are reliable and of any length, as lock-step needs
+        for many messages; else they are as the node has them."""
+        self.case, self._lossless = case, lossless
         self._stack = contextlib.ExitStack()
         try:
             self._start([*arguments])
@@ -112,7 +114,7 @@ class Rig:
     def _start(self, arguments: list[str]) -> None:
         case, enter = self.case, self._stack.enter_context
         topics = dict.fromkeys(one.topic for one in case.messages())
-        for name in (*topics, f'{case.system}/estimate'):
+        for name in (*(topics if self._lossless else ()), f'{case.system}/estimate'):
             end = 'publisher' if name.endswith('estimate') else 'subscription'
             for policy in ('history:=keep_all', 'reliability:=reliable'):
                 arguments += ['-p', f'qos_overrides./{name}.{end}.{policy}']
@@ -246,7 +248,7 @@ class Rig:
         self.reset()
         self.enable(True)
         self.fresh_diagnostics()
-        before, logged = self.diagnostics.counts(), len(self.node.log())
+        before = self.diagnostics.counts()
         messages = self.lockstep.counts.messages
         self.diagnostics.forget()
         disturbed, rest = disturb(*self.case.thirds())
@@ -270,7 +272,7 @@ class Rig:
             estimates=(answered, len(held)),
             losses={k: n for k, n in sorted(lost.items()) if n > 0 and not NO_LOSS.match(k)},
             levels=frozenset(self.diagnostics.levels),
-            words='\n'.join([*sorted(self.diagnostics.words), self.node.log()[logged:]]),
+            words='\n'.join([*sorted(self.diagnostics.words), self.node.log()]),
             answered=self.lockstep.counts.messages > messages,
         )
 

@@ -22,7 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from .cases import Message, Step
+from msg_adapters.table import decode_table, encode_table
+from sonar_imm.nodes.messages import make
+
+from .cases import Message, SECOND, Step
 
 Parts = tuple[list[Step], list[Step]]
 Disturbance = Callable[[list[Message], list[Message], list[Message]], Parts]
@@ -111,3 +114,19 @@ def second_publisher(during: list[Message], seconds: float) -> list[Step]:
 def frame(name: str) -> Callable[[Message], Message]:
     """Another frame_id."""
     return lambda one: one.changed(lambda content: setattr(content.header, 'frame_id', name))
+
+
+def columns(**factors: float) -> Callable[[Message], Message]:
+    """Columns of a table in another unit."""
+
+    def change(content: Any) -> None:
+        table = dict(decode_table(content))
+        for name, factor in factors.items():
+            table[name] = (table[name] * factor).astype(table[name].dtype)
+        stamp = content.header.stamp
+        stamp_ns = stamp.sec * SECOND + stamp.nanosec
+        made = encode_table(table, stamp_ns=stamp_ns, frame_id=content.header.frame_id, make=make)
+        content.fields, content.data = made.fields, made.data
+        content.point_step, content.row_step = made.point_step, made.row_step
+
+    return lambda one: one.changed(change)

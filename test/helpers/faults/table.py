@@ -49,8 +49,9 @@ class Fault:
     arguments: Sequence[str] = ()
 
 
-KEEPS_LATE = ('diver', 'obstacle')
-ONCE = ('bathymetry', 'fathometer')
+ANY_ORDER = ('diver', 'obstacle', 'bathymetry')
+ONCE = ('fathometer',)
+IN_ORDER = ('diver', 'obstacle', 'fathometer')
 SIMULATED = ('-p', 'use_sim_time:=true')
 
 FAULTS = (
@@ -67,12 +68,19 @@ FAULTS = (
         disturb=lambda case: streams.twice(),
         counted=['duplicate', 'repeated'],
         settle=0,
+        systems=IN_ORDER,
+    ),
+    Fault(
+        name='every ping twice, no ping needs another',
+        disturb=lambda case: streams.twice(),
+        settle=0,
+        systems=['bathymetry'],
     ),
     Fault(
         name='late messages, inside the window',
         disturb=lambda case: streams.late(),
         settle=0,
-        systems=KEEPS_LATE,
+        systems=ANY_ORDER,
     ),
     Fault(
         name='late messages, no window',
@@ -84,7 +92,7 @@ FAULTS = (
         name='shuffled inside the window',
         disturb=lambda case: streams.shuffled(),
         settle=0,
-        systems=KEEPS_LATE,
+        systems=ANY_ORDER,
     ),
     Fault(
         name='shuffled, no window',
@@ -129,7 +137,50 @@ FAULTS = (
         name='a second publisher, its clock late',
         disturb=lambda case: streams.second_publisher(case.window + 3.0),
         counted=['too_late'],
+        level='WARN',
+        says='not used: too_late',
         settle=0,
+        systems=IN_ORDER,
+    ),
+    Fault(
+        name='bearings in degrees',
+        disturb=lambda case: streams.each(streams.columns(bearing=57.29578)),
+        counted=['refused: out_of_range'],
+        level='WARN',
+        says='bearings are in radians',
+        systems=['obstacle'],
+    ),
+    Fault(
+        name='ranges in millimetres',
+        disturb=lambda case: streams.each(streams.columns(range=1000.0)),
+        counted=['refused: out_of_range'],
+        level='WARN',
+        says='ranges are in metres|snapshot reaches from',
+        systems=['obstacle', 'bathymetry'],
+    ),
+    Fault(
+        name='sound speed in feet per second',
+        disturb=lambda case: streams.each(streams.columns(sound_speed=3.28084)),
+        counted=['refused: out_of_range'],
+        level='WARN',
+        says='sound_speed of 4921',
+        systems=['bathymetry'],
+    ),
+    Fault(
+        name='depths in feet',
+        disturb=lambda case: streams.each(streams.columns(depth=3.28084)),
+        counted=['other_depths'],
+        level='WARN',
+        says='not used: other_depths',
+        systems=['fathometer'],
+    ),
+    Fault(
+        name='depths in millimetres',
+        disturb=lambda case: streams.each(streams.columns(depth=1000.0)),
+        counted=['refused: out_of_range'],
+        level='WARN',
+        says='possible',
+        systems=['fathometer'],
     ),
     Fault(
         name='a publisher that cannot be heard (QoS)',
@@ -145,5 +196,13 @@ FAULTS = (
         disturb=lambda case: actions.parameter_storm(),
         says='parameters changed',
         settle=0,
+    ),
+    Fault(
+        name='the state cannot be saved (read-only disk)',
+        disturb=lambda case: actions.long_enough(),
+        level='WARN',
+        says='the state cannot be saved',
+        settle=0,
+        arguments=('-p', 'state_file:=/sys/sonar_imm_state', '-p', 'state_interval:=0.2'),
     ),
 )

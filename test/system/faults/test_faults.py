@@ -50,7 +50,7 @@ def rigs():
         assert code == 0 and 'Traceback' not in log and not children
 
 
-@pytest.mark.parametrize('fault, system', pairs(), ids=lambda one: getattr(one, 'name', one))
+@pytest.mark.parametrize('fault, system', list(pairs()), ids=lambda one: getattr(one, 'name', one))
 def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
     key = system, *fault.arguments
     if key not in rigs:

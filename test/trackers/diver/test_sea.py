@@ -183,3 +183,13 @@ def test_without_anything_stated_no_state_is_added():
 def test_depths_that_do_not_fit_are_refused():
     with pytest.raises(ConfigError, match='depth_min'):
         DiverConfig.from_mapping({'depth_min': 30.0})
+
+
+@pytest.mark.parametrize('told', [{'sound_speed_std': 15.0}, OFF])
+def test_a_fix_before_any_ping_begins_a_track(told) -> None:
+    """Instruments that are off have their place in the state before a ping is heard; `warm` needs
+    it at every start."""
+    tracker = DiverTracker(DiverConfig(**told))
+    tracker.warm()
+    (estimate,) = tracker.process(fix(1.0, 3.0, 4.0))
+    np.testing.assert_allclose(estimate.state[0, :2], [3.0, 4.0])

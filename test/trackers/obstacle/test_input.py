@@ -21,6 +21,7 @@ import pytest
 
 from sonar_imm.measurements import Altitude, Detections, Fix, Navigation
 from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.navigation import MOST_WAITING
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 NAME = 'approach_dst+3_noisy'
@@ -76,6 +77,27 @@ def test_detections_without_navigation_wait_and_do_not_pile_up_results():
         ping = Detections(stamp_ns=SECOND * (k + 1), range=[50.0], bearing=[0.0])
         assert not tracker.process(ping)
     assert tracker.health()['pings_waiting'] == 20
+
+
+def test_pings_that_wait_for_navigation_that_never_comes_are_bounded_and_counted():
+    tracker = ObstacleTracker(ObstacleConfig())
+    for k in range(MOST_WAITING + 300):
+        tracker.process(Detections(stamp_ns=SECOND * (k + 1), range=[50.0], bearing=[0.0]))
+    health = tracker.health()
+    assert health['pings_waiting'] == MOST_WAITING and health['navigation_missing'] == 300
+
+
+def test_the_newest_pings_are_those_that_are_kept():
+    tracker = ObstacleTracker(ObstacleConfig(max_navigation_gap=1000.0, history=0.0))
+    for k in range(MOST_WAITING + 3):
+        tracker.process(Detections(stamp_ns=SECOND * (k + 1), range=[50.0], bearing=[0.0]))
+    last = SECOND * (MOST_WAITING + 3)
+    stamps = []
+    for stamp_ns in (last + 1, last + 2):
+        pose = Navigation(stamp_ns=stamp_ns, position=[0, 0, -5], orientation=[0, 0, 0, 1])
+        stamps += [one.stamp_ns for one in tracker.process(pose)]
+    assert not stamps and tracker.health()['pings_skipped'] == MOST_WAITING
+    assert tracker.health()['navigation_missing'] == 3
 
 
 def test_the_seafloor_method_needs_an_altitude():

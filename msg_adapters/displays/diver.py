@@ -1,0 +1,42 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Displays of divers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from sonar_imm.estimates import Estimate
+
+from ..estimates import write_odometry
+from ..headers import Make
+from .tracks import confirmed_rows, Drawn, MODELS, models_of_the_oldest, NAMED_SCALARS
+
+
+class Displays:
+    """One Odometry per diver, told apart by ``child_frame_id``, and the models."""
+
+    topics: Mapping[str, str] = {'odometry': 'nav_msgs/msg/Odometry', MODELS: NAMED_SCALARS}
+
+    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
+        rows = confirmed_rows(estimate)
+        if heard('odometry'):
+            for row in rows:
+                yield 'odometry', write_odometry(estimate, row, make)
+        yield from models_of_the_oldest(estimate, rows, make, heard)
+
+    def forget(self, make: Make) -> Drawn:
+        return iter(())

@@ -1,0 +1,57 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Displays of obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from sonar_imm.estimates import Estimate
+
+from ..headers import Make
+from ..obstacles import write_ended, write_markers, write_no_markers, write_poses
+from .tracks import confirmed_rows, Drawn, MODELS, models_of_the_oldest, NAMED_SCALARS
+
+
+class Displays:
+    """Places, markers that show the band of the height, and the models."""
+
+    topics: Mapping[str, str] = {
+        'obstacles': 'geometry_msgs/msg/PoseArray',
+        'markers': 'visualization_msgs/msg/MarkerArray',
+        MODELS: NAMED_SCALARS,
+    }
+
+    def __init__(self) -> None:
+        self._frame_id = ''
+        self._shown: set[int] = set()
+
+    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
+        self._frame_id = estimate.frame_id
+        rows = confirmed_rows(estimate)
+        if heard('obstacles'):
+            yield 'obstacles', write_poses(estimate, rows, make)
+        ids = set(estimate.extras['track_id'][rows].tolist())
+        ended, self._shown = sorted(self._shown - ids), ids
+        if heard('markers') and ended:
+            yield 'markers', write_ended(self._frame_id, ended, make)
+        if heard('markers') and len(rows):
+            yield 'markers', write_markers(estimate, rows, make)
+        yield from models_of_the_oldest(estimate, rows, make, heard)
+
+    def forget(self, make: Make) -> Drawn:
+        self._shown = set()
+        yield 'markers', write_no_markers(self._frame_id, make)

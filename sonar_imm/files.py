@@ -1,0 +1,101 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Files and folders that are either whole or not there.
+
+What is written is at first in a folder of its own beside its place, named after it with
+``.unfinished-`` and some letters. Only when it is finished it is moved to its place, by one
+rename, which no program can see half of. A process that is killed leaves such a folder behind,
+which the next one to write there removes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import contextlib
+import fcntl
+import glob
+import os
+from pathlib import Path
+import shutil
+import tempfile
+
+UNFINISHED = '.unfinished-'
+
+
+@contextlib.contextmanager
+def whole(path: str | Path) -> Iterator[Path]:
+    """Yields where to write the file or folder `path`: the same name elsewhere.
+
+    Moved to `path` at the end of the block, or thrown away by an exception. A file that is there
+    is replaced, a folder only when it is empty; a device or a pipe is written to as it is. The
+    folder around `path` is made. Raises OSError, which names `path`.
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not (target.is_file() or target.is_dir()):
+        yield target
+        return
+    with _named(path):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with beside(target) as place:
+            yield place / target.name
+            os.replace(place / target.name, target)
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove what killed processes left of `path`. What a living one is writing is left alone."""
+    for place in path.parent.glob(f'{glob.escape(path.name)}{UNFINISHED}*'):
+        with contextlib.suppress(OSError):
+            handle = os.open(place, os.O_RDONLY)
+            try:
+                # Nobody holds it: the process that made it is gone.
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(place, ignore_errors=True)
+            finally:
+                os.close(handle)
+
+
+@contextlib.contextmanager
+def beside(target: Path) -> Iterator[Path]:
+    """A new folder beside `target` for what is not finished, removed at the end. It is locked
+    while this process lives."""
+    _remove_leftovers(target)
+    while True:
+        place = Path(tempfile.mkdtemp(prefix=target.name + UNFINISHED, dir=target.parent))
+        try:
+            handle = os.open(place, os.O_RDONLY)
+        except FileNotFoundError:
+            continue  # taken for a leftover by another process, before the lock
+        with contextlib.suppress(OSError):  # file systems without locks: leftovers stay there
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if place.exists():
+            break
+        os.close(handle)
+    try:
+        yield place
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _named(path: str | Path) -> Iterator[None]:
+    """Give an error of the operating system the name `path` where it names the folder of what is
+    unfinished, or nothing."""
+    try:
+        yield
+    except OSError as error:
+        if not error.errno or (error.filename and UNFINISHED not in str(error.filename)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None

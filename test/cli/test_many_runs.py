@@ -1,0 +1,231 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Several runs of one command: instruments of one recording, several recordings, and going on."""
+
+import json
+from pathlib import Path
+
+from helpers.dive_bags import write_dive
+from helpers.source import ROOT
+import pytest
+
+from sonar_imm.cli import main
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.topics import fitting_systems, fitting_topics, instruments
+from sonar_imm.recordings.writer import BagWriter
+
+FEW = ('--set', 'particles_per_model=10')
+
+
+@pytest.fixture(scope='module')
+def swaths(tmp_path_factory):
+    """A short recording of a sonar with two sides."""
+    bag = tmp_path_factory.mktemp('swaths') / 'swaths.bag'
+    scene = ('two_sides', '--set', 'pings=3', '--set', 'last_range=22')
+    assert main(['simulate', 'bathymetry', str(bag), '--scenario', *scene]) == 0
+    return bag
+
+
+def renamed(bag, out, names):
+    """The recording `bag` with other names of topics; those that are not named are left out."""
+    with BagReader(bag) as reader, BagWriter(out) as writer:
+        for item in reader.messages():
+            for name in names.get(item.topic, ()):
+                writer.write(name, item.message, item.log_ns)
+    return out
+
+
+@pytest.fixture
+def two_ships(swaths, tmp_path):
+    """Two sonars of two sides each, one of them with topics named by words."""
+    return renamed(
+        swaths,
+        tmp_path / 'two_ships',
+        {
+            '/port/snapshot': ('/fore/port/snapshot', '/aft/sidescan_port/snapshot'),
+            '/starboard/snapshot': ('/fore/starboard/snapshot', '/aft/sidescan_stbd/snapshot'),
+            '/truth/port/estimate': ('/truth/fore/port/estimate',),
+            '/truth/starboard/estimate': ('/truth/fore/starboard/estimate',),
+        },
+    )
+
+
+def contents(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in Path(folder).rglob('*')
+        if path.is_file() and path.name not in ('run.json', 'summary.json')
+    }
+
+
+def track(*arguments):
+    return main(['track', *map(str, arguments)])
+
+
+def test_words_in_a_name_tell_the_side(swaths, tmp_path):
+    bag = renamed(
+        swaths,
+        tmp_path / 'bag',
+        {
+            '/port/snapshot': ('/sidescan_PORT/snapshot',),
+            '/starboard/snapshot': ('/sidescan_stbd/snapshot',),
+        },
+    )
+    with BagReader(bag) as reader:
+        named = {name: entry.name for name, entry in fitting_topics(reader, 'bathymetry').items()}
+    assert named == {
+        '/sidescan_PORT/snapshot': 'port/snapshot',
+        '/sidescan_stbd/snapshot': 'starboard/snapshot',
+    }
+    assert track(bag, tmp_path / 'words', *FEW) == 0 == track(swaths, tmp_path / 'own', *FEW)
+    assert contents(tmp_path / 'words') == contents(tmp_path / 'own')
+
+
+def test_instruments_are_told_apart_and_share_what_is_nobodys(tmp_path):
+    bag = renamed(
+        ROOT / 'bags' / 'bathymetry_ship',
+        tmp_path / 'bag',
+        {
+            '/nav': ('/nav', '/b/nav'),
+            '/port/snapshot': ('/a/snapshot', '/b/snapshot', '/snapshot'),
+        },
+    )
+    with BagReader(bag) as reader:
+        found = instruments(reader, 'bathymetry')
+    assert {name: sorted(inputs) for name, inputs in found.items()} == {
+        'a': ['/a/snapshot', '/nav'],
+        'b': ['/b/nav', '/b/snapshot'],
+        'snapshot': ['/nav', '/snapshot'],
+    }
+
+
+def test_every_instrument_is_tracked_as_if_it_were_alone(swaths, two_ships, tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert track(two_ships, out, *FEW, '--jobs', '2') == 0
+    assert '2 runs in' in capsys.readouterr().out
+    assert track(swaths, tmp_path / 'alone', *FEW) == 0
+    alone = contents(tmp_path / 'alone')
+    assert contents(out / 'fore') == contents(out / 'aft_sidescan') == alone
+    summary = json.loads((out / 'summary.json').read_text())
+    assert [run['folder'] for run in summary['runs']] == ['aft_sidescan', 'fore']
+    assert all(run['estimates'] == 6 and run['state'] == 'tracked' for run in summary['runs'])
+    topics = json.loads((out / 'fore' / 'run.json').read_text())['topics']
+    assert topics == {
+        '/fore/port/snapshot': 'port/snapshot',
+        '/fore/starboard/snapshot': 'starboard/snapshot',
+    }
+    # Downstream: all at once, one by one, and a sentence where only one will do.
+    capsys.readouterr()
+    assert main(['evaluate', str(out), '--json']) == 0
+    metrics = json.loads(capsys.readouterr().out)
+    assert list(metrics) == ['aft_sidescan', 'fore'] and (out / 'report.html').is_file()
+    assert metrics['fore'] == json.loads((out / 'fore' / 'metrics.json').read_text())
+    assert main(['evaluate', str(out / 'fore'), '--no-report']) == 0
+    assert main(['export', str(out), str(tmp_path / 'x.xyz')]) == 2
+    assert 'holds several runs' in capsys.readouterr().err
+
+
+def test_a_named_topic_is_tracked_alone(two_ships, tmp_path):
+    chosen = ('--topic', 'port/snapshot=/fore/port/snapshot')
+    assert track(two_ships, tmp_path / 'out', *FEW, *chosen) == 0
+    run = json.loads((tmp_path / 'out' / 'run.json').read_text())
+    assert run['topics'] == {'/fore/port/snapshot': 'port/snapshot'}
+
+
+def test_the_same_command_again_makes_only_what_is_missing(tmp_path, capsys):
+    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('abc')]
+    out = tmp_path / 'out'
+    assert track(*bags, out) == 0
+    first, times = contents(out), {path: path.stat().st_mtime_ns for path in out.rglob('*.csv')}
+    (out / 'a' / 'run.json').unlink()  # as if killed
+    (out / 'c' / 'estimate.csv').unlink()
+    (out / 'c' / 'run.json').unlink()
+    capsys.readouterr()
+    assert track(*bags, out, '--json', '--jobs', '2') == 0
+    states = [run['state'] for run in json.loads(capsys.readouterr().out)['runs']]
+    assert states == ['tracked', 'kept', 'tracked']
+    assert contents(out) == first
+    assert (out / 'b' / 'estimate.csv').stat().st_mtime_ns == times[out / 'b' / 'estimate.csv']
+    # Another parameter, another recording, another version: refused, and by --overwrite made anew.
+    assert track(*bags, out, '--set', 'gate_probability=0.9') == 1
+    assert 'b holds another run, which differs in parameters (gate_probability)' in (
+        capsys.readouterr().err
+    )
+    run = json.loads((out / 'b' / 'run.json').read_text())
+    run['versions']['sonar_imm'] = '0.0.1'
+    (out / 'b' / 'run.json').write_text(json.dumps(run))
+    assert track(*bags, out) == 1
+    assert 'b holds another run, which differs in versions (sonar_imm)' in capsys.readouterr().err
+    assert track(*bags, out, '--overwrite', '--set', 'gate_probability=0.9') == 0
+    capsys.readouterr()
+    (bags[0] / 'notes.txt').write_text('one byte more')
+    assert track(*bags, out, '--set', 'gate_probability=0.9') == 1
+    said = capsys.readouterr()
+    assert 'a holds another run, which differs in bag_bytes, bag_sha256' in said.err
+    assert '3 runs in' in said.out and '2 kept, 1 failed' in said.out
+
+
+def test_the_summary_keeps_what_other_commands_made(tmp_path, capsys):
+    a, b, c = (write_dive(tmp_path / name) for name in 'abc')
+    assert track(a, b, tmp_path / 'out') == 0 == track(b, c, tmp_path / 'out')
+    runs = json.loads((tmp_path / 'out' / 'summary.json').read_text())['runs']
+    assert [(run['folder'], run['state']) for run in runs] == [
+        ('a', 'tracked'),
+        ('b', 'kept'),
+        ('c', 'tracked'),
+    ]
+    assert main(['evaluate', str(tmp_path / 'out'), '--json', '--no-report']) == 0
+    capsys.readouterr()
+    assert track(a, tmp_path / 'single') == 0
+    assert track(a, b, tmp_path / 'single') == 2
+    assert 'holds a run itself' in capsys.readouterr().err
+    (tmp_path / 'out' / 'summary.json').write_text('{"runs": [{"folder": 3}]}')
+    assert main(['evaluate', str(tmp_path / 'out')]) == 2
+    assert 'cannot be understood' in capsys.readouterr().err
+
+
+def test_bags_on_a_cluster(tmp_path, capsys):
+    distributed = pytest.importorskip('distributed')
+    bags = [write_dive(tmp_path / name, spoilt=range(k)) for k, name in enumerate('ab')]
+    assert track(*bags, tmp_path / 'here') == 0
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=None,
+        scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
+        silence_logs='CRITICAL',
+    ) as there:
+        address = ('--scheduler', there.scheduler_address)
+        assert track(*bags, tmp_path / 'missing', tmp_path / 'there', *address) == 1
+        assert 'missing does not exist' in capsys.readouterr().err
+        assert contents(tmp_path / 'there') == contents(tmp_path / 'here')
+        capsys.readouterr()
+        assert track(*bags, tmp_path / 'there', *address) == 0
+        assert '2 kept' in capsys.readouterr().out
+    assert track(*bags, tmp_path / 'no', '--scheduler', 'nonsense') == 2
+    assert 'no dask scheduler at nonsense' in capsys.readouterr().err
+    assert track(*bags, tmp_path / 'no', *address, '--jobs', '2') == 2
+
+
+def test_the_tracker_with_the_best_evidence_is_chosen():
+    """A ship with navigation is no obstacle tracker's, and a companion no diver's."""
+    for name, system in (
+        ('bathymetry_ship', 'bathymetry'),
+        ('fathometer_array', 'fathometer'),
+        ('obstacle_tethers', 'obstacle'),
+    ):
+        with BagReader(ROOT / 'bags' / name) as reader:
+            assert fitting_systems(reader)[0] == system

@@ -1,0 +1,122 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings that are damaged, disks that are full or may not be written to."""
+
+import contextlib
+import io
+from pathlib import Path
+import resource
+import shutil
+import subprocess
+import sys
+
+from helpers.faults.cases import BAGS, CASES
+from helpers.faults.figures import count, long_form
+import numpy as np
+import pytest
+
+from sonar_imm.cli import main
+
+pytestmark = pytest.mark.system
+
+KINDS = ('cut short', 'one bit flipped')
+SIGNALS_OF_DAMAGE = ('damaged', 'checksum', 'CRC', 'truncated', 'index', 'not read', 'corrupt')
+
+
+def run(*words):
+    """The command in this process: exit code, and what it said."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        code = main([str(word) for word in words])
+    return code, said.getvalue()
+
+
+def tracked(bag, out):
+    """What became of `track`: exit code, words, and the estimates as bytes, None without."""
+    code, said = run('track', bag, out, '--system', CASES_BY_BAG[Path(bag).name])
+    estimates = out / 'estimate.csv'
+    return code, said, estimates.read_bytes() if estimates.exists() else None
+
+
+CASES_BY_BAG = {case.bag: system for system, case in CASES.items()}
+
+
+def damage(folder, kind, rng):
+    """Spoil the recording in `folder`."""
+    (file,) = folder.glob('*.mcap')
+    whole = bytearray(file.read_bytes())
+    if kind == 'cut short':
+        del whole[int(rng.integers(len(whole) // 20, len(whole))) :]
+    else:
+        whole[int(rng.integers(len(whole)))] ^= 1 << int(rng.integers(8))
+    file.write_bytes(whole)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
+    """What is tracked without a word is what would have been tracked without the damage."""
+    rng = np.random.default_rng(len(kind))
+    names = ['diver_table1', 'obstacle_movers'] if long_form() else ['diver_table1']
+    whole = {name: tracked(BAGS / name, tmp_path / f'whole_{name}') for name in names}
+    assert all(code == 0 for code, _, _ in whole.values())
+    tries, silent, failed, said_so = count(3, 60), [], [], 0
+    for turn in range(tries):
+        name = names[turn % len(names)]
+        bag = tmp_path / f'{turn}' / name
+        shutil.copytree(BAGS / name, bag)
+        damage(bag, kind, rng)
+        code, said, estimates = tracked(bag, tmp_path / f'out_{turn}')
+        if code not in (0, 2) or 'Traceback' in said or (code == 2) == (estimates is not None):
+            failed.append((turn, code, said[-300:]))
+        problem = code == 2 or said.count('problem') or any(w in said for w in SIGNALS_OF_DAMAGE)
+        said_so += bool(problem)
+        if not problem and estimates != whole[name][2]:
+            silent.append((turn, said[-300:]))
+    figures.add(what=kind, tried=tries, said=said_so, silent=len(silent), failed=len(failed))
+    assert not failed and not silent
+
+
+def limited(size, *words):
+    """The command as a process that may not write files above `size` bytes, as on a full disk."""
+    return subprocess.run(
+        [sys.executable, '-m', 'sonar_imm.cli', *map(str, words)],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_nothing_that_looks_whole(tmp_path, figures):
+    rng = np.random.default_rng(3)
+    whole = tmp_path / 'whole'
+    run('track', BAGS / 'diver_table1', whole)
+    largest = max(file.stat().st_size for file in whole.rglob('*') if file.is_file())
+    tries, bad = count(1, 12), []
+    for turn in range(tries):
+        out = tmp_path / f'out_{turn}'
+        done = limited(int(rng.integers(0, largest)), 'track', BAGS / 'diver_table1', out)
+        words = [line for line in done.stderr.splitlines() if line.startswith('sonar-imm:')]
+        if done.returncode != 2 or len(words) != 1 or 'Traceback' in done.stderr or out.exists():
+            bad.append((turn, done.returncode, done.stderr[-300:]))
+    figures.add(what='full disk', tried=tries, said=tries - len(bad), silent=0, failed=len(bad))
+    assert not bad
+
+
+def test_a_folder_that_may_not_be_written_to_is_one_sentence(figures):
+    # /sys belongs to the kernel: not even root makes a folder there
+    code, said = run('track', BAGS / 'diver_table1', '/sys/sonar_imm')
+    figures.add(what='read-only folder', tried=1, said=int(code == 2), silent=0, failed=code != 2)
+    assert code == 2 and len(said.splitlines()) == 1 and '/sys/sonar_imm' in said

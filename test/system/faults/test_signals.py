@@ -1,0 +1,88 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Signals at random moments of a node's life, and the start after them."""
+
+import signal
+import time
+
+from helpers.faults.cases import CASES
+from helpers.faults.figures import count
+from helpers.faults.nodes import ended, heeds_signals, reason_unclean, Running
+import numpy as np
+import pytest
+
+from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id
+
+pytestmark = pytest.mark.system
+
+ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SYSTEMS = tuple(CASES)
+
+
+@pytest.mark.parametrize('how', [*ASKING, signal.SIGKILL], ids=lambda how: how.name)
+def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figures):
+    """All four nodes at once, each while it works on a burst of messages."""
+    rng = np.random.default_rng(int(how))
+    turns, unclean = count(1, 20), []
+    for _ in range(turns):
+        with Running(SYSTEMS) as running:
+            for system in SYSTEMS:
+                running.send(system, int(rng.integers(1, len(CASES[system].messages()))))
+            time.sleep(0.2 * rng.random())
+            for system in SYSTEMS:
+                running.nodes[system].process.send_signal(how)
+            for system in SYSTEMS:
+                unclean += reason_unclean(running.nodes[system], -9 if how == 9 else 0)
+            if how == signal.SIGKILL:
+                running.start_again()
+                for system in SYSTEMS:
+                    running.step(system)
+                unclean += running.stop()
+    for system in SYSTEMS:
+        mine = [why for name, why in unclean if name == system]
+        figures.add(system=system, signal=how.name, tried=turns, clean=turns - len(mine), why=mine)
+    assert not unclean
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
+    """Moments over the two seconds in which modules load and kernels get warm. What came before
+    the first line of ours is the interpreter's."""
+    rng = np.random.default_rng(17 + SYSTEMS.index(system))
+    moments, early, unclean = count(5, 20), 0, []
+    for turn in rng.permutation(moments):
+        with (
+            reserved_domain_id() as domain,
+            NodeProcess(system, domain_id=domain) as node,
+        ):
+            while not heeds_signals(node.process):
+                assert node.process.poll() is None
+                time.sleep(0.001)
+            time.sleep(2.0 / moments * (turn + rng.random()))
+            early += 'ready, hears' not in node.log()
+            node.process.send_signal(ASKING[turn % 3])
+            node.process.send_signal(ASKING[turn % 3])  # as launch and a terminal do together
+            unclean += reason_unclean(node, 0)
+            said = [line for line in node.log().splitlines() if '[INFO]' not in line]
+            unclean += [(system, line) for line in said]
+    figures.add(
+        system=system,
+        signal='while it starts',
+        tried=moments,
+        clean=moments - len(unclean),
+        why=unclean,
+    )
+    assert not unclean and early > 0
+    assert ended()

@@ -1,0 +1,103 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A process that is killed leaves nothing that looks whole."""
+
+import random
+import signal
+import subprocess
+import sys
+import time
+
+from helpers.dive_bags import write_dive
+from helpers.source import ROOT
+import pytest
+
+from sonar_imm.evaluation.batch import run_folders
+from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.files import UNFINISHED
+from sonar_imm.recordings.reader import BagReader
+
+pytestmark = pytest.mark.system
+MOMENTS = 20
+
+
+def command(*arguments):
+    return [sys.executable, '-m', 'sonar_imm.cli', *map(str, arguments)]
+
+
+def whole_run(path):
+    """Whether `path` is a finished run; anything else that is there fails the test."""
+    if not path.exists():
+        return False
+    folder = RunFolder(path)
+    assert folder.read_run()['estimates'] == len(folder.read_estimates()) > 0
+    return True
+
+
+def test_track_is_killed_at_twenty_moments(tmp_path):
+    bag = write_dive(tmp_path / 'bag' / 'dive')
+    arguments = command('track', bag, tmp_path / 'once')
+    begin = time.perf_counter()
+    subprocess.run(arguments, cwd=ROOT, check=True, capture_output=True)
+    usual = time.perf_counter() - begin
+    # Half of the moments where the files are written and moved, which is at the end.
+    chance = random.Random(14)
+    moments = [chance.uniform(0.0, 1.05) for _ in range(MOMENTS // 2)]
+    moments += [chance.uniform(0.75, 1.02) for _ in range(MOMENTS - len(moments))]
+    whole = 0
+    for number, moment in enumerate(moments):
+        out = tmp_path / 'runs' / f'run{number}'
+        with subprocess.Popen(
+            command('track', bag, out), cwd=ROOT, stdout=subprocess.DEVNULL
+        ) as it:
+            try:
+                it.wait(moment * usual)
+            except subprocess.TimeoutExpired:
+                it.send_signal(signal.SIGKILL)
+        whole += whole_run(out)
+    assert whole < MOMENTS
+    names = {path.name for path in (tmp_path / 'runs').glob('*')}
+    others = {name for name in names if UNFINISHED not in name}
+    assert len(others) == whole and all(name.startswith('run') for name in names)
+
+
+def test_a_killed_command_goes_on_where_it_was(tmp_path):
+    bags = [write_dive(tmp_path / f'bag{k}', spoilt=range(k)) for k in range(8)]
+    out = tmp_path / 'out'
+    arguments = command('track', *bags, out)
+    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL) as it:
+        while it.poll() is None and len(list(out.glob('bag?/run.json'))) < 2:
+            time.sleep(0.005)
+        it.send_signal(signal.SIGKILL)
+    before = {path: path.stat().st_mtime_ns for path in out.glob('bag?/run.json')}
+    assert len(before) >= 2 and all(whole_run(path.parent) for path in before)
+    again = subprocess.run(arguments, cwd=ROOT, check=True, capture_output=True, text=True)
+    assert f'{8 - len(before)} tracked, {len(before)} kept, 0 failed' in again.stdout
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert len(run_folders(out)) == 8 and all(whole_run(path) for path in run_folders(out))
+    assert not [path for path in out.iterdir() if UNFINISHED in path.name]
+
+
+def test_a_bag_that_is_being_written_is_not_there(tmp_path):
+    out = tmp_path / 'scene'
+    arguments = command('simulate', 'obstacle', out)
+    with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL) as it:
+        while it.poll() is None and not list(tmp_path.glob(f'scene{UNFINISHED}*/scene/*.mcap')):
+            time.sleep(0.002)
+        it.send_signal(signal.SIGKILL)
+    if out.exists():  # it was faster
+        with BagReader(out) as bag:
+            assert not bag.problems
+    assert all(path.name.startswith('scene') for path in tmp_path.iterdir())

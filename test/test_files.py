@@ -1,0 +1,104 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Files and folders are whole or not there."""
+
+import fcntl
+import os
+from pathlib import Path
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from sonar_imm.files import beside, UNFINISHED, whole
+
+
+def test_a_file_is_there_at_the_end_only_and_replaces_an_older_one(tmp_path):
+    target = tmp_path / 'new' / 'file.txt'
+    for text in ('first', 'second'):
+        with whole(target) as path:
+            assert path.name == 'file.txt' and path != target
+            path.write_text(text)
+            assert not target.exists() or target.read_text() == 'first'
+        assert target.read_text() == text
+    with pytest.raises(KeyError), whole(target) as path:
+        path.write_text('third')
+        raise KeyError
+    assert target.read_text() == 'second' and len(list(target.parent.iterdir())) == 1
+
+
+def test_a_folder_is_there_at_the_end_and_no_other_is_replaced(tmp_path):
+    for _ in range(2):
+        try:
+            with whole(tmp_path / 'folder') as path:
+                path.mkdir()
+                (path / 'file').touch()
+        except OSError as error:
+            assert error.filename == str(tmp_path / 'folder')
+    assert [path.name for path in tmp_path.rglob('*')] == ['folder', 'file']
+
+
+def test_links_and_devices_stay_what_they_are(tmp_path):
+    (tmp_path / 'link').symlink_to(tmp_path / 'file')
+    with whole(tmp_path / 'link') as path:
+        path.write_text('text')
+    assert (tmp_path / 'link').is_symlink() and (tmp_path / 'file').read_text() == 'text'
+    with whole('/dev/null') as path:
+        path.write_text('text')
+    assert Path('/dev/null').is_char_device()
+
+
+def test_errors_name_what_the_user_named(tmp_path):
+    (tmp_path / 'file').touch()
+    for path in (tmp_path / 'file' / 'below', tmp_path / 'none'):
+        with pytest.raises(OSError) as caught, whole(path) as unfinished:
+            unfinished.open('r')
+        assert str(caught.value.filename) in (str(path), str(path.parent))
+
+
+def test_what_a_killed_process_left_is_removed_and_that_of_a_living_one_is_not(tmp_path):
+    text = (
+        'import sys\nfrom pathlib import Path\nfrom sonar_imm.files import beside\n'
+        'with beside(Path(sys.argv[1])) as place:\n'
+        "    (place / 'file').touch()\n    print(flush=True)\n    sys.stdin.read()\n"
+    )
+    target = tmp_path / 'out'
+    with subprocess.Popen(
+        [sys.executable, '-c', text, str(target)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        with beside(target) as place:
+            assert len(list(tmp_path.iterdir())) == 2
+        assert not place.exists()
+        other.kill()
+        other.wait()
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(f'out{UNFINISHED}') and (left / 'file').exists()
+    with beside(target) as place:
+        assert list(tmp_path.iterdir()) == [place]
+
+
+def test_file_systems_without_locks_keep_leftovers(tmp_path, monkeypatch):
+    def no_locks(*_):
+        raise OSError(38, 'no locks')
+
+    shutil.rmtree(tmp_path)
+    os.mkdir(tmp_path)
+    (tmp_path / f'out{UNFINISHED}abc').mkdir()
+    monkeypatch.setattr(fcntl, 'flock', no_locks)
+    with whole(tmp_path / 'out') as path:
+        path.touch()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['out', f'out{UNFINISHED}abc']
