@@ -25,8 +25,8 @@ from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.reflectors import (
-    relative_amplitude,
     Reflectors,
+    relative_amplitude,
     sediment_depths,
 )
 from sonar_imm.trackers.fathometer.response import Response
