@@ -65,7 +65,11 @@ class Pose(NamedTuple):
 
 
 def flip_world(vector: ArrayLike) -> FloatArray:
-    """NED of a vector (..., 3) in ENU, and the other way round."""
+    """NED of a vector (..., 3) in ENU, and the other way round.
+
+    >>> flip_world([1.0, 2.0, 3.0]).tolist()
+    [2.0, 1.0, -3.0]
+    """
     return np.asarray(vector, np.float64) @ _WORLD
 
 
@@ -92,7 +96,12 @@ def flip_pose(pose: Pose) -> Pose:
 
 
 def rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> FloatArray:
-    """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians."""
+    """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians.
+
+    >>> import numpy as np
+    >>> (rotation(0.0, 0.0, np.pi / 2) @ [1.0, 0.0, 0.0]).round(9).tolist()  # x becomes y
+    [0.0, 1.0, 0.0]
+    """
     roll, pitch, yaw = np.broadcast_arrays(
         *(np.asarray(a, np.float64) for a in (roll, pitch, yaw))
     )
@@ -202,7 +211,13 @@ def project(m: FloatArray, model: str = 'plane') -> tuple[FloatArray, FloatArray
 
 
 def vertical_offset(m: FloatArray, R: FloatArray) -> FloatArray:
-    """d_st (...,), how far m (..., 3) lies below the sonar, m: eq. (7)."""
+    """d_st (...,), how far m (..., 3) lies below the sonar, m: eq. (7).
+
+    >>> import numpy as np
+    >>> R = rotation(0.0, np.radians(30.0), 0.0)
+    >>> round(float(vertical_offset(np.array([20.0, 0.0, 0.0]), R)), 3)  # the bow up: above
+    -10.0
+    """
     return np.asarray(np.einsum('...i,...i->...', R[..., 2, :], m))
 
 

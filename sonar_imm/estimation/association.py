@@ -55,7 +55,11 @@ from .kalman import BoolArray, factorise, log_density
 @lru_cache(maxsize=256)
 def gate_threshold(probability: float, dimension: int) -> float:
     """Chi-square quantile: the normalised innovation squared of a `dimension`-vector of the target
-    itself lies below it with `probability`."""
+    itself lies below it with `probability`.
+
+    >>> round(gate_threshold(0.99, 2), 3)
+    9.21
+    """
     from scipy.special import gammaincinv  # scipy.stats has it too, but takes a second to import
 
     return 2.0 * float(gammaincinv(dimension / 2.0, probability))
@@ -140,6 +144,11 @@ def assign(
     target, detection, cost: (pairs,), each pair once; a pair that is not listed is forbidden, and
     one whose cost is not negative is never chosen. Returns (targets,) the detection of each
     target, -1 for none. The same input gives the same choice, ties included.
+
+    >>> import numpy as np
+    >>> target, detection = np.array([0, 0, 1]), np.array([0, 1, 0])
+    >>> assign(target, detection, np.array([-3.0, -2.5, -4.0]), 2, 2).tolist()
+    [1, 0]
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

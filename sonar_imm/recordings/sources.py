@@ -20,7 +20,7 @@ one sentence here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -35,6 +35,7 @@ from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
 from .mcap_scan import Channel, McapScan
 from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
+from .source_hints import advice, convert_hint, leftovers, packed_hint
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -281,7 +282,7 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
         if path.suffix not in SUFFIXES:
             raise BagError(
                 f'{path} is not a recording: the names of recordings end in '
-                f'{", ".join(SUFFIXES)}{_packed_hint([path])}'
+                f'{", ".join(SUFFIXES)}{packed_hint([path])}{convert_hint(path)}'
             )
         return _open_files([path], [])
     return _open_directory(path)
@@ -300,7 +301,7 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
             )
         else:
             if not source.unordered:
-                return [source], _leftovers(path)
+                return [source], leftovers(path)
             source.close()
     files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
     if not files:
@@ -308,7 +309,7 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
             problems[0]
             if problems
             else f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
-            f'ends in {", ".join(SUFFIXES)}{_packed_hint(path.iterdir())}'
+            f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}'
         )
     if not problems and not (path / 'metadata.yaml').exists():
         problems.append(f'{path} has no metadata.yaml, its files are read one by one')
@@ -323,10 +324,10 @@ def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], l
         try:
             source, damage = _open_file(file)
         except Exception as error:  # see the module docstring
-            failures.append(f'{file} cannot be read: {one_line(error)}{_advice(file)}')
+            failures.append(f'{file} cannot be read: {one_line(error)}{advice(file)}')
             continue
         sources.append(source)
-        problems += damage + _leftovers(file)
+        problems += damage + leftovers(file)
     if not sources:
         raise BagError('; '.join(failures))
     return sources, problems + failures
@@ -355,27 +356,6 @@ def _unpacked(raw: bytes) -> bytes:
         return unpack(raw, 'zstd')
     except (TooLargeError, ZstdError):
         return bytes(raw)
-
-
-def _leftovers(path: Path) -> list[str]:
-    """Sentences about write-ahead logs that a crashed recorder left, whose rows are not read."""
-    logs = path.glob('*.db3-wal') if path.is_dir() else [path.with_name(path.name + '-wal')]
-    return [
-        f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
-        f"the messages in it are not read (sqlite3 {log.name[:-4]} 'pragma wal_checkpoint' "
-        'merges them)'
-        for log in logs
-        if log.exists() and log.stat().st_size
-    ]
-
-
-def _advice(file: Path) -> str:
-    return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
-
-
-def _packed_hint(files: Iterable[Path]) -> str:
-    packed = [file.name for file in files if file.suffix in ('.zstd', '.zst')]
-    return f'; {packed[0]} is compressed, unpack it with zstd first' if packed else ''
 
 
 def _split_order(file: Path) -> tuple[int, str]:
