@@ -31,6 +31,9 @@ endif
 TESTS ?=
 # Where the parts of `make reliability` go.
 RELIABILITY ?= $(abspath $(VENV))/reliability
+# Hostile messages of `make fuzz` for each system.
+CASES ?= 100000
+FUZZ_JSON ?=
 # Tests that run the compiled kernels.
 KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary grid imm imm_particles \
     set_particles smoothing covariance kalman)) \
@@ -41,7 +44,7 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-bounds test-system reliability lint generate docs docs-numbers bench clean
+.PHONY: help venv demo test test-core test-bounds test-system fuzz reliability lint generate docs docs-numbers bench clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
@@ -71,6 +74,10 @@ test-core: venv ## run the tests that need no processes of their own (JOBS=... C
 test-bounds: venv ## run the tests of the compiled kernels with every index checked
 	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
 	    $(BIN)/python -m pytest -m 'not system' -n $(JOBS) $(or $(TESTS),$(KERNEL_TESTS))
+
+fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON=...)
+	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \
+	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
 test-system: venv ## run the tests that start real nodes, one at a time
 	$(TEST_ENV) $(BIN)/python -m pytest -m system

@@ -98,14 +98,25 @@ class NodeConfig(Config):
 
 
 @frozen(kw_only=True)
-class BathymetryNodeConfig(NodeConfig):
+class PlacedNodeConfig(NodeConfig):
+    """What is tracked has a place in the world."""
+
+    use_tf_static: bool = parameter(
+        False,
+        'hear /tf_static, and turn what comes in another frame that is fixed to that of the '
+        'tracks into it, instead of refusing it',
+    )
+
+
+@frozen(kw_only=True)
+class BathymetryNodeConfig(PlacedNodeConfig):
     """A swath is looked at while it is surveyed, and no ping needs the one before."""
 
     max_wait: float = inherited(NodeConfig, 'max_wait', 0.5)
 
 
 @frozen(kw_only=True)
-class ReplayNodeConfig(NodeConfig):
+class ReplayNodeConfig(PlacedNodeConfig):
     """A late message has its window computed again: up to a second, while others go on coming."""
 
     queue_depth: int = inherited(NodeConfig, 'queue_depth', 500)
@@ -130,6 +141,11 @@ def node_config_type(system: System) -> type[NodeConfig]:
     """What the node of `system` can be told besides the parameters of its tracker."""
     found: type[NodeConfig] = globals()[system.node_config]
     return found
+
+
+def hears_transforms(node: NodeConfig) -> bool:
+    """Whether /tf_static is heard for the frames of measurements."""
+    return isinstance(node, PlacedNodeConfig) and node.use_tf_static
 
 
 def type_specs(system: str) -> tuple[ParameterSpec, ...]:

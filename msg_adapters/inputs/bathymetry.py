@@ -29,6 +29,7 @@ from ..navigation import (
     write_range,
 )
 from ..snapshots import read_snapshot, write_snapshot
+from ..transforms import TF_STATIC
 from .topic import InputTopic
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
@@ -79,4 +80,5 @@ TOPICS = (
         write=write_range,
         companion=True,
     ),
+    TF_STATIC,
 )

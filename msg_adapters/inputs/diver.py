@@ -44,6 +44,7 @@ from ..navigation import write_navigation
 from ..relative import read_beacon, read_modem, read_relative, read_usbl_data, write_relative
 from ..scans import doubt_scan, read_poses, read_scan, write_scan
 from ..starts import read_start, write_start
+from ..transforms import TF_STATIC
 from ..vessel import read_heading, read_vessel_pose, write_heading
 from .topic import InputTopic
 
@@ -162,4 +163,5 @@ TOPICS = (
         prefix='~/',
         by_name=frozenset({POSE}),
     ),
+    TF_STATIC,
 )

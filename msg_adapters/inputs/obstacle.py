@@ -36,6 +36,7 @@ from ..navigation import (
     write_range,
 )
 from ..sonar_images import read_picture, read_projected_image, read_raw_image, write_picture
+from ..transforms import TF_STATIC
 from ..vendor_images import read_oculus_ping, read_ping360_echo, read_sonoptix_echo
 from .topic import InputTopic
 
@@ -77,6 +78,7 @@ TOPICS = (
         },
         write=write_range,
     ),
+    TF_STATIC,
 )
 
 IMAGES = (

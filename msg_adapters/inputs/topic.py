@@ -69,6 +69,8 @@ class InputTopic:
     the inputs that are neither required nor companions, one is enough.
     prefix: ``'~/'`` for a topic below the name of the node, ``'/'`` for one that no namespace
     changes; '' for a relative topic.
+    latched: whether messages wait for listeners that come later, and none may be lost.
+    wanted: whether it is heard at all, by the parameters of tracker and node.
     words: words in a topic's name, any of which says that it is this input rather than the one of
     the same last name: ``/sidescan_port/snapshot`` is a ``port/snapshot``.
     makes: the input of a tracker that a node before it makes of this one; '' for an input of the
@@ -94,6 +96,10 @@ class InputTopic:
         default=lambda settings: False, kw_only=True
     )
     prefix: str = field(default='', kw_only=True)
+    latched: bool = field(default=False, kw_only=True)
+    wanted: Callable[[Mapping[str, Any]], bool] = field(
+        default=lambda settings: True, kw_only=True
+    )
     words: frozenset[str] = field(default=frozenset(), kw_only=True)
     makes: str = field(default='', kw_only=True)
 

@@ -29,8 +29,16 @@ Cells of an image are not independent: speckle is as wide as the beam and as lon
 `effective_cells` says how many independent ones a window holds. Taking all for independent makes
 ten times as many false alarms.
 
+Two things spoil the mean of the noise. An obstacle that reaches into the training cells hides
+itself, as a chain along the line of sight does; so cells far above the mean logarithm of their
+neighbourhood, which a few loud cells hardly move, are left out (`quiet_level`). And a rough sea
+floor has longer tails than a Rayleigh law: power of patches that differ is K distributed. How
+rough it is shows in the variance of the logarithm of the power in the rows around (`roughness`),
+and the factor grows by what that shape needs (`tail_factor`).
+
 Sources: Hansen & Sawyers 1980, 'Detectability loss due to greatest-of selection in a
-cell-averaging CFAR'; Finn & Johnson 1968 for a single side.
+cell-averaging CFAR'; Finn & Johnson 1968 for a single side; Ward, Tough & Watts 2013, 'Sea
+clutter: scattering, the K distribution and radar performance'.
 """
 
 from __future__ import annotations
@@ -40,9 +48,18 @@ from functools import lru_cache
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .cfar_kernels import greatest_of_level
+from .cfar_kernels import across_beams, greatest_of_level
 
 _LARGEST_FACTOR = 1e6
+CENSORED = 5.0
+"""Times the mean above which a training cell is left out; of Rayleigh noise one in 150 is, and the
+mean 3 % lower for it."""
+_TINY = 1e-300
+_SILENT = 0.02
+"""Share of the level below which a cell counts as that quiet: coarse samples have zeros."""
+_SHAPES = np.geomspace(0.2, 50.0, 60)
+_ROWS = 20
+"""Rows to either side that tell how rough the sea floor is."""
 
 
 def effective_cells(cells: int, width: float) -> float:
@@ -104,3 +121,83 @@ def noise_level(
     return greatest_of_level(
         np.ascontiguousarray(power, np.float64), max(beams // 2, 0), training, guard
     )
+
+
+def quiet_level(
+    power: FloatArray, *, beams: int, training: int, guard: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`noise_level` of the cells that are no echoes, the sides (R,) it comes from, and how rough
+    (R,) the noise is.
+
+    Raises ValueError for an image that is not two-dimensional.
+    """
+    window = {'beams': beams, 'training': training, 'guard': guard}
+    level, sides = noise_level(power, **window)
+    if not power.size:
+        return level, sides, np.zeros(len(power))
+    known = np.isfinite(level) & (level > 0.0)
+    floor = np.where(known, level, np.inf)
+    logarithm = np.log(np.maximum(power, _SILENT * np.where(known, level, 1.0)) + _TINY)
+    around, _ = noise_level(logarithm, **window)
+    # The mean of a Rayleigh law lies above its mean logarithm.
+    usual = np.exp(np.where(known, around, 0.0) + np.euler_gamma)
+    quiet = ~known | (power <= CENSORED * usual)
+    half = max(beams // 2, 0)
+    share = across_beams(quiet.astype(np.float64), half)
+    kept = across_beams(np.where(quiet, power, 0.0), half) / np.maximum(share, 0.1)
+    censored, _ = greatest_of_level(np.ascontiguousarray(kept), 0, training, guard)
+    off = np.where(known, logarithm - around, np.nan)
+    return np.minimum(censored, floor), sides, roughness(off)
+
+
+def roughness(logarithm: FloatArray) -> FloatArray:
+    """Variance (R,) of the logarithm of power (R, B) over its local mean, in the rows around each;
+    NaN counts as unknown."""
+    known = np.isfinite(logarithm)
+    value = np.where(known, logarithm, 0.0)
+    sums = [
+        np.concatenate([[0.0], np.cumsum(part.sum(axis=1))])
+        for part in (known.astype(float), value, np.square(value))
+    ]
+    row = np.arange(len(value))
+    first, last = np.maximum(row - _ROWS, 0), np.minimum(row + _ROWS + 1, len(value))
+    count, total, square = (part[last] - part[first] for part in sums)
+    count = np.maximum(count, 1.0)
+    return square / count - np.square(total / count)
+
+
+def tail_factor(rough: FloatArray, false_alarm: float) -> FloatArray:
+    """How much higher (R,) than for a Rayleigh law a threshold has to be where the logarithm of
+    power has the variance `rough` (R,)."""
+    variances, factors = _tails(false_alarm)
+    return np.interp(rough, variances, factors)
+
+
+def _area(y: FloatArray, x: FloatArray) -> float:
+    return float(np.sum(0.5 * (y[1:] + y[:-1]) * np.diff(x)))
+
+
+@lru_cache(maxsize=16)
+def _tails(false_alarm: float) -> tuple[FloatArray, FloatArray]:
+    """Variance of the logarithm of K distributed power, rising, and the threshold that each needs
+    over that of a Rayleigh law."""
+    from scipy.optimize import brentq
+    from scipy.special import gammaln, kve
+
+    def tail(log_factor: FloatArray, shape: float) -> FloatArray:
+        """Logarithm of the probability above a multiple of the mean."""
+        z = np.sqrt(shape * np.exp(log_factor))
+        power = np.log(2.0 * kve(shape, 2.0 * z)) - 2.0 * z + shape * np.log(z)
+        return np.asarray(power - gammaln(shape))
+
+    grid = np.linspace(np.log(_SILENT), np.log(1e4), 4000)
+    variances, factors = [], []
+    for shape in _SHAPES:
+        # Moments of a value that is never below the first of the grid, from its tail alone.
+        above = np.exp(tail(grid, shape))
+        first = _area(above, grid)
+        second = 2.0 * _area((grid - grid[0]) * above, grid)
+        variances.append(second - first**2)
+        factor = brentq(lambda x: float(tail(x, shape)) - np.log(false_alarm), -5.0, 15.0)  # noqa: B023
+        factors.append(np.exp(factor) / -np.log(false_alarm))
+    return np.array(variances)[::-1], np.maximum(np.array(factors)[::-1], 1.0)

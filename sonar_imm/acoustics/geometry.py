@@ -40,6 +40,7 @@ Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daura
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -64,7 +65,11 @@ class Pose(NamedTuple):
 
 
 def flip_world(vector: ArrayLike) -> FloatArray:
-    """NED of a vector (..., 3) in ENU, and the other way round."""
+    """NED of a vector (..., 3) in ENU, and the other way round.
+
+    >>> flip_world([1.0, 2.0, 3.0]).tolist()
+    [2.0, 1.0, -3.0]
+    """
     return np.asarray(vector, np.float64) @ _WORLD
 
 
@@ -91,7 +96,12 @@ def flip_pose(pose: Pose) -> Pose:
 
 
 def rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> FloatArray:
-    """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians."""
+    """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians.
+
+    >>> import numpy as np
+    >>> (rotation(0.0, 0.0, np.pi / 2) @ [1.0, 0.0, 0.0]).round(9).tolist()  # x becomes y
+    [0.0, 1.0, 0.0]
+    """
     roll, pitch, yaw = np.broadcast_arrays(
         *(np.asarray(a, np.float64) for a in (roll, pitch, yaw))
     )
@@ -121,9 +131,12 @@ def rotation_of_quaternion(q: ArrayLike) -> FloatArray:
     """The rotation (..., 3, 3) of quaternions (..., 4) x, y, z, w, which need not have unit
     length."""
     q = np.asarray(q, np.float64)
-    parts = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    # Of one quaternion plain floats: the same bits in a tenth of the time.
-    x, y, z, w = parts.tolist() if q.ndim == 1 else parts
+    if q.ndim == 1:  # plain floats: a tenth of the time
+        x, y, z, w = q.tolist()
+        size = math.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = x / size, y / size, z / size, w / size
+    else:
+        x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
         [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
@@ -137,6 +150,8 @@ def rotation_of_quaternion(q: ArrayLike) -> FloatArray:
 def slerp(q0: FloatArray, q1: FloatArray, fraction: ArrayLike) -> FloatArray:
     """The quaternion (..., 4) `fraction` (...) of the way from q0 to q1 (..., 4) at constant rate,
     the short way round. Fractions outside [0, 1] go on at the same rate."""
+    if np.ndim(q0) == np.ndim(q1) == 1 and np.ndim(fraction) == 0:
+        return _slerp_one(q0.tolist(), q1.tolist(), float(fraction))  # type: ignore[arg-type]
     q0, q1 = q0 / np.sqrt(_dot(q0, q0)), q1 / np.sqrt(_dot(q1, q1))
     fraction = np.asarray(fraction, np.float64)[..., None]
     cosine = _dot(q0, q1)
@@ -146,6 +161,22 @@ def slerp(q0: FloatArray, q1: FloatArray, fraction: ArrayLike) -> FloatArray:
     angle = np.arctan2(sine, cosine)
     turned = np.sin(fraction * angle) * aside / np.where(sine < 1e-12, 1.0, sine)
     return np.asarray(np.where(sine < 1e-12, q0, np.cos(fraction * angle) * q0 + turned))
+
+
+def _slerp_one(q0: list[float], q1: list[float], fraction: float) -> FloatArray:
+    """`slerp` of one pair, in plain floats: a fifth of the time."""
+    size0, size1 = math.sqrt(sum(a * a for a in q0)), math.sqrt(sum(a * a for a in q1))
+    q0, q1 = [a / size0 for a in q0], [a / size1 for a in q1]
+    cosine = sum(a * b for a, b in zip(q0, q1))
+    if cosine < 0.0:
+        cosine, q1 = -cosine, [-a for a in q1]
+    aside = [b - cosine * a for a, b in zip(q0, q1)]
+    sine = math.sqrt(sum(a * a for a in aside))
+    if sine < 1e-12:
+        return np.array(q0)
+    angle = math.atan2(sine, cosine)
+    along, across = math.cos(fraction * angle), math.sin(fraction * angle) / sine
+    return np.array([along * a + across * b for a, b in zip(q0, aside)])
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -180,7 +211,13 @@ def project(m: FloatArray, model: str = 'plane') -> tuple[FloatArray, FloatArray
 
 
 def vertical_offset(m: FloatArray, R: FloatArray) -> FloatArray:
-    """d_st (...,), how far m (..., 3) lies below the sonar, m: eq. (7)."""
+    """d_st (...,), how far m (..., 3) lies below the sonar, m: eq. (7).
+
+    >>> import numpy as np
+    >>> R = rotation(0.0, np.radians(30.0), 0.0)
+    >>> round(float(vertical_offset(np.array([20.0, 0.0, 0.0]), R)), 3)  # the bow up: above
+    -10.0
+    """
     return np.asarray(np.einsum('...i,...i->...', R[..., 2, :], m))
 
 

@@ -28,7 +28,8 @@ The variance of a centroid is, in range and likewise in bearing,
 
 w is the -3 dB width of the echo of a point, S the second moment of the echo and S_point that of a
 point. Over something extended the centroid wanders by the *whole* spread from ping to ping,
-because the glints interfere; dividing by the number of cells would be wrong.
+because the glints interfere; dividing by the number of cells would be wrong. An echo on the edge
+of the image is cut off and has w^2 more.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
-from .cfar import effective_cells, noise_level, threshold_factor
+from .cfar import effective_cells, quiet_level, tail_factor, threshold_factor
 from .image_echo_kernels import joined_parts
 
 MAX_CELLS = 20_000
@@ -102,14 +103,15 @@ def find_echoes(
     power = np.square(np.where(np.isfinite(amplitude), amplitude, 0.0).clip(-_LARGEST, _LARGEST))
     step = _step(distance), _step(bearing)
     width = max(rules.range_resolution, step[0]), max(rules.beam_width, step[1])
-    level, sides = noise_level(
+    level, sides, rough = quiet_level(
         power, beams=rules.beams, training=rules.training, guard=rules.guard
     )
     if not power.size:
         return _nothing()
     cells = effective_cells(rules.training, width[0] / step[0])
     cells *= effective_cells(min(rules.beams, power.shape[1]), width[1] / step[1])
-    high = _thresholds(rules.false_alarm, cells, sides) * rules.margin
+    high = _thresholds(rules.false_alarm, cells, sides)
+    high *= rules.margin * tail_factor(rough, rules.false_alarm)
     low = _thresholds(rules.growth, cells, sides)
     low[distance < rules.nearest] = np.inf
     with np.errstate(invalid='ignore'):  # an infinite threshold of a silent cell
@@ -191,6 +193,10 @@ def _measured(
         np.square(0.5 * w) / snr + np.square(0.1 * s) + np.maximum(0.0, S - w**2 * _GAUSSIAN)
         for w, s, S in zip(width, step, (S_r, S_b))
     ]
+    # Of an echo on the edge of the image one side is missing.
+    for index, w, size in ((row, width[0], power.shape[0]), (beam, width[1], power.shape[1])):
+        edge = np.bincount(part, (index == 0) | (index == size - 1), count) > 0
+        variances[0 if index is row else 1] += np.square(w) * edge
     best = np.argsort(-loudest, kind='stable')
     columns = (r, b, *variances, np.sqrt(S_r), np.sqrt(S_b), np.sqrt(loudest), snr)
     return Echoes(*(column[best] for column in columns))

@@ -79,8 +79,12 @@ class Candidate:
 
     def distance2(self, position: FloatArray) -> float:
         """Squared Mahalanobis distance of another position (2,) from this one."""
-        gap = position - self.position
-        return float(gap @ np.linalg.solve(self.covariance, gap))
+        # Where one direction is known far better than the other, rounding can leave a covariance
+        # without an inverse: no variance counts as less than its share of the larger one.
+        variances, axes = np.linalg.eigh(self.covariance)
+        least = variances[1] / MOST_CONDITION
+        along = (position - self.position) @ axes
+        return float(np.sum(np.square(along) / np.maximum(variances, least)))
 
 
 @frozen(eq=False, kw_only=True)

@@ -60,7 +60,11 @@ def slant_range(
 
 
 def range_sum(position: ArrayLike, tx: ArrayLike, rx: ArrayLike, target_z: float) -> FloatArray:
-    """Length (..., n) of the path transmitter - target - receiver in metres."""
+    """Length (..., n) of the path transmitter - target - receiver in metres.
+
+    >>> range_sum([3.0, 4.0], [[0.0, 0.0, 0.0]], [[3.0, 0.0, 0.0]], target_z=0.0).tolist()
+    [9.0]
+    """
     return slant_range(position, tx, target_z)[0] + slant_range(position, rx, target_z)[0]
 
 
@@ -73,7 +77,11 @@ def range_sum_jacobian(
 
 def bearing(position: ArrayLike, rx: ArrayLike) -> FloatArray:
     """Direction (..., n) of the target seen from each receiver, in [-pi, pi]; 0 where they
-    coincide."""
+    coincide.
+
+    >>> bearing([0.0, 5.0], [[0.0, 0.0, 0.0]]).round(4).tolist()  # due north
+    [1.5708]
+    """
     offset, _ = _offset(position, rx, 0.0)
     return np.arctan2(offset[..., 1], offset[..., 0])
 

@@ -46,6 +46,7 @@ COMMANDS = {
     'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
     'view': 'Show a recording, a run or running nodes in Foxglove.',
     'play': 'Publish a bag to live nodes.',
+    'echo': 'Show the estimates of running nodes as a live table.',
     'check': 'Start the real nodes, play the bags, compare with track and truth.',
     'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
     'bench': 'Measure speed against other libraries, in one run.',

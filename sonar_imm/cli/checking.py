@@ -30,6 +30,7 @@ from ..evaluation.batch import Job
 from ..evaluation.judging import Check, Judgement
 from ..evaluation.run_folder import BAG, CSV, RunFolder
 from ..evaluation.tracking import final_estimates, InputOptions
+from ..node_config import hears_transforms
 from ..nodes.harness import LockstepResult, run_lockstep
 from ..parameters import Config
 from ..recordings.own_limit import own_limit
@@ -116,6 +117,7 @@ def check_recording(
     options = InputOptions(
         topics=topics,
         frame_id=node.frame_id,
+        use_tf_static=hears_transforms(node),
         world_frame=node.world_frame_convention,
         detector=load_detector(SYSTEMS[system], params, {}),
     )
@@ -136,7 +138,7 @@ def check_recording(
             bag,
             system,
             params_file=params,
-            settings=config.as_dict(),
+            settings={**config.as_dict(), 'use_tf_static': hears_transforms(node)},
             topics=topics,
             progress=advance,
         )

@@ -181,7 +181,8 @@ def load_detector(
         return {}
     from ..trackers.obstacle.detector import DetectorConfig
 
-    values = _parameters_of(params, FEEDERS[system.name]) if params else {}
+    # A file for the tracker's node alone says nothing of the detector.
+    values = _parameters_of(params, FEEDERS[system.name], needed=False) if params else {}
     values.update(
         {name: _typed(text, specs[name]) for name, text in overrides.items() if name in specs}
     )
@@ -199,7 +200,8 @@ def _detector_specs(system: System) -> dict[str, ParameterSpec]:
     return {spec.name: spec for spec in DetectorConfig.specs()}
 
 
-def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
+def _parameters_of(path: Path, node_name: str, *, needed: bool = True) -> dict[str, Any]:
+    """What a file says for a node; needed: it is a mistake when it is for others only."""
     try:
         text = path.read_text(encoding='utf-8')
         values = parameters_from_yaml(text, node_name=node_name)
@@ -208,7 +210,8 @@ def _parameters_of(path: Path, node_name: str) -> dict[str, Any]:
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
     # Beside a recording the file describes the instruments for one tracker; others do without.
-    if not values and path.name != OWN_PARAMETERS and (names := _others(text, node_name)):
+    foreign = needed and not values and path.name != OWN_PARAMETERS
+    if foreign and (names := _others(text, node_name)):
         raise ConfigError(
             f"{path} is for {', '.join(names)}, and not for '{node_name}': rename the section, or "
             "call it '/**' for any node"

@@ -106,9 +106,11 @@ def _say_all(label: str, lines: Iterable[str]) -> None:
 def fixes(source: Path, out_bag: Path, as_json: bool, **values: Any) -> None:
     """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
 
-    Columns: stamp, x and y [m] or latitude and longitude [deg]; optional var_x, cov_xy, var_y
-    [m^2] or std_x, std_y or std [m], id and valid. Usual names are recognised. Rows flagged as
-    invalid are left out and counted; repeated polls are counted, and left out by `track`.
+    Columns: stamp, or date and time of day, x and y [m] or latitude and longitude [deg]; optional
+    var_x, cov_xy, var_y [m^2] or std_x, std_y or std [m], id and valid. Usual names are
+    recognised; which columns were taken, and which not, is said. Times may count from 0; one that
+    is written without a zone needs --time-zone. Rows flagged as invalid are left out and counted;
+    repeated polls are counted, and left out by `track`.
     """
     _convert(
         'fixes',

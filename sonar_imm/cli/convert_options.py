@@ -96,6 +96,13 @@ def csv_options(prefix: str = '', what: str = 'the input') -> Callable[..., Any]
                 metavar='UNIT',
                 help=f'Unit of numeric times in {what}: s, ms, us or ns.',
             ),
+            click.option(
+                f'--{dashed}time-zone',
+                f'{name}time_zone',
+                default='',
+                metavar='ZONE',
+                help=f'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.',
+            ),
             pairs_option(
                 f'--{dashed}column',
                 f'{name}columns',
@@ -156,6 +163,7 @@ def options(values: dict[str, Any], prefix: str = '') -> Any:
     return CsvOptions(
         columns=values.pop(f'{prefix}columns'),
         time_unit=values.pop(f'{prefix}time_unit'),
+        time_zone=values.pop(f'{prefix}time_zone'),
         time_offset_ns=values.pop(f'{prefix}time_offset'),
         delimiter=values.pop(f'{prefix}delimiter'),
     )

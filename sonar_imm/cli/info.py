@@ -70,8 +70,9 @@ def _print(found: dict[str, Any]) -> None:
             click.echo(f'      problem: {problem}')
     for problem in found['problems']:
         click.echo(f'problem: {problem}')
-    for system, inputs in found['systems'].items():
-        click.echo(f'to track it: {_track_line(found["bag"], system, inputs)}')
+    for number, (system, named) in enumerate(found['topic_options'].items()):
+        told = 'or as something else' if number else 'to track it'
+        click.echo(f'{told}: {track_line(found["bag"], system, named)}')
     if not found['systems']:
         click.echo('no tracker can use it')
 
@@ -81,11 +82,7 @@ def _scans(scans: dict[str, int] | None) -> str:
     return f', {scans["count"]} scans, up to {scans["most"]} per scan' if several else ''
 
 
-def _track_line(bag: str, system: str, inputs: dict[str, list[str]]) -> str:
+def track_line(bag: str, system: str, named: dict[str, str]) -> str:
     """The command that tracks the recording, with --topic where the names do not fit."""
-    named = [
-        f' --topic {shlex.quote(f"{name}={topics[0]}")}'
-        for name, topics in inputs.items()
-        if not any(topic.split('/')[-1] == name for topic in topics)
-    ]
-    return f'sonar-imm track {shlex.quote(bag)} OUT_DIR --system {system}{"".join(named)}'
+    topics = [f' --topic {shlex.quote(f"{name}={topic}")}' for name, topic in named.items()]
+    return f'sonar-imm track {shlex.quote(bag)} OUT_DIR --system {system}{"".join(topics)}'

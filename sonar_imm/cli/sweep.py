@@ -24,6 +24,7 @@ from typing import Any, TYPE_CHECKING
 from attrs import evolve
 import click
 
+from ..node_config import hears_transforms
 from ..trackers import SYSTEMS
 from .common import (
     example,
@@ -165,6 +166,7 @@ def planned(
         options=InputOptions(
             topics=inputs_by_topic(topics or {}),
             frame_id=node.frame_id,
+            use_tf_static=hears_transforms(node),
             world_frame=node.world_frame_convention,
             detector=load_detector(SYSTEMS[system], params, {}) if params else scene.told_feeder(),
         ),

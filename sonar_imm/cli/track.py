@@ -25,6 +25,7 @@ from typing import Any, TYPE_CHECKING
 from attrs import evolve, field, frozen
 import click
 
+from ..node_config import hears_transforms
 from ..trackers import System, SYSTEMS
 from .common import (
     BAG,
@@ -178,6 +179,7 @@ class Plan:
                     topics={t: entry.name for t, entry in inputs.items()} if several else wanted,
                     order=self.order,
                     frame_id=node.frame_id,
+                    use_tf_static=hears_transforms(node),
                     world_frame=node.world_frame_convention,
                     smooth=self.smooth,
                     detector=detector,

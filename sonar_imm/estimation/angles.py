@@ -28,6 +28,10 @@ def wrap_angle(angle: ArrayLike) -> FloatArray:
     """The same direction in [-pi, pi]; apply it to every difference of angles.
 
     Angles already inside keep their bits. NaN stays NaN. Any shape.
+
+    >>> import math
+    >>> round(float(wrap_angle(math.radians(350.0) - math.radians(20.0))), 4)  # -30 degrees
+    -0.5236
     """
     angle = np.asarray(angle, np.float64)
     return angle - TWO_PI * np.round(angle / TWO_PI)

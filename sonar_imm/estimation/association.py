@@ -55,7 +55,11 @@ from .kalman import BoolArray, factorise, log_density
 @lru_cache(maxsize=256)
 def gate_threshold(probability: float, dimension: int) -> float:
     """Chi-square quantile: the normalised innovation squared of a `dimension`-vector of the target
-    itself lies below it with `probability`."""
+    itself lies below it with `probability`.
+
+    >>> round(gate_threshold(0.99, 2), 3)
+    9.21
+    """
     from scipy.special import gammaincinv  # scipy.stats has it too, but takes a second to import
 
     return 2.0 * float(gammaincinv(dimension / 2.0, probability))
@@ -140,6 +144,11 @@ def assign(
     target, detection, cost: (pairs,), each pair once; a pair that is not listed is forbidden, and
     one whose cost is not negative is never chosen. Returns (targets,) the detection of each
     target, -1 for none. The same input gives the same choice, ties included.
+
+    >>> import numpy as np
+    >>> target, detection = np.array([0, 0, 1]), np.array([0, 1, 0])
+    >>> assign(target, detection, np.array([-3.0, -2.5, -4.0]), 2, 2).tolist()
+    [1, 0]
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -147,7 +156,7 @@ def assign(
     chosen = np.full(targets, -1, np.int64)
     worthwhile = cost < 0.0
     target, detection, cost = target[worthwhile], detection[worthwhile], cost[worthwhile]
-    if len(np.unique(target)) == len(target) and len(np.unique(detection)) == len(detection):
+    if not (_repeats(target, targets) or _repeats(detection, detections)):
         chosen[target] = detection  # nothing is contested
         return chosen
     nodes = targets + detections
@@ -165,6 +174,11 @@ def assign(
     return chosen
 
 
+def _repeats(numbers: IntArray, count: int) -> bool:
+    """Whether any of `numbers`, each below `count`, stands there twice."""
+    return bool(np.bincount(numbers, minlength=count).max(initial=0) > 1)
+
+
 def assign_by_rank(
     target: IntArray, detection: IntArray, cost: FloatArray, rank: IntArray, detections: int
 ) -> IntArray:
@@ -173,7 +187,7 @@ def assign_by_rank(
     rank: (T,) of each target; one with a negative rank gets nothing. The rest as in `assign`.
     """
     chosen, free = np.full(len(rank), -1, np.int64), np.ones(detections, np.bool_)
-    for turn in np.unique(rank[rank >= 0]):
+    for turn in sorted(set(rank[rank >= 0].tolist())):
         pairs = (rank == turn)[target] & free[detection]
         found = assign(target[pairs], detection[pairs], cost[pairs], len(rank), detections)
         chosen = np.where(found >= 0, found, chosen)

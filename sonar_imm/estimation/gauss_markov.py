@@ -31,5 +31,10 @@ import math
 
 def gauss_markov(std: float, time: float, dt: float) -> tuple[float, float]:
     """(a, q): the factor of a step of dt seconds and the variance it adds, `std` being the
-    standard deviation for ever and `time` in seconds that of the correlation."""
+    standard deviation for ever and `time` in seconds that of the correlation.
+
+    >>> a, q = gauss_markov(std=2.0, time=10.0, dt=10.0)
+    >>> round(a, 4), round(q, 4)  # exp(-1), 4 (1 - exp(-2))
+    (0.3679, 3.4587)
+    """
     return math.exp(-dt / time), -(std**2) * math.expm1(-2.0 * dt / time)

@@ -90,6 +90,12 @@ def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray) ->
 
     A model that nothing can become (c_j = 0) is given the mixture of all, so that it stays finite
     and can come back when the chain allows.
+
+    >>> import numpy as np
+    >>> x, P = np.array([[[0.0], [10.0]]]), np.ones((1, 2, 1, 1))  # one target, two models
+    >>> mixed = mix(x, P, np.array([[0.5, 0.5]]), np.array([[0.9, 0.1], [0.2, 0.8]]))
+    >>> mixed.c.round(3).tolist(), mixed.x.round(3).tolist()
+    ([[0.55, 0.45]], [[[1.818], [8.889]]])
     """
     joint = transition * mu[:, :, None]
     c = joint.sum(axis=1)

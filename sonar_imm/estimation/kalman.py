@@ -77,7 +77,14 @@ def apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
 def predict(
     x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, b: FloatArray | None = None
 ) -> Predicted:
-    """Time update: ``F x + b`` (..., n) and ``F P F' + Q`` (..., n, n)."""
+    """Time update: ``F x + b`` (..., n) and ``F P F' + Q`` (..., n, n).
+
+    >>> import numpy as np
+    >>> F = np.array([[1.0, 2.0], [0.0, 1.0]])  # two seconds at constant velocity
+    >>> x, P, _ = predict(np.array([5.0, 1.0]), np.eye(2), F, np.zeros((2, 2)))
+    >>> x.tolist(), P.tolist()
+    ([7.0, 1.0], [[5.0, 2.0], [2.0, 1.0]])
+    """
     moved = apply(F, x)
     return Predicted(moved if b is None else moved + b, *propagate(F, P, Q))
 
@@ -92,6 +99,12 @@ def update(
 
     Raises CovarianceError when an innovation covariance ``S = H P H' + R`` is not finite, or has a
     component without any variance.
+
+    >>> import numpy as np
+    >>> x, P, H, R = np.zeros(1), np.eye(1), np.eye(1), np.eye(1)
+    >>> found = update(x, P, np.array([2.0]) - H @ x, H, R)
+    >>> found.x.round(6).tolist(), found.P.round(6).tolist()  # half way, half the variance
+    ([1.0], [[0.5]])
     """
     after = correct(P, H, R)
     if not after.usable.all():

@@ -81,6 +81,10 @@ class RateChain:
     The generator is the matrix logarithm. For some matrices it has negative rates and is not
     valid. Those rates are set to zero, and `residual` says how far ``P(step)`` then is from the
     matrix given (0 when the matrix is embeddable).
+
+    >>> chain = RateChain([[0.9, 0.1], [0.2, 0.8]], step=1.0)
+    >>> chain.transition(2.0).round(6).tolist()  # the square of the matrix
+    [[0.83, 0.17], [0.34, 0.66]]
     """
 
     def __init__(self, matrix: ArrayLike, step: float):
@@ -162,7 +166,11 @@ def _generator(P: FloatArray, step: float) -> FloatArray:
 
 
 def persistent(models: int, stay: float) -> FloatArray:
-    """(M, M): a model is kept with probability `stay`, else each other one is as probable."""
+    """(M, M): a model is kept with probability `stay`, else each other one is as probable.
+
+    >>> persistent(3, 0.9).round(3).tolist()
+    [[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]]
+    """
     P = np.full((models, models), (1.0 - stay) / max(models - 1, 1))
     np.fill_diagonal(P, stay if models > 1 else 1.0)
     return P

@@ -40,6 +40,11 @@ def smooth_modes(
     """Smoothed probabilities (T, M) from filtered ones mu (T, M).
 
     moved (T,): False where the chain rested on the step into k, True everywhere if not given.
+
+    >>> import numpy as np
+    >>> mu = np.array([[0.5, 0.5], [0.99, 0.01]])  # undecided, then sure
+    >>> smooth_modes(mu, np.array([[0.9, 0.1], [0.1, 0.9]])).round(3).tolist()
+    [[0.892, 0.108], [0.99, 0.01]]
     """
     smoothed = mu.copy()
     predicted = mu[:-1] @ transition

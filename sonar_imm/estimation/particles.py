@@ -34,6 +34,11 @@ def normalise(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     Where every weight is zero (-inf) nothing is known of the particles: w is uniform and the
     logarithm of the sum is -inf.
+
+    >>> import numpy as np
+    >>> w, total = normalise(np.log([1.0, 3.0]))
+    >>> w.round(6).tolist(), round(float(total), 6)  # log 4
+    ([0.25, 0.75], 1.386294)
     """
     best = np.max(log_weights, axis=-1, keepdims=True)
     dead = ~np.isfinite(best)
@@ -47,6 +52,10 @@ def effective_sample_size(w: FloatArray) -> FloatArray:
     """``1 / sum_n w_n^2``, (...,): N for equal weights, 1 when one particle has everything.
 
     (``1 / sum_n w_n``, sometimes seen in print, is always one.)
+
+    >>> import numpy as np
+    >>> float(effective_sample_size(np.array([0.5, 0.5, 0.0, 0.0])))
+    2.0
     """
     return np.asarray(1.0 / np.sum(np.square(w), axis=-1))
 

@@ -76,7 +76,12 @@ def stratified(weights: ArrayLike, count: int, rng: np.random.Generator) -> Inde
 
 
 def systematic(weights: ArrayLike, count: int, rng: np.random.Generator) -> IndexArray:
-    """The same draw in each of `count` slices."""
+    """The same draw in each of `count` slices.
+
+    >>> import numpy as np
+    >>> systematic([0.5, 0.25, 0.25], 4, np.random.default_rng(1)).tolist()
+    [0, 0, 1, 2]
+    """
     return invert(np.cumsum(_checked(weights)), (np.arange(count) + rng.random()) / count)
 
 

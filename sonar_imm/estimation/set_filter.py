@@ -161,7 +161,8 @@ class SetFilter:
         sums = np.zeros((rows, self.model.record_cells))
         offset, variance = _offset_of(step.path)
         kernels.moments(w, sets, step.amplitude, offset, variance, self.model.order_min, pmf, sums)
-        return pmf, sums
+        # Weights add up to one but for rounding: no probability may pass it for that.
+        return np.minimum(pmf, 1.0), sums
 
     def shift(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[float, float]:
         """Mean and standard deviation of the shift, cells, of `sets` with weights w (N,)."""

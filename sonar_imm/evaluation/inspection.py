@@ -18,17 +18,18 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from attrs import define, field
 import numpy as np
 
 from msg_adapters.headers import stamp_ns
-from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs, needed
 
 from ..measurements import Rejection
 from ..recordings.reader import BagMessage, BagReader, TopicInfo
+from ..recordings.topics import fitting_systems, instruments
 from ..trackers import SYSTEMS
 from . import SECOND
 
@@ -60,7 +61,9 @@ def inspect(
 
     detector: what readers of images have to be told, by the names of its parameters.
     topics: one entry per topic with count, rate, frames, scans, the tracker inputs it suits and
-    its problems. problems: of the recording as a whole. systems: topics by input for each tracker.
+    its problems. problems: of the recording as a whole. systems: topics by input for each tracker,
+    the best fitting one first. topic_options: topic by input that has to be named to the tracker;
+    nothing where the names say enough.
     """
     heard = {topic.name: _Heard(topic) for topic in bag.topics}
     for item in bag.messages():
@@ -69,12 +72,14 @@ def inspect(
     topics = [_topic_entry(entry) for entry in heard.values()]
     first = min((entry.logs[0] for entry in heard.values() if entry.logs), default=0)
     last = max((entry.logs[-1] for entry in heard.values() if entry.logs), default=0)
+    systems, options = _systems(bag, list(heard.values()))
     return {
         'bag': str(bag.path),
         'duration_s': (last - first) / SECOND,
         'messages': sum(len(entry.logs) for entry in heard.values()),
         'topics': topics,
-        'systems': _systems(topics),
+        'systems': systems,
+        'topic_options': options,
         'problems': list(bag.problems),
     }
 
@@ -112,7 +117,6 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     """The tracker inputs that a message could be for. Truth is no input."""
     if _is_truth(item.topic):
         return []
-    own = item.topic.split('/')[-1]
     found = []
     for system in SYSTEMS:
         fitting = [
@@ -120,8 +124,8 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
             for one in (*inputs_of(system), *made_inputs(system))
             if one.may_be(item.topic, item.type_name)
         ]
-        named = [one for one in fitting if one.name.split('/')[-1] == own]
-        # A topic of several sides is named by its namespace too, see `InputTopic.name`.
+        # Of several inputs that a name says, the later one counts, as in `fitting_topics`.
+        named = [one for one in fitting if one.is_named(item.topic)][-1:]
         found += [(system, entry) for entry in named or fitting]
     return found
 
@@ -202,21 +206,59 @@ def _content_problems(heard: _Heard) -> list[str]:
     return problems
 
 
-def _systems(topics: list[dict[str, Any]]) -> dict[str, dict[str, list[str]]]:
-    """Topics by input for each tracker that can use the recording."""
-    systems: dict[str, dict[str, list[str]]] = {}
-    for topic in topics:
-        for suited in topic['suits']:
-            system, name = suited.split(' ')
-            systems.setdefault(system, {}).setdefault(name, []).append(topic['name'])
-    companions = {
-        (system, entry.name)
-        for system in SYSTEMS
-        for entry in inputs_of(system)
-        if entry.companion
+Inputs = dict[str, list[str]]
+"""Topics by input."""
+
+
+def _systems(
+    bag: BagReader, heard: list[_Heard]
+) -> tuple[dict[str, Inputs], dict[str, dict[str, str]]]:
+    """Topics by input for each tracker that can use the recording, the best fitting one first, and
+    what has to be named to it.
+
+    First come trackers whose inputs have their names, in the order of `fitting_systems`. Others
+    follow, by the number of their inputs, unless they would only take what is named after an
+    input of those.
+    """
+    found: dict[str, Inputs] = {}
+    good: Counter[tuple[str, str, str]] = Counter()
+    for one in heard:
+        for (system, name), count in one.good.items():
+            found.setdefault(system, {}).setdefault(name, []).append(one.topic.name)
+            good[system, name, one.topic.name] = count
+    systems: dict[str, Inputs] = {}
+    options: dict[str, dict[str, str]] = {}
+    for system in fitting_systems(bag):
+        named = {
+            entry.name for each in instruments(bag, system).values() for entry in each.values()
+        }
+        if _enough(system, named & found.get(system, {}).keys()):
+            systems[system], options[system] = found[system], {}
+    taken = {
+        topic.name
+        for system in systems
+        for each in instruments(bag, system).values()
+        for topic in bag.topics
+        if topic.name in each
     }
-    return {
-        system: found
-        for system, found in systems.items()
-        if any((system, name) not in companions for name in found)
-    }
+    for system in sorted(found.keys() - systems.keys(), key=lambda name: -len(found[name])):
+        chosen: dict[str, str] = {}
+        for key, _ in good.most_common():
+            if key[0] == system and key[1] not in chosen and key[2] not in chosen.values():
+                chosen[key[1]] = key[2]
+        primary = {_entry(system, name).companion for name in chosen}
+        free = any(t not in taken and not _entry(system, n).companion for n, t in chosen.items())
+        if False in primary and free and _enough(system, chosen.keys()):
+            systems[system], options[system] = found[system], chosen
+    return systems, options
+
+
+def _entry(system: str, name: str) -> InputTopic:
+    return next(one for one in (*inputs_of(system), *made_inputs(system)) if one.name == name)
+
+
+def _enough(system: str, names: Collection[str]) -> bool:
+    """Whether a tracker with the default parameters can do something with these inputs."""
+    there = {_entry(system, name).makes or name for name in names}
+    required, one_of = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())
+    return there.issuperset(required) and (not one_of or not there.isdisjoint(one_of))

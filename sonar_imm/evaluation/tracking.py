@@ -40,6 +40,7 @@ from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagReader
 from ..recordings.topics import fitting_topics
 from ..trackers import System
+from ..trackers.frames import FrameDoor
 from . import SECOND
 from .jobs import processes
 from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
@@ -63,6 +64,7 @@ class InputOptions:
     order: str = 'recorded'
     world_frame: str = 'enu'
     frame_id: str = ''
+    use_tf_static: bool = False
     smooth: bool = False
     jobs: int = 1
     detector: Mapping[str, Any] = field(factory=dict)
@@ -139,7 +141,8 @@ class OfflineRun:
         self.bag = bag
         self.system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
-        self.topics = {name: entry.name for name, entry in chosen.items()}
+        told = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
+        self.topics = {name: entry.name for name, entry in chosen.items() if entry.wanted(told)}
         build = system.build_smoother if self.options.smooth else system.build
         self.tracker = build(config.for_inputs(frozenset(self.topics.values())))
         self.refused: dict[str, Refused] = {}
@@ -147,6 +150,7 @@ class OfflineRun:
         self.durations = array('d')
         self._window_ns = window_ns(config)
         self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
+        self._door = FrameDoor(self.tracker, FrameGuard(self.options.frame_id))
 
     @property
     def total(self) -> int:
@@ -200,7 +204,7 @@ class OfflineRun:
         return made
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
-        guard = FrameGuard(self.options.frame_id)
+        door = self._door
         for heard in measurements_of(
             self.bag,
             self.system.name,
@@ -217,12 +221,14 @@ class OfflineRun:
             try:
                 if isinstance(heard.measurement, Rejection):
                     raise heard.measurement
-                guard.check(heard.measurement)
-                measurement = self._repeats.fresh(heard.measurement)
+                measurement = door.admit(heard.measurement)
+                if measurement is not None:
+                    measurement = self._repeats.fresh(measurement)
             except Rejection as rejection:
                 self._refuse(heard.topic, rejection)
                 continue
-            yield measurement
+            if measurement is not None:
+                yield measurement
 
     def _refuse(self, topic: str, rejection: Rejection) -> None:
         entry = self.refused.setdefault(
@@ -267,6 +273,10 @@ class OfflineRun:
         """Where the frame of the tracks lies on Earth, as plain values; nothing when not known."""
         origin = getattr(self.tracker, 'origin', None)
         return {} if origin is None else {'origin': asdict(origin)}
+
+    def mounting(self) -> dict[str, Any]:
+        """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
+        return {'mounting': self._door.mounting} if self._door.mounting else {}
 
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""
@@ -321,6 +331,7 @@ def write_run(
         warnings=offline.warnings(),
         problems=list(offline.bag.problems),
         **offline.origin(),
+        **offline.mounting(),
         timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
     )
     folder.write_json(RUN, run)

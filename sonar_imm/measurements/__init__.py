@@ -39,6 +39,7 @@ from .obstacle import (
 from .positions import GeodeticFix, RelativeFix, VesselFix, VesselHeading, VesselPose
 from .repeats import RepeatGuard
 from .starts import Start
+from .transforms import FrameTree, moved, StaticTransforms
 
 __all__ = [
     'Altitude',
@@ -53,11 +54,13 @@ __all__ = [
     'Fixes',
     'frame_role',
     'FrameGuard',
+    'FrameTree',
     'GeodeticFix',
     'IMAGE_ORDERS',
     'MAX_BINS',
     'MAX_IMAGE_CELLS',
     'Measurement',
+    'moved',
     'nanoseconds',
     'Navigation',
     'NOBODY',
@@ -70,6 +73,7 @@ __all__ = [
     'Snapshot',
     'SonarImage',
     'Start',
+    'StaticTransforms',
     'Trace',
     'usable_fixes',
     'VesselFix',
@@ -95,4 +99,5 @@ Measurement = (
     | Detections
     | Navigation
     | Altitude
+    | StaticTransforms
 )

@@ -28,7 +28,7 @@ have no estimate.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 import contextlib
 import functools
 from pathlib import Path
@@ -42,10 +42,8 @@ from attrs import evolve
 import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import InvalidQoSProfileException
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
@@ -57,15 +55,16 @@ from ..measurements import FrameGuard, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
+from ..trackers.frames import FrameDoor
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
-from .diagnostics import Meter, Reporter
+from .diagnostics import Announcer, Meter, Reporter
 from .drawing import Drawing
 from .executor import MessagesFirst
 from .keeping import StateKeeper
 from .messages import make, message_class
 from .parameters import NodeParameters
-from .qos import Endpoints, input_qos, latched_qos, output_qos
+from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos
 from .stopping import START_PATIENCE, stopper
 from .tables import TablePublisher
 
@@ -95,6 +94,7 @@ class TrackerNode(Node):
         guards = (self._guard, self._repeats)
         self._keeper = StateKeeper(self, system, self._node_config, guards)
         self.tracker = self._keeper.begin(config)
+        self._door = FrameDoor(self.tracker, self._guard)
         self._warm()
 
         self._enabled = True
@@ -102,12 +102,14 @@ class TrackerNode(Node):
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
-        with _explained_overrides(self):
+        with explained_overrides(self):
             self._advertise()
+            told = {**self.tracker.config.as_dict(), **self._node_config.as_dict()}
             hears = {
                 name: self._listen(topic, name)
                 for topic in self._topics
-                for name in topic.instances(self.tracker.config.as_dict())
+                for name in topic.instances(told)
+                if topic.wanted(told)
             }
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)
@@ -117,7 +119,7 @@ class TrackerNode(Node):
             ),
             post_callback=self._on_clock_back,
         )
-        name, told = self.get_fully_qualified_name().lstrip('/'), self.tracker.config.as_dict()
+        name = self.get_fully_qualified_name().lstrip('/')
         required, one_of = needed(self._topics, told)
         self._reporter = Reporter(name, hears, self._meter, required=required, one_of=one_of)
         self.create_timer(
@@ -126,7 +128,7 @@ class TrackerNode(Node):
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self._keeper.save_every_now_and_then(lambda: self.tracker)
-        self._settings.on_change(lambda: self.tracker.reconfigure(self._settings[config_type]))
+        self._settings.on_change(lambda: self._door.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
         self.get_logger().info(f'ready, hears {", ".join(hears.values())}')
@@ -176,9 +178,7 @@ class TrackerNode(Node):
         self._answers = Answers(
             self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
         )
-        self._diagnostics = self._endpoints.advertise(
-            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
-        )
+        self._announcer = Announcer(self._endpoints, self.get_fully_qualified_name().lstrip('/'))
         self._drawing = Drawing(self._system, self.advertise)
         self.advertise_more()
 
@@ -196,7 +196,7 @@ class TrackerNode(Node):
             message_class(type_name),
             topic.prefix + name,
             functools.partial(self._receive, evolve(topic, name=name), reader),
-            input_qos(self._node_config.queue_depth),
+            latched_qos(1000) if topic.latched else input_qos(self._node_config.queue_depth),
         )
         return subscription.topic_name
 
@@ -209,9 +209,10 @@ class TrackerNode(Node):
     ) -> None:
         """Take one message all the way; whatever it holds, the node goes on."""
         start = time.monotonic()
+        stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(topic.name, start)
         if self._waited_too_long(topic, info):
-            self._acknowledge(message.header.stamp)
+            self._acknowledge(stamp)
             return
         try:
             if self._enabled:
@@ -224,7 +225,7 @@ class TrackerNode(Node):
             if not self.context.ok():
                 raise  # the middleware went away under our feet: `run` knows
             self._recover(topic)
-        self._acknowledge(message.header.stamp)
+        self._acknowledge(stamp)
         self._meter.spent(time.monotonic() - start)
 
     def _waited_too_long(self, topic: InputTopic, info: Mapping[str, Any]) -> bool:
@@ -244,7 +245,9 @@ class TrackerNode(Node):
     def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         measurement = reader(message)
         doubt = topic.doubt(message, measurement)
-        self._guard.check(measurement)
+        measurement = self._door.admit(measurement)
+        if measurement is None:
+            return
         rows = self._repeats.rows
         measurement = self._repeats.fresh(measurement)
         if self._repeats.rows > rows:
@@ -336,7 +339,7 @@ class TrackerNode(Node):
             counts['revisions_withheld'] = self._withheld
         if self._ignored:
             counts['ignored_while_disabled'] = self._ignored
-        self._diagnostics.publish(
+        self._announcer.publish(
             self._reporter.report(
                 self.get_clock().now().to_msg(),
                 time.monotonic(),
@@ -398,16 +401,3 @@ def _init(args: list[str] | None) -> None:
         rclpy.init(args=args, signal_handler_options=mine)
     except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
         raise ConfigError(' '.join(str(error).split())) from None
-
-
-@contextlib.contextmanager
-def _explained_overrides(node: Node) -> Iterator[None]:
-    """Turn what is raised for a bad qos_overrides or type parameter into a `ConfigError`."""
-    try:
-        yield
-    except (ImportError, InvalidParameterTypeException, InvalidQoSProfileException) as error:
-        raise ConfigError(str(error)) from None
-    except RuntimeError as error:
-        if not node.context.ok():
-            raise
-        raise ConfigError(str(error)) from None

@@ -15,7 +15,8 @@
 """What /diagnostics says of a node, in the shape of diagnostic_updater.
 
 Two entries a node: ``<node>: input`` (rates, silence, refused and lost messages) and
-``<node>: tracker`` (what the tracker says of itself, and how long it takes). Everything here is
+``<node>: tracker`` (what the tracker says of itself, and how long it takes). When a finding
+becomes a level is decided in `health`. Everything here is
 measured with the steady clock of the machine: under simulated time, paused or looped, silence
 still shows.
 
@@ -31,8 +32,11 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
+from .health import ERROR, FALL, Finding, Hysteresis, RISE, STALE, summary, told, WARN
+from .qos import Endpoints, latched_qos, output_qos
 from .unused import Unused
 
+MUCH_LOST = 0.1
 _WINDOW = 1000
 _PATIENCE = 5.0
 """Mean intervals after which an input that is not needed is said to be gone."""
@@ -84,16 +88,20 @@ class Reporter:
         *,
         required: Collection[str] = (),
         one_of: Collection[str] = (),
+        rise: int = RISE,
+        fall: int = FALL,
     ):
         """Report as `name`; `topics` maps input names to resolved topic names.
 
-        required: inputs that are all needed; one_of: inputs of which one is enough.
+        required: inputs that are all needed; one_of: inputs of which one is enough. rise, fall:
+        see `health.Hysteresis`.
         """
         self._name = name
         self._topics = dict(topics)
         self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
         self._before = (None, Counter(), Counter(), 0, Counter())
+        self._of_input, self._of_tracker = Hysteresis(rise, fall), Hysteresis(rise, fall)
         self._unused = Unused()
 
     def report(
@@ -142,6 +150,7 @@ class Reporter:
                 stale,
             ),
             self._tracker_status(
+                fresh.total() == 0,
                 (fresh + missing).total() / elapsed,
                 dropped - dropped_before,
                 enabled,
@@ -158,25 +167,26 @@ class Reporter:
 
     def _stale(self, now: float, stale_after: float) -> list[str]:
         """Sentences about what is needed and does not come."""
-        told, last = [], self._meter.last
+        sentences, last = [], self._meter.last
         for names in self._needed:
             heard = [name for name in names if name in last]
             silence = now - max((last[name] for name in heard), default=-np.inf)
             where = ' or '.join(self._topics[name] for name in heard or names)
             if not heard:
-                told.append(f'no message yet on {where}')
+                sentences.append(f'no message yet on {where}')
             elif silence > stale_after:
-                told.append(f'no message for {silence:.1f} s on {where}')
-        return told
+                sentences.append(f'no message for {silence:.1f} s on {where}')
+        return sentences
 
-    def _gone(self, now: float, stale_after: float) -> list[str]:
-        """Sentences about other inputs that came, and do not any more."""
-        told = []
+    def _gone(self, now: float, stale_after: float) -> list[tuple[str, str]]:
+        """Other inputs that came, and do not any more, and a sentence about each."""
+        gone = []
         for name, last in self._meter.last.items():
             limit = max(stale_after, _PATIENCE * self._meter.interval(name))
             if now - last > limit:
-                told.append(f'nothing more on {self._topics[name]} for {now - last:.1f} s')
-        return told
+                sentence = f'nothing more on {self._topics[name]} for {now - last:.1f} s'
+                gone.append((name, sentence))
+        return gone
 
     def _input_status(
         self,
@@ -207,25 +217,33 @@ class Reporter:
             f'incompatible peer on {topic}': policy
             for topic, policy in sorted(incompatible.items())
         }
-        level, text = DiagnosticStatus.OK, 'receiving'
-        if stale:
-            level, text = DiagnosticStatus.STALE, '; '.join(stale)
-        elif refused and refused.total() >= fresh.total():
-            level, text = DiagnosticStatus.ERROR, f'every message is refused: {_most(refused)}'
+        found = [
+            Finding(one.split(' for ')[0], STALE, one, at_once=True, passing=True) for one in stale
+        ]
+        if refused and refused.total() >= fresh.total():
+            sentence = f'every message is refused: {_most(refused)}'
+            found.append(Finding('refused', ERROR, sentence))
         elif refused:
-            level, text = DiagnosticStatus.WARN, f'messages are refused: {_most(refused)}'
-        elif incompatible:
-            level, text = DiagnosticStatus.WARN, 'a peer has an incompatible quality of service'
-        elif missing:
-            level, text = DiagnosticStatus.WARN, _share_lost(missing, fresh)
-        elif gone := self._gone(now, stale_after):
-            level, text = DiagnosticStatus.WARN, '; '.join(gone)
+            sentence = f'messages are refused: {_most(refused)}'
+            found.append(Finding('refused', WARN, sentence))
+        if missing:
+            many = missing.total() > max(2, MUCH_LOST * fresh.total())
+            found.append(Finding('lost', WARN, _share_lost(missing, fresh), at_once=many))
+        if incompatible:
+            sentence = 'a peer has an incompatible quality of service'
+            found.append(Finding('incompatible', WARN, sentence, timed=True))
+        if not stale:
+            gone = self._gone(now, stale_after)
+            found += [Finding(f'gone {one}', WARN, text, timed=True) for one, text in gone]
+        counting = self._of_input.settle(found, quiet=not fresh)
+        level, text = told(counting, 'receiving')
         if not enabled:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
 
     def _tracker_status(
         self,
+        quiet: bool,
         rate: float,
         dropped: int,
         enabled: bool,
@@ -238,22 +256,24 @@ class Reporter:
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
-        level, text = DiagnosticStatus.OK, 'tracking' if enabled else 'disabled'
+        found = [Finding(_wording(one), WARN, one) for one in warnings]
         if stale and enabled:
-            level, text = DiagnosticStatus.STALE, f'waiting for input: {stale[0]}'
-        if warnings:
-            level, text = DiagnosticStatus.WARN, '; '.join(warnings)
+            sentence = f'waiting for input: {stale[0]}'
+            found.append(Finding('stale', STALE, sentence, at_once=True, passing=True))
         if dropped:
-            level, text = (
-                DiagnosticStatus.WARN,
-                (f'input comes faster than it can be processed: {dropped} messages dropped'),
-            )
+            sentence = f'input comes faster than it can be processed: {dropped} messages dropped'
+            found.append(Finding('dropped', WARN, sentence, at_once=True))
         elif rate * p50 > 1000.0:
-            level, text = DiagnosticStatus.WARN, 'input comes faster than it can be processed'
-        elif health.get('moving_alike'):
-            level, text = DiagnosticStatus.WARN, 'most obstacles move alike: navigation may drift'
+            sentence = 'input comes faster than it can be processed'
+            found.append(Finding('slow', WARN, sentence))
+        if health.get('moving_alike'):
+            sentence = 'most obstacles move alike: navigation may drift'
+            found.append(Finding('moving_alike', WARN, sentence))
         if counts.get('internal_error'):
-            level, text = DiagnosticStatus.ERROR, 'an internal error was caught, see the log'
+            sentence = 'an internal error was caught, see the log'
+            found.append(Finding('internal_error', ERROR, sentence, at_once=True))
+        counting = self._of_tracker.settle(found, quiet=quiet)
+        level, text = told(counting, 'tracking' if enabled else 'disabled')
         return self._status('tracker', level, text, values)
 
     def _status(
@@ -272,11 +292,32 @@ class Reporter:
         )
 
 
+class Announcer:
+    """Publishes what a `Reporter` made: all of it on /diagnostics, and on ``~/health`` one status,
+    latched. health: the newest one."""
+
+    def __init__(self, endpoints: Endpoints, name: str):
+        self._name = name
+        self.health = DiagnosticStatus(level=STALE, name=name, message='starting')
+        self._all = endpoints.advertise(DiagnosticArray, '/diagnostics', output_qos())
+        self._one = endpoints.advertise(DiagnosticStatus, '~/health', latched_qos())
+
+    def publish(self, message: DiagnosticArray) -> None:
+        self._all.publish(message)
+        self.health = summary(self._name, message.status)
+        self._one.publish(self.health)
+
+
 def _share_lost(missing: Counter[str], fresh: Counter[str]) -> str:
     shares = ', '.join(
         f'{100 * n / (n + fresh[topic]):.1f} % on {topic}' for topic, n in missing.most_common(3)
     )
     return f'messages are lost before they can be read: {shares}'
+
+
+def _wording(sentence: str) -> str:
+    """What stays of a sentence whose numbers change."""
+    return ''.join(letter for letter in sentence if letter.isalpha())[:60]
 
 
 def _most(refused: Counter[str]) -> str:

@@ -49,7 +49,7 @@ from ..parameters import ConfigError
 from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
 from .answers import Answers
 from .base import run
-from .diagnostics import Meter, Reporter
+from .diagnostics import Announcer, Meter, Reporter
 from .messages import make, message_class
 from .parameters import NodeParameters
 from .qos import Endpoints, input_qos, latched_qos, output_qos
@@ -86,9 +86,7 @@ class FlsDetectorNode(Node):
         self._detections = self._endpoints.advertise(
             table, 'detections', output_qos(), matched=lambda: self._acknowledge(None)
         )
-        self._diagnostics = self._endpoints.advertise(
-            message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', output_qos()
-        )
+        self._announcer = Announcer(self._endpoints, self.get_fully_qualified_name().lstrip('/'))
         heard = self._endpoints.subscribe(
             image_class,
             topic.name,
@@ -156,7 +154,7 @@ class FlsDetectorNode(Node):
         self._answers.say(counts, stamp)
 
     def _report(self) -> None:
-        self._diagnostics.publish(
+        self._announcer.publish(
             self._reporter.report(
                 self.get_clock().now().to_msg(),
                 time.monotonic(),

@@ -98,6 +98,7 @@ def run_lockstep(
         inputs = {
             name: evolve(entry, name=entry.instance(name, settings or {}))
             for name, entry in fitting_topics(bag, system, topics).items()
+            if entry.wanted(settings or {})
         }
         fed = {topic: entry for topic, entry in inputs.items() if entry.makes}
         direct = {topic: entry for topic, entry in inputs.items() if not entry.makes}

@@ -37,11 +37,12 @@ from .chain import Chain
 from .link import Link, MATCH_LIMIT
 from .lockstep import LockStep, only_node
 from .messages import make, message_class
-from .qos import lockstep_qos, output_qos
+from .qos import latched_qos, lockstep_qos, output_qos
 
 NAME = 'sonar_imm_player'
 _FIRST_LISTENER, _OTHER_LISTENERS = 5.0, 0.5
 _DEPTH = 100
+_LATCHED = 1000
 _NANO = 10**9
 
 
@@ -109,6 +110,11 @@ def play(
         player = Player(bag, link, options)
         player.run(progress)
         return player.result()
+
+
+def _kept(name: str, qos: QoSProfile) -> QoSProfile:
+    """`qos`, for ``/tf_static`` with all messages kept for listeners that come later."""
+    return latched_qos(_LATCHED) if name.rpartition('/')[2] == 'tf_static' else qos
 
 
 class Player:
@@ -179,7 +185,7 @@ class Player:
                 self._problems.append(f'topic {name} is not published: {error}')
                 continue
             publishers[name] = self._link.node.create_publisher(
-                cls, options.remap.get(name, name), options.qos.get(name, qos)
+                cls, options.remap.get(name, name), options.qos.get(name) or _kept(name, qos)
             )
         if not publishers:
             raise BagError(f'{self._bag.path} has nothing to publish')

@@ -24,15 +24,18 @@ refuses a best-effort driver.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+import contextlib
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    InvalidQoSProfileException,
     qos_policy_name_from_kind,
     QoSProfile,
     ReliabilityPolicy,
@@ -65,13 +68,13 @@ def output_qos(depth: int = 10) -> QoSProfile:
     )
 
 
-def latched_qos() -> QoSProfile:
-    """Reliable, and the last message waits for listeners that come later."""
+def latched_qos(depth: int = 1) -> QoSProfile:
+    """Reliable, and the last `depth` messages wait for listeners that come later."""
     return QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE,
         history=HistoryPolicy.KEEP_LAST,
         durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        depth=1,
+        depth=depth,
     )
 
 
@@ -213,3 +216,16 @@ def _profile(topic: str, policies: dict[str, Any]) -> QoSProfile:
             known = ', '.join(_POLICIES[name].short_keys())
             raise ConfigError(f"{topic}: {name} is one of {known}, got '{value}'") from None
     return profile
+
+
+@contextlib.contextmanager
+def explained_overrides(node: Node) -> Iterator[None]:
+    """Turn what is raised for a bad qos_overrides or type parameter into a `ConfigError`."""
+    try:
+        yield
+    except (ImportError, InvalidParameterTypeException, InvalidQoSProfileException) as error:
+        raise ConfigError(str(error)) from None
+    except RuntimeError as error:
+        if not node.context.ok():
+            raise
+        raise ConfigError(str(error)) from None

@@ -39,6 +39,10 @@ REASONS = frozenset(
     }
 )
 """Counts of a tracker that say that a message was of no use."""
+HINTS = {
+    'too_late': 'too_late (older than the history: a long delay, or clocks that disagree)',
+    'doubted': 'doubted (their stamps do not go on from those before)',
+}
 WINDOW = 10.0
 """Seconds over which the share is taken."""
 SHARE, LEAST = 0.1, 5
@@ -61,6 +65,6 @@ class Unused:
         fresh, lost = received - before, unused - then_unused
         if lost.total() < max(LEAST, SHARE * fresh):
             return ''
-        reasons = ', '.join(name for name, _ in lost.most_common(3))
+        reasons = ', '.join(HINTS.get(name, name) for name, _ in lost.most_common(3))
         share = 100.0 * min(1.0, lost.total() / max(fresh, 1))
         return f'{share:.0f} % of the messages of the last {now - then:.0f} s not used: {reasons}'

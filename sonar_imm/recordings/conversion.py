@@ -72,6 +72,14 @@ class ConversionReport:
                 yield row, parse(row)
             except (BadRow, Rejection) as error:
                 self.bad_row(table.path, f'line {row.line}', error)
+        self.note_columns(table)
+
+    def note_columns(self, table: CsvTable) -> None:
+        """Note which columns of a file were taken for what, and which were not."""
+        taken, left = table.columns_used()
+        self.notes[f'columns of {table.path.name}'] = taken
+        if left:
+            self.notes[f'ignored columns of {table.path.name}'] = left
 
 
 def write_bag(

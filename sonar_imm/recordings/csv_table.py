@@ -21,9 +21,10 @@ Columns with other names are mapped by hand. A row that cannot be read raises `B
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import contextlib
 import csv
-from datetime import datetime, timezone
 from decimal import Decimal
+import itertools
 import math
 from pathlib import Path
 import re
@@ -32,9 +33,15 @@ from typing import Any, TextIO
 from attrs import field, frozen
 
 from ..parameters import did_you_mean
+from .csv_times import BadRow, dated, iso_ns, TIME_OF_DAY, TIME_TEXT, zone_of
 from .sources import BagError
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
+
+LONGEST_NS = 10**8 * 10**9
+"""A recording is shorter, a date since 1970 longer."""
+LOOKED_AT = 1000
+"""Rows by which a file is judged."""
 
 ALIASES: dict[str, tuple[str, ...]] = {
     'stamp': (
@@ -46,9 +53,13 @@ ALIASES: dict[str, tuple[str, ...]] = {
         'date_time',
         'utc',
         'utc_time',
+        'time_utc',
+        'timestamp_utc',
+        'datetime_utc',
         'epoch',
         'unix_time',
     ),
+    'date': ('date', 'utc_date', 'gps_date', 'date_utc', 'day'),
     'x': ('x', 'east', 'easting', 'px', 'pos_x', 'position_x', 'utm_e', 'utm_x', 'e'),
     'y': ('y', 'north', 'northing', 'py', 'pos_y', 'position_y', 'utm_n', 'utm_y', 'n'),
     'z': ('z', 'up', 'pz', 'pos_z', 'position_z'),
@@ -107,20 +118,10 @@ ALIASES: dict[str, tuple[str, ...]] = {
     'std_depth': ('std_depth', 'sigma_depth'),
 }
 _UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
-_TIME = re.compile(r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
 
 
 _YES = ('1', '1.0', 'true', 't', 'yes', 'y', 'valid', 'ok')
 _NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
-
-
-class BadRow(ValueError):
-    """A row that cannot be used; the text says why, `reason` is a code where rows are counted by
-    reason."""
-
-    def __init__(self, why: str, reason: str = ''):
-        super().__init__(why)
-        self.reason = reason
 
 
 @frozen(kw_only=True)
@@ -130,13 +131,16 @@ class CsvOptions:
     columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``. What is not listed is
     found by its usual names (`ALIASES`); case and units are ignored.
     time_unit: of numeric times, one of s, ms, us, ns. Empty: from the header (``time_ms``), else
-    s. ISO 8601 texts are recognised; without a zone they are UTC.
+    s. ISO 8601 texts are recognised, also as a date and a time of day in two columns.
+    time_zone: of texts that do not say theirs: ``UTC``, ``+02:00`` or a name such as
+    ``Europe/Berlin``. Empty: UTC where the header says so (``utc_time``), else they are refused.
     time_offset_ns: added to every time, for files that count from their own start.
     delimiter: empty to find it from the header line.
     """
 
     columns: Mapping[str, str] = field(factory=dict)
     time_unit: str = ''
+    time_zone: str = ''
     time_offset_ns: int = 0
     delimiter: str = ''
 
@@ -145,6 +149,8 @@ class CsvOptions:
             raise BagError(
                 f"the time unit must be one of {', '.join(TIME_UNITS)}, got '{self.time_unit}'"
             )
+        if self.time_zone:
+            zone_of(self.time_zone)
         for name in self.columns:
             if name not in ALIASES:
                 raise BagError(
@@ -163,6 +169,7 @@ class Row:
 
     def text(self, name: str) -> str:
         """The cell as text; empty when the column is missing or the line is short."""
+        self.table.used.add(name)
         index = self.table.index.get(name, len(self.cells))
         return self.cells[index].strip() if index < len(self.cells) else ''
 
@@ -215,15 +222,46 @@ class Row:
 
     def stamp_ns(self, name: str = 'stamp') -> int:
         """A time since 1970 in integer nanoseconds, with the offset of the options added."""
-        parts = _TIME.match(self.text(name))
-        stamp = _iso_ns(*parts.groups()) if parts else self.seconds_ns(name)
+        parts = TIME_TEXT.match(self._moment(name))
+        if parts:
+            *moment, zone = parts.groups()
+            stamp = iso_ns(*moment, zone_of(zone or self._zone(name)))
+        else:
+            stamp = self.seconds_ns(name)
         stamp += self.table.options.time_offset_ns
+        if not stamp and self.table.counts_from_zero(name):
+            stamp = 1  # a stamp of 0 means none in ROS
         if not 0 < stamp < 2**31 * 10**9:
             raise BadRow(
                 f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
                 'can hold; set the time offset or the time unit'
             )
         return stamp
+
+    def _moment(self, name: str) -> str:
+        """The text of a time, with the date of its own column where it has only a time of day."""
+        text = self.text(name)
+        if not TIME_OF_DAY.match(text):
+            return text
+        if not self.table.has('date'):
+            raise BadRow(
+                f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
+                'the date'
+            )
+        return dated(self.text('date'), text, self.table.header('date'))
+
+    def _zone(self, name: str) -> str:
+        """The zone of a time that does not say it."""
+        if self.table.options.time_zone:
+            return self.table.options.time_zone
+        headers = f'{self.table.header(name)} {self.table.header("date")}'.lower()
+        if 'utc' in headers or 'gmt' in headers:
+            return 'UTC'
+        raise BadRow(
+            f"{self.table.header(name)} is '{self.text(name)[:40]}' without a time zone; say "
+            '--time-zone UTC, or that of the clock, e.g. --time-zone +02:00',
+            'no time zone',
+        )
 
 
 class CsvTable:
@@ -248,6 +286,8 @@ class CsvTable:
         self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
         self.headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
         self.index = self._find_columns()
+        self.used: set[str] = set()
+        self._from_zero: dict[str, bool] = {}
 
     def __iter__(self) -> Iterator[Row]:
         with self._open() as file:
@@ -282,6 +322,27 @@ class CsvTable:
                 f'{", ".join(self.headers)}; say which column holds '
                 f'{"it" if len(missing) == 1 else "them"}'
             )
+
+    def counts_from_zero(self, name: str) -> bool:
+        """Whether the first times of the file are seconds from its own start rather than a date,
+        so that a time of 0 is one, and not one that is missing."""
+        if name not in self._from_zero:
+            told = []
+            for row in itertools.islice(self, LOOKED_AT):
+                with contextlib.suppress(BadRow):
+                    told.append(row.seconds_ns(name))
+            self._from_zero[name] = max(told, default=0) < LONGEST_NS
+        return self._from_zero[name]
+
+    def columns_used(self) -> tuple[str, str]:
+        """What was taken from which column so far, and which columns were not, as text."""
+        taken = {name: self.index[name] for name in self.index if name in self.used}
+        told = ', '.join(
+            name if self.headers[k] == name else f'{name} = {self.headers[k]}'
+            for name, k in taken.items()
+        )
+        left = [header for k, header in enumerate(self.headers) if k not in taken.values()]
+        return told, ', '.join(header or '(no name)' for header in left)
 
     def header(self, name: str) -> str:
         """What the file calls a quantity."""
@@ -341,15 +402,3 @@ def _plain(header: str) -> str:
     """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
     name = re.sub(r'[\[(].*', '', header.lower()).strip()
     return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))
-
-
-def _iso_ns(date: str, clock: str, fraction: str | None, zone: str | None) -> int:
-    """Nanoseconds since 1970 of an ISO 8601 time."""
-    zone = '+00:00' if zone in (None, 'Z') else zone if ':' in zone else f'{zone[:3]}:{zone[3:]}'
-    try:
-        moment = datetime.fromisoformat(f'{date}T{clock}{zone}')
-    except ValueError:
-        raise BadRow(f"'{date} {clock}{zone}' is no date and time of the calendar") from None
-    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
-    nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
-    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)

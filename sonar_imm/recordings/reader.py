@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from heapq import merge
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -186,17 +187,26 @@ class BagReader:
     def _guarded(
         self, source: Source, topics: Collection[str] | None
     ) -> Iterator[tuple[Source, RawMessage]]:
-        """Read one source up to its end or its first damage."""
+        """Read one source up to its end or, where nothing else helps, its first damage."""
+        given = 0
         try:
             for item in source.messages(topics):
                 yield source, item
+                given += 1
         except GeneratorExit:
             raise
         except Exception as error:  # rosbags raises nearly anything on damaged files
-            self.add_problem(
-                f'{self.path} is damaged: {one_line(error)}; the messages after the '
-                'damage are lost'
-            )
+            rest = source.rescue()
+            if rest is None:
+                self.add_problem(
+                    f'{self.path} is damaged: {one_line(error)}; the messages after the '
+                    'damage are lost'
+                )
+                return
+            self._sources.append(rest)
+            self.add_problem(rest.damage)
+            for item in islice(rest.messages(topics), given, None):
+                yield rest, item
 
     def _cannot_decode(self, item: RawMessage, index: int, error: Exception) -> None:
         reason = f'message {index}, {one_line(error)}'

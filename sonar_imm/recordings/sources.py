@@ -20,17 +20,22 @@ one sentence here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from attrs import frozen
+from backports.zstd import ZstdError
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
-from .mcap_scan import McapScan, oversized_chunk, unpack
+from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
+from .mcap_scan import Channel, McapScan
+from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
+from .source_hints import advice, convert_hint, leftovers, packed_hint
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -79,6 +84,10 @@ class Source(Protocol):
 
     def decode(self, type_name: str, raw: bytes) -> Any: ...
 
+    def rescue(self) -> ScanSource | None:
+        """What can still be read after damage stopped `messages`, from the first one again."""
+        ...
+
     def span(self) -> tuple[int, int] | None: ...
 
     def close(self) -> None: ...
@@ -96,19 +105,44 @@ class RosbagsSource:
     """A bag directory or storage file read by rosbags."""
 
     def __init__(self, path: Path):
-        files = path.glob('*.mcap') if path.is_dir() else [path]
-        for file in files:
-            if file.suffix == '.mcap' and (oversized := oversized_chunk(file)):
+        self._path = path
+        for file in self._mcaps():
+            if oversized := oversized_chunk(file):
                 raise BagError(oversized)
+            if wrong := wrong_sums(file):
+                raise BagError(f'the checksum of {" and of ".join(wrong)} in {file.name} is wrong')
+        for file in path.glob('*.zstd') if path.is_dir() else []:
+            if oversized := oversized_file(file):
+                raise BagError(f'{file.name} cannot be unpacked: {oversized}')
         place = _FolderPath(path) if path.is_dir() else path
         self._reader = AnyReader([place], default_typestore=typestore())
         self._reader.open()
+        self._unpack_here()
         if trouble := self._trouble():
             self._reader.close()
             raise BagError(f'metadata.yaml has {trouble}')
         # rosbags ignores its default types as soon as the bag defines a single one
         self.types = self._reader.typestore
         _add_known_types(self.types, [link.msgtype for link in self._reader.connections])
+
+    def _unpack_here(self) -> None:
+        """Have compressed messages handed out as they are: rosbags unpacks without a limit."""
+        for reader in self._reader.readers:
+            storage = getattr(reader, 'storage', None)
+            if getattr(getattr(storage, 'metadata', None), 'compression_mode', None) == 'message':
+                storage.metadata = storage.metadata._replace(compression_mode=None)
+
+    def _mcaps(self) -> list[Path]:
+        """Its files of that kind."""
+        if self._path.is_dir():
+            return sorted(self._path.glob('*.mcap'))
+        return [self._path] if self._path.suffix == '.mcap' else []
+
+    def rescue(self) -> ScanSource | None:
+        """A scan of its one MCAP file, which gives the same messages in the same order without
+        those of damaged chunks; None where it has no such file."""
+        files = self._mcaps()
+        return ScanSource(files[0]) if len(files) == 1 else None
 
     def _trouble(self) -> str:
         """What of the metadata is of a wrong kind, empty when nothing is; rosbags does not ask."""
@@ -161,6 +195,8 @@ class RosbagsSource:
                 yield RawMessage(link.topic, link.msgtype, log_ns, _unpacked(raw))
 
     def decode(self, type_name: str, raw: bytes) -> Any:
+        if raw[:4] == _ZSTD_MAGIC:
+            unpack(raw, 'zstd')  # says why it is still packed
         if self._reader.is2:
             return decode_cdr(self.types, type_name, raw)
         return self._reader.deserialize(raw, type_name)
@@ -179,16 +215,25 @@ class ScanSource:
     """An MCAP file without a usable index."""
 
     def __init__(self, path: Path):
+        self._file = path
         self._scan = McapScan(path)
-        self.lost = self._scan.lost
-        self.types = get_typestore(Stores.EMPTY)
-        for channel in self._scan.channels.values():
-            if channel.definition and 'idl' in channel.definition_encoding:
-                self.types.register(get_types_from_idl(channel.definition))
-            elif channel.definition:
-                self.types.register(get_types_from_msg(channel.definition, channel.type_name))
-        _add_known_types(
-            self.types, [channel.type_name for channel in self._scan.channels.values()]
+        self.types = _types_of(frozenset(self._scan.channels.values()))
+
+    def rescue(self) -> None:
+        return None
+
+    @property
+    def damage(self) -> str:
+        """What is lost, and what is not, as a sentence."""
+        count, stated = sum(self._scan.counts.values()), self._scan.stated
+        if not self._scan.lost:
+            return (
+                f'{self._file} is damaged beside its messages; all {count} messages were recovered'
+            )
+        of = f' of {stated}' if stated is not None else ''
+        return (
+            f'{self._file} {self._scan.lost}; {count}{of} messages were recovered, the rest is '
+            'lost'
         )
 
     def topics(self) -> list[TopicInfo]:
@@ -237,7 +282,7 @@ def open_sources(path: Path) -> tuple[list[Source], list[str]]:
         if path.suffix not in SUFFIXES:
             raise BagError(
                 f'{path} is not a recording: the names of recordings end in '
-                f'{", ".join(SUFFIXES)}{_packed_hint([path])}'
+                f'{", ".join(SUFFIXES)}{packed_hint([path])}{convert_hint(path)}'
             )
         return _open_files([path], [])
     return _open_directory(path)
@@ -256,7 +301,7 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
             )
         else:
             if not source.unordered:
-                return [source], _leftovers(path)
+                return [source], leftovers(path)
             source.close()
     files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
     if not files:
@@ -264,7 +309,7 @@ def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
             problems[0]
             if problems
             else f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
-            f'ends in {", ".join(SUFFIXES)}{_packed_hint(path.iterdir())}'
+            f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}'
         )
     if not problems and not (path / 'metadata.yaml').exists():
         problems.append(f'{path} has no metadata.yaml, its files are read one by one')
@@ -279,10 +324,10 @@ def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], l
         try:
             source, damage = _open_file(file)
         except Exception as error:  # see the module docstring
-            failures.append(f'{file} cannot be read: {one_line(error)}{_advice(file)}')
+            failures.append(f'{file} cannot be read: {one_line(error)}{advice(file)}')
             continue
         sources.append(source)
-        problems += damage + _leftovers(file)
+        problems += damage + leftovers(file)
     if not sources:
         raise BagError('; '.join(failures))
     return sources, problems + failures
@@ -296,10 +341,7 @@ def _open_file(file: Path) -> tuple[Source, list[str]]:
         if file.suffix != '.mcap' or not file.stat().st_size:
             raise
         scan = ScanSource(file)
-        count = sum(topic.count for topic in scan.topics())
-        if scan.lost:
-            return scan, [f'{file} {scan.lost}; {count} messages were recovered, the rest is lost']
-        return scan, [f'{file} has a damaged end; all its {count} messages were recovered']
+        return scan, [scan.damage]
     if source.unordered:
         source.close()
         return ScanSource(file), []
@@ -307,34 +349,31 @@ def _open_file(file: Path) -> tuple[Source, list[str]]:
 
 
 def _unpacked(raw: bytes) -> bytes:
-    """Undo message compression, which only a missing metadata.yaml would have told about."""
-    return unpack(raw, 'zstd') if raw[:4] == _ZSTD_MAGIC else bytes(raw)
-
-
-def _leftovers(path: Path) -> list[str]:
-    """Sentences about write-ahead logs that a crashed recorder left, whose rows are not read."""
-    logs = path.glob('*.db3-wal') if path.is_dir() else [path.with_name(path.name + '-wal')]
-    return [
-        f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
-        f"the messages in it are not read (sqlite3 {log.name[:-4]} 'pragma wal_checkpoint' "
-        'merges them)'
-        for log in logs
-        if log.exists() and log.stat().st_size
-    ]
-
-
-def _advice(file: Path) -> str:
-    return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
-
-
-def _packed_hint(files: Iterable[Path]) -> str:
-    packed = [file.name for file in files if file.suffix in ('.zstd', '.zst')]
-    return f'; {packed[0]} is compressed, unpack it with zstd first' if packed else ''
+    """Undo the compression of a message; one that cannot be unpacked stays as it is."""
+    if raw[:4] != _ZSTD_MAGIC:
+        return bytes(raw)
+    try:
+        return unpack(raw, 'zstd')
+    except (TooLargeError, ZstdError):
+        return bytes(raw)
 
 
 def _split_order(file: Path) -> tuple[int, str]:
     """Order the files of a split bag: name_2 comes before name_10."""
     return len(file.name), file.name
+
+
+@lru_cache(maxsize=8)
+def _types_of(channels: frozenset[Channel]) -> Any:
+    """What these channels define, and what is known of the rest. To parse it takes a while."""
+    types = get_typestore(Stores.EMPTY)
+    for channel in sorted(channels):
+        if channel.definition and 'idl' in channel.definition_encoding:
+            types.register(get_types_from_idl(channel.definition))
+        elif channel.definition:
+            types.register(get_types_from_msg(channel.definition, channel.type_name))
+    _add_known_types(types, [channel.type_name for channel in channels])
+    return types
 
 
 def _add_known_types(types: Any, names: list[str]) -> None:

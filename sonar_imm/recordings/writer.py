@@ -39,6 +39,7 @@ from rosbags.rosbag2 import (
 )
 
 from ..files import whole
+from .mcap_sums import seal
 from .messages import cdr_of, ros_message, typestore
 from .own_parameters import write_own_parameters
 from .sources import BagError
@@ -128,9 +129,11 @@ class BagWriter:
         self._place.__exit__(kind, error, trace)
 
     def close(self) -> None:
-        """Finish the bag: index, metadata and parameters; then move it to its place."""
+        """Finish the bag: index, metadata, checksums and parameters; then move it to its place."""
         with naming(self.path), self._place:
             self._writer.close()
+            for file in self._unfinished.glob('*.mcap'):
+                seal(file)
             write_own_parameters(self._unfinished, self._parameters)
 
     def write(self, topic: str, message: Any, log_ns: int) -> None:

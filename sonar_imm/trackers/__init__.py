@@ -13,7 +13,24 @@
 # limitations under the License.
 
 """The trackers: one folder per system. `SYSTEMS` says what exists; importing it does not load a
-tracker."""
+tracker.
+
+>>> from sonar_imm.measurements import Fix
+>>> from sonar_imm.trackers.diver.config import DiverConfig
+>>> tracker = SYSTEMS['diver'].build(DiverConfig(fix_std=1.5))
+>>> for second in range(1, 30):
+...     fix = Fix(stamp_ns=second * 10**9, position=(0.5 * second, 0.0, 0.0))
+...     estimates = tracker.process(fix)
+>>> newest = estimates[-1]
+>>> newest.state_names, newest.state.shape
+(('px', 'py', 'vx', 'vy'), (1, 4))
+>>> bool(abs(newest.state[0, 0] - 14.5) < 1.0), tracker.counts['used']
+(True, 29)
+>>> DiverConfig(fix_std=-1.0)
+Traceback (most recent call last):
+    ...
+sonar_imm.parameters.ConfigError: parameter 'fix_std' must be between 0.0001 and 100000, got -1.0 m
+"""
 
 from __future__ import annotations
 

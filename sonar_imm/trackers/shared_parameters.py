@@ -57,6 +57,27 @@ class DetectionParameters(Config):
 
 
 @frozen(kw_only=True, slots=False)
+class MountingParameters(Config):
+    """Where the place of the sonar on its vehicle is taken from."""
+
+    vehicle_frame: str = parameter(
+        '', 'with sonar_frame: the frame in which the poses of nav are, e.g. base_link'
+    )
+    sonar_frame: str = parameter(
+        '',
+        'the frame of the sonar (x forward, y port, z up); with it and vehicle_frame /tf_static '
+        'says sonar_lever and sonar_mount_rpy_deg, and pings before it does are refused; empty: '
+        'the parameters say it',
+    )
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if bool(self.vehicle_frame) != bool(self.sonar_frame):
+            problems.append('vehicle_frame and sonar_frame need each other')
+        return problems
+
+
+@frozen(kw_only=True, slots=False)
 class TrackLifeParameters(Config):
     """When tracks begin, are confirmed and end."""
 

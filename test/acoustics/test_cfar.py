@@ -15,12 +15,15 @@
 """CFAR: the rate of false alarms it promises, and the level it compares with."""
 
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.acoustics.cfar import (
     effective_cells,
     false_alarm_probability,
     noise_level,
+    quiet_level,
+    tail_factor,
     threshold_factor,
 )
 
@@ -97,3 +100,51 @@ def test_independent_cells_are_all_effective():
 def test_only_images_are_taken():
     with pytest.raises(ValueError, match=r'\(R, B\)'):
         noise_level(np.ones(5), beams=3, training=4, guard=1)
+
+
+def test_a_factor_for_k_noise_gives_the_probability_that_was_asked_for():
+    """Drawn: power of patches of gamma distributed power."""
+    rng = np.random.default_rng(3)
+    for shape in (1.5, 4.0, 40.0):
+        power = rng.gamma(shape, 1.0 / shape, (400, 5000)) * rng.exponential(size=(400, 5000))
+        rough = np.var(np.log(np.maximum(power, 0.02)))
+        threshold = -np.log(1e-4) * tail_factor(np.array([rough]), 1e-4)[0]
+        assert np.mean(power > threshold) == pytest.approx(1e-4, rel=0.25)
+
+
+def test_rayleigh_noise_asks_for_no_more():
+    power = np.random.default_rng(4).exponential(size=(200, 256))
+    _, _, rough = quiet_level(power, beams=25, training=16, guard=4)
+    assert np.max(tail_factor(rough[60:140], 1e-6)) < 10.0**0.1
+
+
+def test_the_rougher_the_sea_floor_the_higher():
+    rng = np.random.default_rng(5)
+    factor = []
+    for shape in (1000.0, 4.0, 1.5, 0.7):
+        patches = np.repeat(np.repeat(rng.gamma(shape, 1.0 / shape, (50, 64)), 4, 0), 4, 1)
+        power = patches * rng.exponential(size=(200, 256))
+        _, _, rough = quiet_level(power, beams=25, training=16, guard=4)
+        factor.append(np.median(tail_factor(rough[40:160], 1e-6)))
+    assert np.all(np.diff(factor) > 0.2)
+
+
+def test_what_reaches_into_its_own_training_cells_is_left_out_of_the_noise():
+    rng = np.random.default_rng(6)
+    power = rng.exponential(size=(200, 100))
+    power[80:120, 48:53] += 60.0  # along the line of sight, longer than the training cells
+    plain, _ = noise_level(power, beams=25, training=16, guard=4)
+    quiet, _, _ = quiet_level(power, beams=25, training=16, guard=4)
+    assert plain[100, 50] > 8.0 and quiet[100, 50] < 1.5
+    # Noise alone keeps its level.
+    assert_allclose(quiet[20:60].mean(), plain[20:60].mean(), rtol=0.06)
+
+
+def test_silence_and_one_huge_cell_are_survived():
+    for power in (np.zeros((60, 40)), np.full((60, 40), 1e76), np.zeros((0, 40)), np.ones((3, 2))):
+        level, sides, rough = quiet_level(power, beams=25, training=16, guard=4)
+        assert level.shape == power.shape and len(sides) == len(rough) == len(power)
+        assert not np.isnan(level).any() and not np.isnan(tail_factor(rough, 1e-6)).any()
+    power = np.random.default_rng(7).exponential(size=(60, 40))
+    power[30, 20] = 1e76
+    assert quiet_level(power, beams=25, training=16, guard=4)[0][50, 20] < 3.0

@@ -22,7 +22,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from sonar_imm.acoustics import multistatic
-from sonar_imm.acoustics.localisation import Limits, Localisation, localise, Refusal
+from sonar_imm.acoustics.localisation import Candidate, Limits, Localisation, localise, Refusal
 
 SOUND_SPEED, Z, SIGMA = 1500.0, -5.0, 1e-4
 TX = np.array([5.0, -10.0, -2.0])
@@ -478,3 +478,21 @@ def test_no_input_raises_or_gives_nan(data):
     else:
         assert np.isfinite(result.position).all() and np.isfinite(result.cost)
         assert np.linalg.eigvalsh(result.covariance)[0] > 0.0
+
+
+def test_the_distance_from_a_fix_needs_no_inverse():
+    """Two rows alike: rounding has left nothing of what is known across them."""
+    for scale in (1e-20, 1e-4, 1.0, 1e20):
+        covariance = scale * np.array([[1.0, 1.0], [1.0, 1.0]])
+        with pytest.raises(np.linalg.LinAlgError):
+            np.linalg.inv(covariance)
+        candidate = Candidate(np.zeros(2), covariance, 0.0)
+        step = np.sqrt(scale) * np.array([1.0, 1.0])
+        np.testing.assert_allclose(candidate.distance2(step), 1.0, rtol=1e-9)
+        assert candidate.distance2(np.sqrt(scale) * np.array([1.0, -1.0])) > 1e12
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        root, gap = rng.normal(size=(2, 2)), rng.normal(size=2)
+        candidate = Candidate(np.zeros(2), root @ root.T, 0.0)
+        wanted = gap @ np.linalg.inv(candidate.covariance) @ gap
+        np.testing.assert_allclose(candidate.distance2(gap), wanted, rtol=1e-6)

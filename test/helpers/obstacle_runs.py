@@ -164,7 +164,7 @@ def follow(measurements, config):
         sonar = Sonar(
             mount.sonar(NavigationBuffer().added(pose).pose(pose.stamp_ns)), altitude.altitude
         )
-        z, R, _ = tracker._detections(ping)
+        z, R, *_ = tracker._detections(ping)
         if mixture is None:
             mixture = filter_.begin(z, R, sonar)
         else:

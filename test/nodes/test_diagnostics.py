@@ -18,21 +18,27 @@ from collections import Counter
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from helpers.rig import a_fix, FIX
+import numpy as np
 import pytest
 
 from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.diagnostics import Meter, Reporter
-from sonar_imm.nodes.qos import output_qos
+from sonar_imm.nodes.health import summary
+from sonar_imm.nodes.messages import message_class
+from sonar_imm.nodes.qos import latched_qos, output_qos
 
 
 class Desk:
     """A reporter whose clock the test sets."""
 
-    def __init__(self):
+    def __init__(self, rise=1, fall=1):
         self.meter = Meter()
         topics = {'fix': '/usbl/fix', 'arrivals': '/arrivals', 'altitude': '/altitude'}
-        self.reporter = Reporter('diver', topics, self.meter, one_of=('fix', 'arrivals'))
+        self.reporter = Reporter(
+            'diver', topics, self.meter, one_of=('fix', 'arrivals'), rise=rise, fall=fall
+        )
 
     def report(self, now, **changes):
         state = {
@@ -124,7 +130,7 @@ def test_each_input_that_is_needed_is_looked_at_alone():
     desk = Desk()
     desk.meter, desk.reporter = (
         meter,
-        Reporter('obstacle', topics, meter, required=('detections', 'nav')),
+        Reporter('obstacle', topics, meter, required=('detections', 'nav'), rise=1, fall=1),
     )
     for second in range(20):
         meter.arrived('detections', second)
@@ -231,6 +237,7 @@ def test_dropped_messages_warn_while_they_are_dropped(desk):
     desk.report(1.0)
     assert desk.tracker.level == DiagnosticStatus.WARN
     assert '3 messages dropped' in desk.tracker.message
+    desk.meter.arrived('fix', 1.5)
     desk.report(2.0)
     assert desk.tracker.level == DiagnosticStatus.OK
     assert desk.values['fix dropped, waited too long'] == '3'
@@ -267,5 +274,76 @@ def test_obstacles_that_all_move_alike_warn_of_the_navigation(desk):
     desk.report(0.0, health={'moving_alike': 1})
     assert desk.tracker.level == DiagnosticStatus.WARN
     assert 'navigation' in desk.tracker.message
+    desk.meter.arrived('fix', 0.5)
     desk.report(1.0, health={'moving_alike': 0})
     assert desk.tracker.level == DiagnosticStatus.OK
+
+
+def run(desk, *refused):
+    """Levels of the input while one message a period comes, refused where `refused` says so."""
+    levels = []
+    for second, bad in enumerate(refused):
+        for k in range(2):
+            desk.meter.arrived('fix', second + 0.5 * k)
+        if bad:
+            desk.meter.refused['nan'] += 1
+        desk.report(second + 0.9)
+        levels.append(desk.input.level[0])
+    return levels
+
+
+def test_a_level_rises_after_two_bad_periods_and_falls_after_five_good_ones():
+    desk = Desk(rise=2, fall=5)
+    levels = run(desk, 0, 1, 0, 1, 1, 0, 0, 0, 0, 0, 0)
+    assert levels == [0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0]
+
+
+def test_a_value_at_its_limit_does_not_flap():
+    desk = Desk(rise=2, fall=5)
+    rng = np.random.default_rng(5)
+    levels = run(desk, *(rng.random(600) < 0.5))
+    assert np.count_nonzero(np.diff(levels)) <= 2 * 600 * 0.5**6 + 8
+    assert np.mean(levels) > 0.8
+    calm = run(Desk(rise=2, fall=5), *([1, 0] * 100))
+    assert not any(calm)  # every other period, never two in a row
+
+
+def test_periods_without_a_message_say_nothing():
+    """A sensor that is heard every few periods is judged by the periods in which it is."""
+    desk = Desk(rise=2, fall=5)
+    levels = []
+    for second in range(60):
+        if second % 4 == 0:
+            desk.meter.arrived('fix', second)
+            if second < 30:
+                desk.meter.refused['nan'] += 1
+        desk.report(second + 0.9)
+        levels.append(desk.input.level[0])
+    assert levels[:4] == [0] * 4 and levels[4:32] == [2] * 28
+    assert levels[47] == 2 and levels[48:] == [0] * 12
+
+
+def test_the_health_of_a_node_is_its_worst_entry(desk):
+    desk.meter.arrived('fix', 1.0)
+    desk.report(1.0, lost={'fix': 4})
+    told = summary('diver', [desk.input, desk.tracker])
+    assert (told.level, told.name) == (DiagnosticStatus.WARN, 'diver')
+    assert told.message == desk.input.message
+    assert {pair.key for pair in told.values} == {'input', 'tracker'}
+    desk.report(2.0, counts={'internal_error': 1})
+    assert summary('diver', [desk.input, desk.tracker]).level == DiagnosticStatus.ERROR
+    desk.report(60.0)
+    assert desk.input.level == DiagnosticStatus.STALE
+
+
+def test_health_waits_for_those_who_ask_later(make_bench, walker):
+    bench = make_bench('-p', 'diagnostics_period:=0.05')
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    fix = bench.peer.create_publisher(message_class(FIX), 'fix', 10)
+    bench.spin_until(fix.get_subscription_count)
+    fix.publish(a_fix(1.0))
+    bench.spin_until(lambda: node._meter.received['fix'])
+    bench.spin_until(lambda: node._announcer.health.level == DiagnosticStatus.OK)
+    late = bench.listen(DiagnosticStatus, '/walker/health', latched_qos())
+    bench.spin_until(lambda: late)
+    assert (late[0].name, late[0].message) == ('walker', 'receiving; tracking')

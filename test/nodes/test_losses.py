@@ -152,5 +152,9 @@ def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):
     said = next(one.status[0] for one in told if 'are lost before' in one.status[0].message)
     assert said.level == DiagnosticStatus.WARN
     assert '% on fix' in said.message
-    values = {pair.key: pair.value for pair in told[-1].status[0].values}
-    assert int(values['lost on fix']) == 101 - node._meter.received['fix'] > 90
+
+    def values():
+        return {pair.key: pair.value for pair in told[-1].status[0].values}
+
+    bench.spin_until(lambda: int(values()['lost on fix']) == 101 - node._meter.received['fix'])
+    assert int(values()['lost on fix']) > 90

@@ -81,7 +81,8 @@ def test_a_missing_column_is_named_with_what_is_there(table):
         ('time [ms]', '1568052068920', 1568052068920000000),
         ('time', '1.568052068e9', 1568052068000000000),
         ('time', '2019-09-09T18:01:08.920238123Z', 1568052068920238123),
-        ('time', '2019-09-09 18:01:08', 1568052068000000000),
+        ('time_utc', '2019-09-09 18:01:08', 1568052068000000000),
+        ('time', '0', 1),
         ('time', '2019-09-09T20:01:08,5+02:00', 1568052068500000000),
         ('time', '2019-09-09T14:01:08-0400', 1568052068000000000),
     ],
@@ -101,13 +102,14 @@ def test_a_stated_unit_and_an_offset_are_used(table):
     [
         ('', 'not a time'),
         ('noon', "'noon', not a time"),
-        ('0', 'time unit'),
+        ('2019-09-09 18:01:08', '--time-zone UTC'),
+        ('18:01:08', 'no column holds the date'),
         ('-5', 'time unit'),
         ('1568052068920238123', 'time unit'),
         ('1e400', 'time unit'),
         ('nan', 'not a time'),
         ('inf', 'time unit'),
-        ('2019-13-45T00:00:00', 'calendar'),
+        ('2019-13-45T00:00:00Z', 'calendar'),
         ('1e9999999999', ''),
     ],
 )
@@ -116,6 +118,61 @@ def test_bad_times_are_bad_rows(table, cell, words):
     with pytest.raises(BadRow) as caught:
         row.stamp_ns()
     assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    'header, cells, stamp',
+    [
+        ('date,time_utc', '2019-09-09,18:01:08.5', 1568052068500000000),
+        ('UTC Date,time', '2019/9/9,18:01:08', 1568052068000000000),
+        ('date,time', '20190909,20:01:08+02:00', 1568052068000000000),
+        ('day,utc', '9.9.2019,6:01', 1568008860000000000),
+        ('date,time', '2019-09-09,1568052068', 1568052068000000000),
+    ],
+)
+def test_date_and_time_of_day_may_be_two_columns(table, header, cells, stamp):
+    (row,) = table(f'{header},x\n{cells},1\n')
+    assert row.stamp_ns() == stamp
+
+
+@pytest.mark.parametrize('date', ['05/06/2019', '9 Sep 2019', '', '190909'])
+def test_a_date_that_can_be_read_in_several_ways_is_a_bad_row(table, date):
+    (row,) = table(f'date,utc,x\n{date},18:01:08,1\n')
+    with pytest.raises(BadRow, match='several ways'):
+        row.stamp_ns()
+
+
+@pytest.mark.parametrize(
+    'zone, stamp',
+    [
+        ('UTC', 1568052068),
+        ('+02:00', 1568044868),
+        ('-0330', 1568064668),
+        ('Europe/Berlin', 1568044868),  # summer time
+    ],
+)
+def test_a_zone_can_be_stated_and_that_of_a_cell_wins(table, zone, stamp):
+    first, second = table(
+        'time,x\n2019-09-09 18:01:08,1\n2019-09-09 18:01:08Z,1\n', time_zone=zone
+    )
+    assert first.stamp_ns() == stamp * 10**9 and second.stamp_ns() == 1568052068 * 10**9
+    with pytest.raises(BagError, match='no time zone'):
+        CsvOptions(time_zone='Berlin')
+
+
+def test_zero_is_a_time_where_the_file_counts_from_its_start(table):
+    assert [row.stamp_ns() for row in table('time\n0\n0.5\n')] == [1, 500_000_000]
+    missing, there = table('time\n0\n1568052068\n')
+    assert there.stamp_ns() == 1568052068 * 10**9
+    with pytest.raises(BadRow, match='time unit'):
+        missing.stamp_ns()
+
+
+def test_what_was_taken_and_what_was_not(table):
+    rows = table('Time [s],east,y,quality,\n5,1,2,3,4\n')
+    for row in rows:
+        row.stamp_ns(), row.number('x'), row.number('y'), row.optional('z')
+    assert rows.columns_used() == ('stamp = Time [s], x = east, y', 'quality, (no name)')
 
 
 def test_numbers(table):
@@ -191,7 +248,7 @@ def test_degrees_are_recognised(table, header):
 
 
 def test_an_impossible_date_is_told_in_our_words(table):
-    (row,) = table('time\n2024-13-40T10:00:00\n')
+    (row,) = table('time\n2024-13-40T10:00:00Z\n')
     with pytest.raises(BadRow, match='no date and time of the calendar'):
         row.stamp_ns()
 

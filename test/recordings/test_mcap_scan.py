@@ -26,10 +26,10 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from sonar_imm.recordings import mcap_scan
+from sonar_imm.recordings import mcap_records
 from sonar_imm.recordings.mcap_scan import McapScan
 from sonar_imm.recordings.messages import ros_message, typestore
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.reader import BagError, BagReader
 
 TEXT = 'std_msgs/msg/String'
 
@@ -83,7 +83,7 @@ def test_a_cut_keeps_whole_messages_of_the_last_chunk(recording, tmp_path):
     first_chunk = sum(scan.counts.values())
     scan.close()
     assert 0 < first_chunk < 40
-    end = [*chunks, data.index(bytes([mcap_scan._DATA_END]), chunks[-1])][2]
+    end = [*chunks, data.index(bytes([mcap_records.DATA_END]), chunks[-1])][2]
     cut.write_bytes(data[: (chunks[1] + 3 * end) // 4])
     scan = McapScan(cut)
     found = messages(scan)
@@ -97,7 +97,7 @@ def test_a_cut_keeps_whole_messages_of_the_last_chunk(recording, tmp_path):
 def test_a_damaged_chunk_costs_only_itself(recording, tmp_path):
     file, expected = recording
     data = bytearray(file.read_bytes())
-    at = data.index(b'\x06', len(mcap_scan.MAGIC) + 30)
+    at = data.index(b'\x06', len(mcap_records.MAGIC) + 30)
     data[at + 9 + 28 : at + 9 + 32] = b'\x04\x00\x00\x00'
     data[at + 9 + 32 : at + 9 + 36] = b'zstf'  # a compression nobody knows
     broken = tmp_path / 'broken.mcap'
@@ -109,9 +109,9 @@ def test_a_damaged_chunk_costs_only_itself(recording, tmp_path):
 
 def chunks_of(data):
     """The bytes at which chunks begin."""
-    found, position = [], len(mcap_scan.MAGIC)
-    while data[position] != mcap_scan._DATA_END:
-        if data[position] == mcap_scan._CHUNK:
+    found, position = [], len(mcap_records.MAGIC)
+    while data[position] != mcap_records.DATA_END:
+        if data[position] == mcap_records.CHUNK:
             found.append(position)
         position += 9 + int.from_bytes(data[position + 1 : position + 9], 'little')
     return found
@@ -182,7 +182,7 @@ def test_no_damage_raises_or_invents_messages(small, cut, place, junk):
     try:
         scan = McapScan(file)
     except ValueError:
-        assert bytes(damaged[:8]) != mcap_scan.MAGIC
+        assert bytes(damaged[:8]) != mcap_records.MAGIC
         return
     assert len(messages(scan)) <= 5
     scan.close()
@@ -217,7 +217,7 @@ def bomb(path, compression, packed, stated):
         + packed,
     )
     footer = framed(0x02, struct.pack('<QQI', 0, 0, 0))
-    path.write_bytes(mcap_scan.MAGIC + head + chunk + footer + mcap_scan.MAGIC)
+    path.write_bytes(mcap_records.MAGIC + head + chunk + footer + mcap_records.MAGIC)
     return path
 
 
@@ -252,7 +252,45 @@ def test_a_chunk_of_a_great_many_zeros_costs_no_memory(tmp_path, compression, wi
 
 
 def test_an_honest_size_below_the_limit_is_unpacked():
-    assert mcap_scan.unpack(zstd.compress(bytes(1000)), 'zstd') == bytes(1000)
-    assert mcap_scan.unpack(lz4.frame.compress(bytes(1000)), 'lz4') == bytes(1000)
-    with pytest.raises(mcap_scan.TooLargeError):
-        mcap_scan.unpack(zstd.compress(bytes(mcap_scan.MAX_UNPACKED + 1)), 'zstd')
+    assert mcap_records.unpack(zstd.compress(bytes(1000)), 'zstd') == bytes(1000)
+    assert mcap_records.unpack(lz4.frame.compress(bytes(1000)), 'lz4') == bytes(1000)
+    with pytest.raises(mcap_records.TooLargeError):
+        mcap_records.unpack(zstd.compress(bytes(mcap_records.MAX_UNPACKED + 1)), 'zstd')
+
+
+@pytest.mark.parametrize('with_size', [True, False])
+def test_a_packed_file_of_zeros_is_not_written_to_disk(tmp_path, with_size, monkeypatch):
+    """rosbags unpacks a bag that is packed as a whole into a folder, without a limit."""
+    monkeypatch.setattr(mcap_records, 'MAX_UNPACKED', 1 << 20)
+    path = tmp_path / 'bag'
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        link = writer.add_connection('/a', TEXT, typestore=typestore())
+        writer.write(link, 1, typestore().serialize_cdr(ros_message(TEXT, data='x'), TEXT))
+    metadata = path / 'metadata.yaml'
+    told = metadata.read_text().replace("compression_mode: ''", 'compression_mode: file')
+    told = told.replace("compression_format: ''", 'compression_format: zstd')
+    metadata.write_text(told.replace('bag.mcap', 'bag.mcap.zstd'))
+    plain = (path / 'bag.mcap').read_bytes()
+    (path / 'bag.mcap').unlink()
+    packed = path / 'bag.mcap.zstd'
+    packed.write_bytes(zstd.compress(plain))
+    with BagReader(path) as bag:
+        assert len(list(bag.messages())) == 1 and not bag.problems
+    packed.write_bytes(zeros(b'zstd', 40 << 20, with_size=with_size))
+    with pytest.raises(BagError, match='unpacks to more than 1 MiB'), BagReader(path):
+        pass
+
+
+def test_a_packed_message_of_zeros_costs_itself(tmp_path, monkeypatch):
+    path = tmp_path / 'bag'
+    monkeypatch.setattr(mcap_records, 'MAX_UNPACKED', 1 << 20)
+    writer = Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        link = writer.add_connection('/a', TEXT, typestore=typestore())
+        raw = bytes(typestore().serialize_cdr(ros_message(TEXT, data='x'), TEXT))
+        for i, data in enumerate([raw, bytes(4 << 20), raw]):
+            writer.write(link, i, data)
+    with BagReader(path) as bag:
+        assert [item.log_ns for item in bag.messages()] == [0, 2]
+        assert 'message 1, it unpacks to more than' in bag.problems[0]

@@ -147,6 +147,8 @@ def _same(one, other):
         return len(one) == len(other) and all(map(_same, one, other))
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other, equal_nan=one.dtype.kind == 'f')
+    if hasattr(one, '__dict__') and not callable(one):
+        return _same(freeze(one), freeze(other))
     return callable(one) or one == other
 
 

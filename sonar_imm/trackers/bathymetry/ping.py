@@ -126,7 +126,8 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
     if config.smoothing_used == 'modes':
         smoothed = smooth_modes(track.probability, models.transition, likelihood.heard)
         track = track._replace(probability=smoothed)
-    return track
+    # They add up to one but for rounding: none may pass it for that.
+    return track._replace(probability=np.minimum(track.probability, 1.0))
 
 
 def answer_of(seen: Look, track: Track) -> Answer:
@@ -181,7 +182,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
         'label_probability': track.probability[np.arange(len(label)), label],
     }
     if config.in_bank:
-        extras['rough'] = track.probability[:, models.rough].sum(axis=1)
+        extras['rough'] = np.minimum(track.probability[:, models.rough].sum(axis=1), 1.0)
     if posed is not None:
         vertical, horizontal = swath.uncertainties(floor, config.budget())
         extras |= {

@@ -25,8 +25,8 @@ from attrs import evolve, frozen
 
 from ...acoustics.rays import profile_problem
 from ...acoustics.sounding import ErrorBudget
-from ...parameters import Config
 from ...parameters import parameter as fixed_parameter
+from ..shared_parameters import MountingParameters
 
 parameter = partial(fixed_parameter, read_only=False)
 
@@ -36,7 +36,7 @@ NAVIGATION = ('auto', 'required', 'ignored')
 
 
 @frozen(kw_only=True, slots=False)
-class SeaParameters(Config):
+class SeaParameters(MountingParameters):
     """What the bathymetry tracker has to know of the ship and of the water."""
 
     # -- the ship --------------------------------------------------------------------------------

@@ -79,6 +79,10 @@ class BathymetryTracker:
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config
 
+    def remount(self, config: BathymetryConfig) -> None:
+        """Take another place of the sonar on the ship, for all pings from now on."""
+        self.config = config
+
     def warm(self) -> None:
         T, P = 8, 8
         snapshot = Snapshot(

@@ -24,11 +24,13 @@ Source: docs/obstacle.md, section Avoidance.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from functools import cache
 
 import numpy as np
 
 from ...estimation.arrays import FloatArray
+from ...measurements import nanoseconds
 from ..navigation import NavigationBuffer
 from . import avoidance_kernels
 from .avoidance_kernels import Safety
@@ -44,17 +46,15 @@ _SHORTEST = 1.0
 def course(buffer: NavigationBuffer, stamp_ns: int, window: float) -> FloatArray:
     """Velocity (3,) m/s ENU of the vehicle: slope of the straight line through its positions of
     the last `window` seconds. NaN where there are too few."""
-    taken = [
-        (sample.stamp_ns, sample.position)
-        for sample in buffer.samples
-        if -window <= (sample.stamp_ns - stamp_ns) * 1e-9 <= 0.0
-    ]
-    if len(taken) < 2 or (taken[-1][0] - taken[0][0]) * 1e-9 < _SHORTEST:
+    first = bisect_left(buffer.stamps, stamp_ns - nanoseconds(window))
+    last = bisect_right(buffer.stamps, stamp_ns)
+    stamps = buffer.stamps[first:last]
+    if len(stamps) < 2 or (stamps[-1] - stamps[0]) * 1e-9 < _SHORTEST:
         return np.full(3, np.nan)
-    t = np.array([(stamp - stamp_ns) * 1e-9 for stamp, _ in taken])
-    positions = np.array([position for _, position in taken])
-    t -= t.mean()
-    return np.asarray(t @ (positions - positions.mean(axis=0)) / (t @ t))
+    t = (np.array(stamps) - stamp_ns) * 1e-9
+    positions = np.array([sample.position for sample in buffer.samples[first:last]])
+    t -= t.sum() / len(t)
+    return np.asarray(t @ (positions - positions[0]) / (t @ t))
 
 
 def closest_approach(

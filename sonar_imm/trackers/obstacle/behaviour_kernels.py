@@ -31,7 +31,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import lift, semidefinite_root
-from .kernels import along, echo, moments, point, to_world
+from .kernels import along, echo, echo_beside, moments, point_towards, to_world
 
 STATES = 6
 COMMON = 4
@@ -108,22 +108,24 @@ def mix(
                 continue
             for a in range(M):
                 j = first + a
+                # A behaviour without e has none after the mixing either.
+                size = n if prior[j] > 0.0 else COMMON
                 total = 0.0
                 for i in range(M):
                     share[i] = mu[t, first + i] * (stay if i == a else change)
                     total += share[i]
                 mu1[t, j] = total
-                for b in range(n):
+                for b in range(size):
                     x1[t, j, b] = 0.0
                 for i in range(M):
                     share[i] = share[i] / total if total > 0.0 else (1.0 if i == a else 0.0)
-                    for b in range(n):
+                    for b in range(size):
                         off[i, b] = x[t, first + i, b] if b < COMMON or i == a else 0.0
                         x1[t, j, b] += share[i] * off[i, b]
                 for i in range(M):
-                    for b in range(n):
+                    for b in range(size):
                         off[i, b] -= x1[t, j, b]
-                for b in range(n):
+                for b in range(size):
                     for d in range(b + 1):
                         value = 0.0
                         for i in range(M):
@@ -182,13 +184,17 @@ def advance(
             n = size if motion.prior[j] > 0.0 else COMMON
             centre, mean, spread, root = x[t, j], x1[t, j, :n], P1[t, j, :n, :n], L[:n, :n]
             semidefinite_root(P[t, j, :n, :n], root)
+            towards = math.cos(centre[1]), math.sin(centre[1])
             for number in range(2 * n + 1):
                 column, reach = along(number, n)
                 for a in range(n):
                     y[a] = centre[a] + reach * root[a, column]
                 # The root is triangular: on its later columns a point is where the centre is.
                 if column < PLACED:
-                    point(y[0], y[1], y[2] - p0[2], R0, cone, m)
+                    cosine, sine = towards
+                    if column < 2 and number > 0:
+                        cosine, sine = math.cos(y[1]), math.sin(y[1])
+                    point_towards(y[0], cosine, sine, y[2] - p0[2], R0, cone, m)
                     to_world(R0, m, world)
                     if number == 0:
                         middle[:] = world
@@ -202,13 +208,16 @@ def advance(
                 world[2] += p0[2] - p1[2]
                 for i in range(3):
                     m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
-                images[0, number], images[1, number] = echo(m, cone)
                 images[2, number], images[3, number] = y[2], y[3]
-                if number == 0 and n > COMMON:
-                    slopes(m, R1, cone, J)
-                apart = images[1, number] - images[1, 0]
-                if abs(apart) > math.pi:
-                    images[1, number] -= 2.0 * math.pi * np.round(apart / (2.0 * math.pi))
+                if number == 0:
+                    seen = m[0], m[1]
+                    images[0, 0], images[1, 0] = echo(m, cone)
+                    if n > COMMON:
+                        slopes(m, R1, cone, J)
+                else:
+                    images[0, number], images[1, number] = echo_beside(
+                        m, cone, seen[0], seen[1], images[1, 0]
+                    )
             moments(images, 2 * n + 1, mean, spread)
             P1[t, j, 0, 0] += noise[0]
             P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]

@@ -30,6 +30,8 @@ Source: docs/obstacle.md, section Behaviours.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
@@ -40,7 +42,7 @@ from .filters import depth_slices, depth_span, DepthSlices, Filter, Landmark, Mi
 
 PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
 """Probability of each behaviour of a new obstacle, among those asked for."""
-DROPPED = 1e-6
+DROPPED = 1e-5
 """A slice that weighs less takes no further part."""
 OUTLIER_DENSITY = 1.0 / (2.0 * 8.0 * 2.0 * np.radians(6.0))
 """1/(m rad) of an echo that is not the obstacle's: anywhere within 8 m and 6 degrees of it. A
@@ -69,6 +71,9 @@ class BehaviourSlices(DepthSlices):
         self._is = {name: np.array([one == name for one in names]) for name in BEHAVIOURS}
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
+        self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))
+        self._prior = self._swaying * config.sway_std**2
+        self._prior += self._moving * (0.5 * config.max_speed) ** 2
 
     def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
         B, M, last = len(z), self.M, self.slices * self.M
@@ -95,7 +100,7 @@ class BehaviourSlices(DepthSlices):
             P[:, last, 2, 2] = self.config.seabed_std**2
         # e is unknown and uncorrelated with the rest.
         for i in (COMMON, COMMON + 1):
-            P[:, :, i, i] = self._motion(0.0).prior
+            P[:, :, i, i] = self._prior
         return self._unshift(Mixture(x, P, mu), z, sonar)
 
     def advance(
@@ -121,17 +126,16 @@ class BehaviourSlices(DepthSlices):
         return float(1.0 / self.M + (1.0 - 1.0 / self.M) * np.exp(-rate * dt))
 
     def _motion(self, dt: float) -> Motion:
-        config = self.config
-        keep, step, push, noise, prior = np.zeros((5, self.K))
-        swaying, moving = self._is['swaying'], self._is['moving']
-        phi = np.exp(-dt / config.sway_time)
-        keep[swaying], step[swaying], push[swaying] = phi, phi - 1.0, 1.0
-        noise[swaying] = config.sway_std**2 * -np.expm1(-2.0 * dt / config.sway_time)
-        prior[swaying] = config.sway_std**2
-        keep[moving], step[moving], push[moving] = 1.0, dt, 0.5 * dt
-        noise[moving] = config.speed_noise**2 * dt
-        prior[moving] = (0.5 * config.max_speed) ** 2
-        return Motion(keep, step, push, noise, prior)
+        config, swaying, moving = self.config, self._swaying, self._moving
+        phi = math.exp(-dt / config.sway_time)
+        swung = config.sway_std**2 * -math.expm1(-2.0 * dt / config.sway_time)
+        return Motion(
+            keep=swaying * phi + moving,
+            step=swaying * (phi - 1.0) + moving * dt,
+            push=swaying + moving * (0.5 * dt),
+            noise=swaying * swung + moving * (config.speed_noise**2 * dt),
+            prior=self._prior,
+        )
 
 
 def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,12 @@ from attrs import frozen
 from ...acoustics.geometry import AZIMUTH_MODELS
 from ...measurements import BEAM_AXES
 from ...parameters import inherited, parameter
-from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
+from ..shared_parameters import (
+    DetectionParameters,
+    MountingParameters,
+    StreamParameters,
+    TrackLifeParameters,
+)
 
 live = partial(parameter, read_only=False)
 
@@ -32,7 +37,9 @@ BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 
 
 @frozen(kw_only=True)
-class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
+class ObstacleConfig(
+    DetectionParameters, TrackLifeParameters, MountingParameters, StreamParameters
+):
     """Everything the obstacle tracker can be told. The defaults fit a Blueview P450 on a survey
     AUV."""
 
@@ -211,6 +218,13 @@ class ObstacleConfig(DetectionParameters, TrackLifeParameters, StreamParameters)
     scale_std: float = parameter(
         0.003,
         "scale error of the navigation's horizontal distances against sonar ranges",
+        low=0.0,
+        high=0.2,
+    )
+    range_scale_std: float = live(
+        0.001,
+        'scale error of ranges, from the speed of sound that the sonar believes in: no ping tells '
+        'it, so it is added to the covariance of range, offset and place',
         low=0.0,
         high=0.2,
     )

@@ -104,7 +104,11 @@ class DetectorConfig(Config):
         1e-6, 'that a cell of Rayleigh noise is taken for an echo', low=1e-15, high=0.1
     )
     threshold_margin_db: float = parameter(
-        3.0, 'that much higher, for noise with longer tails', unit='dB', low=0.0, high=30.0
+        1.5,
+        'that much higher, beside what the roughness of the sea floor asks for',
+        unit='dB',
+        low=0.0,
+        high=30.0,
     )
     growth_false_alarm: float = parameter(
         1e-3, 'the same of the cells around that belong to the echo', low=1e-15, high=0.5

@@ -30,6 +30,7 @@ Everything is in NED and FRD; T targets, K components. Component weights mu (T, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +49,16 @@ BAND = 0.9
 
 BEAM_MARGIN = 1.6
 """A new obstacle lies within this many half beams of the axis: an edge is not sharp."""
+
+
+def put(
+    parts: Sequence[FloatArray], rows: np.ndarray, new: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Copies of arrays with `new` in some of their rows."""
+    copies = [part.copy() for part in parts]
+    for part, values in zip(copies, new):
+        part[rows] = values
+    return copies
 
 
 NOWHERE = np.full(3, np.nan)
@@ -84,6 +95,10 @@ class Mixture(NamedTuple):
     def joined(self, other: Mixture) -> Mixture:
         return Mixture(*(np.concatenate(both) for both in zip(self, other)))
 
+    def replaced(self, rows: np.ndarray, new: Mixture) -> Mixture:
+        """A copy with `new` in some of its rows."""
+        return Mixture(*put(self, rows, new))
+
 
 class View(NamedTuple):
     """A mixture in words a user knows, all (T, ...): range, azimuth and vertical offset with their
@@ -116,6 +131,7 @@ class DepthSlices:
         self.seafloor = config.method == 'seafloor'
         self.K = 1 if self.seafloor else config.components
         self.moves = np.zeros(self.K, np.bool_)
+        self._still = Motion.none(self.K)
         self.cone = config.azimuth_model == 'cone'
         self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
@@ -161,7 +177,7 @@ class DepthSlices:
         to be repaired."""
         mixture = self._clamp_to_seafloor(mixture, before)
         step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
-        x, P, repaired = behaviour_kernels.advance(*mixture, Motion.none(self.K), step)
+        x, P, repaired = behaviour_kernels.advance(*mixture, self._still, step)
         return Mixture(x, P, mixture.mu), int(repaired.sum())
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:

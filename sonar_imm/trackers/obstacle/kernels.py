@@ -51,8 +51,15 @@ NORMAL_95 = 1.645
 @kernel
 def point(d: float, delta: float, d_st: float, R: FloatArray, cone: bool, m: FloatArray) -> None:
     """`geometry.reconstruct` into m (3,)."""
+    point_towards(d, math.cos(delta), math.sin(delta), d_st, R, cone, m)
+
+
+@kernel
+def point_towards(
+    d: float, cosine: float, sine: float, d_st: float, R: FloatArray, cone: bool, m: FloatArray
+) -> None:
+    """`point` at the azimuth of which cosine and sine are known."""
     a, b, c = R[2, 0], R[2, 1], R[2, 2]
-    cosine, sine = math.cos(delta), math.sin(delta)
     if cone:
         m_y, r = d * sine, d * cosine
         m[0], m[2] = _level(a, c, d_st - b * m_y, r)
@@ -83,6 +90,23 @@ def echo(m: FloatArray, cone: bool) -> tuple[float, float]:
     if cone:
         return d, math.asin(min(1.0, max(-1.0, m[1] / d)))
     return d, math.atan2(m[1], m[0])
+
+
+@kernel
+def echo_beside(
+    m: FloatArray, cone: bool, x: float, y: float, azimuth: float
+) -> tuple[float, float]:
+    """`echo` of a point whose azimuth is within half a turn of `azimuth`, which is that of (x, y).
+    The difference of two near directions needs no arc tangent: its series ends below 1e-17."""
+    if cone:
+        return echo(m, cone)
+    d = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+    dot, cross = x * m[0] + y * m[1], x * m[1] - y * m[0]
+    if abs(cross) >= 0.03 * dot:
+        return d, azimuth + math.atan2(cross, dot)
+    t = cross / dot
+    u = t * t
+    return d, azimuth + t * (1.0 - u * (1.0 / 3.0 - u * (0.2 - u * (1.0 / 7.0 - u / 9.0))))
 
 
 @kernel
@@ -231,6 +255,9 @@ def soft_update(
         determinant = max(s00 * s11 - s01 * s01, LIMIT * s00 * s11)
         nis[t] = (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / determinant
         for j in range(K):
+            if mu[t, j] == 0.0:
+                x1[t, j], P1[t, j], mu1[t, j] = x[t, j], P[t, j], 0.0
+                continue
             r0, r1 = z[t, 0] - h[t, j, 0], z[t, 1] - h[t, j, 1]
             s00 = P[t, j, 0, 0] + R[t, 0, 0]
             s01 = P[t, j, 0, 1] + R[t, 0, 1]
@@ -303,22 +330,20 @@ def _careful_soft_update(
 
 
 @kernel
-def below(mean: FloatArray, std: FloatArray, mu: FloatArray, value: float) -> tuple[float, float]:
-    """Probability of a Gaussian mixture (K,) below `value`, and its density there."""
-    probability = density = 0.0
+def below(mean: FloatArray, std: FloatArray, mu: FloatArray, value: float) -> float:
+    """Probability of a Gaussian mixture (K,) below `value`."""
+    probability = 0.0
     for j in range(len(mu)):
         if mu[j] > NEGLIGIBLE:
-            u = (value - mean[j]) / std[j]
-            probability += mu[j] * normal(u)
-            density += mu[j] * math.exp(-0.5 * u * u) / (std[j] * math.sqrt(2.0 * math.pi))
-    return probability, density
+            probability += mu[j] * normal((value - mean[j]) / std[j])
+    return probability
 
 
 @kernel
 def quantile(
     mean: FloatArray, std: FloatArray, mu: FloatArray, probability: float, first: float
 ) -> float:
-    """The value (K components) below which a mixture lies with `probability`: Newton's steps from
+    """The value (K components) below which a mixture lies with `probability`: Halley's steps from
     `first`, halving the bracket where they leave it."""
     low, high = np.inf, -np.inf
     for j in range(len(mu)):
@@ -327,14 +352,25 @@ def quantile(
             high = max(high, mean[j] + 9.0 * std[j])
     value = min(max(first, low), high)
     for _ in range(100):
-        reached, density = below(mean, std, mu, value)
+        reached = density = slope = 0.0
+        for j in range(len(mu)):
+            if mu[j] > NEGLIGIBLE:
+                u = (value - mean[j]) / std[j]
+                height = mu[j] * math.exp(-0.5 * u * u) / (std[j] * math.sqrt(2.0 * math.pi))
+                reached += mu[j] * normal(u)
+                density += height
+                slope -= height * u / std[j]
         if reached < probability:
             low = value
         else:
             high = value
         step = (probability - reached) / density if density > 0.0 else np.inf
-        if abs(step) <= 1e-9 * (1.0 + abs(value)):
-            return value + step
+        # A step e of Halley's leaves an error of e^3, but where the density bends within it.
+        bend = 0.5 * step * slope / density if density > 0.0 else 0.0
+        if abs(step) <= 1e-5 * (1.0 + abs(value)) and abs(bend) <= 1e-3:
+            return value + step / (1.0 + bend)
+        if abs(bend) < 0.5:
+            step /= 1.0 + bend
         value += step
         if not low < value < high:
             value = 0.5 * (low + high)
@@ -358,5 +394,5 @@ def bands(
         low[t] = quantile(mean[t], std[t], mu[t], tail, middle - reach)
         high[t] = quantile(mean[t], std[t], mu[t], 1.0 - tail, middle + reach)
         # Weights add up to one but for rounding: no probability may leave [0, 1] for that.
-        negative[t] = min(below(mean[t], std[t], mu[t], 0.0)[0], 1.0)
+        negative[t] = min(below(mean[t], std[t], mu[t], 0.0), 1.0)
     return low, high, negative

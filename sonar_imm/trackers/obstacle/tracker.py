@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
@@ -52,10 +52,12 @@ from ..navigation import MOST_WAITING, NavigationBuffer
 from ..stream import ReplayStream, StreamRules
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
+from .bodies import Bodies, considered
 from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
 from .navigation import Mount
+from .state import ObstacleState, PingState
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -65,59 +67,10 @@ IN_BEAM = 0.9
 """A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
 echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
 approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
+_EYE = np.eye(2)
 _TINY, _WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
 nothing."""
-
-
-@frozen(eq=False, kw_only=True)
-class PingState:
-    """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
-    alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
-    each component assumes them."""
-
-    stamp_ns: int
-    sonar: Sonar
-    life: Tracks
-    mixture: Mixture
-    nis: FloatArray
-    strengths: Strengths
-    repairs: int = 0
-    alike: bool = False
-
-    def rows(self, kept: np.ndarray) -> PingState:
-        """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
-        if kept.all():
-            return self
-        return evolve(
-            self,
-            mixture=self.mixture.rows(kept),
-            nis=self.nis[kept],
-            strengths=self.strengths.rows(kept),
-        )
-
-    def only(self, kept: np.ndarray) -> PingState:
-        """The obstacles where `kept` (T,) is True."""
-        return self if kept.all() else evolve(self.rows(kept), life=self.life.only(kept))
-
-
-@frozen(eq=False, kw_only=True)
-class ObstacleState:
-    """All that is known at a stamp. last: after the newest ping used, None before the first; done:
-    the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
-    skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
-    because too many waited; broken: tracks ended so far because their numbers were not finite;
-    alike: pings so far in which most obstacles moved alike."""
-
-    last: PingState | None = None
-    done: tuple[PingState, ...] = ()
-    navigation: NavigationBuffer = NavigationBuffer()
-    altitude: Altitude | None = None
-    waiting: tuple[tuple[Detections, Altitude | None], ...] = ()
-    skipped: int = 0
-    missing: int = 0
-    broken: int = 0
-    alike: int = 0
 
 
 class ObstacleTracker:
@@ -127,11 +80,19 @@ class ObstacleTracker:
     STATE = ('_stream',)
 
     def __init__(self, config: ObstacleConfig):
-        self.config = config
-        self.filter = build_filter(config)
+        self._settle(config)
         self.mount = Mount(config)
         self._H = np.tile(np.eye(2), (1, self.filter.K, 1, 1))
         self.reset()
+
+    def _settle(self, config: ObstacleConfig) -> None:
+        """What follows from the parameters, once and not in every ping."""
+        self.config = config
+        self.filter = build_filter(config)
+        self.rules = track_rules(config)
+        own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
+        own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
+        self._own_variance = own
 
     def reset(self) -> None:
         self._stream = ReplayStream(
@@ -145,8 +106,11 @@ class ObstacleTracker:
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
-        self.config = config
-        self.filter = build_filter(config)
+        self._settle(config)
+
+    def remount(self, config: ObstacleConfig) -> None:
+        """Take another place of the sonar on the vehicle, for all pings from now on."""
+        self.config, self.mount = config, Mount(config)
 
     def warm(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
@@ -247,11 +211,9 @@ class ObstacleTracker:
         pose = self.mount.sonar(vehicle)
         reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
         straight = geometry.flip_world(course(buffer, ping.stamp_ns, self.config.course_window))
-        height = np.nan
-        if altitude is not None:
-            age = ping.stamp_ns - altitude.stamp_ns
-            if age <= nanoseconds(self.config.max_altitude_age):
-                height = altitude.altitude
+        oldest_ns = ping.stamp_ns - nanoseconds(self.config.max_altitude_age)
+        known = altitude is not None and altitude.stamp_ns >= oldest_ns
+        height = altitude.altitude if known else np.nan
         late_ns = self._late_ns()
         if not late_ns:
             return Sonar(pose, height, reference=reference, course=straight)
@@ -262,12 +224,13 @@ class ObstacleTracker:
         self, before: PingState | None, ping: Detections, sonar: Sonar
     ) -> tuple[PingState, int]:
         """The state after a ping, and how many tracks broke."""
-        z, R, level = self._detections(ping)
+        z, R, intensity, extended = self._detections(ping)
         now, broken = self._predict(before or self._nobody(sonar), ping.stamp_ns, sonar)
         chosen, expected = self._associate(now, z, R)
-        now = self._update(now, chosen, expected, z, R)
+        now = self._update(now, chosen, expected, z, R, extended)
         if self.config.vertical_beam_width_deg and before:
-            dt, heard = (now.stamp_ns - before.stamp_ns) * 1e-9, np.append(level, np.nan)[chosen]
+            dt = (now.stamp_ns - before.stamp_ns) * 1e-9
+            heard = np.append(level_db(intensity), np.nan)[chosen]
             told = by_intensity(
                 *now.mixture, now.strengths, now.sonar.pose, heard, dt, self.config
             )
@@ -275,7 +238,7 @@ class ObstacleTracker:
         now = self._prune(now, chosen >= 0)
         free = np.ones(len(z), bool)
         free[chosen[chosen >= 0]] = False
-        now = self._spawn(now, z[free], R[free])
+        now = self._spawn(now, z[free], R[free], extended[free])
         confirmed = now.life.status != TrackStatus.TENTATIVE
         return evolve(now, alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
@@ -294,18 +257,20 @@ class ObstacleTracker:
         )
         return now.only(sound), int((~sound).sum())
 
-    def _detections(self, ping: Detections) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """z (D, 2), R (D, 2, 2) and level dB (D,) of the rows that are echoes, azimuth positive to
-        starboard. A row that is as uncertain as it is far says nothing and is left out."""
-        config = self.config
+    def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
+        """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is told (D,), of the rows
+        that are echoes, azimuth positive to starboard. A row that is as uncertain as it is far
+        says nothing and is left out."""
         z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
         stated = np.column_stack([ping.var_range, ping.var_bearing])
-        own = np.square([config.range_std, np.radians(config.bearing_std_deg)])
-        own += np.square([config.range_step, np.radians(config.bearing_step_deg)]) / 12.0
-        variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, own)
+        variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, self._own_variance)
         real = np.isfinite(z).all(axis=1) & (z[:, 0] > 2.0 * np.sqrt(variance[:, 0]))
         real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
-        return z[real], variance[real, :, None] * np.eye(2), level_db(ping.intensity[real])
+        columns = z, variance, ping.intensity, np.isfinite(ping.extent_range)
+        if not real.all():
+            columns = tuple(column[real] for column in columns)
+        z, variance, intensity, extended = columns
+        return z, variance[:, :, None] * _EYE, intensity, extended
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray
@@ -326,48 +291,62 @@ class ObstacleTracker:
         return chosen, h
 
     def _update(
-        self, now: PingState, chosen: np.ndarray, h: FloatArray, z: FloatArray, R: FloatArray
+        self,
+        now: PingState,
+        chosen: np.ndarray,
+        h: FloatArray,
+        z: FloatArray,
+        R: FloatArray,
+        extended: np.ndarray,
     ) -> PingState:
         nis = np.full(len(chosen), np.nan)
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
             return evolve(now, nis=nis)
-        after, nis[hit], repairs = self.filter.update(
-            now.mixture.rows(hit), h[hit], z[chosen[hit]], R[chosen[hit]], now.sonar
-        )
-        mixture = Mixture(*(part.copy() for part in now.mixture))
-        for part, new in zip(mixture, after):
-            part[hit] = new
-        return evolve(now, mixture=mixture, nis=nis, repairs=now.repairs + repairs)
+        every = len(hit) == len(chosen)
+        mixture, bodies = now.mixture, now.bodies
+        if not every:
+            mixture, bodies, h, chosen = mixture.rows(hit), bodies.rows(hit), h[hit], chosen[hit]
+        z, R = z[chosen], R[chosen]
+        bodies, R = bodies.seen(extended[chosen], z, R, self._own_variance)
+        mixture, nis[hit], repairs = self.filter.update(mixture, h, z, R, now.sonar)
+        if not every:
+            mixture = now.mixture.replaced(hit, mixture)
+            bodies = now.bodies.replaced(hit, bodies)
+        repairs += now.repairs
+        return evolve(now, mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
 
     def _prune(self, now: PingState, hit: np.ndarray) -> PingState:
         """End the tracks that are over or passed; `hit` (T,): those that got a detection."""
         tentative = now.life.status == TrackStatus.TENTATIVE
         in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
         looked = tentative | (in_beam > IN_BEAM)
-        life, kept = now.life.scan(hit, now.stamp_ns, track_rules(self.config), looked=looked)
+        life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
         return evolve(now.rows(kept), life=life).only(ahead[kept])
 
-    def _spawn(self, now: PingState, z: FloatArray, R: FloatArray) -> PingState:
+    def _spawn(
+        self, now: PingState, z: FloatArray, R: FloatArray, extended: np.ndarray
+    ) -> PingState:
         """Begin a track at each detection z (B, 2), R (B, 2, 2), as long as there is room."""
-        room = max(0, self.config.max_tracks - len(now.life))
-        if not self.filter.ready(now.sonar):
-            room = 0
-        z, R = z[:room], R[:room]
+        ready = self.filter.ready(now.sonar)
+        room = max(0, self.config.max_tracks - len(now.life)) if ready else 0
+        z, R, extended = z[:room], R[:room], extended[:room]
         if not len(z):
             return now
+        bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
         return evolve(
             now,
-            life=now.life.born(len(z), now.stamp_ns, track_rules(self.config)),
+            life=now.life.born(len(z), now.stamp_ns, self.rules),
             mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
             strengths=now.strengths.joined(Strengths.unknown(len(z), self.filter.K)),
+            bodies=now.bodies.joined(bodies),
         )
 
     def _nobody(self, sonar: Sonar) -> PingState:
         K, n = self.filter.K, self.filter.n
         nothing = Mixture(np.empty((0, K, n)), np.empty((0, K, n, n)), np.empty((0, K)))
-        life = Tracks.none(track_rules(self.config))
+        life = Tracks.none(self.rules)
         return PingState(
             stamp_ns=0,
             sonar=sonar,
@@ -375,10 +354,12 @@ class ObstacleTracker:
             mixture=nothing,
             nis=np.empty(0),
             strengths=Strengths.unknown(0, K),
+            bodies=Bodies.unknown(0),
         )
 
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
+        view = considered(view, ping.sonar, ping.bodies, self.config.range_scale_std)
         side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {

@@ -56,7 +56,7 @@ def truth_of(path):
 
 
 def test_bad_rows_are_named_by_line_and_the_rest_is_converted(convert):
-    report = convert('stamp,x,y\n5,1,2\n6,abc,2\n7,1\n8,nan,1\n9,1e12,1\n0,1,1\n4,3,4\n')
+    report = convert('stamp,x,y\n5,1,2\n6,abc,2\n7,1\n8,nan,1\n9,1e12,1\n-1,1,1\n4,3,4\n')
     assert isinstance(report, ConversionReport)
     assert (report.rows, report.bad_rows, report.messages) == (7, 5, {'/fix': 2})
     assert [problem.split(':')[0] for problem in report.problems] == [

@@ -45,7 +45,7 @@ def test_rows_that_are_no_echo_are_ignored():
 
 def test_variances_of_the_detections_win():
     def first(**columns):
-        tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
+        tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1, range_scale_std=0.0))
         tracker.process(navigation(rows(NAME)[0], SECOND))
         ping = Detections(stamp_ns=SECOND, range=[40.0], bearing=[0.1], **columns)
         return tracker.process(ping)[0].covariance[0]

@@ -1,0 +1,114 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""What the echoes of a body that is no point say of its place, and what they never can.
+
+The glints of a body interfere, and the centroid of its echo wanders from ping to ping by about the
+spread of the body. The spread that one image shows does not tell by how much: where one glint
+outshines the others the echo looks like that of a point, and is as far off as ever. The size of a
+body stays, so its mean over the pings does tell. Detections that come with their extent, as those
+of images do, are therefore as uncertain as the echoes of their track were on average; a track
+begins with what the parameters say of a detection without variance. Standard deviations are
+averaged and not variances, in which a single echo that caught some noise would outweigh all
+others.
+
+Two errors are the same in every ping, so that no filter averages them out. They are
+*considered*, that is added to what is published, while the filter goes on without them:
+
+- the speed of sound: all ranges are wrong by the same factor (`range_scale_std`);
+- the centre of a body: the mean of a few glints lies beside it, by a share `CENTRE` of the
+  variance by which the centroid wanders.
+
+Source: docs/obstacle.md, section From images; Schmidt 1966, 'Application of state space methods to
+navigation problems', for considered errors.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...estimation.arrays import BoolArray, FloatArray
+from .filters import put, Sonar, View
+
+CENTRE = 0.1
+"""That of ten glints of equal strength."""
+MEMORY = 30.0
+"""Pings over which is averaged: aspect and range change what is seen of a body."""
+
+
+class Bodies(NamedTuple):
+    """Of T tracks: count (T,) of echoes with an extent, and their mean standard deviation (T, 2),
+    m, in range and across it; zeros as long as there was none."""
+
+    count: FloatArray
+    std: FloatArray
+
+    @staticmethod
+    def unknown(T: int) -> Bodies:
+        return Bodies(np.zeros(T), np.zeros((T, 2)))
+
+    def rows(self, which: np.ndarray) -> Bodies:
+        return Bodies(self.count[which], self.std[which])
+
+    def joined(self, other: Bodies) -> Bodies:
+        return Bodies(*(np.concatenate(both) for both in zip(self, other)))
+
+    def replaced(self, rows: np.ndarray, new: Bodies) -> Bodies:
+        """A copy with `new` in some of its rows."""
+        return Bodies(*put(self, rows, new))
+
+    def seen(
+        self, extended: BoolArray, z: FloatArray, R: FloatArray, own: FloatArray
+    ) -> tuple[Bodies, FloatArray]:
+        """After one detection z (T, 2), R (T, 2, 2) for each, of which some are `extended` (T,);
+        and the covariance (T, 2, 2) to update with. own (2,): m^2 and rad^2, variances of a
+        detection that comes without."""
+        if not extended.any():
+            return self, R
+        metres = np.column_stack([np.ones(len(z)), z[:, 0]])
+        stated = np.sqrt(np.diagonal(R, axis1=-2, axis2=-1)) * metres
+        # The first echo of a track is averaged with what is believed beforehand.
+        before = np.where(self.count[:, None] > 0.0, self.std, np.sqrt(own) * metres)
+        weight = 1.0 / (np.minimum(self.count, MEMORY) + 2.0)
+        mean = before + weight[:, None] * (stated - before)
+        told = extended[:, None]
+        after = Bodies(self.count + extended, np.where(told, mean, self.std))
+        used = np.square(np.where(told, mean, stated) / metres)
+        return after, used[:, :, None] * np.eye(2)
+
+
+def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> View:
+    """The view with the errors that are the same in every ping."""
+    scale = scale_std**2
+    covariance, place_covariance = view.covariance.copy(), view.place_covariance.copy()
+    reach = view.state * [1.0, 0.0, 1.0]
+    covariance += scale * reach[:, :, None] * reach[:, None, :]
+    away = view.place - sonar.pose.position
+    place_covariance += scale * away[:, :, None] * away[:, None, :]
+    if bodies.count.any():
+        centre = CENTRE * np.square(bodies.std)
+        covariance[:, 0, 0] += centre[:, 0]
+        covariance[:, 1, 1] += centre[:, 1] / np.square(view.state[:, 0])
+        level = away[:, :2] / np.maximum(np.linalg.norm(away[:, :2], axis=1), 1e-9)[:, None]
+        for axis, variance in (
+            (level, centre[:, 0]),
+            (level[:, ::-1] * [-1.0, 1.0], centre[:, 1]),
+        ):
+            place_covariance[:, :2, :2] += (
+                variance[:, None, None] * axis[:, :, None] * axis[:, None, :]
+            )
+    return view._replace(covariance=covariance, place_covariance=place_covariance)

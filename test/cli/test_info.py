@@ -1,0 +1,129 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What ``info`` recommends works."""
+
+import json
+import shlex
+
+from helpers.source import ROOT
+import pytest
+
+from msg_adapters.geodetic import write_geodetic
+from sonar_imm.cli import main
+from sonar_imm.measurements import GeodeticFix
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.writer import BagWriter, ros_message
+
+SHIPPED = sorted(path.name for path in (ROOT / 'bags').iterdir() if path.is_dir())
+
+
+def recommended(bag, capsys):
+    """The commands that ``info`` prints, the best one first."""
+    capsys.readouterr()
+    assert main(['info', str(bag)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    return [
+        line.partition(': ')[2]
+        for line in lines
+        if line.startswith(('to track it: ', 'or as something else: '))
+    ]
+
+
+def run(command, out, capsys, *more):
+    """What a recommended command leaves."""
+    program, *arguments = shlex.split(command)
+    assert program == 'sonar-imm'
+    arguments = [str(out) if word == 'OUT_DIR' else word for word in arguments]
+    capsys.readouterr()
+    assert main([*arguments, *more, '--json']) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize('name', SHIPPED)
+def test_the_recommended_command_tracks_every_shipped_recording(name, tmp_path, capsys):
+    (command,) = recommended(ROOT / 'bags' / name, capsys)
+    system = name.split('_')[0]
+    assert command.endswith(f'--system {system}')
+    assert run(command, tmp_path / 'out', capsys)['rows'] > 0
+
+
+def copied(name, out, rename=None, extra=()):
+    """A shipped recording under other names, with further messages (topic, message, log time)."""
+    with BagReader(ROOT / 'bags' / name) as reader, BagWriter(out) as writer:
+        for item in reader.messages():
+            if 'truth' not in item.topic:
+                writer.write((rename or {}).get(item.topic, item.topic), item.message, item.log_ns)
+        for topic, message, log_ns in extra:
+            writer.write(topic, message, log_ns)
+    return out
+
+
+def test_topics_that_have_to_be_named_are_all_named(tmp_path, capsys):
+    names = {'/nav': '/odom', '/detections': '/fls/points'}
+    bag = copied('obstacle_movers', tmp_path / 'bag', names)
+    command = recommended(bag, capsys)[0]
+    assert '--topic nav=/odom' in command and '--topic detections=/fls/points' in command
+    assert run(command, tmp_path / 'out', capsys)['rows'] > 0
+    bag = copied('obstacle_movers', tmp_path / 'one', {'/nav': '/odom'})
+    told = run(recommended(bag, capsys)[0], tmp_path / 'out1', capsys)
+    assert told['rows'] > 0 and told['system'] == 'obstacle'
+
+
+def test_the_ships_own_position_is_no_diver(tmp_path, capsys):
+    """A recording of obstacles with a NavSatFix on a topic ``fix`` fits two trackers."""
+    with BagReader(ROOT / 'bags' / 'obstacle_tethers') as reader:
+        logs = [item.log_ns for item in reader.messages(['/nav'])][::10]
+    fixes = [
+        (
+            '/gps/fix',
+            write_geodetic(
+                GeodeticFix(
+                    stamp_ns=log_ns, latitude=54.0, longitude=10.0, height=0.0, frame_id='gps'
+                ),
+                ros_message,
+            ),
+            log_ns,
+        )
+        for log_ns in logs
+    ]
+    bag = copied('obstacle_tethers', tmp_path / 'bag', extra=fixes)
+    commands = recommended(bag, capsys)
+    assert [command.split()[-1] for command in commands] == ['obstacle', 'diver']
+    assert main(['track', str(bag), str(tmp_path / 'out')]) == 0
+    assert json.loads((tmp_path / 'out' / 'run.json').read_text())['system'] == 'obstacle'
+
+
+def test_both_sides_of_a_side_scan(tmp_path, capsys):
+    scene = ('two_sides', '--set', 'pings=2', '--set', 'last_range=22')
+    assert main(['simulate', 'bathymetry', str(tmp_path / 'bag'), '--scenario', *scene]) == 0
+    few = ('--set', 'particles_per_model=10')
+    (command,) = recommended(tmp_path / 'bag', capsys)
+    assert run(command, tmp_path / 'out', capsys, *few)['estimates'] == 4
+    names = {f'/{side}/snapshot': f'/{side}_sonar/x/snapshot' for side in ('port', 'starboard')}
+    with BagReader(tmp_path / 'bag') as reader, BagWriter(tmp_path / 'other') as writer:
+        for item in reader.messages(list(names)):
+            writer.write(names[item.topic], item.message, item.log_ns)
+    (command,) = recommended(tmp_path / 'other', capsys)
+    assert run(command, tmp_path / 'named', capsys, *few)['estimates'] == 4
+
+
+@pytest.mark.parametrize(
+    'name, kind', [('a.csv', 'fixes'), ('a.npz', 'snapshots'), ('b.SGY', 'segy')]
+)
+def test_a_file_of_another_kind_names_convert(name, kind, tmp_path, capsys):
+    (tmp_path / name).write_text('1,2\n')
+    assert main(['track', str(tmp_path / name), str(tmp_path / 'out')]) == 2
+    said = capsys.readouterr().err
+    assert f'sonar-imm convert {kind} {tmp_path / name} OUT_BAG' in said

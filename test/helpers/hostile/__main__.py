@@ -1,0 +1,148 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``python -m helpers.hostile``: hostile messages and extreme parameters, many, and what they did.
+
+Run by ``make fuzz``; prints one line per system and writes the numbers as JSON. Exit code 1 when
+something got through.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+import json
+from pathlib import Path
+import resource
+import sys
+from time import process_time
+import traceback
+import warnings
+
+from hypothesis import given, HealthCheck, Phase, seed, settings
+import numpy as np
+
+from sonar_imm.trackers import SYSTEMS
+
+from . import extremes
+from .runs import BATCH, batches, run, Tally
+
+MOST_EXAMPLES = 500
+"""Batches of one search of hypothesis, which remembers those it has tried."""
+
+
+def messages(system, cases, first_seed=0):
+    """Send `cases` hostile messages or more; what happened, as plain values."""
+    tally, failures, start, number = Tally(), [], process_time(), first_seed
+    grown = 0.0
+    while tally.cases < cases:
+
+        @seed(number)
+        @settings(
+            max_examples=min(MOST_EXAMPLES, -(-(cases - tally.cases) // BATCH)),
+            deadline=None,
+            database=None,
+            phases=[Phase.generate, Phase.shrink],
+            suppress_health_check=list(HealthCheck),
+        )
+        @given(batch=batches(system))
+        def search(batch):
+            run(system, batch, tally)
+
+        try:
+            search()
+        except BaseException as error:  # groups of several failures too
+            failures.append(_told(error))
+            if len(failures) == 5:
+                break
+        number += 1
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        grown = grown or peak
+    slow = np.sort(tally.seconds)
+    return {
+        'cases': tally.cases,
+        'read': tally.read,
+        'refused': dict(tally.refused.most_common()),
+        'refused_by_the_tracker': dict(tally.counted.most_common()),
+        'estimates': tally.estimates,
+        'failures': failures,
+        'ms_median': round(1e3 * float(np.median(slow)), 3),
+        'ms_p999': round(1e3 * float(slow[int(0.999 * len(slow))]), 1),
+        'ms_most': round(1e3 * float(slow[-1]), 1),
+        'memory_grown_mb': round(peak - grown, 1),
+        'cpu_seconds': round(process_time() - start, 1),
+    }
+
+
+def parameters(system, draws):
+    """Run `draws` extreme configurations."""
+    failures, start, ran, estimates = [], process_time(), 0, 0
+    for number in range(draws):
+        try:
+            found = extremes.run(system, number)
+        except Exception as error:
+            failures.append(_told(error))
+            continue
+        ran += found is not None
+        estimates += found or 0
+    return {
+        'draws': draws,
+        'ran': ran,
+        'estimates': estimates,
+        'failures': failures,
+        'cpu_seconds': round(process_time() - start, 1),
+    }
+
+
+def _told(error):
+    return ''.join(traceback.format_exception(type(error), error, error.__traceback__))[-3000:]
+
+
+def _all(system, cases, draws):
+    warnings.simplefilter('ignore')  # of numpy: what overflows is looked at in the estimates
+    return {'messages': messages(system, cases), 'parameters': parameters(system, draws)}
+
+
+def main():
+    parser = argparse.ArgumentParser(prog='python -m helpers.hostile', description=__doc__)
+    parser.add_argument('--cases', type=int, default=100_000, help='messages for each system')
+    parser.add_argument('--draws', type=int, default=300, help='configurations for each system')
+    parser.add_argument('--systems', nargs='*', default=list(SYSTEMS), choices=list(SYSTEMS))
+    parser.add_argument('--jobs', type=int, default=2)
+    parser.add_argument('--json', type=Path, help='write the numbers here')
+    told = parser.parse_args()
+    with ProcessPoolExecutor(told.jobs) as pool:
+        coming = {
+            system: pool.submit(_all, system, told.cases, told.draws) for system in told.systems
+        }
+        results = {system: one.result() for system, one in coming.items()}
+    failed = False
+    for system, result in results.items():
+        hostile, extreme = result['messages'], result['parameters']
+        failed = failed or bool(hostile['failures'] or extreme['failures'])
+        print(
+            f'{system}: {hostile["cases"]} messages, {hostile["read"]} read, '
+            f'{hostile["estimates"]} estimates, {len(hostile["failures"])} failures, slowest '
+            f'{hostile["ms_most"]} ms; {extreme["ran"]} configurations, '
+            f'{len(extreme["failures"])} failures'
+        )
+        for failure in hostile['failures'] + extreme['failures']:
+            print(failure)
+    if told.json:
+        told.json.write_text(json.dumps(results, indent=1) + '\n')
+    return int(failed)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,177 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A tracker under a stream of good messages with bad ones between them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import cache
+from time import process_time
+from typing import NamedTuple
+
+from attrs import define, field
+from hypothesis import strategies as st
+import numpy as np
+
+from msg_adapters.inputs import inputs_of, made_inputs
+from sonar_imm.measurements import Rejection
+from sonar_imm.recordings.detected import DetectedImages
+from sonar_imm.trackers import SYSTEMS
+
+from .mutations import mutated, MUTATIONS
+from .properties import check_estimate, check_refusal
+from .streams import IMAGES, stream, templates, VARIANTS
+
+BATCH = 50
+"""Bad messages in one run of a tracker."""
+
+REFUSALS = {
+    'doubted', 'too_late', 'duplicate', 'other_frame', 'unknown_type', 'other_spacing', 'full',
+}  # fmt: skip
+"""What trackers count of a measurement that changes nothing."""
+
+
+class Bad(NamedTuple):
+    """One hostile message: which template, what is done to it, and the seed of how."""
+
+    template: int
+    mutation: int
+    seed: int
+
+    @classmethod
+    def of(cls, system, number):
+        """One for each number; a smaller number is no simpler a case, but the same every time."""
+        number, template = divmod(number, len(templates(system)))
+        return cls(template, *reversed(divmod(number, len(MUTATIONS))))
+
+
+@define
+class Tally:
+    """What happened to hostile messages."""
+
+    cases: int = 0
+    read: int = 0
+    estimates: int = 0
+    refused: Counter = field(factory=Counter)
+    counted: Counter = field(factory=Counter)
+    seconds: list = field(factory=list)
+
+
+def batches(system):
+    """A strategy: which variant of the tracker, and the bad messages."""
+    bad = st.integers(0, 2**40 - 1).map(lambda number: Bad.of(system, number))
+    return st.tuples(
+        st.integers(0, len(VARIANTS[system]) - 1), st.lists(bad, min_size=BATCH, max_size=BATCH)
+    )
+
+
+@cache
+def _tracker(system, variant):
+    """A warm tracker, what reads for it, and the measurements of its stream."""
+    entry = SYSTEMS[system]
+    config = entry.config_type().from_mapping(VARIANTS[system][variant])
+    tracker = entry.build(config)
+    tracker.warm()
+    settings = config.as_dict()
+    readers = {
+        (one.name, type_name): one.reader(type_name, 'enu', settings, one.name)
+        for one in inputs_of(system)
+        for type_name in one.readers
+    }
+    images = DetectedImages(system, IMAGES, settings) if made_inputs(system) else None
+    for one in made_inputs(system):
+        for type_name in one.readers:
+            readers[one.name, type_name] = images.reader(one, type_name)
+    good = [readers[name, kind](message) for name, kind, message in stream(system, variant)]
+    return tracker, readers, good
+
+
+def run(system, batch, tally=None):
+    """Send the bad messages between good ones; every property is checked on the way."""
+    tally = Tally() if tally is None else tally
+    variant, bads = batch
+    tracker, readers, good = _tracker(system, variant)
+    tracker.reset()
+    kept, estimates = [], {}
+    for i, measurement in enumerate(good):
+        kept.append((i, measurement))
+        estimates[i] = _processed(tracker, measurement, tally)
+        for j in range(len(bads) * i // len(good), len(bads) * (i + 1) // len(good)):
+            hostile = _read(system, bads[j], readers, measurement.stamp_ns, tally)
+            if hostile is None:
+                continue
+            before = Counter(tracker.counts)
+            found = _processed(tracker, hostile, tally)
+            delta = Counter(tracker.counts) - before
+            if found or not delta or set(delta) - REFUSALS:
+                kept.append((None, hostile))
+            else:
+                tally.counted.update(delta)
+    refused = len(kept) < len(good) + len(bads)
+    if refused and bads[0].seed % 2 and not tracker.counts['restarts']:
+        _check_nothing_lost(tracker, kept, estimates)
+
+
+def _read(system, bad, readers, stamp_ns, tally):
+    """The measurement that a bad message gives, None when it is refused."""
+    rng = np.random.default_rng(bad.seed)
+    name, type_name, message = templates(system)[bad.template]
+    message = _at(message, stamp_ns + int(rng.integers(10**8)))
+    message = mutated(message, MUTATIONS[bad.mutation], rng)
+    if rng.random() < 0.05:  # on another input of the same type
+        name = rng.choice([one for one, kind in readers if kind == type_name])
+    tally.cases += 1
+    start = process_time()
+    try:
+        measurement = readers[name, type_name](message)
+    except Rejection as rejection:
+        check_refusal(rejection)
+        tally.refused[rejection.reason] += 1
+        measurement = None
+    tally.seconds.append(process_time() - start)
+    tally.read += measurement is not None
+    return measurement
+
+
+def _processed(tracker, measurement, tally):
+    start = process_time()
+    found = tracker.process(measurement)
+    tally.seconds.append(process_time() - start)
+    for estimate in found:
+        check_estimate(estimate)
+    tally.estimates += len(found)
+    return found
+
+
+def _check_nothing_lost(tracker, kept, estimates):
+    """Without what was refused, every good message gives the same estimates."""
+    tracker.reset()
+    for i, measurement in kept:
+        found = tracker.process(measurement)
+        if i is None:
+            continue
+        assert len(found) == len(estimates[i])
+        for one, other in zip(found, estimates[i]):
+            assert one.stamp_ns == other.stamp_ns
+            np.testing.assert_array_equal(one.state, other.state)
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+            np.testing.assert_array_equal(one.probabilities, other.probabilities)
+
+
+def _at(message, stamp_ns):
+    """The message, its stamp moved; what is below is shared, since a mutation copies it."""
+    stamp = message.header.stamp
+    stamp.sec, stamp.nanosec = divmod(stamp_ns, 10**9)
+    return message

@@ -1,0 +1,133 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Messages as trees of plain values, by the definitions of their types.
+
+Adapters read by attribute access only, so that a tree serves as a message. Every leaf keeps to its
+type: what no wire could bring is not tried.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg
+
+from .. import driver_messages, marine
+
+NUMBERS = {
+    'bool': 'u1', 'byte': 'u1', 'char': 'u1', 'octet': 'u1',
+    'int8': 'i1', 'uint8': 'u1', 'int16': 'i2', 'uint16': 'u2', 'int32': 'i4', 'uint32': 'u4',
+    'int64': 'i8', 'uint64': 'u8', 'float32': 'f4', 'float64': 'f8',
+}  # fmt: skip
+"""The numpy type of each number on the wire."""
+
+DVL = (
+    'std_msgs/Header header\nuint8 DVL_MODE_BOTTOM=1\nuint8 DVL_MODE_WATER=2\n'
+    'uint8 velocity_mode\nuint8 dvl_type\ngeometry_msgs/Vector3 velocity\n'
+    'float64[9] velocity_covar\nfloat64 altitude\nfloat64 course_gnd\nfloat64 speed_gnd\n'
+    'uint8 num_good_beams\nfloat64 sound_speed\nbool beam_ranges_valid\n'
+    'bool beam_velocities_valid\ngeometry_msgs/Vector3[] beam_unit_vec\nfloat32[] range\n'
+    'float32[] range_covar\nfloat32[] beam_quality\nfloat32[] beam_velocity\n'
+    'float32[] beam_velocity_covar\n'
+)
+
+
+@cache
+def definitions():
+    """The fields of every message type that an adapter reads: (name, node) by type."""
+    store = marine.typestore()
+    found = {}
+    for name, text in driver_messages.DEFINITIONS.items():
+        if name not in store.fielddefs:
+            found |= get_types_from_msg(text, name)
+    found |= get_types_from_msg(DVL, 'marine_acoustic_msgs/msg/Dvl')
+    store.register({name: found[name] for name in found if name not in store.fielddefs})
+    return {name: tuple(fields) for name, (_, fields) in store.fielddefs.items()}
+
+
+def blank(type_name):
+    """A message of zeros."""
+    return SimpleNamespace(
+        **{name: _zero(node) for name, node in definitions()[type_name]}, __msgtype__=type_name
+    )
+
+
+def make(type_name, **values):
+    """A message with some fields; the factory that writers take."""
+    message = blank(type_name)
+    for name, value in values.items():
+        setattr(message, name, value)
+    return message
+
+
+def clone(value):
+    """A copy that shares nothing that can change."""
+    if isinstance(value, SimpleNamespace):
+        return SimpleNamespace(**{name: clone(one) for name, one in vars(value).items()})
+    if isinstance(value, list):
+        return [clone(one) for one in value]
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def leaves(message):
+    """Every place that holds something: (owner, name, node), lists and arrays as one."""
+    for name, node in definitions()[message.__msgtype__]:
+        kind, detail = node
+        if kind == Nodetype.NAME:
+            yield from leaves(getattr(message, name))
+            continue
+        yield message, name, node
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and detail[0][0] == Nodetype.NAME:
+            for one in getattr(message, name)[:3]:
+                yield from leaves(one)
+
+
+def number_type(node):
+    """The numpy type of a leaf or of its elements; None for text and for messages."""
+    kind, detail = node
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return number_type(detail[0])
+    return np.dtype(NUMBERS[detail[0]]) if kind == Nodetype.BASE and detail[0] in NUMBERS else None
+
+
+def is_many(node):
+    return node[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
+
+
+def is_sequence(node):
+    return node[0] == Nodetype.SEQUENCE
+
+
+def is_bool(node):
+    return node[0] == Nodetype.BASE and node[1][0] == 'bool'
+
+
+def _zero(node):
+    kind, detail = node
+    if kind == Nodetype.NAME:
+        return blank(detail)
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        inner, count = detail
+        length = count if kind == Nodetype.ARRAY else 0
+        number = number_type(inner)
+        if number is not None:
+            return np.zeros(length, number)
+        return [_zero(inner) for _ in range(length)]
+    if detail[0] in NUMBERS:
+        return False if detail[0] == 'bool' else np.zeros((), NUMBERS[detail[0]]).item()
+    return ''

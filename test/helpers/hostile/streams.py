@@ -1,0 +1,320 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Good messages: a short stream for each system, and one message of every input and type."""
+
+from __future__ import annotations
+
+from functools import cache
+import math
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from msg_adapters.inputs import inputs_of, made_inputs
+from sonar_imm.measurements import (
+    Altitude,
+    ArrayDepth,
+    Arrivals,
+    CrossSpectra,
+    Detections,
+    Fix,
+    Fixes,
+    Navigation,
+    Pressure,
+    Snapshot,
+    Trace,
+)
+
+from .schema import blank, clone, is_many, leaves, make, number_type
+
+T0 = 1_700_000_000 * 10**9
+SECOND = 10**9
+STEPS = 12
+
+VARIANTS = {
+    'bathymetry': (
+        {'particles_per_model': 8, 'smoothing': 'none'},
+        {'model_set': 'height_rw_ncs', 'particles_per_model': 8, 'smoothing': 'modes'},
+        {
+            'engine': 'grid',
+            'grid_step': 0.5,
+            'navigation': 'ignored',
+            'smoothing': 'states',
+            'ping_coupling': 0.3,
+        },
+    ),
+    'diver': (
+        {'max_tracks': 4},
+        {
+            'origin_latitude': 3.0,
+            'origin_longitude': 3.0,
+            'fix_bias_std': 0.5,
+            'tags': ['a'],
+            'max_tracks': 4,
+        },
+        {
+            'dimensions': 3,
+            'association': 'jipda',
+            'estimate_covariance_scale': True,
+            'max_tracks': 4,
+        },
+    ),
+    'fathometer': (
+        {'particles': 40, 'order_max': 3, 'phones': 0, 'record_seconds': 0.2},
+        {'particles': 40, 'order_max': 2, 'phones': 0, 'smoothing_lag': 1, 'heave': 'memory'},
+        {
+            'particles': 40,
+            'order_max': 2,
+            'phones': 4,
+            'polarity': 'both',
+            'output': 'correlation',
+        },
+    ),
+    'obstacle': (
+        {'max_tracks': 6, 'history': 1.0},
+        {
+            'ping_timing': 'two_way',
+            'vertical_beam_width_deg': 15.0,
+            'max_tracks': 4,
+            'history': 1.0,
+        },
+        {'method': 'landmark', 'behaviours': ['fixed'], 'max_tracks': 4},
+    ),
+}
+"""Parameters of the trackers under test; small, since speed is not what is tried."""
+
+COVARIANCE = np.eye(2)
+FRAMES = {
+    ('obstacle', 'detections'): 'sonar',
+    ('obstacle', 'image'): 'sonar',
+    ('obstacle', 'altitude'): 'altimeter',
+    ('bathymetry', 'altitude'): 'altimeter',
+    ('fathometer', 'array_depth'): '',
+}
+"""The frame of messages; 'map' where it is not said."""
+
+
+def _diver(k):
+    stamp = T0 + k * SECOND
+    at = np.array([0.7 * k, 5.0 + 0.1 * (k % 3), 0.0])
+    if k % 4 == 3:
+        rx = np.array([[0.0, 0, 0], [70, 10, 0], [-60, 45, 0], [10, 85, 0]])
+        leg = np.linalg.norm(rx - at, axis=1)
+        none = np.full(4, np.nan)
+        yield 'arrivals', Arrivals(
+            stamp_ns=stamp, frame_id='map', tx_id=np.zeros(4), rx_id=np.arange(4),
+            tx=np.tile(rx[0], (4, 1)), rx=rx, toa=(leg + leg[0]) / 1500.0,
+            var_toa=np.full(4, 1e-8), bearing=none, var_bearing=none,
+        )  # fmt: skip
+    elif k % 4 == 1:
+        both = np.array([at, at + [20.0, 9.0, 0.0]])
+        covariance = np.tile(COVARIANCE, (2, 1, 1))
+        yield 'fixes', Fixes(stamp_ns=stamp, frame_id='map', position=both, covariance=covariance)
+    else:
+        yield 'fix', Fix(stamp_ns=stamp, frame_id='map', position=at, covariance=COVARIANCE)
+
+
+def _pose(k, step_ns):
+    yaw = 0.05 * math.sin(k)
+    return Navigation(
+        stamp_ns=T0 + k * step_ns,
+        position=[0.5 * k, 0.0, -5.0],
+        orientation=[0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)],
+        velocity=[1.0, 0.0, 0.0],
+        frame_id='map',
+        child_frame_id='base',
+    )
+
+
+def _obstacle(k):
+    step = SECOND // 2
+    yield 'nav', _pose(k, step)
+    if k % 4 == 0:
+        yield 'altitude', Altitude(stamp_ns=T0 + k * step, altitude=12.0, frame_id='altimeter')
+    ranges = np.array([40.0, 25.0]) - 0.5 * k
+    yield 'detections', Detections(
+        stamp_ns=T0 + k * step, frame_id='sonar', range=ranges, bearing=[0.05, -0.1],
+        var_range=[0.04, 0.04], var_bearing=[1e-4, 1e-4], intensity=[10.0, 20.0],
+    )  # fmt: skip
+
+
+@cache
+def _noise(*shape):
+    rng = np.random.default_rng(7)
+    return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+
+def _csdm(stamp):
+    y = _noise(16, 4, 6)
+    csdm = np.einsum('fms,fns->fmn', y, y.conj()) / 6.0
+    return CrossSpectra(
+        stamp_ns=stamp, frequency=500.0 + 50.0 * np.arange(16), csdm=csdm, snapshots=6,
+        frame_id='array', reference_depth=30.0,
+    )  # fmt: skip
+
+
+def _pressure(k, stamp):
+    samples = _noise(STEPS * 600, 4).real[600 * k : 600 * (k + 1)].astype(np.float32)
+    return Pressure(
+        stamp_ns=stamp, pressure=samples, sample_rate=6000.0, frame_id='array', scale=0.0,
+        reference_depth=30.0,
+    )  # fmt: skip
+
+
+def _trace(stamp):
+    depth = 20.0 + 0.1 * np.arange(60)
+    amplitude = np.exp(-np.square((depth - 22.0) / 0.3)) + 0.02 * np.sin(31.0 * depth)
+    return Trace(
+        stamp_ns=stamp, depth=depth, amplitude=amplitude, sigma=np.full(60, 0.1), frame_id='array'
+    )
+
+
+def _fathometer(k, variant):
+    stamp = T0 + k * (SECOND // 10 if variant == 0 else SECOND)
+    if k % 5 == 0:
+        yield 'array_depth', ArrayDepth(stamp_ns=stamp, depth=30.0)
+    if variant == 0:
+        yield 'pressure', _pressure(k, stamp)
+    elif variant == 1:
+        yield 'trace', _trace(stamp)
+    else:
+        yield 'csdm', _csdm(stamp)
+
+
+def _bathymetry(k):
+    stamp = T0 + k * SECOND // 5
+    ranges = 18.0 + 0.4 * np.arange(16)
+    iq = (_noise(STEPS * 16, 1) * np.exp(1j * np.arange(4)) * 5.0)[16 * k : 16 * (k + 1)]
+    yield 'nav', _pose(k, SECOND // 5)
+    if k % 4 == 0:
+        yield 'altitude', Altitude(stamp_ns=stamp, altitude=15.0, frame_id='altimeter')
+    yield 'snapshot', Snapshot(
+        stamp_ns=stamp, range=ranges, iq=iq.astype(np.complex64), frame_id='sonar',
+        noise_variance=np.ones(16), sound_speed=1500.0,
+    )  # fmt: skip
+
+
+@cache
+def stream(system, variant):
+    """(input, type, message) of a short stream that the variant of a tracker follows."""
+    entries = {entry.name: entry for entry in inputs_of(system)}
+    steps = {'diver': _diver, 'obstacle': _obstacle, 'bathymetry': _bathymetry}
+    found = []
+    for k in range(STEPS):
+        made = _fathometer(k, variant) if system == 'fathometer' else steps[system](k)
+        for name, measurement in made:
+            message = entries[name].write(measurement, make)
+            if hasattr(message, 'data'):
+                message.data = np.frombuffer(message.data, np.uint8)
+            found.append((name, message.__msgtype__, message))
+    return tuple(found)
+
+
+@cache
+def templates(system):
+    """(input, type, message): a good message of every type of every input of a system."""
+    found = {}
+    for variant in range(len(VARIANTS[system])):
+        for name, type_name, message in stream(system, variant):
+            found.setdefault((name, type_name), clone(message))
+    for entry in (*inputs_of(system), *made_inputs(system)):
+        for type_name in entry.readers:
+            if (entry.name, type_name) in found:
+                continue
+            table = type_name.endswith('PointCloud2')
+            message = (
+                clone(next(one for (_, kind), one in found.items() if kind == type_name))
+                if table
+                else plausible(type_name)
+            )
+            message.header.frame_id = FRAMES.get((system, entry.name), 'map')
+            found[entry.name, type_name] = message
+    return tuple((name, type_name, one) for (name, type_name), one in found.items())
+
+
+SPECIAL = {
+    'sensor_msgs/msg/LaserScan': {
+        'angle_min': -0.2, 'angle_increment': 0.1, 'range_min': 0.5, 'range_max': 80.0,
+        'angle_max': 0.1,
+    },
+    'sensor_msgs/msg/Image': {
+        'height': 4, 'width': 4, 'step': 4, 'encoding': 'mono8', 'data': np.arange(16, dtype='u1'),
+    },
+    'oculus_interfaces/msg/Ping': {
+        'n_ranges': 4, 'n_beams': 4, 'step': 4, 'sample_size': 1, 'range_resolution': 0.5,
+        'bearings': np.array([-200, -100, 100, 200], 'i2'), 'ping_data': np.arange(16, dtype='u1'),
+        'speed_of_sound_used': 1500.0, 'has_gains': False,
+    },
+    'ping360_sonar_msgs/msg/SonarEcho': {
+        'number_of_samples': 4, 'range': 20, 'speed_of_sound': 1500,
+        'intensities': np.arange(4, dtype='u1'),
+    },
+    'seatrac_interfaces/msg/ModemRec': {'position_flt_error': False, 'msg_id': 0x10},
+    'sensors/msg/SonoptixECHO': {
+        'array_data': make(
+            'std_msgs/msg/Float32MultiArray',
+            data=np.arange(16, dtype='f4'),
+            layout=make(
+                'std_msgs/msg/MultiArrayLayout',
+                dim=[
+                    make('std_msgs/msg/MultiArrayDimension', label=name, size=4, stride=4)
+                    for name in ('ranges', 'beams')
+                ],
+            ),
+        )
+    },
+}  # fmt: skip
+"""Fields that a type needs beside plausible numbers."""
+
+IMAGES = {'image_near_range': 1.0, 'image_far_range': 20.0, 'image_fov_deg': 60.0}
+"""What images that say nothing of themselves are told of."""
+
+_FIELDS = {
+    'w': 0.9273618495495704, 'x': 0.3, 'y': 0.2, 'z': 0.1, 'sec': T0 // SECOND, 'nanosec': 0,
+    'sound_speed': 1500.0, 'sample_rate': 1000.0, 'beam_count': 4, 'samples_per_beam': 4,
+    'dtype': 0, 'flags': [],
+}  # fmt: skip
+
+
+def plausible(type_name):
+    """A message in which no number is odd."""
+    message = blank(type_name)
+    _fill(message)
+    for name, value in SPECIAL.get(type_name, {}).items():
+        setattr(message, name, value)
+    return message
+
+
+def _fill(message):
+    for owner, name, node in leaves(message):
+        number = number_type(node)
+        if name in _FIELDS:
+            value = _FIELDS[name]
+        elif is_many(node) and number is not None:
+            count = len(getattr(owner, name))
+            side = round(math.sqrt(count))
+            square = np.eye(side).ravel() if side and side * side == count else None
+            value = (np.arange(4) + 3.0 if square is None else square).astype(number)
+            if node[1][0] == (Nodetype.BASE, ('uint8', 0)):
+                value = np.arange(16, dtype='u1')
+        elif is_many(node):
+            value = [plausible(node[1][0][1]) for _ in range(4)]
+        elif number is None:
+            value = 'map'
+        elif number.kind == 'f':
+            value = 3.0
+        else:
+            value = 1
+        setattr(owner, name, value)

@@ -1,0 +1,81 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whatever a wire brings and a parameter file says, a tracker goes on and tells the truth.
+
+2,000 messages for each system here; ``make fuzz`` sends 100,000.
+"""
+
+import warnings
+
+from helpers.hostile import extremes
+from helpers.hostile.mutations import MUTATIONS
+from helpers.hostile.runs import Bad, BATCH, batches, run, Tally
+from helpers.hostile.streams import stream, templates, VARIANTS
+from hypothesis import given, HealthCheck, settings
+import pytest
+
+from msg_adapters.inputs import inputs_of, made_inputs
+from sonar_imm.trackers import SYSTEMS
+
+pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_no_message_breaks_a_tracker(system):
+    tally = Tally()
+
+    @settings(max_examples=2000 // BATCH, suppress_health_check=list(HealthCheck))
+    @given(batch=batches(system))
+    def search(batch):
+        run(system, batch, tally)
+
+    search()
+    assert tally.cases >= 2000
+    # Most get past the reader, or nothing behind it would be tried.
+    assert tally.read > 0.5 * tally.cases and len(tally.refused) >= 5 and tally.counted
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_no_parameter_breaks_a_tracker(system):
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        ran = [extremes.run(system, seed) for seed in range(15)]
+    assert sum(bool(one) for one in ran) > 5
+
+
+@pytest.mark.parametrize('system', SYSTEMS)
+def test_every_type_of_every_input_is_tried(system):
+    tried = {(name, type_name) for name, type_name, _ in templates(system)}
+    entries = (*inputs_of(system), *made_inputs(system))
+    assert tried == {(entry.name, type_name) for entry in entries for type_name in entry.readers}
+    for variant in range(len(VARIANTS[system])):
+        tally = Tally()
+        run(system, (variant, []), tally)
+        assert tally.estimates >= len(stream(system, variant)) / 4
+    unchanged = next(i for i, one in enumerate(MUTATIONS) if one.__name__ == 'again')
+    tally = Tally()
+    run(system, (0, [Bad(i, unchanged, 5) for i in range(len(tried))]), tally)
+    assert tally.read >= 0.75 * len(tried)  # good messages are good
+
+
+def test_an_error_of_the_sound_speed_concerns_fixes_alone_too():
+    """A configuration by which the diver's tracker once fell over the first fix."""
+    run_with = SYSTEMS['diver'].config_type().from_mapping({'sound_speed_std': 5.0})
+    tracker = SYSTEMS['diver'].build(run_with)
+    entries = {entry.name: entry for entry in inputs_of('diver')}
+    found = []
+    for name, type_name, message in stream('diver', 0):
+        found += tracker.process(entries[name].readers[type_name](message))
+    assert len(found) == len(stream('diver', 0))

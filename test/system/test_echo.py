@@ -1,0 +1,94 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``echo`` beside a real node."""
+
+import json
+import os
+import subprocess
+import sys
+
+from helpers.dive_bags import write_dive
+from helpers.source import ROOT
+import pytest
+
+pytest.importorskip('rclpy')
+
+from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id  # noqa: E402
+
+pytestmark = pytest.mark.system
+
+
+def command(domain, *arguments):
+    """A started command in the ROS domain `domain`."""
+    return subprocess.Popen(
+        [sys.executable, '-m', 'sonar_imm.cli', *map(str, arguments)],
+        cwd=ROOT,
+        env=dict(os.environ, ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture
+def playing(tmp_path, monkeypatch):
+    """The domain of a diver node that gets fixes again and again."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    bag = write_dive(tmp_path / 'dive')
+    with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
+        player = command(domain, 'play', bag, '--rate', '20', '--loop')
+        try:
+            yield domain
+        finally:
+            player.terminate()
+            player.communicate()
+        assert node.process.poll() is None
+
+
+def test_estimates_are_found_and_shown(playing):
+    echoes = {
+        'lines': command(playing, 'echo', '--once', '--timeout', '60'),
+        'json': command(
+            playing, 'echo', 'diver/estimate', '--json', '--count', '3', '--timeout', '60'
+        ),
+        'truth': command(playing, 'echo', '/truth/estimate', '--once', '--timeout', '60'),
+        'other': command(playing, 'echo', '/fix', '--timeout', '60'),
+    }
+    told = {name: (*one.communicate(timeout=120), one.returncode) for name, one in echoes.items()}
+    lines = told['lines'][0].splitlines()
+    assert told['lines'][2] == 0 and lines[0].startswith('/diver/estimate  20')
+    assert 'frame map  1 row' in lines[0] and lines[1].split()[2:4] == ['px', 'py']
+    assert '±' in lines[2] and 'heading_' in lines[2]
+    tables = [json.loads(line) for line in told['json'][0].splitlines()]
+    assert told['json'][2] == 0 and len(tables) == 3
+    assert {one['topic'] for one in tables} == {'/diver/estimate'}
+    assert len({one['stamp_ns'] for one in tables}) == 3 and tables[0]['types']['px'] == 'f8'
+    assert told['truth'][2] == 0 and told['truth'][0].startswith('/truth/estimate')
+    assert told['other'][2] == 1 and told['other'][1].count('\n') == 1
+    assert 'PoseWithCovarianceStamped and no table; ros2 topic echo /fix' in told['other'][1]
+
+
+def test_silence_is_told(monkeypatch):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
+        alone = command(domain, 'echo', '/divr/estimate', '--timeout', '25')
+        silent = command(domain, 'echo', '--timeout', '25')
+        said = alone.communicate(timeout=90)[1]
+        assert alone.returncode == 1 and 'nobody publishes /divr/estimate within 25 s' in said
+        assert "did you mean '/diver/estimate'" in said
+        said = silent.communicate(timeout=90)[1]
+        assert silent.returncode == 1
+        assert said == 'sonar-imm: nothing was published on /diver/estimate within 25 s\n'
+        assert node.process.poll() is None

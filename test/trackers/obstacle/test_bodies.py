@@ -1,0 +1,194 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Echoes of bodies wander, and some errors are the same in every ping: what is published knows."""
+
+from attrs import evolve
+from helpers.obstacle_runs import navigation, rows, SECOND
+import numpy as np
+from numpy.testing import assert_allclose
+import pytest
+
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.estimates import Estimate
+from sonar_imm.evaluation.obstacle.scoring import score
+from sonar_imm.evaluation.obstacle.series import series_of, truth_of
+from sonar_imm.measurements import Detections, SonarImage
+from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.bodies import Bodies, CENTRE, considered
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
+from sonar_imm.trackers.obstacle.filters import Sonar, View
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+OWN = np.array([0.15, 0.004]) ** 2
+Z = np.array([[40.0, 0.1]])
+
+
+def stated(std_range, std_across, z=Z):
+    return np.square([std_range, std_across / z[0, 0]])[None, :, None] * np.eye(2)
+
+
+def test_an_echo_is_as_uncertain_as_those_of_its_track_were():
+    bodies, told = Bodies.unknown(1), np.array([True])
+    used = []
+    for k in range(200):
+        # Every other echo looks like that of a point.
+        bodies, R = bodies.seen(told, Z, stated(*((0.2, 0.4) if k % 2 else (0.02, 0.04))), OWN)
+        used.append(np.sqrt(np.diagonal(R[0])) * [1.0, Z[0, 0]])
+    assert_allclose(used[0], [(0.15 + 0.02) / 2.0, (0.004 * 40.0 + 0.04) / 2.0])
+    assert_allclose(np.mean(used[100:], axis=0), [0.11, 0.22], rtol=0.02)
+    assert np.ptp(used[100:], axis=0)[0] < 0.02
+
+
+def test_detections_without_extent_are_as_uncertain_as_they_say():
+    bodies, R = Bodies.unknown(2), np.array([0.3, 0.01])[:, None, None] * np.eye(2)
+    after, used = bodies.seen(np.array([False, False]), np.repeat(Z, 2, axis=0), R, OWN)
+    assert after is bodies and used is R
+    after, used = bodies.seen(np.array([False, True]), np.repeat(Z, 2, axis=0), R, OWN)
+    assert_allclose(used[0], R[0])
+    assert after.count.tolist() == [0.0, 1.0] and not after.std[0].any()
+
+
+def test_the_size_is_kept_in_metres_while_the_range_closes():
+    bodies, told = Bodies.unknown(1), np.array([True])
+    for distance in np.linspace(50.0, 10.0, 60):
+        z = np.array([[distance, 0.0]])
+        bodies, R = bodies.seen(told, z, stated(0.1, 0.3, z), OWN)
+    assert_allclose(np.sqrt(R[0, 1, 1]) * 10.0, 0.3, rtol=0.05)
+
+
+def test_an_error_of_the_scale_lies_along_the_line_of_sight():
+    """Sampling: all that is seen is too far by the same unknown factor."""
+    rng = np.random.default_rng(0)
+    sonar = Sonar(Pose(np.array([5.0, -3.0, 20.0]), np.eye(3)))
+    away = np.array([30.0, 12.0, 4.0])
+    state = np.array([np.linalg.norm(away), np.arctan2(12.0, 30.0), 4.0])
+    view = view_of(state, sonar.pose.position + away)
+    found = considered(view, sonar, Bodies.unknown(1), 0.01)
+    factor = 1.0 + 0.01 * rng.normal(size=(200_000, 1))
+    seen = factor * state * [1.0, 0.0, 1.0]
+    assert_allclose(found.covariance[0], np.cov(seen.T), atol=2e-3)
+    assert_allclose(found.place_covariance[0], np.cov((factor * away).T), atol=2e-3)
+    assert not view.covariance.any() and not view.place_covariance.any()
+
+
+def test_the_centre_of_a_body_lies_beside_its_echoes():
+    sonar = Sonar(Pose(np.zeros(3), np.eye(3)))
+    away = 20.0 * np.array([np.cos(0.5), np.sin(0.5), 0.0])
+    view = view_of(np.array([20.0, 0.5, 0.0]), away)
+    found = considered(view, sonar, Bodies(np.ones(1), np.array([[0.2, 0.6]])), 0.0)
+    assert_allclose(np.diagonal(found.covariance[0]), CENTRE * np.array([0.04, 0.36 / 400.0, 0.0]))
+    along = away / 20.0
+    across = np.array([-along[1], along[0], 0.0])
+    assert_allclose(along @ found.place_covariance[0] @ along, CENTRE * 0.04)
+    assert_allclose(across @ found.place_covariance[0] @ across, CENTRE * 0.36)
+
+
+def view_of(state, place):
+    nothing = np.zeros((1, 1))
+    return View(
+        state=state[None],
+        covariance=np.zeros((1, 3, 3)),
+        low=nothing[0],
+        high=nothing[0],
+        above=nothing[0],
+        place=place[None],
+        place_covariance=np.zeros((1, 3, 3)),
+        behaviour=nothing,
+        velocity=np.zeros((1, 2)),
+        velocity_covariance=np.zeros((1, 2, 2)),
+        near=(np.zeros((1, 1, 5)), np.zeros((1, 1, 5, 5))),
+    )
+
+
+def test_a_track_that_was_missed_keeps_its_size():
+    tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
+    for k, echoes in enumerate(([40.0], [], [38.5])):
+        stamp = (k + 1) * SECOND
+        tracker.process(navigation(rows('approach_dst+3_noisy')[2 * k], stamp))
+        n = len(echoes)
+        tracker.process(
+            Detections(
+                stamp_ns=stamp,
+                range=echoes,
+                bearing=[0.1] * n,
+                var_range=[0.01] * n,
+                var_bearing=[1e-5] * n,
+                extent_range=[0.1] * n,
+                extent_bearing=[0.003] * n,
+            )
+        )
+        assert tracker._stream.state.last.bodies.count[0] == 1.0 + k // 2
+
+
+def image_run(setting, seed):
+    """NEES (rows, 3) of range, bearing and offset alone, of all together, and coverage, of the
+    tracks through the images of a scene."""
+    scene = simulate(setting, seed)
+    feeder = setting.told_feeder()
+    detector = ImageDetector(
+        DetectorConfig(
+            beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']
+        )
+    )
+    tracker = ObstacleTracker(evolve(ObstacleConfig(), max_range=setting.max_range))
+    final = {}
+    for received in scene.measurements:
+        one = received.measurement
+        ping = detector.process(one) if isinstance(one, SonarImage) else one
+        final |= {estimate.stamp_ns: estimate for estimate in tracker.process(ping)}
+    tables = [table for truth in scene.truth for table in truth.tables('odom')]
+    truth = [Estimate.from_columns(one.columns, stamp_ns=one.stamp_ns) for one in tables]
+    metrics, found = score(series_of(final.values()), truth_of(truth), cutoff=5.0, gap=60.0)
+    covariance = found.series.covariance[found.row]
+    alone = np.square(found.error) / np.diagonal(covariance, axis1=1, axis2=2)
+    consistency = metrics['consistency']
+    return (
+        *alone.mean(axis=0),
+        consistency['nees_state']['mean'] / 3.0,
+        consistency['band_coverage'],
+    )
+
+
+@pytest.fixture(scope='module')
+def image_runs():
+    """Floats of half a metre in images of a small sonar, 24 scenes."""
+    setting = scenario(
+        'images',
+        {
+            'image_beams': 96,
+            'image_bins': 192,
+            'max_range': 32.0,
+            'first_range': 30.0,
+            'last_range': 15.0,
+            'passing_distance': 3.0,
+            'vertical_offset': 1.5,
+        },
+    )
+    return np.array([image_run(setting, seed) for seed in range(24)])
+
+
+def test_tracks_of_images_are_as_good_as_they_say(image_runs):
+    """Each image says how far glints are apart, which does not tell how far the centroid is off:
+    taken at its word the whole-state NEES of these scenes is several times what it should be."""
+    range_, bearing, offset, state, cover = image_runs.mean(axis=0)
+    assert 0.4 < state < 1.5
+    assert range_ < 1.6 and bearing < 1.6 and offset < 1.5
+    assert 0.84 < cover
+
+
+def test_no_track_of_images_is_far_too_sure(image_runs):
+    assert np.quantile(image_runs[:, 3], 0.9) < 3.0

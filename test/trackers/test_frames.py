@@ -1,0 +1,116 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What /tf_static says: the place of a sonar on its vehicle, and measurements in another frame."""
+
+from attrs import evolve
+import numpy as np
+import pytest
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.measurements import Fix, FrameGuard, Rejection, StaticTransforms
+from sonar_imm.parameters import ConfigError
+from sonar_imm.simulation.bathymetry import simulator as swath
+from sonar_imm.simulation.obstacle import simulator as obstacle
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.frames import FrameDoor
+
+LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -15.0, 8.0)
+MOUNT = Pose(np.array(LEVER), geometry.rotation(*np.radians(RPY)))
+FRAMES = {'vehicle_frame': 'base_link', 'sonar_frame': 'sonar'}
+SAID = StaticTransforms(
+    poses={
+        'sonar': ('bracket', Pose(np.zeros(3), MOUNT.R)),
+        'bracket': ('base_link', Pose(MOUNT.position, np.eye(3))),
+    }
+)
+
+
+def scene_of(system):
+    if system == 'obstacle':
+        scene = obstacle.scenario('approach', {})
+        return scene, obstacle.simulate(scene, 1).measurements[:200]
+    scene = swath.scenario('moving', {'pings': 3})
+    return scene, swath.simulate(scene, 1).measurements
+
+
+def run(system, said=None, **told):
+    """The last estimate, the reasons of refusals, and the tracker."""
+    scene, received = scene_of(system)
+    config = SYSTEMS[system].config_type()(**{**scene.told(), **told})
+    tracker = SYSTEMS[system].build(config)
+    door, made, refused = FrameDoor(tracker, FrameGuard()), [], []
+    for one in [*([said] if said else []), *(item.measurement for item in received)]:
+        try:
+            measurement = door.admit(one)
+        except Rejection as rejection:
+            refused.append(rejection)
+            continue
+        if measurement is not None:
+            made += tracker.process(measurement)
+    return made[-1] if made else None, refused, tracker
+
+
+@pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
+def test_a_mounting_that_transforms_say_is_that_of_the_parameters(system):
+    by_hand, _, _ = run(system, sonar_lever=LEVER, sonar_mount_rpy_deg=RPY)
+    plain, _, _ = run(system)
+    told, refused, tracker = run(system, SAID, **FRAMES)
+    assert not refused and tracker.config.sonar_lever == LEVER
+    assert tracker.config.sonar_mount_rpy_deg == pytest.approx(RPY)
+    assert told.state == pytest.approx(by_hand.state, rel=1e-9, abs=1e-9, nan_ok=True)
+    assert told.xyz == pytest.approx(by_hand.xyz, rel=1e-5, abs=1e-5, nan_ok=True)
+    assert plain.state.shape != told.state.shape or not np.allclose(
+        plain.state, told.state, equal_nan=True
+    )
+
+
+@pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
+def test_pings_before_the_mounting_is_known_are_refused_by_name(system):
+    last, refused, _ = run(system, **FRAMES)
+    assert last is None and {one.reason for one in refused} == {'no_mounting'}
+    assert "'sonar' is on 'base_link'" in refused[0].sentence
+
+
+def test_a_change_of_parameters_keeps_the_mounting():
+    config = SYSTEMS['obstacle'].config_type()(**FRAMES)
+    tracker = SYSTEMS['obstacle'].build(config)
+    door = FrameDoor(tracker, FrameGuard())
+    door.admit(SAID)
+    door.reconfigure(evolve(config, detection_probability=0.5))
+    assert tracker.config.detection_probability == 0.5 and tracker.config.sonar_lever == LEVER
+
+
+@pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
+def test_one_frame_alone_is_a_mistake(system):
+    with pytest.raises(ConfigError, match='need each other'):
+        SYSTEMS[system].config_type()(sonar_frame='sonar')
+
+
+def fix(frame_id, x):
+    return Fix(stamp_ns=10**9, position=[x, 0.0, 0.0], covariance=np.eye(2), frame_id=frame_id)
+
+
+def test_a_position_in_another_frame_is_turned_where_the_transform_is_known():
+    door = FrameDoor(SYSTEMS['diver'].build(SYSTEMS['diver'].config_type()()), FrameGuard('map'))
+    with pytest.raises(Rejection, match="'pier' is not the frame 'map'"):
+        door.admit(fix('pier', 1.0))
+    quarter = Pose(np.array([100.0, 0.0, 0.0]), geometry.rotation(0.0, 0.0, np.pi / 2.0))
+    door.admit(StaticTransforms(poses={'pier': ('map', quarter)}))
+    made = door.admit(fix('pier', 1.0))
+    assert made.frame_id == 'map' and made.position == pytest.approx([100.0, 1.0, 0.0])
+    assert door.admit(fix('map', 1.0)).position.tolist() == [1.0, 0.0, 0.0]
+    with pytest.raises(Rejection, match="'odom' is not the frame 'map'"):
+        door.admit(fix('odom', 1.0))
