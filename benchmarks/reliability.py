@@ -209,9 +209,10 @@ def main() -> None:
                 parts[name] = json.loads(file.read_text(encoding='utf-8'))
         write_json(RESULT, parts)
     PAGE.write_text(page_of(page, parts), encoding='utf-8')
-    problems = short_of(parts) if told.folder else []
-    print('\n'.join(problems) or 'all promises kept')
-    sys.exit(bool(problems))
+    if told.folder:
+        problems = short_of(parts)
+        print('\n'.join(problems) or 'all promises kept')
+        sys.exit(bool(problems))
 
 
 if __name__ == '__main__':

@@ -41,7 +41,7 @@ def count(short: int, long: int) -> int:
 
 
 class Figures:
-    """The rows of one part, written when it is done; nothing in the short form."""
+    """The rows of one part, written as they come; nothing in the short form."""
 
     def __init__(self, part: str):
         self.part = part
@@ -49,8 +49,6 @@ class Figures:
 
     def add(self, **row: Any) -> None:
         self.rows.append(row)
-
-    def write(self) -> None:
         if FOLDER:
             folder = Path(FOLDER)
             folder.mkdir(parents=True, exist_ok=True)
