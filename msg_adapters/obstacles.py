@@ -31,13 +31,11 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 
 from .headers import Make, make_header, make_pose
+from .markers import ADD, lifetime
 
-_ADD, _DELETE, _DELETE_ALL = 0, 2, 3
 NAMES = ('band', 'obstacle', 'label')
 """Namespaces of the markers of one obstacle."""
 _CUBE, _SPHERE, _TEXT = 1, 2, 9
-LIFETIME = 5
-"""Seconds."""
 _ABOVE, _BELOW, _UNKNOWN = (0.84, 0.37, 0.0), (0.0, 0.45, 0.7), (0.6, 0.6, 0.6)
 _CLEAR, _NEAR, _DANGER = (0.3, 0.75, 0.4), (0.95, 0.75, 0.1), (0.85, 0.1, 0.1)
 DANGERS = (0.05, 0.2)
@@ -62,36 +60,6 @@ def write_markers(estimate: Estimate, rows: Iterable[int], make: Make) -> Any:
     """Write a MarkerArray of bars, balls and labels."""
     markers = [marker for row in rows for marker in _obstacle(estimate, row, make)]
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
-
-
-def write_ended(frame_id: str, track_ids: Iterable[int], make: Make) -> Any:
-    """Write what removes the bars, balls and labels of tracks that are over."""
-    markers = [
-        make(
-            'visualization_msgs/msg/Marker',
-            header=make_header(0, frame_id, make),
-            ns=name,
-            id=track_id,
-            action=_DELETE,
-        )
-        for track_id in track_ids
-        for name in NAMES
-    ]
-    return make('visualization_msgs/msg/MarkerArray', markers=markers)
-
-
-def write_no_markers(frame_id: str, make: Make) -> Any:
-    """Write what removes every marker that was drawn before."""
-    return make(
-        'visualization_msgs/msg/MarkerArray',
-        markers=[
-            make(
-                'visualization_msgs/msg/Marker',
-                header=make_header(0, frame_id, make),
-                action=_DELETE_ALL,
-            )
-        ],
-    )
 
 
 def band(estimate: Estimate, row: int) -> tuple[float, float]:
@@ -132,11 +100,11 @@ def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
             ns=name,
             id=track_id,
             type=kind,
-            action=_ADD,
+            action=ADD,
             pose=_pose(make, x, y, height),
             scale=make('geometry_msgs/msg/Vector3', x=size[0], y=size[1], z=size[2]),
             color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgb', colour)), a=alpha),
-            lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
+            lifetime=lifetime(make),
             **more,
         )
 

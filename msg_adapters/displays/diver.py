@@ -21,22 +21,35 @@ from typing import Any
 
 from sonar_imm.estimates import Estimate
 
+from ..divers import NAMES, write_markers, write_poses
 from ..estimates import write_odometry
 from ..headers import Make
-from .tracks import confirmed_rows, Drawn, MODELS, models_of_the_oldest, NAMED_SCALARS
+from .tracks import confirmed_rows, Drawn, Markers, MODELS, models_of_the_oldest, NAMED_SCALARS
 
 
 class Displays:
-    """One Odometry per diver, told apart by ``child_frame_id``, and the models."""
+    """One Odometry per diver, told apart by ``child_frame_id``; all at once as poses and as
+    markers; the models."""
 
-    topics: Mapping[str, str] = {'odometry': 'nav_msgs/msg/Odometry', MODELS: NAMED_SCALARS}
+    topics: Mapping[str, str] = {
+        'odometry': 'nav_msgs/msg/Odometry',
+        'divers': 'geometry_msgs/msg/PoseArray',
+        'markers': 'visualization_msgs/msg/MarkerArray',
+        MODELS: NAMED_SCALARS,
+    }
+
+    def __init__(self) -> None:
+        self._markers = Markers(NAMES, write_markers)
 
     def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
         rows = confirmed_rows(estimate)
         if heard('odometry'):
             for row in rows:
                 yield 'odometry', write_odometry(estimate, row, make)
+        if heard('divers'):
+            yield 'divers', write_poses(estimate, rows, make)
+        yield from self._markers.of(estimate, rows, make, heard)
         yield from models_of_the_oldest(estimate, rows, make, heard)
 
     def forget(self, make: Make) -> Drawn:
-        return iter(())
+        return self._markers.forget(make)

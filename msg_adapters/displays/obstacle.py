@@ -22,8 +22,8 @@ from typing import Any
 from sonar_imm.estimates import Estimate
 
 from ..headers import Make
-from ..obstacles import write_ended, write_markers, write_no_markers, write_poses
-from .tracks import confirmed_rows, Drawn, MODELS, models_of_the_oldest, NAMED_SCALARS
+from ..obstacles import NAMES, write_markers, write_poses
+from .tracks import confirmed_rows, Drawn, Markers, MODELS, models_of_the_oldest, NAMED_SCALARS
 
 
 class Displays:
@@ -36,22 +36,14 @@ class Displays:
     }
 
     def __init__(self) -> None:
-        self._frame_id = ''
-        self._shown: set[int] = set()
+        self._markers = Markers(NAMES, write_markers)
 
     def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
-        self._frame_id = estimate.frame_id
         rows = confirmed_rows(estimate)
         if heard('obstacles'):
             yield 'obstacles', write_poses(estimate, rows, make)
-        ids = set(estimate.extras['track_id'][rows].tolist())
-        ended, self._shown = sorted(self._shown - ids), ids
-        if heard('markers') and ended:
-            yield 'markers', write_ended(self._frame_id, ended, make)
-        if heard('markers') and len(rows):
-            yield 'markers', write_markers(estimate, rows, make)
+        yield from self._markers.of(estimate, rows, make, heard)
         yield from models_of_the_oldest(estimate, rows, make, heard)
 
     def forget(self, make: Make) -> Drawn:
-        self._shown = set()
-        yield 'markers', write_no_markers(self._frame_id, make)
+        return self._markers.forget(make)

@@ -31,6 +31,7 @@ from sonar_imm.estimates import Estimate
 
 from ..estimates import write_model_probabilities
 from ..headers import Make
+from ..markers import write_ended, write_no_markers
 
 CONFIRMED = 1
 """Least `track_state` of a confirmed track: 0 tentative, 1 confirmed, 2 coasting."""
@@ -52,3 +53,30 @@ def models_of_the_oldest(
     if len(rows) and heard(MODELS):
         oldest = rows[np.argmin(estimate.extras['track_id'][rows])]
         yield MODELS, write_model_probabilities(estimate, oldest, make)
+
+
+class Markers:
+    """The markers of the tracks of one system: drawn anew with each estimate, and taken away at
+    once when a track is over. names: their namespaces; write: ``(estimate, rows, make)``."""
+
+    def __init__(self, names: tuple[str, ...], write: Callable[..., Any]):
+        self._names, self._write = names, write
+        self._frame_id = ''
+        self._shown: set[int] = set()
+
+    def of(
+        self, estimate: Estimate, rows: np.ndarray, make: Make, heard: Callable[[str], Any]
+    ) -> Drawn:
+        """Those of an estimate, before them what removes the ones that are over."""
+        self._frame_id = estimate.frame_id
+        ids = set(estimate.extras['track_id'][rows].tolist())
+        ended, self._shown = sorted(self._shown - ids), ids
+        if heard('markers') and ended:
+            yield 'markers', write_ended(self._frame_id, ended, self._names, make)
+        if heard('markers') and len(rows):
+            yield 'markers', self._write(estimate, rows, make)
+
+    def forget(self, make: Make) -> Drawn:
+        """What removes all."""
+        self._shown = set()
+        yield 'markers', write_no_markers(self._frame_id, make)
