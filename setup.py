@@ -99,7 +99,7 @@ setup(
     long_description=(ROOT / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     maintainer='The sonar_imm developers',
-    maintainer_email='maintainers@example.org',
+    maintainer_email='maintainers@example.org',  # see package.xml
     license='Apache-2.0',
     classifiers=[
         'Intended Audience :: Science/Research',

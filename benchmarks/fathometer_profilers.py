@@ -19,8 +19,12 @@ Real lines (SONAR_IMM_DATA, needs segyio), converted and tracked by the command 
 docs/fathometer.md says, and the simulated scene ``diffuse``. On the real lines the floor is picked
 without a tracker: the first of three successive samples above an eighth of what loud traces reach,
 and the greatest of the four from there on. A record is followed when a reflector lies within 1 m
-of that. The older rule beside it picks the first peak above half of the greatest of its record;
-below weak floors that is another layer, so `rules_agree` says how often both pick the same.
+of that. Beside it stand two other rules. `edge`: the first of these three samples itself, where
+the echo begins. `older`: the first peak above half of the greatest of its record; below weak
+floors that is another layer, so `rules_agree` says how often it picks the same as the first rule,
+and `older_missed_at_edge` how many of the records it calls lost have a reflector within 1 m of the
+edge. `sounder`: what the instrument itself wrote into the headers as depth of the water, against
+edge and peak (median, m), where it goes with either within 2 m; it is often wrong by far more.
 
 The parameters that are not measured (scatter_spread, depth_std, the form of the likelihood) were
 chosen on lines L2 and L9 and on seeds 1 and 2 of the scene; L1 and L3 had no part in that, but the
@@ -44,7 +48,7 @@ from sonar_imm.evaluation.fathometer.crossing import crossing_metrics
 from sonar_imm.evaluation.fathometer.records import records_of
 from sonar_imm.evaluation.fathometer.scoring import pair
 from sonar_imm.evaluation.run_folder import RunFolder
-from sonar_imm.recordings.convert.profiler import first_arrivals
+from sonar_imm.recordings.convert.profiler import arrival_edges, first_arrivals
 from sonar_imm.recordings.convert.segy import read_segy
 from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
@@ -115,24 +119,42 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
     amplitude = amplitude[:, FIRST : FIRST + SAMPLES]
     arrival = SPACING * (FIRST + first_arrivals(amplitude))
     old = SPACING * (FIRST + np.array([_half(trace) for trace in amplitude]))
-    hits, by_bottom, by_old, ids, number = [], [], [], set(), []
-    for estimate, depth, older in zip(run.read_estimates(), arrival, old):
+    edge = SPACING * (FIRST + arrival_edges(amplitude))
+    stated = np.median(read_segy(path).water_depth[: STACK * count].reshape(count, STACK), axis=1)
+    hits, by_bottom, by_old, by_edge, ids, number = [], [], [], [], set(), []
+    for estimate, depth, older, first in zip(run.read_estimates(), arrival, old, edge):
         columns = estimate.columns()
         away = np.abs(np.nan_to_num(columns['depth'], nan=1e9) - depth)
         hits.append(away.min() < NEAR)
         if hits[-1]:
             ids.add(int(columns['track_id'][np.argmin(away)]))
         by_bottom.append(away[np.argmax(columns['is_bottom'])] < NEAR)
+        by_edge.append((np.abs(columns['depth'] - first) < NEAR).any())
         by_old.append((np.abs(columns['depth'] - older) < NEAR).any())
         number.append(np.isfinite(columns['depth']).sum())
+    lost = ~np.array(by_old)
     return {
         'records': count,
         'followed': share(hits),
         'followed_by_is_bottom': share(by_bottom),
         'ids_per_100': round(100.0 * len(ids) / count, 2),
         'followed_older_rule': share(by_old),
+        'followed_edge': share(by_edge),
         'rules_agree': share(np.abs(arrival - old) < NEAR),
+        'older_missed_at_edge': share(np.array(by_edge)[lost]) if lost.any() else None,
+        'sounder': sounder(stated, edge, arrival),
         'reflectors': round(float(np.mean(number)), 2),
+    }
+
+
+def sounder(stated: np.ndarray, edge: np.ndarray, peak: np.ndarray) -> dict[str, float]:
+    """The instrument's own depths of the bottom (T,), 0 for none, against edges and peaks."""
+    good = (stated > 0.0) & ((np.abs(stated - edge) < 2.0) | (np.abs(stated - peak) < 2.0))
+    return {
+        'stated': share(stated > 0.0),
+        'believable': share(good),
+        'minus_edge_m': round(float(np.median((stated - edge)[good])), 2),
+        'minus_peak_m': round(float(np.median((stated - peak)[good])), 2),
     }
 
 

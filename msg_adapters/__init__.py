@@ -24,4 +24,4 @@ one too and hide this one. `__owner__` and `__version__` let `sonar_imm` notice.
 """
 
 __owner__ = 'sonar_imm'
-__version__ = '0.1.0'
+__version__ = '1.0.0'

@@ -88,7 +88,9 @@ def read_pose_array(message: Any, *, bearing_positive: str = 'port', **_: Any) -
 def read_laser_scan(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a LaserScan: an echo for each range inside its limits; angles count to port."""
     distance = np.array(message.ranges, np.float64)
-    bearing = float(message.angle_min) + float(message.angle_increment) * np.arange(len(distance))
+    with np.errstate(invalid='ignore'):  # a step that is not finite leaves no bearing
+        steps = float(message.angle_increment) * np.arange(len(distance))
+        bearing = float(message.angle_min) + steps
     inside = (distance >= message.range_min) & (distance <= message.range_max)
     intensity = np.array(message.intensities, np.float64)
     if len(intensity) != len(distance):

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import msg_adapters as _adapters
 
-__version__ = '0.1.0'
+__version__ = '1.0.0'
 
 
 def _check_adapters() -> None:

@@ -131,6 +131,23 @@ def test_package_xml_and_setup_name_the_same_run_time_dependencies(
     assert wanted | WITHOUT_KEY == {distribution(line) for line in setup_lists['REQUIRES']}
 
 
+def test_package_xml_and_setup_pin_the_same_versions(
+    manifest: ElementTree.Element, setup_lists: dict[str, list[str]]
+) -> None:
+    extras = setup_lists['EXTRAS']
+    assert isinstance(extras, dict)
+    pins = {
+        distribution(line): set(re.findall(r'[<>]=?[0-9.]+', line))
+        for line in (*setup_lists['REQUIRES'], *extras['test'])
+    }
+    signs = {'version_gte': '>=', 'version_lt': '<'}
+    for kind in ('exec_depend', 'test_depend'):
+        for element in manifest.findall(kind):
+            if (name := PYPI_OF_KEY.get(str(element.text))) is not None:
+                told = {signs[key] + value for key, value in element.attrib.items()}
+                assert told == pins[name], name
+
+
 def test_package_xml_and_setup_name_the_same_test_dependencies(
     manifest: ElementTree.Element, setup_lists: dict[str, dict[str, list[str]]]
 ) -> None:

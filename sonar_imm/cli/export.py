@@ -91,7 +91,8 @@ def command(
     its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
     depth, uncertainty, label and count); they come from recordings with navigation. Horizons of
     the fathometer: .csv (picks by horizon), .geojson (points along the track), .sgy, .segy or .seg
-    (the file given by --segy with picks in place of its samples).
+    (the file given by --segy with picks in place of its samples). Where the recording has no fixes
+    by satellite, the places of horizons come from its navigation, with --epsg and --origin.
     """
     from ..evaluation.run_folder import RunFolder, SOUNDINGS
     from ..recordings.export.grid import grid_of, write_geotiff
@@ -106,7 +107,7 @@ def command(
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
     told = RunFolder(run).read_run()
     if kind in HORIZON_FORMATS:
-        _export_horizons(run, told, out, kind, epsg, original, as_json)
+        _export_horizons(run, told, out, kind, epsg, origin, original, as_json)
         return
     if not (run / SOUNDINGS).is_file():
         raise BagError(
@@ -137,14 +138,18 @@ def _export_horizons(
     out: Path,
     kind: str,
     epsg: int | None,
+    origin: tuple[float, float, float],
     original: Path | None,
     as_json: bool,
 ) -> None:
     """Picks of a run of the fathometer; told: its run.json."""
+    import numpy as np
+
     from ..evaluation.run_folder import RunFolder
     from ..recordings.export.horizons import picks_of, write_geojson, write_horizons
     from ..recordings.export.picks import write_picks
-    from ..recordings.positions import read_positions
+    from ..recordings.export.points import degrees_of
+    from ..recordings.positions import navigation_topics, read_navigated, read_positions
     from ..recordings.reader import BagReader
     from ..recordings.sources import BagError
 
@@ -161,6 +166,15 @@ def _export_horizons(
     if Path(told['bag']).exists():
         with BagReader(told['bag']) as bag:
             positions, notes = read_positions(bag), bag.custom_data
+            if positions is None and epsg is not None:
+                positions = read_navigated(
+                    bag, lambda places: degrees_of(places + np.array(origin[:2]), epsg)
+                )
+            elif positions is None and kind == 'geojson' and navigation_topics(bag):
+                raise BagError(
+                    'the recording has navigation in metres: say with --epsg and --origin where '
+                    'its origin lies'
+                )
     elif segy or kind == 'geojson':
         raise BagError(f'{told["bag"]}, the recording of {run}, is gone')
     speed = float(told['parameters'].get('sound_speed', 1500.0))

@@ -160,7 +160,8 @@ class SetFilter:
         rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
         sums = np.zeros((rows, self.model.record_cells))
         offset, variance = _offset_of(step.path)
-        kernels.moments(w, sets, step.amplitude, offset, variance, self.model.order_min, pmf, sums)
+        prior, least = self._amplitudes.variance, self.model.order_min
+        kernels.moments(w, sets, step.amplitude, offset, variance, prior, least, pmf, sums)
         # Weights add up to one but for rounding: no probability may pass it for that.
         return np.minimum(pmf, 1.0), sums
 

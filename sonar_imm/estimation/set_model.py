@@ -153,7 +153,7 @@ class SetModel:
 
 class Sets(NamedTuple):
     """N sets: order (N,), cell (N, J) of which the first `order` count, ascending; prior_mean and
-    prior_variance (N, J) of the amplitudes in units of the noise, used with a memory only; sign
+    prior_variance (N, J) of the amplitudes in units of the noise, (N, 0) without a memory; sign
     (N, J) of the amplitudes, 1 or -1; shift (N,) plus pad: what is in cell z shows in the record's
     cell z + shift."""
 
@@ -167,11 +167,12 @@ class Sets(NamedTuple):
     @classmethod
     def empty(cls, model: SetModel, count: int) -> Sets:
         shape = count, model.order_max
+        remembered = count, model.order_max if model.amplitude_memory else 0
         return cls(
             np.zeros(count, np.int64),
             np.zeros(shape, np.int64),
-            np.zeros(shape),
-            np.full(shape, model.amplitude_std**2),
+            np.zeros(remembered),
+            np.full(remembered, model.amplitude_std**2),
             np.ones(shape, np.int8),
             np.full(count, model.pad, np.int64),
         )

@@ -285,10 +285,10 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
         at = np.flatnonzero(sets.order == m)
         z = sets.cell[at, :m]
         A = model.gram[np.abs(z[:, :, None] - z[:, None, :])]
+        precision, expected = np.full(z.shape, model.ridge), np.zeros(z.shape)
         if model.amplitude_memory:
             precision = 1.0 / sets.prior_variance[at, :m]
-        else:
-            precision = np.full(z.shape, model.ridge)
+            expected = sets.prior_mean[at, :m]
         place = z + sets.shift[at, None]
         seen, scale = b[place], np.ones(z.shape)
         if model.scatter:
@@ -296,14 +296,14 @@ def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, Float
             mean = fit.level[k] * fit.profile[fit.row[k], len(b) - 1 + place - k]
             scale = np.sqrt(1.0 + np.square(fit.spread * mean))
             seen = (seen - mean) / scale
-        h = seen + precision * sets.prior_mean[at, :m]
+        h = seen + precision * expected
         A = A + precision[:, :, None] * np.eye(m)
         a = np.linalg.solve(A, h[..., None])[..., 0]
         value = 0.5 * np.einsum('im,im->i', h, a) - m * model.penalty
         if model.amplitude_prior == 'marginal':
             value -= 0.5 * np.linalg.slogdet(A)[1]
         if model.amplitude_memory:
-            value -= 0.5 * np.sum(precision * np.square(sets.prior_mean[at, :m]), axis=1)
+            value -= 0.5 * np.sum(precision * np.square(expected), axis=1)
             value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
         if model.scatter:
             value += fit.evidence[place[:, 0]]

@@ -288,17 +288,19 @@ def moments(
     amplitude: FloatArray,
     offset: FloatArray,
     variance: float,
+    prior_variance: float,
     order_min: int,
     pmf: FloatArray,
     sums: FloatArray,
 ) -> None:
     """Add to pmf (orders,) and to sums (5, n), the intensity, the first two moments of the
-    amplitude, the variance it had before the record, and the share of members that are the first
-    of their set, that lie on each cell. Both are zero before. With a shift, cells are those of
+    amplitude, the variance it had before the record (prior_variance where sets have none of their
+    own), and the share of members that are the first of their set, that lie on each cell. Both
+    are zero before. With a shift, cells are those of
     the record, where members that share an error are not blurred by it, and sums (8, n + 2 pad)
     has the first two moments of the cell on the lattice and its product with the amplitude
     besides, with the mean offset (N,) of the shift and its variance (see `set_shifts`)."""
-    shifted = sums.shape[0] > SUMS
+    shifted, own = sums.shape[0] > SUMS, sets.prior_variance.shape[1] > 0
     for i in range(w.shape[0]):
         if w[i] > 0.0:
             pmf[sets.order[i] - order_min] += w[i]
@@ -308,7 +310,7 @@ def moments(
                 sums[0, z] += w[i]
                 sums[1, z] += w[i] * a
                 sums[2, z] += w[i] * a * a
-                sums[3, z] += w[i] * sets.prior_variance[i, k]
+                sums[3, z] += w[i] * (sets.prior_variance[i, k] if own else prior_variance)
                 if shifted:
                     at = place - offset[i]
                     sums[5, z] += w[i] * at

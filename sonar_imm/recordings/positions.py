@@ -17,10 +17,14 @@
 They are the messages ``sensor_msgs/NavSatFix`` of the topic ``position``, or of the only topic of
 that type. Between two of them the place is interpolated; a stamp further than `GAP_S` from both
 has none.
+
+Without them the topic ``nav`` (nav_msgs/Odometry, ENU metres) tells places, once it is said where
+its origin lies.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from attrs import frozen
@@ -32,6 +36,7 @@ from .reader import BagReader
 from .sources import BagError
 
 TYPE, TOPIC = 'sensor_msgs/msg/NavSatFix', 'position'
+NAV_TYPE, NAV_TOPIC = 'nav_msgs/msg/Odometry', 'nav'
 GAP_S = 30.0
 _NO_FIX = -1
 
@@ -64,25 +69,56 @@ def read_positions(bag: BagReader) -> Positions | None:
     """The positions in an open recording, None when there are none. Raises `BagError` when several
     topics have some."""
     topics = [topic.name for topic in bag.topics if topic.type_name == TYPE]
-    named = [name for name in topics if f'/{name}'.endswith(f'/{TOPIC}')]
-    chosen = named or topics
-    if len(chosen) > 1:
-        raise BagError(f'several topics have positions: {", ".join(chosen)}')
-    if not chosen:
-        return None
-    rows = {}
-    for item in bag.messages(chosen):
-        message = item.message
+
+    def fix(message: Any) -> tuple[float, float] | None:
         place = float(message.longitude), float(message.latitude)
-        good = np.isfinite(place).all() and abs(place[0]) <= 360.0 and abs(place[1]) <= 90.0
-        if good and message.status.status != _NO_FIX:
-            stamp = message.header.stamp
-            rows[stamp.sec * 10**9 + stamp.nanosec] = place
+        good = abs(place[0]) <= 360.0 and abs(place[1]) <= 90.0
+        return place if good and message.status.status != _NO_FIX else None
+
+    found = _read(bag, _named(topics, TOPIC) or topics, fix)
+    return None if found is None else Positions(found[0], *found[1].T)
+
+
+def navigation_topics(bag: BagReader) -> list[str]:
+    """The topics of a recording that navigation comes on."""
+    return _named([topic.name for topic in bag.topics if topic.type_name == NAV_TYPE], NAV_TOPIC)
+
+
+def read_navigated(
+    bag: BagReader, degrees: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+) -> Positions | None:
+    """The positions by the navigation of an open recording, None when there is none. degrees:
+    gives longitude and latitude (n,) of places (n, 2) east and north, m. Raises `BagError` when
+    several topics have some."""
+
+    def place(message: Any) -> tuple[float, float]:
+        position = message.pose.pose.position
+        return float(position.x), float(position.y)
+
+    found = _read(bag, navigation_topics(bag), place)
+    return None if found is None else Positions(found[0], *degrees(found[1]))
+
+
+def _named(topics: list[str], name: str) -> list[str]:
+    return [one for one in topics if f'/{one}'.endswith(f'/{name}')]
+
+
+def _read(
+    bag: BagReader, topics: list[str], place: Callable[[Any], tuple[float, float] | None]
+) -> tuple[IntArray, FloatArray] | None:
+    """Stamps (n,) and places (n, 2) of the messages of one topic, by time; what is not finite and
+    what `place` gives None for is left out."""
+    if len(topics) > 1:
+        raise BagError(f'several topics have positions: {", ".join(topics)}')
+    rows = {}
+    for item in bag.messages(topics) if topics else ():
+        here, stamp = place(item.message), item.message.header.stamp
+        if here is not None and np.isfinite(here).all():
+            rows[stamp.sec * 10**9 + stamp.nanosec] = here
     if not rows:
         return None
     stamps = sorted(rows)
-    places = np.array([rows[stamp] for stamp in stamps])
-    return Positions(np.array(stamps, np.int64), places[:, 0], places[:, 1])
+    return np.array(stamps, np.int64), np.array([rows[stamp] for stamp in stamps])
 
 
 def write_position(stamp_ns: int, longitude: float, latitude: float) -> Any:

@@ -17,7 +17,10 @@
 from html.parser import HTMLParser
 
 from helpers.dive_scenes import single_run
+import numpy as np
 
+from msg_adapters.fixes import write_fix
+from sonar_imm.cli import main
 from sonar_imm.evaluation.diver.scoring import score
 from sonar_imm.evaluation.diver.sections import diver_part, Material
 from sonar_imm.evaluation.diver.series import series_of
@@ -25,6 +28,8 @@ from sonar_imm.evaluation.diver.truth import Truth
 from sonar_imm.evaluation.judging import Check
 from sonar_imm.evaluation.page import Card, Section
 from sonar_imm.evaluation.report import report_html, run_part
+from sonar_imm.measurements import Fix
+from sonar_imm.recordings.writer import BagWriter, ros_message
 
 RUN = {
     'system': 'diver',
@@ -128,3 +133,29 @@ def test_runs_of_several_systems_share_a_page():
     assert page.headings.index('whale.bag') < page.headings.index('Whale')
     assert 'sonar_imm · diver tracker' in text and 'sonar_imm · whale tracker' in text
     assert 'size.rmse_m' in text
+
+
+SCRIPT = '<script>alert(1)</script>'
+
+
+def test_what_a_recording_names_is_text_on_the_page(tmp_path):
+    """A topic, a frame, a folder and a refused message that would be a script."""
+    bag = tmp_path / 'a<script>alert(1)<script>'
+    with BagWriter(bag) as writer:
+        for k in range(12):
+            fix = Fix(
+                stamp_ns=(1_700_000_000 + k) * 10**9,
+                position=[0.7 * k, 0.0, 0.0],
+                frame_id=SCRIPT,
+                covariance=np.eye(2),
+            )
+            message = write_fix(fix, ros_message)
+            if k == 5:
+                message.header.frame_id = f'{SCRIPT}_ned'
+            writer.write(f'/{SCRIPT}/fix', message, fix.stamp_ns)
+    out, page = tmp_path / 'out', tmp_path / 'page.html'
+    assert main(['track', str(bag), str(out), '--set', f'map_frame={SCRIPT}']) == 0
+    assert main(['evaluate', str(out), '--report', str(page)]) in (0, 1)
+    text = page.read_text()
+    assert '&lt;script&gt;alert(1)' in text
+    assert 'script>alert(1)' not in text

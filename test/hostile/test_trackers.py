@@ -17,16 +17,22 @@
 2,000 messages for each system here; ``make fuzz`` sends 100,000.
 """
 
+import json
 import warnings
 
+from helpers.dive_bags import write_dive
 from helpers.hostile import extremes
 from helpers.hostile.mutations import MUTATIONS
 from helpers.hostile.runs import Bad, BATCH, batches, run, Tally
 from helpers.hostile.streams import stream, templates, VARIANTS
 from hypothesis import given, HealthCheck, settings
+import numpy as np
 import pytest
 
 from msg_adapters.inputs import inputs_of, made_inputs
+from sonar_imm.cli import main
+from sonar_imm.measurements import Fixes
+from sonar_imm.recordings.own_parameters import write_own_parameters
 from sonar_imm.trackers import SYSTEMS
 
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
@@ -79,3 +85,33 @@ def test_an_error_of_the_sound_speed_concerns_fixes_alone_too():
     for name, type_name, message in stream('diver', 0):
         found += tracker.process(entries[name].readers[type_name](message))
     assert len(found) == len(stream('diver', 0))
+
+
+def test_no_more_divers_than_allowed_are_followed():
+    """Three that are plainly there: as many as the limit says, and all without it."""
+    for most, wanted in ((2, 2), (20, 3)):
+        tracker = SYSTEMS['diver'].build(
+            SYSTEMS['diver'].config_type().from_mapping({'max_tracks': most})
+        )
+        for k in range(10):
+            position = [[0.5 * k, 0.0, 0.0], [0.5 * k, 60.0, 0.0], [0.5 * k, 120.0, 0.0]]
+            scan = Fixes(
+                stamp_ns=(1000 + k) * 10**9,
+                position=position,
+                covariance=np.tile(0.1 * np.eye(2), (3, 1, 1)),
+            )
+            last = tracker.process(scan)[-1]
+        assert (last.extras['track_state'] > 0).sum() == wanted
+
+
+def test_track_uses_the_parameters_that_a_recording_brings(tmp_path):
+    bag = write_dive(tmp_path / 'dive', count=6)
+    write_own_parameters(bag, {'diver': {'fix_std': 3.25}})
+    assert main(['track', str(bag), str(tmp_path / 'own')]) == 0
+    run = json.loads((tmp_path / 'own' / 'run.json').read_text())
+    assert run['parameters']['fix_std'] == 3.25
+    (tmp_path / 'named.yaml').write_text('fix_std: 1.5\n')
+    named = ['track', str(bag), str(tmp_path / 'said'), '--params', str(tmp_path / 'named.yaml')]
+    assert main(named) == 0
+    run = json.loads((tmp_path / 'said' / 'run.json').read_text())
+    assert run['parameters']['fix_std'] == 1.5

@@ -139,16 +139,19 @@ def test_a_table_that_cannot_be_used_is_refused_with_its_reason(message, code):
 # -- common_interfaces -------------------------------------------------------------------------
 
 
-def scan(ranges, intensities=()):
+def scan(ranges, intensities=(), **fields):
     return ros_message(
         'sensor_msgs/msg/LaserScan',
-        header=header(),
-        angle_min=-0.2,
-        angle_increment=0.1,
-        range_min=1.0,
-        range_max=50.0,
-        ranges=ranges,
-        intensities=intensities,
+        **{
+            'header': header(),
+            'angle_min': -0.2,
+            'angle_increment': 0.1,
+            'range_min': 1.0,
+            'range_max': 50.0,
+            'ranges': ranges,
+            'intensities': intensities,
+            **fields,
+        },
     )
 
 
@@ -159,6 +162,57 @@ def test_a_laser_scan_counts_to_port_and_keeps_what_lies_inside_its_limits():
     assert ping.intensity.tolist() == [1.0, 5.0]
     assert len(read_laser_scan(scan([]))) == 0
     assert np.isnan(read_laser_scan(scan([2.0], [1.0, 2.0])).intensity).all()
+
+
+def test_a_laser_scan_may_count_from_port():
+    ping = read_laser_scan(scan([10.0, 20.0, 30.0], angle_min=0.2, angle_increment=-0.1))
+    assert ping.bearing == pytest.approx([0.2, 0.1, 0.0], abs=1e-7)
+    turned = read_laser_scan(scan([10.0, 20.0]), bearing_positive='starboard')
+    assert turned.bearing == pytest.approx([0.2, 0.1], abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    'fields',
+    [
+        {'ranges': [np.nan] * 4},
+        {'ranges': [np.inf, -np.inf, -5.0, 0.0]},
+        {'range_min': np.nan},
+        {'range_max': np.nan},
+        {'range_min': 50.0, 'range_max': 1.0},
+        {'angle_min': np.nan},
+        {'angle_increment': np.nan},
+    ],
+    ids=str,
+)
+def test_a_laser_scan_without_an_echo_is_an_empty_ping(fields):
+    ping = read_laser_scan(scan(**{'ranges': [10.0, 20.0, 30.0, 40.0], **fields}))
+    assert len(ping) == 0 and ping.stamp_ns > 0
+
+
+def test_a_laser_scan_without_limits_keeps_what_is_finite():
+    limits = {'range_min': -np.inf, 'range_max': np.inf}
+    ping = read_laser_scan(scan([np.inf, -np.inf, np.nan, -3.0, 12.0], **limits))
+    assert ping.range.tolist() == [12.0]
+    assert len(read_laser_scan(scan([7.0, 8.0], angle_increment=np.inf))) == 0
+
+
+@pytest.mark.parametrize(
+    'message, code',
+    [
+        (scan(np.full(100_001, 10.0), angle_increment=1e-7), 'too_large'),
+        (scan([10.0, 20.0], angle_min=90.0), 'out_of_range'),
+        (scan([10.0, 20.0], angle_min=np.inf, angle_increment=1e30), None),
+        (scan([10.0] * 3, angle_increment=1e30), 'out_of_range'),
+        (scan([3e7, 4e7], range_max=1e30), 'out_of_range'),
+        (scan([10.0], header=ros_message('std_msgs/msg/Header')), 'bad_stamp'),
+    ],
+    ids=['huge', 'degrees', 'nowhere', 'wild step', 'not metres', 'no stamp'],
+)
+def test_a_wild_laser_scan_is_refused_with_its_reason(message, code):
+    if code is None:
+        assert len(read_laser_scan(message)) == 0
+    else:
+        assert reason(read_laser_scan, message) == code
 
 
 def test_a_pose_array_is_read_by_its_places():

@@ -38,21 +38,25 @@ def is_envelope(amplitude: FloatArray) -> bool:
     return bool(np.nanmin(amplitude) >= 0.0 and np.nanmax(amplitude) > 0.0)
 
 
-def first_arrivals(amplitude: FloatArray) -> IntArray:
-    """Sample of the first arrival of each trace (T, n), -1 where there is none: from the first of
-    three successive samples above an eighth of what the loud traces reach, the greatest of
-    four."""
+def arrival_edges(amplitude: FloatArray) -> IntArray:
+    """Sample at which each trace (T, n) first begins, -1 where none does: the first of three
+    successive samples above an eighth of what the loud traces reach."""
     loud = float(np.quantile(amplitude.max(axis=1), 0.99)) / _LOUD
     above = amplitude > loud
     count = amplitude.shape[1] - _RUN + 1
     if count < 1:
         return np.full(len(amplitude), -1)
     run = np.logical_and.reduce([above[:, k : k + count] for k in range(_RUN)])
-    begin = np.where(run.any(axis=1), run.argmax(axis=1), -1)
+    return np.where(run.any(axis=1), run.argmax(axis=1), -1)
+
+
+def first_arrivals(amplitude: FloatArray) -> IntArray:
+    """Sample of the first arrival of each trace (T, n), -1 where there is none: the greatest of
+    the four from its edge on."""
     return np.array(
         [
             -1 if i < 0 else i + int(np.argmax(trace[i : i + _REACH]))
-            for i, trace in zip(begin, amplitude)
+            for i, trace in zip(arrival_edges(amplitude), amplitude)
         ]
     )
 

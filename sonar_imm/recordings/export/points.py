@@ -138,3 +138,13 @@ def wkt_of(epsg: int) -> str:
         return str(CRS.from_epsg(epsg).to_wkt())
     except CRSError:
         raise BagError(f'there is no coordinate system with the EPSG number {epsg}') from None
+
+
+def degrees_of(places: FloatArray, epsg: int) -> tuple[FloatArray, FloatArray]:
+    """Longitude and latitude (n,) of places (n, 2) in a coordinate system. Raises `BagError`.
+    Needs rasterio."""
+    wkt = wkt_of(epsg)
+    from rasterio.warp import transform
+
+    east, north = transform(wkt, 'EPSG:4326', places[:, 0].tolist(), places[:, 1].tolist())
+    return np.array(east), np.array(north)

@@ -20,8 +20,8 @@ written of a scene:
               noise of ships from the horizontal and noise of the hydrophones;
     response  traces processed from such cross-spectra;
     trace     traces made directly, of pulses and noise in the same band: hundreds per second;
-     envelope  of a sub-bottom profiler over a floor that scatters, see `envelope`;
-     pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
+    envelope  of a sub-bottom profiler over a floor that scatters, see `envelope`;
+    pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
 """
 
 from __future__ import annotations
@@ -104,13 +104,20 @@ def _measurements(
         told = None if config.depth_companion else float(drift.array_depth_told[record])
         if config.level == 'pressure':
             yield pressure_blocks(config, drift, record, told, rng)
-        elif config.level == 'trace':
-            yield [_trace(config, drift, record, told, rng)]
-        elif config.level == 'envelope':
-            yield [_envelope(config, drift, record, told, rng)]
+        elif config.level == 'csdm':
+            yield [cross_spectra(config, drift, record, told, rng)]
         else:
-            spectra = cross_spectra(config, drift, record, told, rng)
-            yield [spectra if config.level == 'csdm' else _response(config, spectra, drift)]
+            amplitude, sigma = _TRACES[config.level](config, drift, record, rng)
+            yield [
+                Trace(
+                    stamp_ns=stamp_of(config, record),
+                    frame_id=FRAME_ID,
+                    depth=_depths(config),
+                    amplitude=amplitude,
+                    sigma=None if sigma is None else np.full(len(amplitude), sigma),
+                    reference_depth=told,
+                )
+            ]
 
 
 def cross_spectra(
@@ -142,36 +149,28 @@ def _depths(config: FathometerScenario) -> FloatArray:
     return config.depth_min + config.depth_step * np.arange(count)
 
 
-def _response(config: FathometerScenario, spectra: CrossSpectra, drift: Drift) -> Trace:
+def _response(
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
+    """What the processor makes of cross-spectra, and its noise."""
+    spectra = cross_spectra(config, drift, record, None, rng)
     heights = config.element_spacing * np.arange(config.phones)
     w = fathometer.steering(spectra.frequency, heights, config.sound_speed)
     gamma = fathometer.coherence(spectra.csdm, w, config.processor)
-    record = round((spectra.stamp_ns - FIRST_STAMP_NS) / (config.record_seconds * 1e9)) - 1
     comb = float(spectra.frequency[0]), 1.0 / config.snapshot_seconds
-    depth, where = _depths(config), float(drift.array_depth_told[record])
+    where = float(drift.array_depth_told[record])
 
     def at(first: float, count: int) -> FloatArray:
         lattice = first, config.depth_step, count
         return fathometer.depth_response(gamma, *comb, lattice, where, config.sound_speed)
 
     sigma = fathometer.noise_sigma(at(180.0, 2000))
-    return Trace(
-        stamp_ns=spectra.stamp_ns,
-        frame_id=FRAME_ID,
-        depth=depth,
-        amplitude=at(config.depth_min, len(depth)),
-        sigma=np.full(len(depth), sigma),
-        reference_depth=spectra.reference_depth,
-    )
+    return at(config.depth_min, len(_depths(config))), sigma
 
 
-def _trace(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    told: float | None,
-    rng: np.random.Generator,
-) -> Trace:
+def _pulses(
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
     """Pulses, and noise through the same band, with the error of the array's depth."""
     depth, step = _depths(config), config.depth_step
     pulse = band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
@@ -188,31 +187,18 @@ def _trace(
         12.0 * drift.amplitude[record] / (2.0 * height + config.phones * config.element_spacing)
     )
     there = pulse(depth[:, None] - drift.depth[record] - shift) @ level
-    return Trace(
-        stamp_ns=stamp_of(config, record),
-        frame_id=FRAME_ID,
-        depth=depth,
-        amplitude=there + noise,
-        sigma=np.full(len(depth), config.noise_sigma),
-        reference_depth=told,
-    )
+    return there + noise, config.noise_sigma
 
 
-def _envelope(
-    config: FathometerScenario,
-    drift: Drift,
-    record: int,
-    told: float | None,
-    rng: np.random.Generator,
-) -> Trace:
-    depth = _depths(config)
-    return Trace(
-        stamp_ns=stamp_of(config, record),
-        frame_id=FRAME_ID,
-        depth=depth,
-        amplitude=envelope(config, drift, record, depth, rng),
-        reference_depth=told,
-    )
+def _scattered(
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, None]:
+    """The envelope of a profiler, which says nothing of its noise."""
+    return envelope(config, drift, record, _depths(config), rng), None
+
+
+_TRACES = {'response': _response, 'trace': _pulses, 'envelope': _scattered}
+"""Level: how the amplitudes of its traces are made, and the standard deviation of their noise."""
 
 
 def pressure_blocks(

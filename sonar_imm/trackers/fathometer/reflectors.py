@@ -195,11 +195,12 @@ def relative_amplitude(
 ) -> FloatArray:
     """Amplitudes (K,) freed of spreading and of the window, in m: A (2 H + L) / taper(tau / T), H
     below the array of length L, tau = 2 H / c, T the length of a snapshot. NaN when the depth of
-    the array is not known."""
+    the array is not known, and where the window leaves nothing."""
     height = reflectors.depth - response.reference_depth + reflectors.heave
     with np.errstate(divide='ignore', invalid='ignore'):
         share = 2.0 * height / (config.sound_speed * response.snapshot_seconds)
         taper = window_overlap(config.window, share) if response.aperture else 1.0
+        taper = np.where(np.asarray(taper) > 0.0, taper, np.nan)
         return np.asarray(reflectors.amplitude * (2.0 * height + response.aperture) / taper)
 
 

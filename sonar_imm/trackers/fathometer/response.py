@@ -39,6 +39,8 @@ MAX_MOVES = 8_000_000
 """Of a lattice: cells times the cells that a reflector can move to. Each takes 16 bytes in the
 tables of moves, 32 where reflectors of either sign are looked for."""
 MAX_SIGMAS = 1e6
+LOUDEST = 1e100
+"""Of a trace, whatever its unit: squares of what is louder are beyond numbers."""
 LEAST_NOISE_SAMPLES = 50
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
 
@@ -133,6 +135,11 @@ def trace_response(
     """Put a trace onto the lattice; where it does not reach, the response is zero. Raises
     `Rejection` when it has no noise to compare with, or lies elsewhere."""
     amplitude = np.where(np.isfinite(trace.amplitude), trace.amplitude, 0.0)
+    loudest = max(float(np.max(np.abs(amplitude))), _loudest_noise(trace))
+    if loudest > LOUDEST:
+        raise Rejection(
+            'out_of_range', f'the trace holds {loudest:.3g}; {LOUDEST:g} is possible at most'
+        )
     noise_unknown = False
     quiet = (trace.depth >= config.noise_depth_min) & (trace.depth <= config.noise_depth_max)
     quiet &= np.isfinite(trace.amplitude)
@@ -160,6 +167,11 @@ def trace_response(
         reference_depth,
         noise_unknown=noise_unknown,
     )
+
+
+def _loudest_noise(trace: Trace) -> float:
+    sigma = trace.sigma
+    return 0.0 if sigma is None else float(np.max(sigma[np.isfinite(sigma)], initial=0.0))
 
 
 def residual_sigma(response: Response, fitted: FloatArray) -> Response:

@@ -21,8 +21,14 @@ import struct
 import numpy as np
 import pytest
 
+from msg_adapters.navigation import write_navigation
 from sonar_imm.cli import main
+from sonar_imm.measurements import Navigation
 from sonar_imm.recordings.convert import convert_segy
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.positions import read_positions
+from sonar_imm.recordings.reader import BagReader
+from sonar_imm.recordings.writer import BagWriter
 
 segyio = pytest.importorskip('segyio')
 T, N, STACK = 48, 90, 4
@@ -183,3 +189,36 @@ def test_without_places_there_is_a_table_but_no_map(tracked, tmp_path, capsys):
     ):
         assert export(tmp_path, name, *options) == 2
         assert words in capsys.readouterr().err
+
+
+def test_places_by_navigation(tracked, tmp_path, capsys):
+    """The same line with its places as metres from an origin in place of fixes."""
+    transform = pytest.importorskip('rasterio.warp').transform
+    with BagReader(tracked / 'bag') as bag, BagWriter(tmp_path / 'bag') as out:
+        places = read_positions(bag)
+        for item in bag.messages(['/trace']):
+            out.write('/trace', item.message, item.log_ns)
+        east, north = transform(
+            'EPSG:4326', 'EPSG:32615', places.longitude.tolist(), places.latitude.tolist()
+        )
+        for k, stamp in enumerate(places.stamp_ns.tolist()):
+            here = Navigation(
+                stamp_ns=stamp,
+                frame_id='map',
+                child_frame_id='boat',
+                position=np.array([east[k] - 850_000.0, north[k] - 1_890_000.0, 0.0]),
+                orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+            )
+            out.write('/nav', write_navigation(here, ros_message), stamp)
+    told = (tracked / 'bag' / 'parameters.yaml').read_text()
+    (tmp_path / 'bag' / 'parameters.yaml').write_text(told)
+    run = 'track', tmp_path / 'bag', tmp_path / 'run', '--system', 'fathometer'
+    assert main([*map(str, run), '--set', 'particles=500']) == 0
+    capsys.readouterr()
+    assert export(tmp_path, 'n.geojson') == 2
+    assert '--origin' in capsys.readouterr().err
+    where = '--epsg', 32615, '--origin', '850000,1890000'
+    assert export(tmp_path, 'n.geojson', *where) == 0
+    for one in json.loads((tmp_path / 'n.geojson').read_text())['features']:
+        longitude, latitude, _ = one['geometry']['coordinates']
+        assert -91.65 < longitude < -91.63 and latitude == pytest.approx(17.13, abs=1e-5)

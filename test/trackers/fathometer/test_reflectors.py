@@ -24,7 +24,13 @@ from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.reflectors import Reflectors, sediment_depths
+from sonar_imm.trackers.fathometer.reflectors import (
+    Reflectors,
+    relative_amplitude,
+    sediment_depths,
+)
+from sonar_imm.trackers.fathometer.response import Response
+from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 
@@ -102,3 +108,31 @@ def test_times_and_the_bottom_in_the_estimate():
 def test_without_an_array_depth_there_is_no_two_way_time():
     _, found = run(layers([47.0], [20.0], reference_depth=None), particles=500)
     assert all(np.isnan(one.extras['two_way_time']).all() for one in found.values())
+
+
+@pytest.mark.parametrize('column', ['amplitude', 'sigma'])
+def test_traces_beyond_numbers_are_refused(column):
+    """Squares of such values would make covariances infinite."""
+    depth = np.arange(10.0, 40.0, 0.1)
+    values = {'amplitude': np.sin(3.0 * depth), 'sigma': np.full(len(depth), 0.1)}
+    values[column] = 1e160 * np.abs(values[column])
+    tracker = FathometerTracker(FathometerConfig(particles=50))
+    assert tracker.process(Trace(stamp_ns=1, depth=depth, **values)) == []
+    assert tracker.counts['out_of_range'] == 1
+    values[column] = values[column] * 1e-62
+    (estimate,) = tracker.process(Trace(stamp_ns=2, depth=depth, **values))
+    seen = np.isfinite(estimate.state[:, 0])
+    assert np.isfinite(estimate.covariance[seen]).all()
+
+
+def test_where_the_window_leaves_nothing_amplitudes_are_not_relative():
+    config = FathometerConfig(window='rectangular', sound_speed=1500.0)
+    where = np.array([20.0, 80.0])
+    nothing = np.zeros((2, 2, 2))
+    found = Reflectors(where, np.ones(2), nothing, np.ones(2), np.ones(2))
+    grid = np.arange(0.0, 100.0, 1.0)
+    # In a snapshot of 0.1 s sound goes to 75 m and back.
+    response = Response(1, 'a', grid, grid, grid, 0.0, aperture=3.0, snapshot_seconds=0.1)
+    relative = relative_amplitude(found, response, config)
+    assert relative[0] == pytest.approx((2.0 * 20.0 + 3.0) / (1.0 - 40.0 / 150.0))
+    assert np.isnan(relative[1])
