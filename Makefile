@@ -29,6 +29,8 @@ endif
 
 # What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
 TESTS ?=
+# Where the parts of `make reliability` go.
+RELIABILITY ?= $(abspath $(VENV))/reliability
 # Hostile messages of `make fuzz` for each system.
 CASES ?= 100000
 FUZZ_JSON ?=
@@ -42,7 +44,7 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-bounds test-system fuzz lint generate docs docs-numbers bench clean
+.PHONY: help venv demo test test-core test-bounds test-system fuzz reliability lint generate docs docs-numbers bench clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
@@ -79,6 +81,13 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 
 test-system: venv ## run the tests that start real nodes, one at a time
 	$(TEST_ENV) $(BIN)/python -m pytest -m system
+
+reliability: venv ## every fault, signal, flood, day at sea and hostile message; hours (RELIABILITY=folder of the parts)
+	-SONAR_IMM_FIGURES=$(RELIABILITY) $(TEST_ENV) $(BIN)/python -m pytest -m system test/system/faults
+	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --out $(RELIABILITY)/soak.json
+	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --live --hours 1 --out $(RELIABILITY)/soak_live.json
+	-$(MAKE) fuzz FUZZ_JSON=$(RELIABILITY)/hostile.json
+	$(BIN)/python -m benchmarks.reliability $(RELIABILITY)
 
 lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff check .

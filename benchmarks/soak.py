@@ -106,7 +106,7 @@ def offline(system: str, hours: float) -> dict[str, float]:
         if k % max(1, total // SAMPLES) == 0:
             memory.append((k / total * hours, _resident_mb('self')))
     counted = sum(tracker.counts[name] for name in ('used', 'duplicate', 'too_late', 'doubted'))
-    return _summary(memory, times, total, counted if system != 'bathymetry' else total)
+    return summary(memory, times, total, counted if system != 'bathymetry' else total)
 
 
 def live(system: str, hours: float) -> dict[str, float]:
@@ -141,13 +141,14 @@ def live(system: str, hours: float) -> dict[str, float]:
             step.step(publishers[topic], message)
             if k % max(1, total // SAMPLES) == 0:
                 memory.append((k / total * hours, _resident_mb(node.process.pid)))
-        told = _summary(memory, np.array(step.delays), total, step.counts.messages)
+        told = summary(memory, np.array(step.delays), total, step.counts.messages)
         return told | {'exit_code': float(node.stop())}
 
 
-def _summary(
+def summary(
     memory: list[tuple[float, float]], times: np.ndarray, sent: int, counted: int
 ) -> dict[str, float]:
+    """What is told of a run. memory: readings (hours, MB); times: s per message."""
     hours, mb = np.array(memory)[len(memory) // 10 :].T
     slope, _, low, high = theilslopes(mb, hours)
     tenth = max(1, len(times) // 10)
@@ -155,6 +156,7 @@ def _summary(
         'messages': float(sent),
         'uncounted': float(sent - counted),
         'memory_mb': float(mb[-1]),
+        'grown_mb': float(mb[-1] - mb[len(mb) // 2]),
         'slope_mb_per_h': float(slope),
         'slope_low': float(low),
         'slope_high': float(high),

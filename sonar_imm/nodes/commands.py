@@ -30,4 +30,4 @@ def main() -> int:
     stopper.listen()
     one_blas_thread()  # before the node's module imports numpy
     name = Path(sys.argv[0]).stem.removesuffix('_node')
-    return int(import_module(f'{__package__}.{name}').main())
+    return stopper.end(int(import_module(f'{__package__}.{name}').main()))

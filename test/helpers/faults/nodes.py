@@ -36,7 +36,7 @@ from sonar_imm.nodes.qos import lockstep_qos
 
 from .cases import CASES
 
-END_LIMIT = 15.0
+END_LIMIT = 30.0
 """Seconds a node may take to end."""
 
 
@@ -118,11 +118,21 @@ def reason_unclean(node: NodeProcess, expected: int) -> list[tuple[str, str]]:
     try:
         code = node.process.wait(END_LIMIT)
     except subprocess.TimeoutExpired:
-        return [(node.system, f'it did not end within {END_LIMIT:g} s')]
+        told = f'it did not end within {END_LIMIT:g} s: {_doing(node.process.pid)}, {node.log()}'
+        return [(node.system, told[-1000:])]
     if code != expected:
         return [(node.system, f'exit code {code}: {node.log()[-500:]}')]
     words = [word for word in ('Traceback', 'Error', 'terminate called') if word in node.log()]
     return [(node.system, f'{words}: {node.log()[-500:]}')] if words else []
+
+
+def _doing(pid: int) -> str:
+    """State and CPU seconds of each thread: whether a process hangs or only gets no processor."""
+    told = []
+    for task in Path(f'/proc/{pid}/task').iterdir():
+        words = (task / 'stat').read_text().rpartition(')')[2].split()
+        told.append(f'{words[0]} {(int(words[11]) + int(words[12])) / 100.0:g} s')
+    return ', '.join(told)
 
 
 def heeds_signals(process: subprocess.Popen[bytes]) -> bool:

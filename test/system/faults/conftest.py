@@ -21,6 +21,4 @@ import pytest
 @pytest.fixture(scope='module')
 def figures(request):
     """The rows of the file of this module, e.g. those of ``test_signals.py``."""
-    rows = Figures(request.module.__name__.rpartition('test_')[2])
-    yield rows
-    rows.write()
+    return Figures(request.module.__name__.rpartition('test_')[2])
