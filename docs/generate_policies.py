@@ -24,6 +24,7 @@ from collections.abc import Iterator
 import contextlib
 from importlib import import_module
 from pathlib import Path
+import time
 from typing import Any
 
 import rclpy
@@ -114,6 +115,7 @@ def main() -> None:
     FOLDER.mkdir(exist_ok=True)
     for name in NODES:
         with started(name) as node:
+            time.sleep(2.0)  # the graph hears of a node's own endpoints a little later
             text = policy(name, used_by(node))
         (FOLDER / f'{name}.xml').write_text(text, encoding='utf-8')
         print(f'config/sros2/{name}.xml')
