@@ -30,7 +30,6 @@ LIBRARY = {
     'sonar_imm.acoustics.multistatic.crlb': 'what a geometry of receivers can attain',
     'sonar_imm.acoustics.multistatic.difference_measurement': 'a tag, without its emission',
     'sonar_imm.estimation.consistency.innovation_autocorrelation': 'finds unmodelled dynamics',
-    'sonar_imm.estimation.consistency.nis': 'nees, by its name for innovations',
     'sonar_imm.estimation.consistency.rmse': 'accuracy of one target',
     'sonar_imm.estimation.imm.embed': 'model sets of unequal size',
     'sonar_imm.estimation.kalman.update': 'one Kalman filter, without models',

@@ -34,6 +34,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from attrs import frozen
 import numpy as np
 
 from .arrays import FloatArray, IntArray
@@ -81,6 +82,75 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
     tail = 0.5 * (1.0 - probability)
     low, high = chi2.ppf(tail, count * dimension), chi2.ppf(1.0 - tail, count * dimension)
     return float(low) / count, float(high) / count
+
+
+NIS_MEMORY = 50.0
+"""Innovations over which `NisMemory` gathers and forgets."""
+_LEAST = 0.75 * NIS_MEMORY
+_FARTHEST = 9.0
+"""More, for each degree of freedom, is a sharp turn or another's echo, and says nothing of noise:
+it counts as so much."""
+_SIGMAS = 5.0
+"""A false alarm is so rare then that what the models cannot know (a target that turns as none of
+them does, echoes that are not Gaussian) has room."""
+
+
+@frozen
+class NisMemory:
+    """Normalised innovations squared of the last hits, older ones forgotten: a value, for filters
+    whose state is one.
+
+    nis, dof: their weighted sums; square: of the degrees of freedom, with squared weights; count:
+    of the weights.
+    """
+
+    nis: float = 0.0
+    dof: float = 0.0
+    square: float = 0.0
+    count: float = 0.0
+
+    def after(self, nis: FloatArray, dof: FloatArray | int) -> NisMemory:
+        """With the hits nis (K,) of dof (K,) degrees of freedom."""
+        keep, now = 1.0 - 1.0 / NIS_MEMORY, self
+        for value, m in zip(nis.tolist(), np.broadcast_to(dof, nis.shape).tolist()):
+            now = NisMemory(
+                keep * now.nis + min(value, _FARTHEST * m),
+                keep * now.dof + m,
+                keep * keep * now.square + m,
+                keep * now.count + 1.0,
+            )
+        return now
+
+    @property
+    def mean(self) -> float:
+        """For each degree of freedom, 1 where all is well; NaN without a hit."""
+        return self.nis / self.dof if self.dof else math.nan
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """What the mean of a consistent filter stays between: a weighted sum of chi-squares, as
+        the chi-square of the same variance, by the cube root of Wilson and Hilferty."""
+        if self.count < _LEAST:
+            return 0.0, math.inf
+        spread = 2.0 * self.square / (9.0 * self.dof**2)
+        away = _SIGMAS * math.sqrt(spread)
+        return max(0.0, 1.0 - spread - away) ** 3, (1.0 - spread + away) ** 3
+
+    @property
+    def verdict(self) -> int:
+        """1: innovations are larger than stated; -1: smaller; 0: no evidence of either."""
+        low, high = self.bounds
+        return int(self.mean > high) - int(self.mean < low)
+
+    def warnings(self, what: str, advice: str) -> list[str]:
+        """A sentence where `what` states covariances that cannot be true."""
+        if not self.verdict:
+            return []
+        more = 'more' if self.verdict > 0 else 'less'
+        return [
+            f'what the sensor states cannot be true: {what} miss by {more} than stated, mean NIS '
+            f'{self.mean:.2g} for each coordinate, 1 is due; {advice}'
+        ]
 
 
 def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> float:

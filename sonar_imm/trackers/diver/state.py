@@ -27,6 +27,7 @@ from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import Tracks
+from ...estimation.consistency import NisMemory
 from .fix_consistency import FixConsistency
 from .instruments import Instruments
 from .model_set import ModelSet, Motion
@@ -53,12 +54,13 @@ class DiverState:
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
     track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
     for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    white (T, 2): whitened innovation of the last fix, NaN for none; fixes: what innovations say of
-    the stated covariances; existence (T,): probability that there is a diver, NaN where hits are
-    counted instead; evidence (T,): sum of the probabilities of its detections; target_id (T,):
-    whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older track it is
-    near, 0 for none, and for how many scans (`soft`, `names`); said: names and when each was said
-    last, ns; broken: tracks ended so far because their numbers were not finite; not_started:
+    white (T, 2): whitened innovation of the last fix, NaN for none; fixes, arrivals: what
+    innovations say of the stated covariances of either; existence (T,): probability that there
+    is a diver, NaN where hits are counted instead; evidence (T,): sum of the probabilities of its
+    detections; target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for
+    (T,): the older track it is near, 0 for none, and for how many scans (`soft`, `names`);
+    said: names and when each was said last, ns; broken: tracks ended so far because their numbers
+    were not finite; not_started:
     starts so far for which there was no room; repairs: covariances repaired so far
     (`estimation.covariance`).
     """
@@ -80,6 +82,7 @@ class DiverState:
     near_for: IntArray
     white: FloatArray
     fixes: FixConsistency
+    arrivals: NisMemory = NisMemory()
     broken: int = 0
     not_started: int = 0
     repairs: int = 0

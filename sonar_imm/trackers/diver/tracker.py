@@ -145,6 +145,7 @@ class DiverTracker:
             'not_started': now.not_started,
             'fixes_mean_nis': now.fixes.mean_nis,
             'fixes_lag_1': now.fixes.lag_1,
+            'arrivals_mean_nis': now.arrivals.mean,
             'waiting_for_vessel': len(self._placer),
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
@@ -152,8 +153,10 @@ class DiverTracker:
 
     def warnings(self) -> list[str]:
         """What of the input cannot be true or used, in sentences for the user."""
-        lasting = self._stream.state.fixes.warnings(self.config.fix_bias_std > 0.0)
-        return self._placer.warnings() + lasting + no_room(self._stream.state, self.config)
+        state, advice = self._stream.state, 'check var_toa, var_bearing and toa_std'
+        lasting = state.fixes.warnings(self.config.fix_bias_std > 0.0)
+        heard = state.arrivals.warnings('arrivals', advice)
+        return [*self._placer.warnings(), *lasting, *heard, *no_room(state, self.config)]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -207,7 +210,12 @@ class DiverTracker:
             taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
             births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
         said = names_said(groups, pings)
-        now = self._prune(remembered(scan.learn(), before, said, self.config.max_coast), items)
+        learnt = scan.learn()
+        if pings and not groups:
+            sure = (learnt.nis_dof > 0) & (learnt.life.status != TENTATIVE)
+            heard = before.arrivals.after(learnt.nis[sure], learnt.nis_dof[sure])
+            learnt = evolve(learnt, arrivals=heard)
+        now = self._prune(remembered(learnt, before, said, self.config.max_coast), items)
         now = merged(now, before, groups, self.config, self.models.E[:, :2])
         now = self._spawn(now, births, scan.layout)
         for start in starts_of(items):

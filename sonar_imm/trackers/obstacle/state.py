@@ -22,6 +22,7 @@ import numpy as np
 
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks
+from ...estimation.consistency import NisMemory
 from ...measurements import Altitude, Detections
 from ..navigation import NavigationBuffer
 from .bodies import Bodies
@@ -68,7 +69,7 @@ class ObstacleState:
     the pings this step completed; waiting: pings without a pose yet, each with the altitude then;
     skipped: pings so far for which navigation had a gap; missing: pings so far that were given up
     because too many waited; broken: tracks ended so far because their numbers were not finite;
-    alike: pings so far in which most obstacles moved alike."""
+    alike: pings so far in which most obstacles moved alike; innovations: of confirmed ones."""
 
     last: PingState | None = None
     done: tuple[PingState, ...] = ()
@@ -79,3 +80,12 @@ class ObstacleState:
     missing: int = 0
     broken: int = 0
     alike: int = 0
+    innovations: NisMemory = NisMemory()
+
+
+def identities(state: ObstacleState) -> ObstacleState:
+    """What outlives a restarted clock: the identities that are used up."""
+    if state.last is None:
+        return ObstacleState()
+    nobody = np.zeros(len(state.last.life), bool)
+    return ObstacleState(last=evolve(state.last, stamp_ns=0).only(nobody))

@@ -57,7 +57,7 @@ from .config import ObstacleConfig
 from .filters import Mixture, Sonar
 from .intensity import by_intensity, level_db, Strengths
 from .navigation import Mount
-from .state import ObstacleState, PingState
+from .state import identities, ObstacleState, PingState
 
 __all__ = ['ObstacleConfig', 'ObstacleState', 'ObstacleTracker']
 
@@ -100,7 +100,7 @@ class ObstacleTracker:
             StreamRules.of(self.config),
             step=self._step,
             initial=ObstacleState(),
-            survivor=_identities,
+            survivor=identities,
         )
         self.counts = self._stream.counts
 
@@ -133,6 +133,7 @@ class ObstacleTracker:
             'tracks': len(status),
             'confirmed': int((status != TrackStatus.TENTATIVE).sum()),
             'nis_mean': float(nis.mean() / 2.0) if len(nis) else float('nan'),
+            'nis_memory': state.innovations.mean,
             'pings_waiting': len(state.waiting),
             'pings_skipped': state.skipped,
             'navigation_missing': state.missing,
@@ -141,6 +142,11 @@ class ObstacleTracker:
             'pings_moving_alike': state.alike,
             'covariance_repairs': state.last.repairs if state.last else 0,
         }
+
+    def warnings(self) -> list[str]:
+        """What the sonar states and cannot be true, in a sentence for the user."""
+        advice = 'check range_std, bearing_std_deg and the variances of the detections'
+        return self._stream.state.innovations.warnings('detections', advice)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         revised = self._stream.revise(measurement)
@@ -164,7 +170,7 @@ class ObstacleTracker:
         given_up = max(0, len(waiting) - MOST_WAITING)
         del waiting[:given_up]
         last, done, skipped, broken = before.last, [], before.skipped, before.broken
-        alike = before.alike
+        alike, innovations = before.alike, before.innovations
         while waiting:
             ready = self._readiness(buffer, waiting[0][0])
             if ready == 'wait':
@@ -176,6 +182,8 @@ class ObstacleTracker:
             last, lost = self._ping(last, ping, self._sonar(buffer, ping, height))
             broken += lost
             alike += last.alike
+            sure = np.isfinite(last.nis) & (last.life.status != TrackStatus.TENTATIVE)
+            innovations = innovations.after(last.nis[sure], 2)
             done.append(last)
         oldest = waiting[0][0].stamp_ns if waiting else stamp_ns
         return ObstacleState(
@@ -188,6 +196,7 @@ class ObstacleTracker:
             missing=before.missing + given_up,
             broken=broken,
             alike=alike,
+            innovations=innovations,
         )
 
     def _readiness(self, buffer: NavigationBuffer, ping: Detections) -> str:
@@ -385,11 +394,3 @@ class ObstacleTracker:
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,
         )
-
-
-def _identities(state: ObstacleState) -> ObstacleState:
-    """What outlives a restarted clock: the identities that are used up."""
-    if state.last is None:
-        return ObstacleState()
-    nobody = np.zeros(len(state.last.life), bool)
-    return ObstacleState(last=evolve(state.last, stamp_ns=0).only(nobody))

@@ -1,0 +1,121 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How often trackers warn that the sensor's word cannot be true: of true words, and of false ones.
+
+    python -m benchmarks.false_warnings --runs 60
+
+The scene of every shipped recording is simulated anew with other seeds, and tracked with true
+standard deviations, with twice those, and with half. Told are the warnings raised in an hour of
+sensor time (through the hysteresis of diagnostics, one message being one period) and the share
+of the runs in which there was one.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from attrs import evolve
+import yaml
+
+from sonar_imm.cli.common import load_config
+from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, Trace
+from sonar_imm.nodes.health import Finding, Hysteresis, WARN
+from sonar_imm.recordings.own_parameters import own_parameters
+from sonar_imm.trackers import SYSTEMS
+
+FIRST_SEED = 1000
+SCALED = {
+    Arrivals: ('var_toa', 'var_bearing'),
+    Detections: ('var_range', 'var_bearing'),
+    Fix: ('covariance',),
+    Snapshot: ('noise_variance',),
+    Trace: ('sigma',),
+}
+"""What a measurement states of its noise; variances, but for `sigma`."""
+STATED = {'obstacle': ('range_std', 'range_step', 'bearing_std_deg', 'bearing_step_deg')}
+"""Parameters that state noise where the measurements of the scenes do not."""
+
+
+def misstated(measurement: Any, factor: float) -> Any:
+    """The measurement, which states `factor` times its standard deviations."""
+    changes = {}
+    for name in SCALED.get(type(measurement), ()):
+        value = getattr(measurement, name)
+        if value is not None:
+            changes[name] = value * (factor if name == 'sigma' else factor**2)
+    return evolve(measurement, **changes) if changes else measurement
+
+
+def scene_of(bag: Path) -> tuple[str, str, dict[str, Any]]:
+    """The system, the scenario and its changed values, of a recording we simulated."""
+    text = (bag / 'metadata.yaml').read_text(encoding='utf-8')
+    notes = yaml.safe_load(text)['rosbag2_bagfile_information']['custom_data']
+    system, name = notes['source'].removeprefix('simulated: ').split()
+    told = {k[4:]: yaml.safe_load(f'[{v}]') for k, v in notes.items() if k.startswith('set ')}
+    scenes = import_module(SYSTEMS[system].scenes)
+    specs = {spec.name: spec.kind for spec in type(scenes.scenario(name, {})).specs()}
+    lists = {key for key, kind in specs.items() if kind.endswith('[]')}
+    return system, name, {k: tuple(v) if k in lists else v[0] for k, v in told.items()}
+
+
+def runs(bag: Path, factor: float, count: int) -> Iterator[tuple[float, int]]:
+    """Hours and warnings of each run."""
+    system, name, changes = scene_of(bag)
+    scenes = import_module(SYSTEMS[system].scenes)
+    config = load_config(SYSTEMS[system], own_parameters(bag), {})[0]
+    stated = {name: factor * getattr(config, name) for name in STATED.get(system, ())}
+    tracker = SYSTEMS[system].build(evolve(config, **stated))
+    for seed in range(FIRST_SEED, FIRST_SEED + count):
+        scene = scenes.simulate(scenes.scenario(name, changes), seed)
+        items = sorted(scene.measurements, key=lambda one: one.received_ns)
+        tracker.reset()
+        hysteresis, raised, active = Hysteresis(), 0, set()
+        for one in items:
+            tracker.process(misstated(one.measurement, factor))
+            said = getattr(tracker, 'warnings', list)()
+            found = hysteresis.settle([Finding(text[:20], WARN, text) for text in said])
+            raised += len({one.key for one in found} - active)
+            active = {one.key for one in found}
+        stamps = [one.measurement.stamp_ns for one in items]
+        yield (max(stamps) - min(stamps)) / 3.6e12, raised
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--runs', type=int, default=60)
+    parser.add_argument('--bags', nargs='*', default=[])
+    told = parser.parse_args()
+    print('| scene of | stated / true | hours | warnings per hour | runs with one |')
+    print('|---|---|---|---|---|')
+    for bag in sorted(Path('bags').iterdir()):
+        if not bag.is_dir() or (told.bags and bag.name not in told.bags):
+            continue
+        for factor in (1.0, 2.0, 0.5):
+            found = list(runs(bag, factor, told.runs))
+            hours, raised = sum(one for one, _ in found), sum(one for _, one in found)
+            share = sum(one > 0 for _, one in found) / len(found)
+            print(
+                f'| `{bag.name}` | {factor:g} | {hours:.2f} | {raised / hours:.2g} '
+                f'| {share:.0%} |',
+                flush=True,
+            )
+
+
+if __name__ == '__main__':
+    main()
