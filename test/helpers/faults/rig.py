@@ -50,6 +50,8 @@ from .closeness import agrees
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
 """Counts of what was not lost."""
+_REPORTS = 12
+"""Reports of /diagnostics in a disturbed part, a third or more of which is the fault."""
 
 
 @frozen
@@ -228,14 +230,21 @@ class Rig:
 
     # -- a whole run -----------------------------------------------------------------------------
 
-    def play(self, steps: Iterable[Step]) -> list[Estimate]:
-        """Send messages and do actions; gives the estimates that were published meanwhile."""
+    def play(self, steps: Sequence[Step], reports: int = 0) -> list[Estimate]:
+        """Send messages and do actions; gives the estimates that were published meanwhile.
+
+        reports: how many of /diagnostics are waited for on the way: a level rises when a finding
+        is there in two periods, and lock-step may be done in less.
+        """
         start = len(self.recorder)
-        for step in steps:
+        every = len(steps) // reports + 1 if reports else len(steps) + 1
+        for number, step in enumerate(steps, start=1):
             if isinstance(step, Action):
                 step.run(self)
             else:
                 self.send(step)
+            if number % every == 0:
+                self.fresh_diagnostics()
         return self.recorder.estimates(start)
 
     def undisturbed(self) -> dict[int, Estimate]:
@@ -252,7 +261,7 @@ class Rig:
         messages = self.lockstep.counts.messages
         self.diagnostics.forget()
         disturbed, rest = disturb(*self.case.thirds())
-        self.play(disturbed)
+        self.play(disturbed, reports=_REPORTS)
         self.fresh_diagnostics()
         found = first_words(self.play(rest))
         self.fresh_diagnostics()

@@ -147,7 +147,7 @@ FAULTS = (
         disturb=lambda case: streams.each(streams.columns(bearing=57.29578)),
         counted=['refused: out_of_range'],
         level='WARN',
-        says='bearings are in radians',
+        says='out_of_range',
         systems=['obstacle'],
     ),
     Fault(
@@ -155,7 +155,7 @@ FAULTS = (
         disturb=lambda case: streams.each(streams.columns(range=1000.0)),
         counted=['refused: out_of_range'],
         level='WARN',
-        says='ranges are in metres|snapshot reaches from',
+        says='out_of_range',
         systems=['obstacle', 'bathymetry'],
     ),
     Fault(
@@ -163,7 +163,7 @@ FAULTS = (
         disturb=lambda case: streams.each(streams.columns(sound_speed=3.28084)),
         counted=['refused: out_of_range'],
         level='WARN',
-        says='sound_speed of 4921',
+        says='out_of_range',
         systems=['bathymetry'],
     ),
     Fault(
@@ -179,7 +179,7 @@ FAULTS = (
         disturb=lambda case: streams.each(streams.columns(depth=1000.0)),
         counted=['refused: out_of_range'],
         level='WARN',
-        says='possible',
+        says='out_of_range',
         systems=['fathometer'],
     ),
     Fault(

@@ -61,7 +61,7 @@ def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
     """Moments over the two seconds in which modules load and kernels get warm. What came before
     the first line of ours is the interpreter's."""
     rng = np.random.default_rng(17 + SYSTEMS.index(system))
-    moments, early, unclean = count(5, 20), 0, []
+    moments, early, unclean = count(3, 20), 0, []
     for turn in rng.permutation(moments):
         with (
             reserved_domain_id() as domain,
