@@ -177,9 +177,9 @@ def test_scans_are_heard_and_an_empty_one_is_a_missed_detection(make_bench):
     bench = make_bench()
     node = bench.add(DiverNode(context=bench.context))
     estimates = bench.listen(PointCloud2, '/diver/estimate')
-    publisher = bench.peer.create_publisher(PointCloud2, '/fixes', 20)
+    publisher = bench.peer.create_publisher(PointCloud2, '/fixes', lockstep_qos())
     bench.spin_until(
-        lambda: publisher.get_subscription_count() and node.count_subscribers('/diver/estimate')
+        lambda: publisher.get_subscription_count() and node._estimates.get_subscription_count()
     )
     for second in range(1, 8):
         places = [[0.5 * second, 0.0, 0.0]] if second < 7 else np.empty((0, 3))

@@ -29,8 +29,8 @@ def test_messages_come_at_once_and_events_within_their_period(make_bench):
     node = rclpy.node.Node('hearer', context=bench.context, use_global_arguments=False)
     bench.nodes.append(node)
     endpoints, heard, ticks = Endpoints(node), [], []
-    endpoints.subscribe(Empty, 'good', heard.append, output_qos())
-    endpoints.subscribe(Empty, 'bad', heard.append, lockstep_qos())
+    endpoints.subscribe(Empty, 'good', lambda message, info: heard.append(message), output_qos())
+    endpoints.subscribe(Empty, 'bad', lambda message, info: heard.append(message), lockstep_qos())
     node.create_timer(0.05, lambda: ticks.append(time.monotonic()))
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     bench.peer.create_publisher(Empty, 'bad', best_effort)

@@ -93,6 +93,6 @@ def test_every_answer_has_its_counts_and_its_stamp():
     ):
         answers.say(counts, when)
         message = paper.message
-        assert message.data == array.array('B', np.array([*counts.values()], '<u4').tobytes())
+        assert message.data == array.array('B', np.array([*counts.values()], '<f8').tobytes())
         assert [field.name for field in message.fields] == ['a', 'b']
         assert message.header.stamp == (type(stamp)() if when is None else when)

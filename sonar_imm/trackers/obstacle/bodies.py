@@ -96,9 +96,9 @@ def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> Vi
     scale = scale_std**2
     covariance, place_covariance = view.covariance.copy(), view.place_covariance.copy()
     reach = view.state * [1.0, 0.0, 1.0]
-    covariance += scale * reach[:, :, None] * reach[:, None, :]
+    covariance += scale * (reach[:, :, None] * reach[:, None, :])
     away = view.place - sonar.pose.position
-    place_covariance += scale * away[:, :, None] * away[:, None, :]
+    place_covariance += scale * (away[:, :, None] * away[:, None, :])
     if bodies.count.any():
         centre = CENTRE * np.square(bodies.std)
         covariance[:, 0, 0] += centre[:, 0]
@@ -109,6 +109,6 @@ def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> Vi
             (level[:, ::-1] * [-1.0, 1.0], centre[:, 1]),
         ):
             place_covariance[:, :2, :2] += (
-                variance[:, None, None] * axis[:, :, None] * axis[:, None, :]
+                variance[:, None, None] * (axis[:, :, None] * axis[:, None, :])
             )
     return view._replace(covariance=covariance, place_covariance=place_covariance)
