@@ -108,7 +108,7 @@ def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> Vi
             (level, centre[:, 0]),
             (level[:, ::-1] * [-1.0, 1.0], centre[:, 1]),
         ):
-            place_covariance[:, :2, :2] += (
-                variance[:, None, None] * (axis[:, :, None] * axis[:, None, :])
+            place_covariance[:, :2, :2] += variance[:, None, None] * (
+                axis[:, :, None] * axis[:, None, :]
             )
     return view._replace(covariance=covariance, place_covariance=place_covariance)

@@ -172,8 +172,6 @@ def _check_nothing_lost(tracker, kept, estimates):
 
 def _at(message, stamp_ns):
     """The message, its stamp moved; what is below is shared, since a mutation copies it."""
-    if not hasattr(message, 'header'):
-        return message  # transforms, each with a stamp of its own
     stamp = message.header.stamp
     stamp.sec, stamp.nanosec = divmod(stamp_ns, 10**9)
     return message

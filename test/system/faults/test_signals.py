@@ -33,8 +33,7 @@ SYSTEMS = tuple(CASES)
 
 @pytest.fixture(autouse=True)
 def _heeded():
-    """A run in the background of a script ignores SIGINT, or SIGHUP under nohup, and what it starts
-    would too."""
+    """A run in the background of a script ignores SIGINT, under nohup SIGHUP; so would nodes."""
     ignored = [number for number in ASKING if signal.getsignal(number) is signal.SIG_IGN]
     for number in ignored:
         signal.signal(number, signal.SIG_DFL)
