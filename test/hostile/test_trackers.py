@@ -65,7 +65,11 @@ def test_no_parameter_breaks_a_tracker(system):
 def test_every_type_of_every_input_is_tried(system):
     tried = {(name, type_name) for name, type_name, _ in templates(system)}
     entries = (*inputs_of(system), *made_inputs(system))
-    assert tried == {(entry.name, type_name) for entry in entries for type_name in entry.readers}
+    known = {(entry.name, type_name) for entry in entries for type_name in entry.readers}
+    # A list of transforms has no stamp to move; a single one is tried.
+    assert tried == {
+        (name, type_name) for name, type_name in known if 'TFMessage' not in type_name
+    }
     for variant in range(len(VARIANTS[system])):
         tally = Tally()
         run(system, (variant, []), tally)
