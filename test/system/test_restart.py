@@ -87,12 +87,19 @@ def test_a_diver_node_that_is_killed_goes_on_with_ids_and_covariances(tmp_path, 
     tracker = system.build(config)
     whole = final_estimates([e for one in fixes() for e in tracker.process(one)], config)
     messages = [write_fix(one, make) for one in fixes()]
-    with reserved_domain_id() as domain, Link('restart', domain_id=domain) as link:
-        with NodeProcess('diver', domain_id=domain, arguments=told) as node:
+    # A link of its own for each life: the first one takes the dead node for alive for a while.
+    with reserved_domain_id() as domain:
+        with (
+            Link('before', domain_id=domain) as link,
+            NodeProcess('diver', domain_id=domain, arguments=told) as node,
+        ):
             play(link, messages[:KILLED_AFTER], state.exists)
             os.kill(node.process.pid, signal.SIGKILL)
             node.process.wait(10.0)
-        with NodeProcess('diver', domain_id=domain, arguments=told) as node:
+        with (
+            Link('after', domain_id=domain) as link,
+            NodeProcess('diver', domain_id=domain, arguments=told) as node,
+        ):
             live = play(link, messages[KILLED_AFTER - SENT_AGAIN :])
             assert node.stop() == 0
             assert 'goes on from the state' in node.log()

@@ -31,17 +31,6 @@ ASKING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SYSTEMS = tuple(CASES)
 
 
-@pytest.fixture(autouse=True)
-def _heeded():
-    """A run in the background of a script ignores SIGINT, under nohup SIGHUP; so would nodes."""
-    ignored = [number for number in ASKING if signal.getsignal(number) is signal.SIG_IGN]
-    for number in ignored:
-        signal.signal(number, signal.SIG_DFL)
-    yield
-    for number in ignored:
-        signal.signal(number, signal.SIG_IGN)
-
-
 @pytest.mark.parametrize('how', [*ASKING, signal.SIGKILL], ids=lambda how: how.name)
 def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figures):
     """All four nodes at once, each while it works on a burst of messages."""

@@ -1,0 +1,31 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Real processes heed signals, whatever started the tests."""
+
+import signal
+
+import pytest
+
+
+@pytest.fixture(autouse=True, scope='session')
+def _signals_are_heeded():
+    """A run in the background of a script ignores SIGINT, under nohup SIGHUP; so would nodes."""
+    asking = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM)
+    ignored = [number for number in asking if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.SIG_DFL)
+    yield
+    for number in ignored:
+        signal.signal(number, signal.SIG_IGN)
