@@ -30,7 +30,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 
 from .headers import Make, make_header, make_pose
-from .markers import ADD, lifetime
+from .markers import make_marker
 
 NAMES = ('place', 'course', 'label')
 """Namespaces of the markers of one diver."""
@@ -74,23 +74,8 @@ def _diver(estimate: Estimate, row: int, make: Make) -> list[Any]:
     wide, long = (max(2.0 * _NINETY * math.sqrt(max(v, 0.0)), _LEAST) for v in variance)
 
     def marker(name: str, kind: int, size: tuple[float, float, float], **more: Any) -> Any:
-        colour = _COASTING if coasts else _SEEN
-        return make(
-            'visualization_msgs/msg/Marker',
-            header=make_header(estimate.stamp_ns, estimate.frame_id, make),
-            ns=name,
-            id=track_id,
-            type=kind,
-            action=ADD,
-            scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', size))),
-            color=make(
-                'std_msgs/msg/ColorRGBA',
-                **dict(zip('rgb', colour)),
-                a=0.3 if name == 'place' else 1.0,
-            ),
-            lifetime=lifetime(make),
-            **more,
-        )
+        colour = (*(_COASTING if coasts else _SEEN), 0.3 if name == 'place' else 1.0)
+        return make_marker(estimate, row, make, name, kind, size, colour, **more)
 
     ends = [(x, y, z), (x + AHEAD * vx, y + AHEAD * vy, z)]
     points = [make('geometry_msgs/msg/Point', **dict(zip('xyz', end))) for end in ends]

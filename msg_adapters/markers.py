@@ -12,23 +12,49 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What markers of tracks have in common: how long they last, and how they are taken away."""
+"""What markers of tracks have in common: how one is made, and how they are taken away."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
 
+from sonar_imm.estimates import Estimate
+
 from .headers import Make, make_header
 
-ADD, _DELETE, _DELETE_ALL = 0, 2, 3
+_ADD, _DELETE, _DELETE_ALL = 0, 2, 3
 LIFETIME = 5
 """Seconds after which a marker vanishes when nothing is published any more."""
 
 
-def lifetime(make: Make) -> Any:
-    """`LIFETIME` as a message."""
-    return make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0)
+def make_marker(
+    estimate: Estimate,
+    row: int,
+    make: Make,
+    name: str,
+    kind: int,
+    size: tuple[float, float, float],
+    colour_rgba: tuple[float, ...],
+    **more: Any,
+) -> Any:
+    """Make one marker of the track in `row`.
+
+    name: its namespace; kind: a type of visualization_msgs/Marker; size: metres along its axes;
+    colour_rgba: 0 to 1; more: the fields that only this kind has, and the pose.
+    """
+    return make(
+        'visualization_msgs/msg/Marker',
+        header=make_header(estimate.stamp_ns, estimate.frame_id, make),
+        ns=name,
+        id=int(estimate.extras['track_id'][row]),
+        type=kind,
+        action=_ADD,
+        scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', size))),
+        color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour_rgba))),
+        lifetime=make('builtin_interfaces/msg/Duration', sec=LIFETIME, nanosec=0),
+        **more,
+    )
 
 
 def write_ended(frame_id: str, track_ids: Iterable[int], names: Iterable[str], make: Make) -> Any:

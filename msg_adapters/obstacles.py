@@ -31,7 +31,7 @@ import numpy as np
 from sonar_imm.estimates import Estimate
 
 from .headers import Make, make_header, make_pose
-from .markers import ADD, lifetime
+from .markers import make_marker
 
 NAMES = ('band', 'obstacle', 'label')
 """Namespaces of the markers of one obstacle."""
@@ -94,19 +94,8 @@ def _obstacle(estimate: Estimate, row: int, make: Make) -> list[Any]:
         colour: tuple[float, float, float] = colour,
         **more: Any,
     ) -> Any:
-        return make(
-            'visualization_msgs/msg/Marker',
-            header=make_header(estimate.stamp_ns, estimate.frame_id, make),
-            ns=name,
-            id=track_id,
-            type=kind,
-            action=ADD,
-            pose=_pose(make, x, y, height),
-            scale=make('geometry_msgs/msg/Vector3', x=size[0], y=size[1], z=size[2]),
-            color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgb', colour)), a=alpha),
-            lifetime=lifetime(make),
-            **more,
-        )
+        more['pose'] = _pose(make, x, y, height)
+        return make_marker(estimate, row, make, name, kind, size, (*colour, alpha), **more)
 
     return [
         marker('band', _CUBE, 0.5 * (bottom + top), (0.4, 0.4, max(top - bottom, 0.05)), 0.5),
