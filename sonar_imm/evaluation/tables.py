@@ -89,6 +89,7 @@ class ParquetTable:
         self._notes = dict(notes or {})
         self._writer: Any = None
         self._held: list[dict[str, np.ndarray]] = []
+        self._rows_held = 0
         self._types: dict[str, np.dtype] = {}
 
     def __enter__(self) -> ParquetTable:
@@ -111,7 +112,8 @@ class ParquetTable:
         elif list(self._types) != list(found):
             raise ValueError('the columns change from one estimate to another')
         self._held.append(found)
-        if sum(len(one['stamp_ns']) for one in self._held) >= ROWS_IN_A_GROUP:
+        self._rows_held += rows
+        if self._rows_held >= ROWS_IN_A_GROUP:
             self._write_group()
 
     def _write_group(self) -> None:
@@ -127,5 +129,5 @@ class ParquetTable:
             np.concatenate([one[name] for one in self._held]).astype(dtype, copy=False)
             for name, dtype in types.items()
         ]
-        self._held = []
+        self._held, self._rows_held = [], 0
         self._writer.write_table(arrow.table(columns, schema=self._writer.schema))
