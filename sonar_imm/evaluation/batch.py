@@ -26,10 +26,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from .. import __version__
-from ..files import whole
 from ..parameters import Config, ConfigError
 from ..recordings.reader import BagError, BagReader
 from ..trackers import SYSTEMS
@@ -184,9 +183,7 @@ def _seen(outcome: Outcome) -> Outcome:
         f'a worker wrote {outcome.folder}, which is not to be seen here: the folder has to lie '
         'where all machines reach it'
     )
-    return Outcome(
-        bag=outcome.bag, folder=outcome.folder, instrument=outcome.instrument, failure=sentence
-    )
+    return evolve(outcome, state=FAILED, run=None, failure=sentence)
 
 
 # -- what is told of them ------------------------------------------------------------------------
@@ -227,9 +224,7 @@ def _entry(out: Path, outcome: Outcome) -> dict[str, Any]:
 
 def write_summary(out: Path, content: Mapping[str, Any]) -> None:
     """Write summary.json."""
-    with whole(out / SUMMARY) as unfinished:
-        text = json.dumps(finite(dict(content)), indent=2) + '\n'
-        unfinished.write_text(text, encoding='utf-8')
+    RunFolder(out).write_json(SUMMARY, dict(content))
 
 
 def run_folders(out: Path) -> list[Path]:

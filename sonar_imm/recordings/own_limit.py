@@ -26,6 +26,7 @@ from pathlib import Path
 
 import yaml
 
+from ..files import whole
 from .sources import BagError
 
 NAME = 'check.yaml'
@@ -54,4 +55,6 @@ def own_limit(bag: Path) -> float | None:
 
 def write_own_limit(bag: Path, limit: float) -> None:
     """Write the limit into the folder of a recording."""
-    (bag / NAME).write_text(_HEAD + yaml.safe_dump({'limit': limit}), encoding='utf-8')
+    with whole(bag / NAME) as unfinished:
+        text = _HEAD + yaml.safe_dump({'limit': limit})
+        unfinished.write_text(text, encoding='utf-8')
