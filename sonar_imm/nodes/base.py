@@ -64,7 +64,7 @@ from .executor import MessagesFirst
 from .keeping import StateKeeper
 from .messages import make, message_class
 from .parameters import NodeParameters
-from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos
+from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos, transforms_qos
 from .stopping import START_PATIENCE, stopper
 from .tables import TablePublisher
 
@@ -81,7 +81,7 @@ class TrackerNode(Node):
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
         super().__init__(system, **options)
-        self._system = system
+        self._system, self._full_name = system, self.get_fully_qualified_name().lstrip('/')
         self._topics = inputs_of(system)
         config_type = SYSTEMS[system].config_type()
         self._node_config_type = node_config_type(SYSTEMS[system])
@@ -119,9 +119,10 @@ class TrackerNode(Node):
             ),
             post_callback=self._on_clock_back,
         )
-        name = self.get_fully_qualified_name().lstrip('/')
         required, one_of = needed(self._topics, told)
-        self._reporter = Reporter(name, hears, self._meter, required=required, one_of=one_of)
+        self._reporter = Reporter(
+            self._full_name, hears, self._meter, required=required, one_of=one_of
+        )
         self.create_timer(
             self._node_config.diagnostics_period,
             self._report,
@@ -178,7 +179,7 @@ class TrackerNode(Node):
         self._answers = Answers(
             self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
         )
-        self._announcer = Announcer(self._endpoints, self.get_fully_qualified_name().lstrip('/'))
+        self._announcer = Announcer(self._endpoints, self._full_name)
         self._drawing = Drawing(self._system, self.advertise)
         self.advertise_more()
 
@@ -196,7 +197,7 @@ class TrackerNode(Node):
             message_class(type_name),
             topic.prefix + name,
             functools.partial(self._receive, evolve(topic, name=name), reader),
-            latched_qos(1000) if topic.latched else input_qos(self._node_config.queue_depth),
+            transforms_qos() if topic.latched else input_qos(self._node_config.queue_depth),
         )
         return subscription.topic_name
 

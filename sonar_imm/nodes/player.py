@@ -37,12 +37,11 @@ from .chain import Chain
 from .link import Link, MATCH_LIMIT
 from .lockstep import LockStep, only_node
 from .messages import make, message_class
-from .qos import latched_qos, lockstep_qos, output_qos
+from .qos import lockstep_qos, output_qos, transforms_qos
 
 NAME = 'sonar_imm_player'
 _FIRST_LISTENER, _OTHER_LISTENERS = 5.0, 0.5
 _DEPTH = 100
-_LATCHED = 1000
 _NANO = 10**9
 
 
@@ -114,7 +113,7 @@ def play(
 
 def _kept(name: str, qos: QoSProfile) -> QoSProfile:
     """`qos`, for ``/tf_static`` with all messages kept for listeners that come later."""
-    return latched_qos(_LATCHED) if name.rpartition('/')[2] == 'tf_static' else qos
+    return transforms_qos() if name.rpartition('/')[2] == 'tf_static' else qos
 
 
 class Player:

@@ -78,6 +78,11 @@ def latched_qos(depth: int = 1) -> QoSProfile:
     )
 
 
+def transforms_qos() -> QoSProfile:
+    """What tf2 offers and asks for on /tf_static: all that was ever said is kept."""
+    return latched_qos(1000)
+
+
 def lockstep_qos() -> QoSProfile:
     """Reliable, nothing dropped: keep-last would lose most of a fast burst without a word."""
     return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_ALL)

@@ -24,12 +24,13 @@ from collections.abc import Callable, Collection
 import time
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from ..recordings.messages import message_definition
 from .link import Link
 from .messages import message_class
+from .qos import input_qos, latched_qos, output_qos
 
 LOOK = 1.0
 """Seconds between two looks at the graph."""
@@ -127,18 +128,10 @@ class Relay:
         def all_are(field: str, policy: Any) -> bool:
             return bool(offered) and all(getattr(one, field) == policy for one in offered)
 
-        reliable = all_are('reliability', ReliabilityPolicy.RELIABLE)
-        latched = all_are('durability', DurabilityPolicy.TRANSIENT_LOCAL)
-        return QoSProfile(
-            history=HistoryPolicy.KEEP_LAST,
-            depth=_DEPTH,
-            reliability=(
-                ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-            ),
-            durability=(
-                DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-            ),
-        )
+        if not all_are('reliability', ReliabilityPolicy.RELIABLE):
+            return input_qos(_DEPTH)
+        kept = all_are('durability', DurabilityPolicy.TRANSIENT_LOCAL)
+        return latched_qos(_DEPTH) if kept else output_qos(_DEPTH)
 
     def _drop(self, name: str) -> None:
         subscription = self._subscriptions.pop(name, None)
