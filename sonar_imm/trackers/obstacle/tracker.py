@@ -46,7 +46,14 @@ from ...estimation.association import (
     Tracks,
     TrackStatus,
 )
-from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
+from ...measurements import (
+    Altitude,
+    Detections,
+    Frames,
+    Measurement,
+    nanoseconds,
+    Navigation,
+)
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
 from ..stream import ReplayStream, StreamRules
@@ -103,6 +110,10 @@ class ObstacleTracker:
             survivor=identities,
         )
         self.counts = self._stream.counts
+
+    @property
+    def frames(self) -> Frames:
+        return Frames(self._stream.frames, self._stream.accepts)
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
