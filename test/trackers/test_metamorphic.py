@@ -27,6 +27,9 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from msg_adapters.estimates import read_estimate, write_estimate
+from msg_adapters.obstacles import write_markers, write_poses
+from msg_adapters.soundings import read_soundings, write_soundings
 from sonar_imm.measurements import (
     Arrivals,
     Detections,
@@ -36,6 +39,8 @@ from sonar_imm.measurements import (
     Snapshot,
     Trace,
 )
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers import SYSTEMS
 
 SECOND = 10**9
@@ -293,14 +298,45 @@ def same_floor(plain, moved, motion, tolerance, place):
 
 @pytest.mark.parametrize('name', MOTIONS)
 def test_the_sea_floor(name):
-    """What lies to port of a mirrored ship is what lay to starboard. The place is published as
-    float32, a quarter of a metre coarse at a northing of 4e6; the height is not."""
+    """What lies to port of a mirrored ship is what lay to starboard."""
     motion = MOTIONS[name]
     plain = run('bathymetry', pings(Motion()), **SWATH)
     side = 'port' if motion.sign < 0.0 else 'starboard'
     moved = run('bathymetry', pings(motion, side), **{**SWATH, 'side': side})
-    place = 0.3 if motion.shift.any() else 1e-4
-    same_floor(plain, moved, motion, 0.0 if name == 'later' else 1e-6, place)
+    same_floor(plain, moved, motion, 0.0 if name == 'later' else 1e-6, 1e-6)
+
+
+@pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
+def test_places_keep_millimetres_in_messages_and_displays(system):
+    """x y z are drawn, and a quarter of a metre coarse at a northing of 4e6; the rest is not."""
+    scene = obstacles if system == 'obstacle' else pings
+    parameters = {} if system == 'obstacle' else SWATH
+    motion = MOTIONS['moved to UTM']
+    plain = run(system, scene(Motion()), **parameters)[-1]
+    moved = run(system, scene(motion), **parameters)[-1]
+    read = read_estimate(write_estimate(moved, ros_message))
+    wanted = motion.point(plain.xyz)
+    assert np.abs(read.columns()['y'] - wanted[:, 1]).max() > 0.01
+    np.testing.assert_allclose(read.xyz, wanted, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        np.column_stack([read.columns()[name] for name in ('px', 'py', 'pz')]),
+        wanted,
+        rtol=0,
+        atol=1e-4,
+    )
+    if system == 'obstacle':
+        poses = write_poses(read, range(len(read)), ros_message).poses
+        drawn = [[one.position.x, one.position.y, one.position.z] for one in poses]
+        np.testing.assert_allclose(drawn, wanted, rtol=0, atol=1e-4)
+        first = write_markers(read, [0], ros_message).markers[1].pose.position
+        assert abs(first.y - wanted[0, 1]) < 1e-4
+        return
+    sounded = read_soundings(write_soundings(soundings_of(read), ros_message))
+    kept = sounded.columns
+    assert len(sounded) > 10
+    for name, axis in zip(('px', 'py', 'pz'), range(3)):
+        gap = np.abs(kept[name][:, None] - wanted[None, :, axis]).min(axis=1)
+        assert gap.max() < 1e-4, name
 
 
 # -- reflectors -----------------------------------------------------------------------------------

@@ -353,7 +353,7 @@ class DiverTracker:
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._stream.frame_id,
-            xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
+            xyz=np.column_stack([mean[:, :2], depth]),
             state_names=self.models.outputs,
             state=mean,
             covariance=covariance,

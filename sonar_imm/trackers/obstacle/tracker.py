@@ -36,7 +36,7 @@ from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
-from ...estimates import Estimate
+from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import (
@@ -390,6 +390,7 @@ class ObstacleTracker:
             'vertical_offset_lo': view.low,
             'vertical_offset_hi': view.high,
             'nis': ping.nis,
+            **places(place),
         }
         for i, a in enumerate('xyz'):
             for j, b in enumerate('xyz'[i:], start=i):
