@@ -86,6 +86,7 @@ reliability: venv ## every fault, signal, flood, day at sea and hostile message;
 	-SONAR_IMM_FIGURES=$(RELIABILITY) $(TEST_ENV) $(BIN)/python -m pytest -m system test/system/faults
 	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --out $(RELIABILITY)/soak.json
 	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --live --hours 1 --out $(RELIABILITY)/soak_live.json
+	-SONAR_IMM_FIGURES=$(RELIABILITY) $(TEST_ENV) $(BIN)/python -m pytest -n 0 test/trackers/test_metamorphic.py
 	-$(MAKE) fuzz FUZZ_JSON=$(RELIABILITY)/hostile.json
 	$(BIN)/python -m benchmarks.reliability $(RELIABILITY)
 

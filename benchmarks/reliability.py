@@ -19,8 +19,9 @@
     python -m benchmarks.reliability --check   whether the page says what the file says
 
 A part is a JSON file that a long form wrote: faults, signals, damage and flood by
-`test/system/faults`, soak and soak_live by `benchmarks.soak`, hostile by `make fuzz`. A part that
-is not in FOLDER stays as it was. Ends with 1 when something fell short.
+`test/system/faults`, soak and soak_live by `benchmarks.soak`, hostile by `make fuzz`, metamorphic
+by `test/trackers/test_metamorphic.py`. A part that is not in FOLDER stays as it was. Ends with 1
+when something fell short.
 """
 
 from __future__ import annotations
@@ -39,7 +40,16 @@ from sonar_imm.trackers import SYSTEMS
 ROOT = Path(__file__).resolve().parents[1]
 RESULT = ROOT / 'docs' / 'results' / 'reliability.json'
 PAGE = ROOT / 'docs' / 'reliability.md'
-PARTS = ('faults', 'signals', 'damage', 'flood', 'soak', 'soak_live', 'hostile')
+PARTS = (
+    'faults',
+    'signals',
+    'damage',
+    'flood',
+    'soak',
+    'soak_live',
+    'hostile',
+    'metamorphic',
+)
 FLAT = 1.0
 """MB per hour: memory that grows faster is no longer called flat."""
 SLOWER = 2.0
@@ -142,6 +152,16 @@ def hostile(part: Mapping[str, Mapping[str, Any]]) -> Rows:
     return rows
 
 
+def metamorphic(part: Sequence[Mapping[str, Any]]) -> Rows:
+    """A row per system, variant and transformation: the tolerance, and the worst differences."""
+    kinds = ('places', 'states', 'covariances', 'probabilities')
+    rows = [['system', 'with', 'scene', 'tolerance', *kinds]]
+    for row in sorted(part, key=lambda one: (one['system'], one['how'])):
+        worst = ['' if (gap := row.get(kind)) is None else f'{gap:.1g}' for kind in kinds]
+        rows.append([row['system'], row['how'], row['moved'], f'{row["tolerance"]:g}', *worst])
+    return rows
+
+
 TABLES: dict[str, Callable[[Part], Rows]] = {
     'faults': faults,
     'signals': signals,
@@ -150,6 +170,7 @@ TABLES: dict[str, Callable[[Part], Rows]] = {
     'soak': soak,
     'soak_live': soak,
     'hostile': hostile,
+    'metamorphic': metamorphic,
 }
 
 
