@@ -15,11 +15,12 @@
 """When a stated covariance of fixes cannot be true, and what innovations cannot tell.
 
 Innovations of a filter with true covariances have a mean NIS of their number of coordinates (2)
-and are white; one beyond three sigmas for each coordinate is a sharp turn and counts as that. Larger: the covariances are optimistic, and may be scaled up. Smaller, or correlated
-from fix to fix: the source filters its output, so that its errors last, or its covariances are
-pessimistic. These two look the same. And a source that states only the white part of errors that
-last looks perfect: from one sensor, a bias slower than the motion is not in the innovations. So a
-covariance is never scaled down on this evidence; `warnings` says what the user has to state.
+and are white; one beyond three sigmas for each coordinate is a sharp turn and counts as that.
+Larger: the covariances are optimistic, and may be scaled up. Smaller, or correlated from fix to
+fix: the source filters its output, so that its errors last, or its covariances are pessimistic.
+These two look the same. And a source that states only the white part of errors that last looks
+perfect: from one sensor, a bias slower than the motion is not in the innovations. So a covariance
+is never scaled down on this evidence; `warnings` says what the user has to state.
 """
 
 from __future__ import annotations
