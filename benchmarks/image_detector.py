@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_imm.acoustics.cfar import quiet_level, tail_factor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, SonarImage
 from sonar_imm.simulation.obstacle.images import ImageSonar
@@ -99,6 +100,26 @@ def false_alarms(
                 counts.setdefault(name, []).append(len(detect(picture, detector)))
         for name, each in counts.items():
             table.setdefault(name, {})[floor] = float(np.mean(each))
+    return table
+
+
+def price(images: int) -> dict[str, float]:
+    """By how many dB the threshold lies above what Rayleigh noise asks for, at the median of the
+    ranges that show the sea floor."""
+    rules, config, table = DetectorConfig().rules(), scene(), {}
+    onset = config.altitude / np.sin(np.radians(0.5 * config.vertical_fov_deg))
+    for floor, (shape, patch) in FLOORS.items():
+        factor = []
+        for number in range(images):
+            rng = np.random.default_rng([SCORED_ON, number])
+            sonar = ImageSonar(scene(seabed_shape=shape, seabed_patch=patch), rng)
+            power = np.square(image(sonar, []).amplitude)
+            *_, rough = quiet_level(
+                power, beams=rules.beams, training=rules.training, guard=rules.guard
+            )
+            rough = rough[sonar.range > onset]
+            factor.append(np.median(tail_factor(rough, rules.false_alarm)))
+        table[floor] = float(10.0 * np.log10(rules.margin * np.mean(factor)))
     return table
 
 
@@ -239,6 +260,7 @@ def main() -> None:
         'margins': false_alarms(given.images, margins, CHOSEN_ON),
         'false detections per image': false_alarms(given.images, DETECTORS, SCORED_ON),
         'study, false': STUDY_FALSE,
+        'threshold above Rayleigh, dB': price(6),
         'found': found(given.runs),
         'study, found': STUDY_FOUND,
         'snr_db': LEVELS,
