@@ -59,6 +59,10 @@ BILLION = 10**9 * SECOND
 FIGURES = Figures('metamorphic')
 
 
+def note(system, how, moved, tolerance, told):
+    note(system, how, moved, tolerance, told)
+
+
 # -- divers ---------------------------------------------------------------------------------------
 
 
@@ -71,7 +75,7 @@ def test_divers(name, association):
     assert max(len(one) for one in plain) == 2
     tolerance = 0.0 if name == 'later' else 1e-5
     told = same_divers(plain, moved, motion, tolerance)
-    FIGURES.add(system='diver', how=association, moved=name, tolerance=tolerance, **told)
+    note('diver', association, name, tolerance, told)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +88,7 @@ def test_divers(name, association):
 def test_divers_and_receivers_in_another_order(name, other):
     plain, moved = run('diver', divers(Motion())), run('diver', divers(Motion(), **other))
     told = same_divers(plain, moved, Motion(), 1e-6)
-    FIGURES.add(system='diver', how='gnn', moved=name, tolerance=1e-6, **told)
+    note('diver', 'gnn', name, 1e-6, told)
 
 
 # -- obstacles ------------------------------------------------------------------------------------
@@ -103,7 +107,7 @@ def test_obstacles(name, behaviours):
     tolerance = 0.0 if name == 'later' else tolerance
     told = same_obstacles(plain, moved, motion, tolerance)
     how = 'fixed ones' if behaviours == ['fixed'] else 'all behaviours'
-    FIGURES.add(system='obstacle', how=how, moved=name, tolerance=tolerance, **told)
+    note('obstacle', how, name, tolerance, told)
 
 
 def test_obstacles_in_another_order():
@@ -111,7 +115,7 @@ def test_obstacles_in_another_order():
     moved = run('obstacle', obstacles(Motion(), order=(1, 0)))
     told = same_obstacles(plain, moved, Motion(), 1e-6)
     name = 'echoes in another order'
-    FIGURES.add(system='obstacle', how='all behaviours', moved=name, tolerance=1e-6, **told)
+    note('obstacle', 'all behaviours', name, 1e-6, told)
 
 
 # -- the sea floor --------------------------------------------------------------------------------
@@ -129,7 +133,7 @@ def test_the_sea_floor(name):
     moved = run('bathymetry', pings(motion, side), **{**SWATH, 'side': side})
     tolerance = 0.0 if name == 'later' else 1e-6
     told = same_floor(plain, moved, motion, tolerance, 1e-6)
-    FIGURES.add(system='bathymetry', how='grid', moved=name, tolerance=tolerance, **told)
+    note('bathymetry', 'grid', name, tolerance, told)
 
 
 @pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
@@ -185,9 +189,7 @@ def test_reflectors_twice_as_loud():
         scale = np.outer([1, 1024], [1, 1024])
         agree(told, 'covariances', other.covariance, one.covariance * scale, 0.0)
         agree(told, 'probabilities', other.probabilities, one.probabilities, 0.0)
-    FIGURES.add(
-        system='fathometer', how='particles', moved='1024 times as loud', tolerance=0.0, **told
-    )
+    note('fathometer', 'particles', '1024 times as loud', 0.0, told)
 
 
 def test_reflectors_deeper():
@@ -198,7 +200,7 @@ def test_reflectors_deeper():
         std = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
         agree(told, 'states', (other.state - one.state - [100.0, 0.0]) / std, 0.0 * std, 0.1)
         agree(told, 'probabilities', other.probabilities, one.probabilities, 0.02)
-    FIGURES.add(system='fathometer', how='particles', moved='100 m deeper', tolerance=0.1, **told)
+    note('fathometer', 'particles', '100 m deeper', 0.1, told)
 
 
 def test_reflectors_at_another_time():
@@ -212,7 +214,7 @@ def test_reflectors_at_another_time():
         std = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
         agree(told, 'states', (other.state - one.state) / std, 0.0 * std, 1.0)
     agree(told, 'probabilities', later[-1].probabilities, plain[-1].probabilities, 0.2)
-    FIGURES.add(system='fathometer', how='particles', moved='later', tolerance=1.0, **told)
+    note('fathometer', 'particles', 'later', 1.0, told)
 
 
 # -- a billion seconds ----------------------------------------------------------------------------
@@ -236,7 +238,7 @@ def test_a_billion_seconds_later_every_bit_is_the_same():
             for kind, name in (names | {'probabilities': 'probabilities'}).items():
                 agree(told, kind, getattr(other, name), getattr(one, name), 0.0)
         name = 'later by 1e9 s'
-        FIGURES.add(system=system, how='defaults', moved=name, tolerance=0.0, **told)
+        note(system, 'defaults', name, 0.0, told)
 
 
 def test_single_fixes_far_from_the_origin_keep_their_digits():
