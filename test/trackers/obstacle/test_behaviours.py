@@ -14,6 +14,8 @@
 
 """What obstacles do, through the whole tracker: clutter, several at once, drift, settings."""
 
+from types import SimpleNamespace
+
 from attrs import evolve
 from helpers.obstacle_runs import track_scene
 import numpy as np
@@ -22,6 +24,7 @@ import pytest
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.behaviours import behaviour_columns
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
@@ -140,3 +143,21 @@ def test_the_order_of_the_behaviours_does_not_matter():
         assert list(a.columns()) == list(b.columns())
         for name, values in a.columns().items():
             assert np.array_equal(values, b.columns()[name], equal_nan=True)
+
+
+def test_north_and_east_become_y_and_x():
+    view = SimpleNamespace(
+        behaviour=np.array([[0.7, 0.3]]),
+        velocity=np.array([[1.0, -2.0]]),
+        velocity_covariance=np.array([[[4.0, 0.5], [0.5, 9.0]]]),
+    )
+    columns = behaviour_columns(view, ('fixed', 'moving'))
+    assert {name: float(value[0]) for name, value in columns.items()} == {
+        'prob_fixed': 0.7,
+        'prob_moving': 0.3,
+        'vx': -2.0,
+        'vy': 1.0,
+        'vel_cov_x_x': 9.0,
+        'vel_cov_x_y': 0.5,
+        'vel_cov_y_y': 4.0,
+    }
