@@ -56,6 +56,7 @@ PROGRAMS: dict[str, tuple[str, ...]] = {
     'flood': (*_TEST, 'test/system/faults/test_flood.py'),
     'soak': (*_SOAK, '--out', '{}/soak.json'),
     'soak_live': (*_SOAK, '--live', '--hours', '1', '--out', '{}/soak_live.json'),
+    'metamorphic': ('-m', 'pytest', '-n', '0', 'test/trackers/test_metamorphic.py'),
     'hostile': ('-m', 'helpers.hostile', '--cases', CASES, '--json', '{}/hostile.json'),
 }
 """What makes each part, for Python; {} is the folder."""
@@ -172,6 +173,16 @@ def hostile(part: Mapping[str, Mapping[str, Any]]) -> Rows:
     return rows
 
 
+def metamorphic(part: Sequence[Mapping[str, Any]]) -> Rows:
+    """A row per system, variant and transformation: the tolerance, and the worst differences."""
+    kinds = ('places', 'states', 'covariances', 'probabilities')
+    rows = [['system', 'with', 'scene', 'tolerance', *kinds]]
+    for row in sorted(part, key=lambda one: (one['system'], one['how'])):
+        worst = ['' if (gap := row.get(kind)) is None else f'{gap:.1g}' for kind in kinds]
+        rows.append([row['system'], row['how'], row['moved'], f'{row["tolerance"]:g}', *worst])
+    return rows
+
+
 TABLES: dict[str, Callable[[Part], Rows]] = {
     'faults': faults,
     'signals': signals,
@@ -181,6 +192,7 @@ TABLES: dict[str, Callable[[Part], Rows]] = {
     'soak': soak,
     'soak_live': soak,
     'hostile': hostile,
+    'metamorphic': metamorphic,
 }
 
 
@@ -237,6 +249,11 @@ def _short_hostile(row: Mapping[str, Any], system: str) -> list[str]:
     return [f'hostile, {system}: something got through'] if failed else []
 
 
+def _short_metamorphic(row: Mapping[str, Any], _: str) -> list[str]:
+    said = f'{row["system"]}, {row["how"]}, {row["moved"]}: the states differ by {row["states"]:g}'
+    return [said] if row['states'] > row['tolerance'] else []
+
+
 SHORT: dict[str, Callable[[Any, str], list[str]]] = {
     'faults': _short_fault,
     'signals': _short_signal,
@@ -245,6 +262,7 @@ SHORT: dict[str, Callable[[Any, str], list[str]]] = {
     'flood': _short_flood,
     'soak': _short_soak,
     'soak_live': _short_soak,
+    'metamorphic': _short_metamorphic,
     'hostile': _short_hostile,
 }
 """What is wrong with a row of each part, in sentences."""
@@ -290,7 +308,7 @@ def _merged(old: Part, new: Part) -> Part:
 
 def _key(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a row is about."""
-    return tuple(row.get(name) for name in ('system', 'fault', 'signal', 'what'))
+    return tuple(row.get(name) for name in ('system', 'fault', 'signal', 'what', 'how', 'moved'))
 
 
 def take_in(folder: Path, parts: dict[str, Part]) -> None:

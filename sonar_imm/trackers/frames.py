@@ -51,6 +51,8 @@ class FrameDoor:
     """
 
     def __init__(self, tracker: Any, guard: FrameGuard):
+        """guard: the frame that was told, and those of what the tracker uses whatever its stamp.
+        Of everything else the tracker says what it used, since what is refused must not decide."""
         self._tracker = tracker
         self._guard = guard
         self._tree = FrameTree()
@@ -71,6 +73,11 @@ class FrameDoor:
             )
         measurement = self._turned(measurement)
         self._guard.check(measurement)
+        known = self._tracker.frames
+        if isinstance(measurement, known.kinds):
+            known.guard.check(measurement)
+        else:
+            self._guard.settle(measurement)
         return measurement
 
     def reconfigure(self, config: Config) -> None:
@@ -78,7 +85,8 @@ class FrameDoor:
         self._tracker.reconfigure(evolve(config, **(self.mounting or {})))
 
     def _turned(self, measurement: Any) -> Any:
-        target, source = self._guard.frame_id, measurement.frame_id
+        target = self._guard.frame_id or self._tracker.frames.guard.frame_id
+        source = measurement.frame_id
         placed = frame_role(measurement) == 'world' or isinstance(measurement, VesselPose)
         if not (target and placed) or source in ('', target):
             return measurement

@@ -53,6 +53,15 @@ GOOD = {
         }
     },
     'soak_live': {},
+    'metamorphic': [
+        {
+            'system': 'diver',
+            'how': 'gnn',
+            'moved': 'later',
+            'tolerance': 1e-6,
+            'states': 1e-9,
+        }
+    ],
     'hostile': {},
 }
 
@@ -88,6 +97,7 @@ def test_what_is_good_falls_short_of_nothing():
         ('restart', 0, {'equal': 69}),
         ('damage', 0, {'silent': 1}),
         ('damage', 0, {'failed': 1}),
+        ('metamorphic', 0, {'states': 2e-6}),
         ('soak', 'diver', {'slope_low': 1.5}),
         ('soak', 'diver', {'p99_last_ms': 2.5}),
         ('soak', 'diver', {'uncounted': 1.0}),

@@ -78,7 +78,7 @@ def offline(path, **parameters):
         for heard in measurements_of(reader, 'diver'):
             try:
                 if not isinstance(heard.measurement, Rejection):
-                    guard.check(heard.measurement)
+                    guard.admit(heard.measurement)
                     estimates += tracker.process(heard.measurement)
             except Rejection:
                 pass

@@ -45,7 +45,14 @@ from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_model import banded_transition, gaussian_move, SetModel
-from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from ...measurements import (
+    ArrayDepth,
+    CrossSpectra,
+    Frames,
+    Pressure,
+    Rejection,
+    Trace,
+)
 from ..stream import OnceStream, StreamRules
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
 from .array_response import array_response, rank_deficient
@@ -144,6 +151,10 @@ class FathometerTracker:
         """Build anew what follows from the lattice, after a state was put in."""
         if self._lattice is not None:
             self._begin(self._lattice)
+
+    @property
+    def frames(self) -> Frames:
+        return Frames(self._stream.frames, self._stream.accepts)
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
