@@ -17,7 +17,7 @@
 import time
 
 
-def wait_until_ready(nodes, limit=90.0):
+def wait_until_ready(nodes, limit=300.0):
     """Wait until each NodeProcess says that it hears its inputs; seconds."""
     end = time.monotonic() + limit
     while not all('ready, hears' in node.log() for node in nodes):

@@ -160,7 +160,7 @@ def assert_clean_end(nodes, how):
     for node in nodes:
         node.process.send_signal(how)
     for node in nodes:
-        assert node.process.wait(15.0) == 0, node.log()
+        assert node.process.wait(120.0) == 0, node.log()
         assert 'Traceback' not in node.log()
         assert 'Error' not in node.log()
 
@@ -226,7 +226,7 @@ def test_a_parameter_file_for_another_node_is_named(tmp_path):
         NodeProcess('diver', domain_id=domain, arguments=('--params-file', str(file))) as node,
     ):
         wait_until_ready([node])
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 120.0
         while 'has no effect' not in node.log():
             assert time.monotonic() < end, node.log()
             time.sleep(0.02)

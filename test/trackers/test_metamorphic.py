@@ -60,7 +60,7 @@ FIGURES = Figures('metamorphic')
 
 
 def note(system, how, moved, tolerance, told):
-    note(system, how, moved, tolerance, told)
+    FIGURES.add({'system': system, 'how': how, 'moved': moved}, tolerance=tolerance, **told)
 
 
 # -- divers ---------------------------------------------------------------------------------------
