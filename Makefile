@@ -29,7 +29,8 @@ endif
 
 # What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
 TESTS ?=
-# Where the parts of `make reliability` go.
+# Which parts of `make reliability`, empty for all, and where they go.
+PARTS ?=
 RELIABILITY ?= $(abspath $(VENV))/reliability
 # Hostile messages of `make fuzz` for each system.
 CASES ?= 100000
@@ -82,12 +83,8 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 test-system: venv ## run the tests that start real nodes, one at a time
 	$(TEST_ENV) $(BIN)/python -m pytest -m system
 
-reliability: venv ## every fault, signal, flood, day at sea and hostile message; hours (RELIABILITY=folder of the parts)
-	-SONAR_IMM_FIGURES=$(RELIABILITY) $(TEST_ENV) $(BIN)/python -m pytest -m system test/system/faults
-	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --out $(RELIABILITY)/soak.json
-	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --live --hours 1 --out $(RELIABILITY)/soak_live.json
-	-$(MAKE) fuzz FUZZ_JSON=$(RELIABILITY)/hostile.json
-	$(BIN)/python -m benchmarks.reliability $(RELIABILITY)
+reliability: venv ## hours: all that may go wrong, long form; goes on where it was broken off (PARTS='soak flood' RELIABILITY=folder)
+	CASES=$(CASES) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)
 
 lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff check .

@@ -21,13 +21,14 @@ gives one line on standard error; a traceback is a bug.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
+import functools
 import os
 import signal
 import sys
 import threading
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
@@ -99,7 +100,16 @@ def _leave(number: int, _frame: object) -> NoReturn:
     # A second signal must not interrupt the unwinding.
     for one in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(one, signal.SIG_IGN)
+    sys.unraisablehook = functools.partial(_quiet_on_half_made, sys.unraisablehook)
     raise SystemExit(128 + number)
+
+
+def _quiet_on_half_made(others: Callable[[Any], None], problem: Any) -> None:
+    """Say nothing of objects whose constructor the signal broke off: they miss their attributes
+    when they are taken down."""
+    taken_down = getattr(problem.object, '__name__', '') == '__del__'
+    if not (taken_down and isinstance(problem.exc_value, AttributeError)):
+        others(problem)
 
 
 def _run(arguments: Sequence[str] | None) -> int:

@@ -87,7 +87,7 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
 NIS_MEMORY = 50.0
 """Innovations over which `NisMemory` gathers and forgets."""
 _LEAST = 0.75 * NIS_MEMORY
-_FARTHEST = 9.0
+FARTHEST = 9.0
 """More, for each degree of freedom, is a sharp turn or another's echo, and says nothing of noise:
 it counts as so much."""
 _SIGMAS = 5.0
@@ -114,7 +114,7 @@ class NisMemory:
         keep, now = 1.0 - 1.0 / NIS_MEMORY, self
         for value, m in zip(nis.tolist(), np.broadcast_to(dof, nis.shape).tolist()):
             now = NisMemory(
-                keep * now.nis + min(value, _FARTHEST * m),
+                keep * now.nis + min(value, FARTHEST * m),
                 keep * now.dof + m,
                 keep * keep * now.square + m,
                 keep * now.count + 1.0,

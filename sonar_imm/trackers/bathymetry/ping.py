@@ -31,7 +31,7 @@ import numpy as np
 from ...acoustics import variances
 from ...acoustics.geometry import Pose
 from ...acoustics.rays import profile_of
-from ...estimates import Estimate
+from ...estimates import Estimate, places
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.mode_smoothing import smooth_modes
 from ...measurements import Snapshot
@@ -190,6 +190,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
             'horizontal_uncertainty': horizontal,
             'intensity': intensity(snapshot),
             'beam_angle': swath.beam_angle(floor.angle),
+            **places(floor.xyz),
         }
     elif of_heights and config.sonar_height_std > 0.0:
         # Heights are counted from where the sonar is believed to be: its error is theirs.
@@ -200,7 +201,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     return Estimate(
         stamp_ns=snapshot.stamp_ns,
         frame_id=snapshot.frame_id if posed is None else posed.frame_id,
-        xyz=floor.xyz.astype(np.float32),
+        xyz=floor.xyz,
         state_names=models.state_names,
         state=track.mean,
         covariance=covariance,

@@ -44,7 +44,12 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...measurements import Altitude, Navigation, Snapshot
+from ...measurements import (
+    Altitude,
+    Frames,
+    Navigation,
+    Snapshot,
+)
 from .config import BathymetryConfig
 from .coupling import Alone, Coupling, Favoured
 from .ping import Answer, answer_of, look, LoudBins, Ping, run, track_ping
@@ -75,6 +80,10 @@ class BathymetryTracker:
         self._coupling = Coupling()
         self._health: dict[str, float] = {}
         self._loud: deque[LoudBins] = deque(maxlen=PINGS_JUDGED)
+
+    @property
+    def frames(self) -> Frames:
+        return Frames(self._queue.frames, (Navigation,))
 
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config
