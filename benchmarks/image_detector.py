@@ -20,11 +20,13 @@ Images are those of the simulated sonar (256 beams, 600 ranges), which knows not
 detector. `study` is what an independent prototype reached on images of its own. `margins` are
 false detections by `threshold_margin_db` on images of other seeds than those that are scored: from
 it the margin was chosen, as the smallest whose false detections are not above the study's.
+`--parts` makes some of the tables only.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 import json
 from pathlib import Path
 import time
@@ -32,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.tables import write_json
 from sonar_imm.acoustics.cfar import quiet_level, tail_factor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, SonarImage
@@ -179,7 +182,7 @@ def centroids(runs: int) -> list[dict[str, float]]:
     return rows
 
 
-def five_targets(scenes: int) -> dict[str, Any]:
+def several_targets(scenes: int) -> dict[str, Any]:
     """Points, chains across and along the line of sight and a float over a K sea floor: detections
     of each, and false ones."""
     kinds = (
@@ -248,30 +251,39 @@ def speed(rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('--runs', type=int, default=120, help='images for each SNR')
     parser.add_argument('--images', type=int, default=24, help='images for false alarms')
-    parser.add_argument('--scenes', type=int, default=10, help='scenes of five targets')
+    parser.add_argument('--scenes', type=int, default=20, help='scenes of several targets')
+    margins = {f'{one:g} dB': DetectorConfig(threshold_margin_db=one) for one in MARGINS}
+    parts: dict[str, Callable[[argparse.Namespace], Any]] = {
+        'several targets': lambda given: several_targets(given.scenes),
+        'speed': lambda given: speed(60),
+        'margins': lambda given: false_alarms(given.images, margins, CHOSEN_ON),
+        'false detections per image': lambda given: false_alarms(
+            given.images, DETECTORS, SCORED_ON
+        ),
+        'threshold above Rayleigh, dB': lambda given: price(6),
+        'centroids': lambda given: centroids(given.runs),
+        'found': lambda given: found(given.runs),
+    }
+    parser.add_argument('--parts', nargs='*', choices=list(parts), default=list(parts))
     parser.add_argument('--out', type=Path, help='write the numbers as JSON here')
     given = parser.parse_args()
-    margins = {f'{one:g} dB': DetectorConfig(threshold_margin_db=one) for one in MARGINS}
-    result = {
+    result: dict[str, Any] = {
         'images': given.images,
-        'margins': false_alarms(given.images, margins, CHOSEN_ON),
-        'false detections per image': false_alarms(given.images, DETECTORS, SCORED_ON),
-        'study, false': STUDY_FALSE,
-        'threshold above Rayleigh, dB': price(6),
-        'found': found(given.runs),
-        'study, found': STUDY_FOUND,
+        'runs': given.runs,
         'snr_db': LEVELS,
-        'centroids': centroids(given.runs),
+        'study, false': STUDY_FALSE,
+        'study, found': STUDY_FOUND,
         'study, centroids': STUDY_CENTROID,
-        'five targets': five_targets(given.scenes),
-        'speed': speed(60),
     }
-    print(json.dumps(result, indent=2))
-    if given.out:
-        given.out.write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
+    for name in given.parts:
+        result[name] = parts[name](given)
+        print(json.dumps({name: result[name]}, indent=2), flush=True)
+        write_json(given.out, result)
 
 
 if __name__ == '__main__':

@@ -230,7 +230,8 @@ def _short_damage(row: Mapping[str, Any], _: str) -> list[str]:
 
 def _short_flood(row: Mapping[str, Any], _: str) -> list[str]:
     uncounted = row['sent'] - row['used'] - row['dropped'] - row['lost']
-    late = row['latency_max'] > row['max_wait'] + 1.0 or row['recovered'] > 1.0
+    patience = max(1.0, 6.0 / row['capacity'])
+    late = row['latency_max'] > row['max_wait'] + patience or row['recovered'] > patience
     said = f'flood, {row["system"]}: recovered after {row["recovered"]:.2f} s, {uncounted} lost'
     return [said] if uncounted or late else []
 

@@ -34,5 +34,6 @@ def test_a_flooded_node_answers_soon_counts_what_it_drops_and_recovers(system, f
     assert flood.rate > 5.0 * flood.capacity
     assert flood.sent == flood.used + flood.dropped + flood.lost
     assert flood.dropped + flood.lost > 0.3 * flood.sent and flood.warned
-    assert flood.latency_max < MAX_WAIT + 1.0  # of a loaded machine
-    assert flood.recovered < 1.0
+    patience = max(1.0, 6.0 / flood.capacity)  # a loaded machine is slow with each message
+    assert flood.latency_max < MAX_WAIT + patience
+    assert flood.recovered < patience

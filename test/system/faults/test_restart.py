@@ -69,7 +69,7 @@ def killed(case, arguments, path, messages, at_once, rng):
     with Rig(case, arguments) as rig:
         estimates = rig.play(messages)
         stamp_ns = messages[-round(AGAIN * len(case.messages()))].stamp_ns
-        assert rig.lockstep.wait_for(lambda: saved_after(path, stamp_ns), 60.0)
+        assert rig.wait_for(lambda: saved_after(path, stamp_ns))
         for one in at_once:
             rig.publishers[one.topic].publish(one.content)
         time.sleep(0.1 * rng.random())

@@ -61,8 +61,8 @@ def test_a_signal_at_any_moment_ends_a_busy_node_and_it_starts_again(how, figure
 
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
-    """Moments over the two seconds in which modules load and kernels get warm. What came before
-    the first line of ours is the interpreter's."""
+    """The first moment that is not the interpreter's, and others while modules load and kernels
+    get warm, which takes two seconds."""
     moments, early, unclean = count(3, 20), 0, []
     figures.skip_if_measured(moments, system=system, signal=STARTING)
     rng = np.random.default_rng(17 + SYSTEMS.index(system))
@@ -74,7 +74,7 @@ def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
             while not heeds_signals(node.process):
                 assert node.process.poll() is None
                 time.sleep(0.001)
-            time.sleep(2.0 / moments * (turn + rng.random()))
+            time.sleep(2.0 / moments * (turn + rng.random()) if turn else 0.0)
             early += 'ready, hears' not in node.log()
             node.process.send_signal(ASKING[turn % 3])
             node.process.send_signal(ASKING[turn % 3])  # as launch and a terminal do together

@@ -21,11 +21,13 @@ from helpers.obstacle_runs import track_scene
 import numpy as np
 import pytest
 
+from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate
-from sonar_imm.trackers.obstacle.behaviours import behaviour_columns
+from sonar_imm.trackers.obstacle.behaviours import behaviour_columns, build_filter
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
 
@@ -143,6 +145,19 @@ def test_the_order_of_the_behaviours_does_not_matter():
         assert list(a.columns()) == list(b.columns())
         for name, values in a.columns().items():
             assert np.array_equal(values, b.columns()[name], equal_nan=True)
+
+
+def test_the_depth_of_the_sea_floor_is_that_of_the_first_sight():
+    """Relief: the altitude is that of the floor below the vehicle, wherever the obstacle lies."""
+    filter_ = build_filter(ObstacleConfig())
+    first, later = (
+        Sonar(Pose(np.array([north, 0.0, 20.0]), np.eye(3)), altitude)
+        for north, altitude in ((0.0, 6.0), (1.0, 4.5))
+    )
+    begun = filter_.begin(np.array([[60.0, 0.1]]), np.diag([0.02, 2e-5])[None], first)
+    after, _ = filter_.advance(begun, first, later, 0.5)
+    assert begun.x[0, -1, 2] == pytest.approx(26.0)
+    np.testing.assert_allclose(after.x[..., 2], begun.x[..., 2])
 
 
 def test_north_and_east_become_y_and_x():
