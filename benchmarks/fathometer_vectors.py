@@ -29,7 +29,6 @@ from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.set_filter import SetFilter
 from sonar_imm.estimation.set_model import gaussian_move, SetModel, Sets
-from sonar_imm.estimation.set_particles import weigh
 from sonar_imm.measurements import Pressure
 from sonar_imm.trackers.fathometer.array_response import (
     array_coherence,
@@ -94,7 +93,9 @@ def signed_likelihood(folder: Path) -> dict[str, float]:
         sets = Sets.empty(model, 1)
         sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
         sets.sign[0] = v['sign'][k, :order]
-        found[k] = weigh(model, v['response'][k], sets)[0][0]
+        single = SetFilter(model, 1)
+        # The kernel that weighs sets, without moving them.
+        single._weigh(sets, v['response'][k], found[k : k + 1], single._amplitudes)
     finite = np.isfinite(v['log_likelihood'])
     return {
         'signed_likelihood: error': float(
