@@ -33,6 +33,7 @@ from typing import Any, NoReturn
 import click
 
 from .. import __version__
+from ..texts import visible
 from ..threads import one_blas_thread
 from .lazy import LazyGroup, READER_GONE
 
@@ -176,5 +177,5 @@ def missing_package(name: str) -> str | None:
 
 
 def _complain(sentence: str, status: int = 2) -> int:
-    print(f'{PROGRAM}: {" ".join(sentence.split())}', file=sys.stderr)
+    print(f'{PROGRAM}: {visible(" ".join(sentence.split()))}', file=sys.stderr)
     return status
