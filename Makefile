@@ -19,6 +19,8 @@ DOCS_STAMP := $(VENV)/.installed-docs
 TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
     NUMBA_CACHE_DIR=$(abspath $(VENV))/numba ROS_LOG_DIR=$(abspath $(VENV))/log
 JOBS ?= auto
+# Real nodes wait more than they work, but some of the tests bound their answers in time.
+SYSTEM_JOBS ?= 2
 
 # A kernel type of OpenBLAS to test under, e.g. Prescott, Haswell or SkylakeX; empty: the one that
 # OpenBLAS chooses. `python test/helpers/kernel_types.py` lists those that this processor can run.
@@ -80,8 +82,8 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
-test-system: venv ## run the tests that start real nodes, one at a time
-	$(TEST_ENV) $(BIN)/python -m pytest -m system
+test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
+	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS)
 
 reliability: venv ## hours: all that may go wrong, long form; goes on where it was broken off (PARTS='soak flood' RELIABILITY=folder)
 	CASES=$(CASES) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)

@@ -78,7 +78,7 @@ def sync_folder(path: Path) -> None:
         os.close(handle)
 
 
-def _remove_leftovers(path: Path) -> None:
+def remove_leftovers(path: Path) -> None:
     """Remove what killed processes left of `path`. What a living one is writing is left alone."""
     for place in path.parent.glob(f'{glob.escape(path.name)}{UNFINISHED}*'):
         with contextlib.suppress(OSError):
@@ -95,7 +95,7 @@ def _remove_leftovers(path: Path) -> None:
 def beside(target: Path) -> Iterator[Path]:
     """A new folder beside `target` for what is not finished, removed at the end. It is locked
     while this process lives."""
-    _remove_leftovers(target)
+    remove_leftovers(target)
     while True:
         place = Path(tempfile.mkdtemp(prefix=target.name + UNFINISHED, dir=target.parent))
         try:

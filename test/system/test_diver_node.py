@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 
+from helpers.ready import wait_until_ready
 import numpy as np
 import pytest
 
@@ -153,14 +154,6 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
         lines = [line for line in node.log().splitlines() if not any(w in line for w in own)]
     assert len(lines) == 1
     assert sentence in lines[0]
-
-
-def wait_until_ready(nodes, limit=300.0):
-    end = time.monotonic() + limit
-    while not all('ready, hears' in node.log() for node in nodes):
-        assert all(node.process.poll() is None for node in nodes)
-        assert time.monotonic() < end, [node.log() for node in nodes]
-        time.sleep(0.02)
 
 
 def assert_clean_end(nodes, how):
