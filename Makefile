@@ -19,6 +19,8 @@ DOCS_STAMP := $(VENV)/.installed-docs
 TEST_ENV := ROS_PYTHON_CHECK_FIELDS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
     NUMBA_CACHE_DIR=$(abspath $(VENV))/numba ROS_LOG_DIR=$(abspath $(VENV))/log
 JOBS ?= auto
+# Real nodes wait more than they work, but some of the tests bound their answers in time.
+SYSTEM_JOBS ?= 2
 
 # A kernel type of OpenBLAS to test under, e.g. Prescott, Haswell or SkylakeX; empty: the one that
 # OpenBLAS chooses. `python test/helpers/kernel_types.py` lists those that this processor can run.
@@ -29,7 +31,8 @@ endif
 
 # What to test, e.g. TESTS='test/estimation test/acoustics'; empty: everything.
 TESTS ?=
-# Where the parts of `make reliability` go.
+# Which parts of `make reliability`, empty for all, and where they go.
+PARTS ?=
 RELIABILITY ?= $(abspath $(VENV))/reliability
 # Hostile messages of `make fuzz` for each system.
 CASES ?= 100000
@@ -79,15 +82,11 @@ fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON
 	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \
 	    $(if $(FUZZ_JSON),--json $(abspath $(FUZZ_JSON)))
 
-test-system: venv ## run the tests that start real nodes, one at a time
-	$(TEST_ENV) $(BIN)/python -m pytest -m system
+test-system: venv ## run the tests that start real nodes, two at a time (SYSTEM_JOBS=...)
+	$(TEST_ENV) $(BIN)/python -m pytest -m system -n $(SYSTEM_JOBS)
 
-reliability: venv ## every fault, signal, flood, day at sea and hostile message; hours (RELIABILITY=folder of the parts)
-	-SONAR_IMM_FIGURES=$(RELIABILITY) $(TEST_ENV) $(BIN)/python -m pytest -m system test/system/faults
-	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --out $(RELIABILITY)/soak.json
-	$(TEST_ENV) $(BIN)/python -m benchmarks.soak --live --hours 1 --out $(RELIABILITY)/soak_live.json
-	-$(MAKE) fuzz FUZZ_JSON=$(RELIABILITY)/hostile.json
-	$(BIN)/python -m benchmarks.reliability $(RELIABILITY)
+reliability: venv ## hours: all that may go wrong, long form; goes on where it was broken off (PARTS='soak flood' RELIABILITY=folder)
+	CASES=$(CASES) $(TEST_ENV) $(BIN)/python -m benchmarks.reliability $(RELIABILITY) --run $(PARTS)
 
 lint: venv ## check the style with ruff and the types with mypy
 	$(BIN)/ruff check .

@@ -22,9 +22,15 @@ and the greatest of the four from there on. A record is followed when a reflecto
 of that. Beside it stand two other rules. `edge`: the first of these three samples itself, where
 the echo begins. `older`: the first peak above half of the greatest of its record; below weak
 floors that is another layer, so `rules_agree` says how often it picks the same as the first rule,
-and `older_missed_at_edge` how many of the records it calls lost have a reflector within 1 m of the
-edge. `sounder`: what the instrument itself wrote into the headers as depth of the water, against
-edge and peak (median, m), where it goes with either within 2 m; it is often wrong by far more.
+`older_missed_at_edge` how many of the records it calls lost have a reflector within 1 m of the
+edge, and `older_lost_below_edge` in how many of them its pick lies less than 1 m below the edge,
+up to 2.5 m (the same arrival, a broad one) and more (another layer). `sounder`: what the
+instrument itself wrote into the headers as depth of the water, against edge and peak (median, m),
+where it goes with either within 2 m; it is often wrong by far more.
+
+Crossings are those of the default rows. L3 and L9 cross where the floor is at 4 m, above the
+first sample that is taken (4.5 m), so that this crossing is made once more from the end of the
+transmit pulse on (3.4 m). `between_lines` are the numbers of all horizons that were judged.
 
 The parameters that are not measured (scatter_spread, depth_std, the form of the likelihood) were
 chosen on lines L2 and L9 and on seeds 1 and 2 of the scene; L1 and L3 had no part in that, but the
@@ -44,7 +50,7 @@ from typing import Any
 import numpy as np
 
 from sonar_imm.cli import main as command
-from sonar_imm.evaluation.fathometer.crossing import crossing_metrics
+from sonar_imm.evaluation.fathometer.crossing import crossing_metrics, summary
 from sonar_imm.evaluation.fathometer.records import records_of
 from sonar_imm.evaluation.fathometer.scoring import pair
 from sonar_imm.evaluation.run_folder import RunFolder
@@ -61,6 +67,9 @@ FILES = {
     'L9': 'MET_NS-SN_SBP_L9_SN_20180313161627.seg',
 }
 SPACING, FIRST, SAMPLES, STACK, NEAR, PARTICLES = 0.376, 12, 74, 4, 1.0, 5000
+UNCUT = 9
+"""The first sample after the transmit pulse."""
+FEW = ('--set', f'particles={PARTICLES}')
 WITHOUT = ('--set', 'scatter_decay=[]')
 ROWS = {
     'volume scatter (default)': (),
@@ -87,15 +96,11 @@ def real_lines(folder: Path) -> dict[str, Any]:
     """Every line under every row, and the crossings of the default row."""
     lines: dict[str, Any] = {}
     for line, name in FILES.items():
-        call(
-            *('convert', 'segy', DATA / name, folder / f'{line}.bag', '--sample-spacing', SPACING),
-            *('--first-sample', FIRST, '--samples', SAMPLES, '--stack', STACK),
-        )
+        convert(line, folder / f'{line}.bag', FIRST)
         lines[line] = {}
         for row, extra in ROWS.items():
             out = folder / (line if not extra else 'other')
-            few = ('--set', f'particles={PARTICLES}')
-            call('track', folder / f'{line}.bag', out, '--overwrite', *few, *extra)
+            call('track', folder / f'{line}.bag', out, '--overwrite', *FEW, *extra)
             lines[line][row] = followed(DATA / name, RunFolder(out))
             print(line, row, lines[line][row], flush=True)
     crossings = {}
@@ -103,7 +108,22 @@ def real_lines(folder: Path) -> dict[str, Any]:
         a, b = (RunFolder(folder / line) for line in pair_of)
         crossings[' x '.join(pair_of)] = crossing_metrics(a, b, 3.0)
         print(pair_of, crossings[' x '.join(pair_of)], flush=True)
-    return {'lines': lines, 'crossings': crossings}
+    for line in ('L3', 'L9'):
+        convert(line, folder / f'{line}_uncut.bag', UNCUT)
+        call('track', folder / f'{line}_uncut.bag', folder / f'{line}_uncut', *FEW)
+    a, b = (RunFolder(folder / f'{line}_uncut') for line in ('L3', 'L9'))
+    crossings['L3 x L9, uncut'] = crossing_metrics(a, b, 3.0)
+    horizons = [h for one in crossings.values() for at in one['crossings'] for h in at['horizons']]
+    between = summary([h for h in horizons if h['judged']])
+    print(crossings['L3 x L9, uncut'], between, flush=True)
+    return {'lines': lines, 'crossings': crossings, 'between_lines': between}
+
+
+def convert(line: str, bag: Path, first: int) -> None:
+    call(
+        *('convert', 'segy', DATA / FILES[line], bag, '--sample-spacing', SPACING),
+        *('--first-sample', first, '--samples', FIRST + SAMPLES - first, '--stack', STACK),
+    )
 
 
 def call(*arguments: Any) -> None:
@@ -133,6 +153,7 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         by_old.append((np.abs(columns['depth'] - older) < NEAR).any())
         number.append(np.isfinite(columns['depth']).sum())
     lost = ~np.array(by_old)
+    below = (old - edge)[lost]
     return {
         'records': count,
         'followed': share(hits),
@@ -142,6 +163,7 @@ def followed(path: Path, run: RunFolder) -> dict[str, Any]:
         'followed_edge': share(by_edge),
         'rules_agree': share(np.abs(arrival - old) < NEAR),
         'older_missed_at_edge': share(np.array(by_edge)[lost]) if lost.any() else None,
+        'older_lost_below_edge': [int(n) for n in np.histogram(below, (-99, 1, 2.5, 99))[0]],
         'sounder': sounder(stated, edge, arrival),
         'reflectors': round(float(np.mean(number)), 2),
     }

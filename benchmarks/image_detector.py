@@ -17,12 +17,16 @@
     python -m benchmarks.image_detector --out docs/results/image_detector.json
 
 Images are those of the simulated sonar (256 beams, 600 ranges), which knows nothing of the
-detector. `study` is what an independent prototype reached on images of its own.
+detector. `study` is what an independent prototype reached on images of its own. `margins` are
+false detections by `threshold_margin_db` on images of other seeds than those that are scored, so
+that the margin can be chosen on images it is not scored on.
+`--parts` makes some of the tables only.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 import json
 from pathlib import Path
 import time
@@ -30,6 +34,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.tables import write_json
+from sonar_imm.acoustics.cfar import quiet_level, tail_factor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, SonarImage
 from sonar_imm.simulation.obstacle.images import ImageSonar
@@ -49,6 +55,9 @@ FLOORS = {
     'K 1.5, patches of 5 m': (1.5, 5.0),
 }
 """Shape of the power of patches of the sea floor, and their side in metres."""
+MARGINS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
+CHOSEN_ON, SCORED_ON = 101, 1
+"""Seeds of the images without a target."""
 STUDY_FALSE = {
     'without the margin': {'Rayleigh': 0.1, 'K 4': 1.7, 'K 1.5': 7.3},
     'as it is': {'Rayleigh': 0.0, 'K 4': 0.08, 'K 1.5': 0.2},
@@ -78,16 +87,42 @@ def scene(**values: Any) -> ObstacleScenario:
     return ObstacleScenario(**{'images': True, 'altitude': 6.0, 'depth': DEPTH, **values})
 
 
-def false_alarms(images: int) -> dict[str, dict[str, float]]:
+def false_alarms(
+    images: int, detectors: dict[str, DetectorConfig], seed: int
+) -> dict[str, dict[str, float]]:
     """Detections per image without a target."""
     table: dict[str, dict[str, float]] = {}
     for floor, (shape, patch) in FLOORS.items():
-        config = scene(seabed_shape=shape, seabed_patch=patch)
-        sonar = ImageSonar(config, np.random.default_rng(1))
-        pictures = [image(sonar, []) for _ in range(images)]
-        for name, config in DETECTORS.items():
-            counts = [len(detect(one, config)) for one in pictures]
-            table.setdefault(name, {})[floor] = float(np.mean(counts))
+        counts: dict[str, list[int]] = {}
+        for number in range(images):
+            # The rough spots of the sea floor are others in every image.
+            rng = np.random.default_rng([seed, number])
+            sonar = ImageSonar(scene(seabed_shape=shape, seabed_patch=patch), rng)
+            picture = image(sonar, [])
+            for name, detector in detectors.items():
+                counts.setdefault(name, []).append(len(detect(picture, detector)))
+        for name, each in counts.items():
+            table.setdefault(name, {})[floor] = float(np.mean(each))
+    return table
+
+
+def price(images: int) -> dict[str, float]:
+    """By how many dB the threshold lies above what Rayleigh noise asks for, at the median of the
+    ranges that show the sea floor."""
+    rules, config, table = DetectorConfig().rules(), scene(), {}
+    onset = config.altitude / np.sin(np.radians(0.5 * config.vertical_fov_deg))
+    for floor, (shape, patch) in FLOORS.items():
+        factor = []
+        for number in range(images):
+            rng = np.random.default_rng([SCORED_ON, number])
+            sonar = ImageSonar(scene(seabed_shape=shape, seabed_patch=patch), rng)
+            power = np.square(image(sonar, []).amplitude)
+            *_, rough = quiet_level(
+                power, beams=rules.beams, training=rules.training, guard=rules.guard
+            )
+            rough = rough[sonar.range > onset]
+            factor.append(np.median(tail_factor(rough, rules.false_alarm)))
+        table[floor] = float(10.0 * np.log10(rules.margin * np.mean(factor)))
     return table
 
 
@@ -147,7 +182,7 @@ def centroids(runs: int) -> list[dict[str, float]]:
     return rows
 
 
-def five_targets(scenes: int) -> dict[str, Any]:
+def several_targets(scenes: int) -> dict[str, Any]:
     """Points, chains across and along the line of sight and a float over a K sea floor: detections
     of each, and false ones."""
     kinds = (
@@ -216,26 +251,39 @@ def speed(rounds: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument('--runs', type=int, default=120, help='images for each SNR')
     parser.add_argument('--images', type=int, default=24, help='images for false alarms')
-    parser.add_argument('--scenes', type=int, default=10, help='scenes of five targets')
+    parser.add_argument('--scenes', type=int, default=20, help='scenes of several targets')
+    margins = {f'{one:g} dB': DetectorConfig(threshold_margin_db=one) for one in MARGINS}
+    parts: dict[str, Callable[[argparse.Namespace], Any]] = {
+        'several targets': lambda given: several_targets(given.scenes),
+        'speed': lambda given: speed(60),
+        'margins': lambda given: false_alarms(given.images, margins, CHOSEN_ON),
+        'false detections per image': lambda given: false_alarms(
+            given.images, DETECTORS, SCORED_ON
+        ),
+        'threshold above Rayleigh, dB': lambda given: price(6),
+        'centroids': lambda given: centroids(given.runs),
+        'found': lambda given: found(given.runs),
+    }
+    parser.add_argument('--parts', nargs='*', choices=list(parts), default=list(parts))
     parser.add_argument('--out', type=Path, help='write the numbers as JSON here')
     given = parser.parse_args()
-    result = {
-        'false detections per image': false_alarms(given.images),
-        'study, false': STUDY_FALSE,
-        'found': found(given.runs),
-        'study, found': STUDY_FOUND,
+    result: dict[str, Any] = {
+        'images': given.images,
+        'runs': given.runs,
         'snr_db': LEVELS,
-        'centroids': centroids(given.runs),
+        'study, false': STUDY_FALSE,
+        'study, found': STUDY_FOUND,
         'study, centroids': STUDY_CENTROID,
-        'five targets': five_targets(given.scenes),
-        'speed': speed(60),
     }
-    print(json.dumps(result, indent=2))
-    if given.out:
-        given.out.write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
+    for name in given.parts:
+        result[name] = parts[name](given)
+        print(json.dumps({name: result[name]}, indent=2), flush=True)
+        write_json(given.out, result)
 
 
 if __name__ == '__main__':

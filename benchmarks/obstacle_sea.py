@@ -157,12 +157,12 @@ def velocity(runs: int) -> dict[str, dict[str, float]]:
     return table
 
 
-def case(name: str, runs: int) -> dict[str, dict[str, float]]:
+def case(name: str, runs: int, first: int = 0) -> dict[str, dict[str, float]]:
     kind, changes = CASES[name]
     setting = scenario(kind, {**LEVER, **changes})
     offsets: dict[str, list[list[list[float] | None]]] = {method: [] for method in METHODS}
     does, tracks = [], dict.fromkeys(METHODS, 0)
-    for seed in range(runs):
+    for seed in range(first, first + runs):
         scene = simulate(setting, seed)
         for method, values in METHODS.items():
             final = track(scene, config_of(setting, **values))
@@ -292,6 +292,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument('--runs', type=int, default=100)
+    parser.add_argument('--first', type=int, default=0, help='first seed of the cases')
     every = [*CASES, 'velocity', 'movers', *(f'calibration, {name}' for name in DRAWN)]
     parser.add_argument('--cases', nargs='*', choices=every, default=every)
     parser.add_argument('--out', type=Path, help='write the numbers as JSON')
@@ -311,7 +312,7 @@ def main() -> None:
                 for words in (('stated',), ('Brier', 'guess'))
             ]
         else:
-            tables[name] = case(name, options.runs)
+            tables[name] = case(name, options.runs, options.first)
             both = f'{name}, all'
             told = {key: v for key, v in tables[name][both].items() if key[0] in 'Pv'}
             errors = {

@@ -22,7 +22,7 @@ The messages of a shipped recording are sent again and again, their stamps moved
 hours have passed by their stamps. Told are the slope of the resident memory against those hours
 with the 95 % interval of Theil and Sen, after the first tenth, in which caches fill; CPU time per
 message (live: delay) in the first and in the last tenth; and whether what was counted is what was
-sent. Each run is a process of its own.
+sent. Each run is a process of its own; those that are in the file already are not made again.
 """
 
 from __future__ import annotations
@@ -113,7 +113,12 @@ def live(system: str, hours: float) -> dict[str, float]:
     """The node as a process of its own, in lock-step."""
     from rclpy.serialization import deserialize_message
 
-    from sonar_imm.nodes.harness import local_discovery, NodeProcess, reserved_domain_id
+    from sonar_imm.nodes.harness import (
+        local_discovery,
+        NodeProcess,
+        reserved_domain_id,
+        START_LIMIT,
+    )
     from sonar_imm.nodes.link import Link
     from sonar_imm.nodes.lockstep import LockStep
     from sonar_imm.nodes.messages import message_class
@@ -132,7 +137,7 @@ def live(system: str, hours: float) -> dict[str, float]:
             if topic not in publishers:
                 cls = message_class(item.type_name)
                 publishers[topic] = link.node.create_publisher(cls, topic, lockstep_qos())
-        step.connect(publishers.values(), 90.0)
+        step.connect(publishers.values(), START_LIMIT)
         total, memory = sum(1 for _ in stamps_of(system, hours)), []
         for k, (topic, item, stamp_ns) in enumerate(stamps_of(system, hours)):
             message = deserialize_message(bytes(item.raw), message_class(item.type_name))
@@ -225,12 +230,23 @@ def main() -> None:
             result = run(arguments.here, arguments.hours)
         print(json.dumps(result))
         return
-    table = {}
+    known = arguments.out is not None and arguments.out.is_file()
+    table = json.loads(arguments.out.read_text(encoding='utf-8')) if known else {}
+    failed = []
     for system in arguments.only or BAGS:
-        table[system] = measured(system, arguments.hours, nodes=arguments.live)
-        table[system]['hours'] = arguments.hours
-    print(markdown(table, 3))
-    write_json(arguments.out, table)
+        if table.get(system, {}).get('hours') == arguments.hours:
+            continue
+        try:
+            told = measured(system, arguments.hours, nodes=arguments.live)
+        except subprocess.CalledProcessError as error:
+            failed.append(f'{system}: the run ended with exit code {error.returncode}')
+            continue
+        table[system] = told | {'hours': arguments.hours}
+        write_json(arguments.out, table)
+    if table:
+        print(markdown(table, 3))
+    if failed:
+        sys.exit('\n'.join(failed))
 
 
 if __name__ == '__main__':

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Rejection
 from sonar_imm.soundings import COLUMNS, Soundings
 
@@ -37,7 +38,9 @@ def write_soundings(soundings: Soundings, make: Make) -> Any:
 def read_soundings(message: Any) -> Soundings:
     """Read what `write_soundings` wrote. Raises `Rejection`."""
     columns = decode_table(message)
-    require_columns(columns, tuple(COLUMNS), 'soundings')
+    require_columns(columns, tuple(n for n in COLUMNS if n not in PLACES), 'soundings')
+    for name, coarse in zip(PLACES, 'xyz'):  # older tables lack the exact ones
+        columns.setdefault(name, columns[coarse].astype(np.float64))
     for name, kind in COLUMNS.items():
         if columns[name].dtype != np.dtype(kind) or columns[name].ndim != 1:
             raise Rejection(

@@ -24,13 +24,27 @@ from attrs import field, frozen
 import numpy as np
 from numpy.typing import NDArray
 
+PLACES = ('px', 'py', 'pz')
+"""The columns of places in float64, m; millimetres at any map coordinates."""
+
+
+def places(xyz: NDArray[np.floating[Any]]) -> dict[str, NDArray[np.float64]]:
+    """The columns `PLACES` of places (n, 3)."""
+    return dict(zip(PLACES, np.asarray(xyz, np.float64).T))
+
+
+def _exact(columns: Mapping[str, NDArray]) -> tuple[str, ...]:
+    """The names of the columns that say best where something is."""
+    return PLACES if all(name in columns for name in PLACES) else tuple('xyz')
+
 
 @frozen(eq=False, kw_only=True)
 class Estimate:
     """Everything known at one stamp.
 
-    xyz: (rows, 3) where it is. As published float32, which at a northing of 9e6 m is half a metre
-    coarse: there for display only.
+    xyz: (rows, 3) where it is. Published as ``x y z`` in float32, which displays draw and which at
+    a northing of 9e6 m is half a metre coarse, and, by systems that state places, as ``px py pz``
+    in float64: see `places`.
     state: (rows, n) in the order of `state_names`; covariance: (rows, n, n).
     probabilities: (rows, models) in the order of `model_names`, each row sums to one.
     extras: further columns, each (rows,), dtypes as published.
@@ -100,7 +114,7 @@ class Estimate:
         return cls(
             stamp_ns=stamp_ns,
             frame_id=frame_id,
-            xyz=np.column_stack([columns[c] for c in 'xyz']).astype(np.float32),
+            xyz=np.column_stack([columns[name] for name in _exact(columns)]),
             state_names=states,
             state=np.column_stack([columns[s] for s in states]) if n else np.empty((rows, 0)),
             covariance=covariance,

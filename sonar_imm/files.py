@@ -15,9 +15,9 @@
 """Files and folders that are either whole or not there.
 
 What is written is at first in a folder of its own beside its place, named after it with
-``.unfinished-`` and some letters. Only when it is finished it is moved to its place, by one
-rename, which no program can see half of. A process that is killed leaves such a folder behind,
-which the next one to write there removes.
+``.unfinished-`` and some letters. Only when it is finished, and on the disk, it is moved to its
+place, by one rename, which no program can see half of, nor a power cut leave half of. A process
+that is killed leaves such a folder behind, which the next one to write there removes.
 """
 
 from __future__ import annotations
@@ -50,10 +50,35 @@ def whole(path: str | Path) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
         with beside(target) as place:
             yield place / target.name
+            on_disk(place / target.name)
             os.replace(place / target.name, target)
+            sync_folder(target.parent)
 
 
-def _remove_leftovers(path: Path) -> None:
+def on_disk(path: Path) -> None:
+    """Wait until a file, or a folder with all that is in it, is on the disk. Without that a rename
+    may be there after a power cut, and what was renamed may not. Raises OSError."""
+    if not path.is_dir():
+        with path.open('rb') as file:
+            os.fsync(file.fileno())
+        return
+    for one in path.iterdir():
+        if not one.is_symlink():
+            on_disk(one)
+    sync_folder(path)
+
+
+def sync_folder(path: Path) -> None:
+    """Wait until the names in a folder are on the disk, where the file system can."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):  # some file systems sync files only
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def remove_leftovers(path: Path) -> None:
     """Remove what killed processes left of `path`. What a living one is writing is left alone."""
     for place in path.parent.glob(f'{glob.escape(path.name)}{UNFINISHED}*'):
         with contextlib.suppress(OSError):
@@ -70,7 +95,7 @@ def _remove_leftovers(path: Path) -> None:
 def beside(target: Path) -> Iterator[Path]:
     """A new folder beside `target` for what is not finished, removed at the end. It is locked
     while this process lives."""
-    _remove_leftovers(target)
+    remove_leftovers(target)
     while True:
         place = Path(tempfile.mkdtemp(prefix=target.name + UNFINISHED, dir=target.parent))
         try:

@@ -16,7 +16,8 @@
 
 One row for each bin with an echo, in the frame of the navigation. The columns are the contract of
 ``~/soundings`` and of soundings.csv. Everything a gridder reads is float32: the CUBE node for
-ROS 2 reads four-byte floats whatever a field declares, and knows no NaN.
+ROS 2 reads four-byte floats whatever a field declares, and knows no NaN. The place stands at the
+end once more in float64.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from attrs import frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimates import Estimate
+from .estimates import Estimate, places
 
 SIDES = ('port', 'starboard')
 """Names of the numbers in the column `side`."""
@@ -43,11 +44,14 @@ COLUMNS: dict[str, type] = {
     'label_probability': np.float32,
     'range': np.float32,
     'side': np.uint8,
+    'px': np.float64,
+    'py': np.float64,
+    'pz': np.float64,
 }
 """x y z m in the frame of the navigation; uncertainties: variances, m^2 (horizontal: of x and y
 together); intensity: 10 log10 of the mean power of a stave, dB; beam_angle: rad from straight
 down, port positive; label: number of the most probable terrain model; range m; side: 0 port, 1
-starboard."""
+starboard; px py pz: the same place as x y z, which at map coordinates are half a metre coarse."""
 
 
 @frozen(eq=False)
@@ -70,7 +74,8 @@ def soundings_of(estimate: Estimate) -> Soundings | None:
     """
     if 'vertical_uncertainty' not in estimate.extras:
         return None
-    columns = {**dict(zip('xyz', estimate.xyz.T)), **estimate.extras}
+    exact = places(estimate.xyz)
+    columns = {**dict(zip('xyz', estimate.xyz.T)), **exact, **estimate.extras}
     kept = np.asarray(estimate.extras['valid'], bool)
     with np.errstate(over='ignore'):
         table = {name: np.asarray(columns[name]).astype(kind) for name, kind in COLUMNS.items()}

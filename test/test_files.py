@@ -102,3 +102,29 @@ def test_file_systems_without_locks_keep_leftovers(tmp_path, monkeypatch):
     with whole(tmp_path / 'out') as path:
         path.touch()
     assert sorted(path.name for path in tmp_path.iterdir()) == ['out', f'out{UNFINISHED}abc']
+
+
+def test_what_is_renamed_is_on_the_disk_before_and_the_rename_after(tmp_path, monkeypatch):
+    """A power cut cannot be tried here; the order of the calls that it depends on can."""
+    calls, fsync, replace = [], os.fsync, os.replace
+
+    def synced(handle):
+        calls.append(('sync', Path(os.readlink(f'/proc/self/fd/{handle}')).name))
+        fsync(handle)
+
+    def renamed(old, new):
+        calls.append(('rename', Path(new).name))
+        replace(old, new)
+
+    monkeypatch.setattr(os, 'fsync', synced)
+    monkeypatch.setattr(os, 'replace', renamed)
+    with whole(tmp_path / 'bag') as path:
+        (path / 'deep').mkdir(parents=True)
+        (path / 'deep' / 'b').write_text('b')
+        (path / 'a').write_text('a')
+    assert {('sync', name) for name in ('a', 'b', 'deep', 'bag')} == set(calls[:4])
+    assert calls[4:] == [('rename', 'bag'), ('sync', tmp_path.name)]
+    calls.clear()
+    with whole(tmp_path / 'file') as path:
+        path.write_text('a')
+    assert calls == [('sync', 'file'), ('rename', 'file'), ('sync', tmp_path.name)]

@@ -38,6 +38,7 @@ if not (ROOT / 'setup.py').is_file():
 FLOORS = {
     'sonar_imm.files': 0,
     'sonar_imm.resources': 0,
+    'sonar_imm.texts': 0,
     'sonar_imm.threads': 0,
     'sonar_imm.estimation': 0,
     'sonar_imm.acoustics': 1,

@@ -31,8 +31,8 @@ ten times as many false alarms.
 
 Two things spoil the mean of the noise. An obstacle that reaches into the training cells hides
 itself, as a chain along the line of sight does; so cells far above the mean logarithm of their
-neighbourhood, which a few loud cells hardly move, are left out (`quiet_level`). And a rough sea
-floor has longer tails than a Rayleigh law: power of patches that differ is K distributed. How
+neighbourhood are left out, and then those far above that of the rest (`quiet_level`). And a rough
+sea floor has longer tails than a Rayleigh law: power of patches that differ is K distributed. How
 rough it is shows in the variance of the logarithm of the power in the rows around (`roughness`),
 and the factor grows by what that shape needs (`tail_factor`).
 
@@ -47,7 +47,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..estimation.arrays import FloatArray
+from ..estimation.arrays import BoolArray, FloatArray
 from .cfar_kernels import across_beams, greatest_of_level
 
 _LARGEST_FACTOR = 1e6
@@ -137,17 +137,34 @@ def quiet_level(
         return level, sides, np.zeros(len(power))
     known = np.isfinite(level) & (level > 0.0)
     floor = np.where(known, level, np.inf)
-    logarithm = np.log(np.maximum(power, _SILENT * np.where(known, level, 1.0)) + _TINY)
+    # Of the first rows no level is known; theirs is about that of the first for which one is.
+    first = level[np.argmax(known.any(axis=1))]
+    about = np.where(known, level, np.where(np.isfinite(first) & (first > 0.0), first, 1.0))
+    heard = np.log(power + _TINY)
+    logarithm = np.maximum(heard, np.log(_SILENT * about))
     around, _ = noise_level(logarithm, **window)
-    # The mean of a Rayleigh law lies above its mean logarithm.
-    usual = np.exp(np.where(known, around, 0.0) + np.euler_gamma)
-    quiet = ~known | (power <= CENSORED * usual)
-    half = max(beams // 2, 0)
-    share = across_beams(quiet.astype(np.float64), half)
-    kept = across_beams(np.where(quiet, power, 0.0), half) / np.maximum(share, 0.1)
-    censored, _ = greatest_of_level(np.ascontiguousarray(kept), 0, training, guard)
     off = np.where(known, logarithm - around, np.nan)
+    half = max(beams // 2, 0)
+    # The mean of a Rayleigh law lies above its mean logarithm.
+    above = np.log(CENSORED) + np.euler_gamma
+    quiet = ~known | (heard <= around + above)
+    # Again, by the mean logarithm of what was kept: something long has lifted the first one.
+    kept, few = _kept(quiet, logarithm, half)
+    kept[few] = around[few]
+    around, _ = greatest_of_level(kept, 0, training, guard)
+    quiet = ~known | (heard <= around + above)
+    kept, few = _kept(quiet, power, half)
+    kept[few] = np.exp(np.where(known, around, 0.0)[few] + np.euler_gamma)
+    censored, _ = greatest_of_level(kept, 0, training, guard)
     return np.minimum(censored, floor), sides, roughness(off)
+
+
+def _kept(quiet: BoolArray, value: FloatArray, half: int) -> tuple[FloatArray, BoolArray]:
+    """Mean (R, B) of the quiet cells of the beams within `half` of each, and where these are fewer
+    than one in ten and tell nothing."""
+    share = across_beams(quiet.astype(np.float64), half)
+    kept = across_beams(np.where(quiet, value, 0.0), half) / np.maximum(share, 0.1)
+    return kept, share < 0.1
 
 
 def roughness(logarithm: FloatArray) -> FloatArray:

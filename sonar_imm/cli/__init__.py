@@ -21,17 +21,19 @@ gives one line on standard error; a traceback is a bug.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
+import functools
 import os
 import signal
 import sys
 import threading
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from .. import __version__
+from ..texts import visible
 from ..threads import one_blas_thread
 from .lazy import LazyGroup, READER_GONE
 
@@ -99,7 +101,16 @@ def _leave(number: int, _frame: object) -> NoReturn:
     # A second signal must not interrupt the unwinding.
     for one in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(one, signal.SIG_IGN)
+    sys.unraisablehook = functools.partial(_quiet_on_half_made, sys.unraisablehook)
     raise SystemExit(128 + number)
+
+
+def _quiet_on_half_made(others: Callable[[Any], None], problem: Any) -> None:
+    """Say nothing of objects whose constructor the signal broke off: they miss their attributes
+    when they are taken down."""
+    taken_down = getattr(problem.object, '__name__', '') == '__del__'
+    if not (taken_down and isinstance(problem.exc_value, AttributeError)):
+        others(problem)
 
 
 def _run(arguments: Sequence[str] | None) -> int:
@@ -166,5 +177,5 @@ def missing_package(name: str) -> str | None:
 
 
 def _complain(sentence: str, status: int = 2) -> int:
-    print(f'{PROGRAM}: {" ".join(sentence.split())}', file=sys.stderr)
+    print(f'{PROGRAM}: {visible(" ".join(sentence.split()))}', file=sys.stderr)
     return status

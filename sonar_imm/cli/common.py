@@ -38,6 +38,7 @@ from ..parameters import (
     sections_of,
 )
 from ..recordings.own_parameters import NAME as OWN_PARAMETERS
+from ..texts import visible
 from ..trackers import System, SYSTEMS
 
 Advance = Callable[[int], None]
@@ -236,7 +237,7 @@ def print_json(result: Any) -> None:
 def say(text: str = '', *, quiet: bool = False) -> None:
     """Print a line on standard output, unless the output is JSON (`quiet`)."""
     if not quiet:
-        click.echo(text)
+        click.echo(visible(text))
 
 
 @contextlib.contextmanager

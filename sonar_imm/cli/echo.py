@@ -26,7 +26,7 @@ from typing import Any, TYPE_CHECKING
 
 import click
 
-from .common import example
+from .common import example, say
 
 if TYPE_CHECKING:
     from ..nodes.listening import HeardTable
@@ -108,7 +108,7 @@ def _shower(most: int, as_json: bool) -> Iterator[Show]:
 
             yield show
     else:
-        yield lambda table: click.echo('\n'.join(text_lines(table, most)))
+        yield lambda table: say('\n'.join(text_lines(table, most)))
 
 
 def _picture(newest: Mapping[str, HeardTable], most: int) -> Any:

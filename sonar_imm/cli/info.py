@@ -23,7 +23,7 @@ from typing import Any
 import click
 
 from ..trackers import SYSTEMS
-from .common import BAG, example, json_option, load_detector, print_json, progress
+from .common import BAG, example, json_option, load_detector, print_json, progress, say
 
 
 @click.command(epilog=example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
@@ -56,25 +56,25 @@ def _detector(bag: Path) -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    click.echo(f'{found["bag"]}: {found["messages"]} messages in {found["duration_s"]:.1f} s')
+    say(f'{found["bag"]}: {found["messages"]} messages in {found["duration_s"]:.1f} s')
     for topic in found['topics']:
         rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
         frames = f', frame {", ".join(topic["frames"])}' if any(topic['frames']) else ''
-        click.echo(
+        say(
             f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}'
             f'{_scans(topic["scans"])}{frames}'
         )
         for suited in topic['suits']:
-            click.echo(f'      fits {suited}')
+            say(f'      fits {suited}')
         for problem in topic['problems']:
-            click.echo(f'      problem: {problem}')
+            say(f'      problem: {problem}')
     for problem in found['problems']:
-        click.echo(f'problem: {problem}')
+        say(f'problem: {problem}')
     for number, (system, named) in enumerate(found['topic_options'].items()):
         told = 'or as something else' if number else 'to track it'
-        click.echo(f'{told}: {track_line(found["bag"], system, named)}')
+        say(f'{told}: {track_line(found["bag"], system, named)}')
     if not found['systems']:
-        click.echo('no tracker can use it')
+        say('no tracker can use it')
 
 
 def _scans(scans: dict[str, int] | None) -> str:

@@ -87,7 +87,7 @@ def average_bounds(count: int, dimension: int, probability: float = 0.95) -> tup
 NIS_MEMORY = 50.0
 """Innovations over which `NisMemory` gathers and forgets."""
 _LEAST = 0.75 * NIS_MEMORY
-_FARTHEST = 9.0
+FARTHEST = 9.0
 """More, for each degree of freedom, is a sharp turn or another's echo, and says nothing of noise:
 it counts as so much."""
 _SIGMAS = 5.0
@@ -114,7 +114,7 @@ class NisMemory:
         keep = 1.0 - 1.0 / NIS_MEMORY
         gathered, freedom, square, count = self.nis, self.dof, self.square, self.count
         for value, m in zip(nis.tolist(), np.broadcast_to(dof, nis.shape).tolist()):
-            gathered = keep * gathered + min(value, _FARTHEST * m)
+            gathered = keep * gathered + min(value, FARTHEST * m)
             freedom = keep * freedom + m
             square = keep * keep * square + m
             count = keep * count + 1.0

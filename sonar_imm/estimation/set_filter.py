@@ -31,7 +31,7 @@ from concurrent.futures import ThreadPoolExecutor
 import math
 from typing import NamedTuple
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
 
 from . import set_amplitudes as amplitudes
@@ -151,26 +151,27 @@ class SetFilter:
         lag = np.minimum(np.arange(self.model.record_cells), self.model.cells - 1)
         b = np.maximum(0.0, 10.0 * self.model.gram[np.abs(lag - 1)])
         step = SetFilter(self.model, 8).step(None, b, (0, 0))
-        self.summary(step, step.w, step.sets)
+        self.summary(step)
 
-    def summary(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
-        """PMF (orders,) of the order and sums (5, n), see `set_particles_kernels.moments`, of
-        `sets` with weights w (N,)."""
+    def summary(self, step: SetStep) -> tuple[FloatArray, FloatArray]:
+        """PMF (orders,) of the order and sums (5, n), see `set_particles_kernels.moments`."""
         pmf = np.zeros(len(self.model.transition))
         rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
         sums = np.zeros((rows, self.model.record_cells))
         offset, variance = _offset_of(step.path)
         prior, least = self._amplitudes.variance, self.model.order_min
-        kernels.moments(w, sets, step.amplitude, offset, variance, prior, least, pmf, sums)
+        kernels.moments(
+            step.w, step.sets, step.amplitude, offset, variance, prior, least, pmf, sums
+        )
         # Weights add up to one but for rounding: no probability may pass it for that.
         return np.minimum(pmf, 1.0), sums
 
-    def shift(self, step: SetStep, w: FloatArray, sets: Sets) -> tuple[float, float]:
-        """Mean and standard deviation of the shift, cells, of `sets` with weights w (N,)."""
+    def shift(self, step: SetStep) -> tuple[float, float]:
+        """Mean and standard deviation of the shift, cells."""
         offset, variance = _offset_of(step.path)
-        there = sets.shift + offset
-        mean = float(w @ there)
-        spread = math.sqrt(float(w @ np.square(there - mean)) + variance)
+        there = step.sets.shift + offset
+        mean = float(step.w @ there)
+        spread = math.sqrt(float(step.w @ np.square(there - mean)) + variance)
         return mean - self.model.pad, spread
 
     def _start(
@@ -289,15 +290,21 @@ class SetFilter:
 
 class LagSmoother:
     """Fixed-lag smoothing by surviving lines: each of the newest particles is traced to its
-    ancestor `lag` records ago, which gets its weight."""
+    ancestor `lag` records ago."""
 
     def __init__(self, lag: int):
         self.lag = lag
         self._steps: deque[SetStep] = deque(maxlen=lag + 1)
 
-    def push(self, step: SetStep) -> tuple[SetStep, FloatArray] | None:
-        """The step `lag` records before this one and the weights (N,) its sets now have; None
-        while there is none, and after a record that nothing explained."""
+    def push(self, step: SetStep) -> SetStep | None:
+        """The step `lag` records before this one as the ancestors of its sets, each with the
+        weight of its descendant; None while there is none, and after a record that nothing
+        explained.
+
+        What all members and shifts are off by together is the same in every record. The ancestor
+        knows of it what its descendant does, against its own places: those of the descendant have
+        since been moved by what was drawn of it.
+        """
         if not step.ok:
             self._steps.clear()
             return None
@@ -305,11 +312,17 @@ class LagSmoother:
         if len(self._steps) <= self.lag or not self.lag:
             return None
         steps = list(self._steps)
-        line = np.arange(len(step.w))
+        line, drawn = np.arange(len(step.w)), np.zeros(len(step.w))
         for earlier in reversed(steps[:-1]):
+            if earlier.path:
+                before = earlier.sets.shift[earlier.source]
+                drawn += (earlier.after.sets.shift - before)[line]
             line = earlier.source[line]
-        weights = np.bincount(line, weights=step.w, minlength=len(step.w))
-        return steps[0], weights.astype(np.float64)
+        path = step.path.moved(drawn) if step.path else None
+        first = steps[0]
+        return evolve(
+            first, sets=first.sets.take(line), w=step.w, amplitude=first.amplitude[line], path=path
+        )
 
     def clear(self) -> None:
         self._steps.clear()

@@ -121,6 +121,10 @@ class ShiftPath(NamedTuple):
     def take(self, index: IntArray) -> ShiftPath:
         return self._replace(pull=self.pull[index])
 
+    def moved(self, d: FloatArray) -> ShiftPath:
+        """The same offset for shifts that are less by d (N,) cells."""
+        return self._replace(pull=self.pull - self.precision * d)
+
     @property
     def mean(self) -> FloatArray:
         """Of the offset (N,), cells."""

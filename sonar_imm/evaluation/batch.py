@@ -29,6 +29,7 @@ from typing import Any
 from attrs import evolve, frozen
 
 from .. import __version__
+from ..files import remove_leftovers
 from ..parameters import Config, ConfigError
 from ..recordings.reader import BagError, BagReader
 from ..trackers import SYSTEMS
@@ -90,6 +91,7 @@ def track(job: Job, advance: Callable[[int], Advance] | None = None) -> Outcome:
         overwrite = job.overwrite
         if job.resume and not overwrite:
             if (run := _same_run(folder, offline)) is not None and _complete(job):
+                remove_leftovers(job.folder)
                 return _outcome(job, KEPT, run)
             overwrite = True  # it is not finished, or the same without Parquet
         with folder.fresh(overwrite=overwrite) as unfinished:

@@ -50,7 +50,7 @@ from msg_adapters.soundings import write_soundings
 
 from .. import __version__
 from ..estimates import Estimate
-from ..files import beside, whole
+from ..files import beside, on_disk, sync_folder, whole
 from ..measurements import Rejection
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
@@ -115,11 +115,13 @@ class RunFolder:
             return
         with beside(self.path / 'run') as place:
             yield RunFolder(place)
+            on_disk(place)
             for path in old:  # run.json is the first of them
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
             made = [name for name in _RUN_FILES if (place / name).exists()]
             for name in reversed(made):  # and the last one here
                 (place / name).rename(self.path / name)
+            sync_folder(self.path)
 
     def write_estimates(
         self,

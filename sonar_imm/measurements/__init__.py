@@ -22,10 +22,15 @@ makes them from messages.
 from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
-from .checks import check_covariance, check_stamp, nanoseconds, Rejection
+from .checks import (
+    check_covariance,
+    check_stamp,
+    nanoseconds,
+    Rejection,
+)
 from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
-from .frames import frame_role, FrameGuard
+from .frames import frame_role, FrameGuard, Frames
 from .obstacle import (
     Altitude,
     BEAM_AXES,
@@ -54,6 +59,7 @@ __all__ = [
     'Fixes',
     'frame_role',
     'FrameGuard',
+    'Frames',
     'FrameTree',
     'GeodeticFix',
     'IMAGE_ORDERS',

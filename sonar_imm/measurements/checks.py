@@ -22,16 +22,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
+from ..texts import in_one_line
 
 
 class Rejection(ValueError):
     """Input that cannot be used: `reason` is a short code for counters (``'nan'``), `sentence`
-    tells the user."""
+    tells the user, on one line."""
 
     def __init__(self, reason: str, sentence: str):
         self.reason = reason
-        self.sentence = sentence
-        super().__init__(sentence)
+        self.sentence = in_one_line(sentence)
+        super().__init__(self.sentence)
 
 
 def floats(*shape: int | None) -> Any:

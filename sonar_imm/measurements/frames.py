@@ -20,7 +20,7 @@ each such kind of measurement has to keep to one, too.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from .checks import Rejection
 
@@ -35,7 +35,9 @@ def frame_role(measurement: Any) -> str:
 
 class FrameGuard:
     """Lets one frame of the tracks pass: the one it is told, or else the first that a measurement
-    names; and one frame for each sensor (kind of measurement, and side) that has its own."""
+    names; and one frame for each sensor (kind of measurement, and side) that has its own.
+
+    A measurement that is not used must not decide: `check` only compares, `settle` decides."""
 
     def __init__(self, frame_id: str = ''):
         """Expect `frame_id`; empty means that the measurements decide."""
@@ -55,16 +57,38 @@ class FrameGuard:
         role, frame_id = frame_role(measurement), measurement.frame_id
         if role == 'world':
             _compare(frame_id, self._world, 'the tracks')
-            self._world = frame_id
         elif role == 'own':
-            sensor = type(measurement), getattr(measurement, 'side', '')
-            _compare(frame_id, self._own.get(sensor, ''), 'earlier ones')
-            self._own[sensor] = frame_id
+            _compare(frame_id, self._own.get(_sensor(measurement), ''), 'earlier ones')
+
+    def settle(self, measurement: Any) -> None:
+        """Expect the frame of `measurement`, which passed `check` and is used, from now on."""
+        role = frame_role(measurement)
+        if role == 'world':
+            self._world = measurement.frame_id
+        elif role == 'own':
+            self._own[_sensor(measurement)] = measurement.frame_id
+
+    def admit(self, measurement: Any) -> None:
+        """`check` and `settle`, for what is used whatever its stamp. Raises `Rejection`."""
+        self.check(measurement)
+        self.settle(measurement)
 
     def reset(self) -> None:
         """Let the measurements decide again, unless a frame was told."""
         self._world = self._told
         self._own: dict[tuple[type, str], str] = {}
+
+
+class Frames(NamedTuple):
+    """The frames of the measurements that a tracker used: those of the classes `kinds`, which it
+    can refuse for their stamps."""
+
+    guard: FrameGuard
+    kinds: tuple[type, ...]
+
+
+def _sensor(measurement: Any) -> tuple[type, str]:
+    return type(measurement), getattr(measurement, 'side', '')
 
 
 def _compare(frame_id: str, expected: str, whose: str) -> None:

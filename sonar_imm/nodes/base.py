@@ -51,7 +51,7 @@ from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, Rejection, RepeatGuard
+from ..measurements import FrameGuard, FrameTree, Rejection, RepeatGuard
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
@@ -91,10 +91,11 @@ class TrackerNode(Node):
         config = self._settings[config_type]
         self._guard = FrameGuard(self._node_config.frame_id)
         self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
-        guards = (self._guard, self._repeats)
+        tree = FrameTree()
+        guards = (self._guard, self._repeats, tree)
         self._keeper = StateKeeper(self, system, self._node_config, guards)
         self.tracker = self._keeper.begin(config)
-        self._door = FrameDoor(self.tracker, self._guard)
+        self._door = FrameDoor(self.tracker, self._guard, tree, config)
         self._warm()
 
         self._enabled = True
@@ -128,7 +129,7 @@ class TrackerNode(Node):
             self._report,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self._keeper.save_every_now_and_then(lambda: self.tracker)
+        self._keeper.save_every_now_and_then(lambda: (self.tracker, self._door.given))
         self._settings.on_change(lambda: self._door.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
@@ -136,7 +137,7 @@ class TrackerNode(Node):
 
     def destroy_node(self) -> None:
         """Save the state, then end."""
-        self._keeper.save(self.tracker, wait=True)
+        self._keeper.save(self.tracker, self._door.given, wait=True)
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:

@@ -138,7 +138,7 @@ class FlsDetectorNode(Node):
 
     def _detect(self, message: Any) -> None:
         image = self._read(message)
-        self._guard.check(image)
+        self._guard.admit(image)
         found = self._detector.process(image)
         if found is not None:
             self._detections.publish(write_detections(found, make))

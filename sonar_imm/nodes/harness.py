@@ -47,7 +47,7 @@ from .lockstep import Counts, LockStep, Recorder
 from .player import NAME, Player, PlayOptions
 from .stopping import ENDING
 
-START_LIMIT = 90.0
+START_LIMIT = 300.0
 """Seconds a node may take to appear, with nothing compiled yet, on a slow or busy machine."""
 _STOP_LIMIT = 10.0
 _LOG_TAIL = 12

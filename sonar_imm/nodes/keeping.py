@@ -41,7 +41,8 @@ _ENOUGH = 3
 
 
 class StateKeeper:
-    """Loads and saves the state of one tracker and of the `guards` before it.
+    """Loads and saves the state of one tracker and of the `guards` before it: what is known of
+    frames, and of what was heard.
 
     trouble: why states are not saved, in a sentence; empty while they are.
     """
@@ -80,12 +81,12 @@ class StateKeeper:
                 )
         return self._system.build(config)
 
-    def save_every_now_and_then(self, state: Callable[[], Tracker]) -> None:
-        """Save what `state()` gives, each time something new was heard."""
+    def save_every_now_and_then(self, state: Callable[[], tuple[Tracker, Config]]) -> None:
+        """`save` what `state()` gives, each time something new was heard."""
         if self._path:
             self._node.create_timer(
                 self._period,
-                lambda: self.save(state()),
+                lambda: self.save(*state()),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
 
@@ -107,8 +108,9 @@ class StateKeeper:
             )
         return not self._far
 
-    def save(self, tracker: Tracker, *, wait: bool = False) -> None:
-        """Write the state of now, if there is something new; `wait` until it is on the disk."""
+    def save(self, tracker: Tracker, given: Config, *, wait: bool = False) -> None:
+        """Write the state of now, if there is something new; `wait` until it is on the disk.
+        given: the parameters of the tracker without what /tf_static says."""
         if self._thread is not None and (wait or not self._thread.is_alive()):
             self._thread.join()
             self._thread = None
@@ -117,7 +119,7 @@ class StateKeeper:
         self._saved = self._heard
         saved = Saved(
             system=self._system.name,
-            parameters=json_parameters(tracker.config),
+            parameters=json_parameters(given),
             saved_ns=time.time_ns(),
             newest_ns=self._newest_ns,
             state=frozen_state(tracker),
@@ -138,7 +140,9 @@ class StateKeeper:
         tracker = tracker_from(saved, self._system, config)
         if saved.extras['told'] != self._told:
             raise StateError('it was saved with another frame_id or world_frame_convention')
-        for guard, state in zip(self._guards, saved.extras['guards'], strict=True):
+        if len(saved.extras['guards']) != len(self._guards):
+            raise StateError('it does not fit this version (guards)')
+        for guard, state in zip(self._guards, saved.extras['guards']):
             put(guard, state)
         self._loaded_ns = self._newest_ns = saved.newest_ns
         self._node.get_logger().info(f"goes on from the state in '{path}', {age:.1f} s old")

@@ -31,6 +31,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from ..texts import in_one_line
 from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
 from .mcap_scan import Channel, McapScan
 from .mcap_sums import wrong_sums
@@ -45,8 +46,8 @@ class BagError(Exception):
     """A recording that cannot be used, in one sentence for the user."""
 
     def __init__(self, sentence: str):
-        self.sentence = sentence
-        super().__init__(sentence)
+        self.sentence = in_one_line(sentence)
+        super().__init__(self.sentence)
 
 
 @frozen

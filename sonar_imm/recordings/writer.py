@@ -37,6 +37,7 @@ from rosbags.rosbag2 import (
     StoragePlugin,
     Writer,
 )
+from rosbags.rosbag2.storage_mcap import McapWriter
 
 from ..files import whole
 from .mcap_sums import seal
@@ -47,6 +48,12 @@ from .sources import BagError
 __all__ = ['BagWriter', 'naming', 'ros_message', 'STORAGES']
 
 STORAGES = ('mcap', 'sqlite3')
+
+CHUNK_BYTES = 1 << 18
+CHUNK_NS = 10 * 10**9
+CHUNK_LEAST = 1 << 12
+"""A chunk of an MCAP file is closed when it holds so many bytes of messages, or so much time and
+not too little: a bit that turns costs the chunk that it is in."""
 
 _RELIABLE = Qos(
     QosHistory.KEEP_LAST,
@@ -98,6 +105,7 @@ class BagWriter:
         self.path = Path(path)
         self.count = 0
         self._links: dict[tuple[str, str], Connection] = {}
+        self._chunk: tuple[int, int] | None = None
         self._parameters = parameters or {}
         self._place = contextlib.ExitStack()
         if self.path.exists():
@@ -146,7 +154,18 @@ class BagWriter:
             raise ValueError(f'a recording cannot hold the log time {log_ns} ns')
         with naming(self.path):
             self._writer.write(self._link(topic, type_name), log_ns, raw)
+            self._close_chunk(log_ns, len(raw))
         self.count += 1
+
+    def _close_chunk(self, log_ns: int, size: int) -> None:
+        """Close the chunk of an MCAP file after a message of `size` bytes, if it is time."""
+        first_ns, held = self._chunk or (log_ns, 0)
+        held += size
+        long = abs(log_ns - first_ns) >= CHUNK_NS and held >= CHUNK_LEAST
+        self._chunk = (first_ns, held)
+        if (long or held >= CHUNK_BYTES) and isinstance(self._writer.storage, McapWriter):
+            self._writer.storage.close_chunk()
+            self._chunk = None
 
     def _link(self, topic: str, type_name: str) -> Connection:
         link = self._links.get((topic, type_name))

@@ -41,6 +41,7 @@ from typing import Any, Protocol
 from attrs import frozen
 
 from ..estimates import Estimate
+from ..measurements import Frames
 from ..parameters import Config, ConfigError
 
 
@@ -56,6 +57,11 @@ class Tracker(Protocol):
     STATE: tuple[str, ...]
     config: Any
     counts: Counter[str]
+
+    @property
+    def frames(self) -> Frames:
+        """The frames of what was used so far."""
+        ...
 
     def process(self, measurement: Any) -> list[Estimate]:
         """Take one measurement in. Gives the estimates it made or revised, oldest first; the last

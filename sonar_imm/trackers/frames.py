@@ -47,15 +47,28 @@ SEEN_FROM_THE_SONAR = (Detections, Snapshot)
 class FrameDoor:
     """Lets measurements through to a tracker.
 
-    mounting: the parameters of the place of the sonar, as /tf_static says them, None before.
+    given: the parameters as they were given, without the place of the sonar that /tf_static says;
+    mounting: that place as parameters, None before it is known.
     """
 
-    def __init__(self, tracker: Any, guard: FrameGuard):
+    def __init__(
+        self,
+        tracker: Any,
+        guard: FrameGuard,
+        tree: FrameTree | None = None,
+        given: Config | None = None,
+    ):
+        """guard: the frame that was told, and those of what the tracker uses whatever its stamp.
+        Of everything else the tracker says what it used, since what is refused must not decide.
+        tree: what is known of frames already, as after a restart; given: None for the parameters
+        of `tracker`."""
         self._tracker = tracker
         self._guard = guard
-        self._tree = FrameTree()
+        self._tree = FrameTree() if tree is None else tree
+        self.given: Config = tracker.config if given is None else given
         self._frames = _sonar_frames(tracker.config)
         self.mounting: dict[str, tuple[float, ...]] | None = None
+        self._mount()
 
     def admit(self, measurement: Any) -> Any:
         """The measurement in the frame of the tracks; None for transforms, which are kept here.
@@ -71,14 +84,21 @@ class FrameDoor:
             )
         measurement = self._turned(measurement)
         self._guard.check(measurement)
+        known = self._tracker.frames
+        if isinstance(measurement, known.kinds):
+            known.guard.check(measurement)
+        else:
+            self._guard.settle(measurement)
         return measurement
 
     def reconfigure(self, config: Config) -> None:
         """Give `config` to the tracker, with the place of the sonar where that is known."""
+        self.given = config
         self._tracker.reconfigure(evolve(config, **(self.mounting or {})))
 
     def _turned(self, measurement: Any) -> Any:
-        target, source = self._guard.frame_id, measurement.frame_id
+        target = self._guard.frame_id or self._tracker.frames.guard.frame_id
+        source = measurement.frame_id
         placed = frame_role(measurement) == 'world' or isinstance(measurement, VesselPose)
         if not (target and placed) or source in ('', target):
             return measurement

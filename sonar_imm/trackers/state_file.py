@@ -33,6 +33,7 @@ from attrs import frozen
 import numpy as np
 
 from .. import __version__
+from ..files import sync_folder
 from ..parameters import Config, ConfigError
 from . import System, Tracker
 from .state_values import Decoder, Encoder, restore, StateError
@@ -89,7 +90,7 @@ def write_state(path: Path, saved: Saved) -> int:
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
     return len(line) + len(body)
 
 
@@ -167,12 +168,3 @@ def json_parameters(config: Config) -> dict[str, Any]:
 
 def _json(value: Any) -> Any:
     return json.loads(json.dumps(value))
-
-
-def _sync_folder(folder: Path) -> None:
-    """The rename itself has to reach the disk too."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -76,9 +76,9 @@ class Stream:
 
     def __init__(self, accepts: tuple[type, ...], rules: StreamRules):
         self.counts: Counter[str] = Counter()
-        self._accepts = accepts
+        self.accepts = accepts
+        self.frames = FrameGuard()
         self._rules = rules
-        self._frames = FrameGuard()
         self._gate: StampGate[Any] = StampGate(
             rules.window_ns, rules.max_gap_ns, rules.restart_after, max_late_ns=rules.max_late_ns
         )
@@ -86,21 +86,30 @@ class Stream:
     @property
     def frame_id(self) -> str:
         """The frame of the tracks, empty until a measurement names one."""
-        return self._frames.frame_id
+        return self.frames.frame_id
 
     def _admit(self, measurement: Any) -> Admitted:
         """Ask the gate of stamps about a measurement that is `_recognised`."""
         decision = self._gate.decide(measurement.stamp_ns, measurement)
         decision.count_in(self.counts)
-        return Admitted(decision.released, decision.verdict == 'restart')
+        # Only what is used decides on a frame; what was held came before anything had decided.
+        used = []
+        for item in decision.released:
+            if self._in_frame(item):
+                self.frames.settle(item)
+                used.append(item)
+        return Admitted(tuple(used), decision.verdict == 'restart')
 
     def _recognised(self, measurement: Any) -> bool:
         """Whether type and frame are those of the stream; counts a refusal."""
-        if not isinstance(measurement, self._accepts):
+        if not isinstance(measurement, self.accepts):
             self.counts['unknown_type'] += 1
             return False
+        return self._in_frame(measurement)
+
+    def _in_frame(self, measurement: Any) -> bool:
         try:
-            self._frames.check(measurement)
+            self.frames.check(measurement)
         except Rejection:
             self.counts['other_frame'] += 1
             return False

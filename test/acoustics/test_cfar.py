@@ -140,6 +140,36 @@ def test_what_reaches_into_its_own_training_cells_is_left_out_of_the_noise():
     assert_allclose(quiet[20:60].mean(), plain[20:60].mean(), rtol=0.06)
 
 
+def test_a_wide_chain_does_not_lift_the_level_by_which_it_is_left_out():
+    """A chain along the line of sight, ten of 25 beams wide: its glints lift the mean logarithm by
+    which they are told from noise."""
+    rng = np.random.default_rng(8)
+    power = rng.exponential(size=(200, 100))
+    power[80:120, 45:55] *= 20.0
+    quiet, _, _ = quiet_level(power, beams=25, training=16, guard=4)
+    assert np.median(quiet[90:110, 50]) < 2.0  # 2.6 after one look, 8.9 with all cells
+
+
+def test_the_unit_of_power_does_not_matter_where_nothing_is_quiet():
+    power = np.random.default_rng(9).exponential(size=(120, 60))
+    power[60:] *= 300.0
+    power[90] *= 1e4
+    level, _, rough = quiet_level(power, beams=25, training=16, guard=4)
+    for unit in (1e-8, 1e8):
+        again, _, same = quiet_level(unit * power, beams=25, training=16, guard=4)
+        assert_allclose(again, unit * level, rtol=1e-9)
+        assert_allclose(same, rough, rtol=1e-9)
+
+
+def test_rows_without_a_quiet_beam_count_as_the_others_do():
+    """Two rings, loud in every beam, nearer and farther: they are neither noise nor silence."""
+    rng = np.random.default_rng(10)
+    power = rng.exponential(size=(200, 100))
+    power[80:84] = power[100:104] = 60.0
+    quiet, _, _ = quiet_level(power, beams=25, training=16, guard=4)
+    assert np.median(quiet[91:93]) == pytest.approx(np.median(quiet[140:160]), rel=0.15)
+
+
 def test_silence_and_one_huge_cell_are_survived():
     for power in (np.zeros((60, 40)), np.full((60, 40), 1e76), np.zeros((0, 40)), np.ones((3, 2))):
         level, sides, rough = quiet_level(power, beams=25, training=16, guard=4)

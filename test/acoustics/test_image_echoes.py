@@ -120,6 +120,12 @@ def test_correlated_noise_gives_few_false_alarms():
     assert 0 < count < 60
 
 
+def test_few_independent_cells_ask_for_a_higher_threshold():
+    """Nine beams and eight rows are four independent cells, not 72: taken for 72 they give 84."""
+    small = {'beams': 9, 'training': 8, 'false_alarm': 1e-3, 'growth': 1e-3, 'margin': 1.0}
+    assert 5 < sum(len(found(image(seed=seed), **small).range) for seed in range(10)) < 40
+
+
 @pytest.mark.parametrize(
     'amplitude',
     [

@@ -36,6 +36,7 @@ GOOD = {
         }
     ],
     'signals': [{'system': 'diver', 'signal': 'SIGINT', 'tried': 20, 'clean': 20, 'why': []}],
+    'restart': [{'system': 'diver', 'tried': 9, 'again': 14, 'estimates': 70, 'equal': 70}],
     'damage': [{'what': 'full disk', 'tried': 3, 'said': 3, 'silent': 0, 'failed': 0}],
     'flood': [],
     'soak': {
@@ -52,6 +53,15 @@ GOOD = {
         }
     },
     'soak_live': {},
+    'metamorphic': [
+        {
+            'system': 'diver',
+            'how': 'gnn',
+            'moved': 'later',
+            'tolerance': 1e-6,
+            'states': 1e-9,
+        }
+    ],
     'hostile': {},
 }
 
@@ -84,8 +94,10 @@ def test_what_is_good_falls_short_of_nothing():
         ('faults', 0, {'recovered': 4}),
         ('faults', 0, {'traceback': True}),
         ('signals', 0, {'clean': 19}),
+        ('restart', 0, {'equal': 69}),
         ('damage', 0, {'silent': 1}),
         ('damage', 0, {'failed': 1}),
+        ('metamorphic', 0, {'states': 2e-6}),
         ('soak', 'diver', {'slope_low': 1.5}),
         ('soak', 'diver', {'p99_last_ms': 2.5}),
         ('soak', 'diver', {'uncounted': 1.0}),
@@ -99,3 +111,70 @@ def test_what_falls_short_is_said(part, row, change):
 
 def test_a_part_that_is_missing_is_said():
     assert reliability.short_of({}) == [f'{name}: not measured' for name in reliability.PARTS]
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    """Two parts, whose programs note each row that they measure; the file and the page are others.
+    Gives the folder of the parts and what they noted."""
+    program = """
+import json, pathlib, sys
+file, notes = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
+rows = json.loads(file.read_text()) if file.is_file() else []
+known = [row['signal'] for row in rows]
+for name in ('SIGINT', 'SIGHUP'):
+    if name not in known:
+        notes.open('a').write(name + ' ')
+        rows.append({'system': 'diver', 'signal': name, 'tried': 2, 'clean': 2, 'why': []})
+        file.write_text(json.dumps(rows))
+sys.exit(3)
+"""
+    monkeypatch.setattr(reliability, 'RESULT', tmp_path / 'result.json')
+    monkeypatch.setattr(reliability, 'PAGE', tmp_path / 'page.md')
+    monkeypatch.setattr(
+        reliability, 'PROGRAMS', {'signals': ('-c', program, '{}/signals.json', '{}/notes')}
+    )
+    monkeypatch.setattr(reliability, 'PARTS', ('signals',))
+    page = '<!-- reliability: signals -->\n<!-- /reliability -->\n'
+    reliability.PAGE.write_text(page, encoding='utf-8')
+    return tmp_path / 'parts'
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr('sys.argv', ['reliability', *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        reliability.main()
+    return ended.value.code
+
+
+def test_parts_are_run_and_what_was_broken_off_goes_on(toy, monkeypatch, capsys):
+    toy.mkdir()
+    rows = [{'system': 'diver', 'signal': 'SIGINT', 'tried': 2, 'clean': 2, 'why': []}]
+    (toy / 'signals.json').write_text(json.dumps(rows))
+    assert run(monkeypatch, toy, '--run') == 0
+    assert (toy / 'notes').read_text() == 'SIGHUP '  # the other one was there
+    assert '| diver | 2 of 2 | 2 of 2 |' in reliability.PAGE.read_text()
+    assert 'signals: ended with exit code 3' in capsys.readouterr().out
+    rows = json.loads((toy / 'signals.json').read_text())
+    rows[0]['clean'] = 1
+    (toy / 'signals.json').write_text(json.dumps(rows))
+    assert run(monkeypatch, toy) == 1
+    assert run(monkeypatch, toy, '--run', 'signals') == 0
+    assert (toy / 'notes').read_text() == 'SIGHUP SIGINT '  # what fell short is tried again
+
+
+def test_rows_that_are_not_measured_again_stay(toy, monkeypatch):
+    old = [{'system': 'obstacle', 'signal': 'SIGINT', 'tried': 9, 'clean': 9, 'why': []}]
+    old += [{'system': 'diver', 'signal': 'SIGINT', 'tried': 9, 'clean': 8, 'why': ['no']}]
+    reliability.RESULT.write_text(json.dumps({'signals': old}))
+    assert run(monkeypatch, toy, '--run') == 0
+    told = json.loads(reliability.RESULT.read_text())['signals']
+    assert {(one['system'], one['signal'], one['tried']) for one in told} == {
+        ('diver', 'SIGINT', 2),
+        ('diver', 'SIGHUP', 2),
+        ('obstacle', 'SIGINT', 9),
+    }
+
+
+def test_every_part_has_a_program_a_table_and_limits():
+    assert reliability.PROGRAMS.keys() == reliability.TABLES.keys() == reliability.SHORT.keys()

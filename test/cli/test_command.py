@@ -167,3 +167,32 @@ def test_help_is_fast():
     begin = time.perf_counter()
     assert run('--help').returncode == 0
     assert time.perf_counter() - begin < 2.0
+
+
+ENDED = """
+import signal
+from sonar_imm import cli
+
+class Half:
+    def __init__(self):
+        cli._leave(signal.SIGTERM, None)
+        self.name = 'made'
+
+    def __del__(self):
+        print(self.name)
+
+class Wrong:
+    def __del__(self):
+        raise ValueError('this one is told')
+
+try:
+    Half()
+finally:
+    Wrong()
+"""
+
+
+def test_what_a_signal_leaves_half_made_is_no_traceback():
+    done = subprocess.run([sys.executable, '-c', ENDED], capture_output=True, text=True)
+    assert done.returncode == 143 and 'this one is told' in done.stderr
+    assert 'AttributeError' not in done.stderr and 'Half' not in done.stderr

@@ -14,13 +14,18 @@
 
 """``sonar-imm view``: what it refuses, the report in the browser, the file for Rerun."""
 
+from pathlib import Path
 import sys
 import webbrowser
 
+import numpy as np
 import pytest
 
+from msg_adapters.fixes import write_fix
 from sonar_imm.cli import main
 from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm.measurements import Fix
+from sonar_imm.recordings.writer import BagWriter, ros_message
 from sonar_imm.resources import shared_file
 
 
@@ -88,3 +93,26 @@ def test_rerun_needs_a_run(tmp_path, capsys):
     bag = shared_file('bags/diver_table1')
     assert main(['view', str(bag), '--rerun', str(tmp_path / 'a.rrd')]) == 2
     assert 'holds no finished run' in capsys.readouterr().err
+
+
+def test_names_in_a_recording_do_not_steer_the_terminal_nor_the_page(
+    tmp_path, capsys, monkeypatch
+):
+    """A topic and a frame that would clear the screen, or be a script in the report."""
+    name = '</script><script>alert(1)</script>\x1b[2J'
+    bag = tmp_path / 'bag'
+    with BagWriter(bag) as writer:
+        for k in range(8):
+            stamp = (1_700_000_000 + k) * 10**9
+            fix = Fix(stamp_ns=stamp, position=[k, 0.0, 0.0], frame_id=name, covariance=np.eye(2))
+            writer.write(f'/{name}/fix', write_fix(fix, ros_message), stamp)
+    opened = []
+    monkeypatch.setattr(webbrowser, 'open', opened.append)
+    assert main(['info', str(bag)]) == 0
+    assert main(['view', str(bag), '--browser']) == 0
+    assert main(['view', str(bag), '--port', '0', '--topics', f'{name}']) == 2
+    assert main(['track', str(bag), str(tmp_path / 'run')]) == 0
+    said = capsys.readouterr()
+    assert '\\x1b[2J' in said.out and '\x1b' not in said.out + said.err
+    page = Path(opened[0].removeprefix('file://')).read_text()
+    assert 'alert(1)' in page and '<script>alert(1)' not in page

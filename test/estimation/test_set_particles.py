@@ -59,7 +59,7 @@ def run(model, records, particles, seed, threads=1):
     for name, b in enumerate(records):
         step = tracker.step(before, b, (seed, name))
         before = step.after
-        pmf, sums = tracker.summary(step, step.w, step.sets)
+        pmf, sums = tracker.summary(step)
         pmfs.append(pmf)
         intensities.append(sums[0])
         evidence += step.log_evidence
@@ -302,13 +302,12 @@ def test_what_came_later_corrects_what_was_known(model, exact):
     for name, b in enumerate(exact['B']):
         step = tracker.step(before, b, (4, name))
         before = step.after
-        pmfs.append(tracker.summary(step, step.w, step.sets)[0])
-        found = smoother.push(step)
-        if found:
-            earlier, w = found
-            assert w.sum() == pytest.approx(1.0)
+        pmfs.append(tracker.summary(step)[0])
+        earlier = smoother.push(step)
+        if earlier:
+            assert earlier.w.sum() == pytest.approx(1.0)
             true = exact['true_m'][name - 3] - 1
-            right_later.append(tracker.summary(earlier, w, earlier.sets)[0][true])
+            right_later.append(tracker.summary(earlier)[0][true])
             right_then.append(pmfs[name - 3][true])
     assert np.mean(right_later) > np.mean(right_then) + 0.01
 

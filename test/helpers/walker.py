@@ -23,6 +23,7 @@ import numpy as np
 import msg_adapters.displays.bathymetry
 import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import FrameGuard, Frames
 from sonar_imm.parameters import Config, parameter
 from sonar_imm.trackers import System, SYSTEMS
 
@@ -60,6 +61,7 @@ class WalkerTracker:
 
     def reset(self):
         self.fixes = {}
+        self.frames = Frames(FrameGuard(), ())
 
     def reconfigure(self, config):
         self.config = config

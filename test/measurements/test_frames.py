@@ -33,15 +33,15 @@ def fix(frame_id):
 
 def refused(guard, frame_id):
     with pytest.raises(Rejection) as caught:
-        guard.check(fix(frame_id))
+        guard.admit(fix(frame_id))
     return caught.value
 
 
 def test_the_first_named_frame_stays():
     guard = FrameGuard()
-    guard.check(fix(''))
-    guard.check(fix('map'))
-    guard.check(fix('map'))
+    guard.admit(fix(''))
+    guard.admit(fix('map'))
+    guard.admit(fix('map'))
     rejection = refused(guard, 'odom')
     assert rejection.reason == 'frame'
     assert rejection.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
@@ -50,9 +50,9 @@ def test_the_first_named_frame_stays():
 
 def test_reset_lets_the_next_one_decide():
     guard = FrameGuard()
-    guard.check(fix('map'))
+    guard.admit(fix('map'))
     guard.reset()
-    guard.check(fix('odom'))
+    guard.admit(fix('odom'))
     refused(guard, 'map')
 
 
@@ -61,7 +61,7 @@ def test_a_told_frame_holds_from_the_start_and_survives_reset():
     refused(guard, 'map')
     guard.reset()
     refused(guard, '')
-    guard.check(fix('harbour'))
+    guard.admit(fix('harbour'))
 
 
 def test_what_sensors_on_board_say_is_in_frames_of_their_own():
@@ -70,19 +70,19 @@ def test_what_sensors_on_board_say_is_in_frames_of_their_own():
     height = Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter')
     place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
     for measurement in (echo, height, place, echo, height, place):
-        guard.check(measurement)
+        guard.admit(measurement)
     for other in (
         Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
         Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='map'),
     ):
         with pytest.raises(Rejection) as caught:
-            guard.check(other)
+            guard.admit(other)
         assert caught.value.reason == 'frame'
     guard.reset()
-    guard.check(Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'))
+    guard.admit(Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'))
 
 
 def test_a_depth_is_a_depth_in_any_frame():
     guard = FrameGuard('map')
-    guard.check(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
+    guard.admit(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
     assert guard.frame_id == 'map'

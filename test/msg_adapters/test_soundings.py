@@ -17,6 +17,7 @@ import pytest
 
 from msg_adapters.soundings import read_soundings, write_soundings
 from msg_adapters.table import encode_table
+from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Rejection
 from sonar_imm.recordings.messages import ros_message
 from sonar_imm.soundings import COLUMNS, Soundings
@@ -61,6 +62,14 @@ def test_the_topic_reads_back_with_the_reader_of_ros():
     table = point_cloud2.read_points(write_soundings(one, messages.make), skip_nans=True)
     for name, column in one.columns.items():
         assert (table[name] == column).all()
+
+
+def test_older_soundings_without_exact_places_are_read():
+    one = soundings()
+    older = {name: column for name, column in one.columns.items() if name not in PLACES}
+    again = read_soundings(encode_table(older, stamp_ns=1, frame_id='map', make=ros_message))
+    assert list(again.columns) == list(COLUMNS) and again.columns['py'].dtype == np.float64
+    assert (again.columns['py'] == one.columns['y']).all()
 
 
 def test_no_soundings_are_a_message_too():

@@ -136,7 +136,7 @@ def test_a_disk_that_is_full_is_said(start, monkeypatch, capfd):
     monkeypatch.setattr('sonar_imm.nodes.keeping.write_state', full)
     rig = start()
     rig.send(a_fix(1.0))
-    rig.node._keeper.save(rig.node.tracker, wait=True)
+    rig.node._keeper.save(rig.node.tracker, rig.node.tracker.config, wait=True)
     assert 'No space left on device' in rig.node._keeper.trouble
     assert capfd.readouterr().err.count('the state cannot be saved') == 1
 

@@ -164,3 +164,22 @@ def test_what_has_no_summary_cannot_be_sealed(tmp_path):
     with pytest.raises(ValueError, match='summary'):
         seal(tmp_path / 'x.mcap')
     assert not wrong_sums(tmp_path / 'x.mcap')
+
+
+@pytest.mark.parametrize('compressed', [False, True])
+@pytest.mark.parametrize('size, step_ns, chunks', [(1000, 10**9, 4), (40_000, 10**6, 5)])
+def test_a_bit_costs_one_chunk_of_a_short_recording(tmp_path, compressed, size, step_ns, chunks):
+    """Less than a megabyte, and less than a minute: chunks end by time, or by size."""
+    rng = np.random.default_rng(2)
+    with BagWriter(tmp_path / 'bag', compressed=compressed) as bag:
+        for i in range(40):
+            bag.write('/a', ros_message(TEXT, data=rng.bytes(size // 2).hex()), i * step_ns)
+    path = tmp_path / 'bag' / 'bag.mcap'
+    (_, whole), problems = content(path)
+    starts, _ = chunks_of(path)
+    assert len(whole) == 40 and not problems and chunks <= len(starts) <= 2 * chunks
+    for start in starts:
+        (tmp_path / 'one.mcap').write_bytes(flipped(path.read_bytes(), 8 * (start + 100) + 3))
+        (_, found), problems = content(tmp_path / 'one.mcap')
+        assert problems and 0 < len(whole) - len(found) <= 40 // chunks + 1
+        assert set(found) < set(whole)

@@ -20,6 +20,7 @@ import subprocess
 import sys
 
 from helpers.dive_bags import write_dive
+from helpers.ready import wait_until_ready
 from helpers.source import ROOT
 import pytest
 
@@ -48,6 +49,7 @@ def playing(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     bag = write_dive(tmp_path / 'dive')
     with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
+        wait_until_ready([node])
         player = command(domain, 'play', bag, '--rate', '20', '--loop')
         try:
             yield domain
@@ -83,6 +85,7 @@ def test_estimates_are_found_and_shown(playing):
 def test_silence_is_told(monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with reserved_domain_id() as domain, NodeProcess('diver', domain_id=domain) as node:
+        wait_until_ready([node])
         alone = command(domain, 'echo', '/divr/estimate', '--timeout', '25')
         silent = command(domain, 'echo', '--timeout', '25')
         said = alone.communicate(timeout=90)[1]

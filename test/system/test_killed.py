@@ -14,6 +14,7 @@
 
 """A process that is killed leaves nothing that looks whole."""
 
+import math
 import random
 import signal
 import subprocess
@@ -21,6 +22,7 @@ import sys
 import time
 
 from helpers.dive_bags import write_dive
+from helpers.faults.figures import count
 from helpers.source import ROOT
 import pytest
 
@@ -30,7 +32,7 @@ from sonar_imm.files import UNFINISHED
 from sonar_imm.recordings.reader import BagReader
 
 pytestmark = pytest.mark.system
-MOMENTS = 20
+MOMENTS = count(6, 20)
 
 
 def command(*arguments):
@@ -46,31 +48,34 @@ def whole_run(path):
     return True
 
 
-def test_track_is_killed_at_twenty_moments(tmp_path):
+def test_track_is_killed_at_any_moment(tmp_path):
     bag = write_dive(tmp_path / 'bag' / 'dive')
-    arguments = command('track', bag, tmp_path / 'once')
-    begin = time.perf_counter()
-    subprocess.run(arguments, cwd=ROOT, check=True, capture_output=True)
-    usual = time.perf_counter() - begin
+    runs = tmp_path / 'runs'
+    usual = _killed(bag, runs / 'once', math.inf)
     # Half of the moments where the files are written and moved, which is at the end.
     chance = random.Random(14)
-    moments = [chance.uniform(0.0, 1.05) for _ in range(MOMENTS // 2)]
+    moments = [0.0, *(chance.uniform(0.0, 1.05) for _ in range(MOMENTS // 2 - 1))]
     moments += [chance.uniform(0.75, 1.02) for _ in range(MOMENTS - len(moments))]
-    whole = 0
     for number, moment in enumerate(moments):
-        out = tmp_path / 'runs' / f'run{number}'
-        with subprocess.Popen(
-            command('track', bag, out), cwd=ROOT, stdout=subprocess.DEVNULL
-        ) as it:
-            try:
-                it.wait(moment * usual)
-            except subprocess.TimeoutExpired:
-                it.send_signal(signal.SIGKILL)
-        whole += whole_run(out)
+        _killed(bag, runs / f'run{number}', moment * usual)
+    whole = sum(whole_run(runs / f'run{number}') for number in range(MOMENTS))
     assert whole < MOMENTS
-    names = {path.name for path in (tmp_path / 'runs').glob('*')}
+    names = {path.name for path in runs.glob('*')} - {'once'}
     others = {name for name in names if UNFINISHED not in name}
     assert len(others) == whole and all(name.startswith('run') for name in names)
+
+
+def _killed(bag, out, moment):
+    """Track `bag`, killed `moment` seconds after the first trace of `out`; seconds it lived."""
+    with subprocess.Popen(command('track', bag, out), cwd=ROOT, stdout=subprocess.DEVNULL) as it:
+        while it.poll() is None and not list(out.parent.glob(f'{out.name}*')):
+            time.sleep(0.001)
+        begin = time.perf_counter()
+        try:
+            it.wait(None if math.isinf(moment) else moment)
+        except subprocess.TimeoutExpired:
+            it.send_signal(signal.SIGKILL)
+    return time.perf_counter() - begin
 
 
 def test_a_killed_command_goes_on_where_it_was(tmp_path):

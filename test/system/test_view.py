@@ -40,7 +40,7 @@ from sonar_imm.resources import shared_file  # noqa: E402
 pytestmark = pytest.mark.system
 
 BAG = shared_file('bags/diver_multistatic')
-LIMIT = 60.0
+LIMIT = 240.0
 
 
 @contextlib.contextmanager

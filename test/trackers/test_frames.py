@@ -20,7 +20,14 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.measurements import Fix, FrameGuard, Rejection, StaticTransforms
+from sonar_imm.measurements import (
+    Altitude,
+    Fix,
+    FrameGuard,
+    Navigation,
+    Rejection,
+    StaticTransforms,
+)
 from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.bathymetry import simulator as swath
 from sonar_imm.simulation.obstacle import simulator as obstacle
@@ -114,3 +121,27 @@ def test_a_position_in_another_frame_is_turned_where_the_transform_is_known():
     assert door.admit(fix('map', 1.0)).position.tolist() == [1.0, 0.0, 0.0]
     with pytest.raises(Rejection, match="'odom' is not the frame 'map'"):
         door.admit(fix('odom', 1.0))
+
+
+def test_a_late_altitude_does_not_shut_out_the_later_ones():
+    tracker = SYSTEMS['obstacle'].build(SYSTEMS['obstacle'].config_type()())
+    door = FrameDoor(tracker, FrameGuard())
+
+    def take(second, frame_id):
+        said = Altitude(stamp_ns=second * 10**9, altitude=9.0, frame_id=frame_id)
+        tracker.process(door.admit(said))
+
+    for second in range(5000, 5005):
+        pose = Navigation(
+            stamp_ns=second * 10**9,
+            position=[0.0, 0.0, 0.0],
+            orientation=[0.0, 0.0, 0.0, 1.0],
+            frame_id='map',
+        )
+        tracker.process(door.admit(pose))
+    take(4000, 'another')
+    assert tracker.counts['too_late'] == 1
+    take(5005, 'altimeter')
+    assert tracker.counts['used'] == 6
+    with pytest.raises(Rejection, match="'another' is not the frame 'altimeter'"):
+        take(5006, 'another')

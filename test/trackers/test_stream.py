@@ -108,3 +108,36 @@ def test_rules_come_from_a_config():
     assert StreamRules.of(config) == StreamRules(2_500_000_000, 60 * S, 4)
     # Without `history` nothing late is used.
     assert StreamRules.of(StampParameters(max_gap=60.0)) == StreamRules(0, 60 * S, 5)
+
+
+@frozen
+class Echo(Number):
+    """What a sensor on board says, in a frame of its own."""
+
+    FRAME = 'own'
+
+
+@pytest.mark.parametrize('make, take', [(replay, 'revise'), (once, 'admit')])
+def test_only_what_is_used_decides_on_the_frame_of_a_sensor(make, take):
+    stream = make()
+    stream.accepts = (Number, Echo)
+    for second in range(5000, 5010):
+        getattr(stream, take)(Number(second * S))
+    getattr(stream, take)(Echo(4000 * S, frame_id='bow_1'))  # late
+    getattr(stream, take)(Echo(9000 * S, frame_id='bow_2'))  # ahead of its time
+    assert getattr(stream, take)(Echo(5010 * S, frame_id='bow')) not in ([], Admitted())
+    assert stream.counts['too_late'] == 1 and not stream.counts['other_frame']
+    assert getattr(stream, take)(Echo(5011 * S, frame_id='stern')) in ([], Admitted())
+    assert stream.counts['other_frame'] == 1
+
+
+def test_what_was_held_is_in_one_frame_after_a_restart():
+    stream = once()
+    stream.accepts = (Number, Echo)
+    for one in at(5000, 5001):
+        stream.admit(one)
+    for second, frame in ((10, 'bow'), (11, 'stern')):
+        stream.admit(Echo(second * S, frame_id=frame))
+    admitted = stream.admit(Echo(12 * S, frame_id='bow'))
+    assert [one.stamp_ns for one in admitted.items] == [10 * S, 12 * S]
+    assert stream.counts['other_frame'] == 1

@@ -70,8 +70,8 @@ def test_every_channel_comes_with_its_schema_and_every_message_arrives():
                 expected.setdefault(item.topic, []).append((item.log_ns, item.raw))
         count = sum(map(len, expected.values()))
         # The states have a queue of their own and may overtake the messages.
-        viewer.wait(lambda: len(viewer.messages) == count and viewer.states)
-        assert viewer.states[-1][0] == ENDED
+        viewer.wait(lambda: len(viewer.messages) == count)
+        viewer.wait(lambda: viewer.states and viewer.states[-1][0] == ENDED)
         for topic, sent in expected.items():
             got = [(log_ns, raw) for name, log_ns, raw in viewer.messages if name == topic]
             assert got == sent

@@ -19,10 +19,18 @@ nothing in common but the instrument. The difference of a horizon's depths, divi
 runs state of its error, is the only independent judgement that such data allow.
 
 The tracks are straight between positions, in metres around the first of them. At each crossing a
-horizon counts that was found within `REACH` metres of it; its depth there is that of the nearest
-record, moved along the slope of the horizon, and its variance that of the record plus
-(slope * position_std)^2. Horizons are matched by least total distance, none further apart than the
-larger `min_separation` of both runs.
+horizon counts that was found within `AT` metres of it, or two `position_std` where they are more,
+and within `REACH` metres often enough for a slope; its depth is that of the nearest record, moved
+along the slope. Its variance is that of the record, or the scatter of its records about the slope
+where this is more. A place that is wrong counts by the slope in every direction, which the slopes
+along both lines give together, and for both lines. Horizons are matched by least total distance,
+none further apart than the larger `min_separation` of both runs.
+
+Not judged is what is cut: a horizon at the first or last depth that is tracked lies there or
+beyond, and below a floor that is cut nobody can tell multiples from horizons. The others are also
+judged after the shift that is common to all of a crossing (another depth of the instrument, of the
+water, another speed of sound near the surface), and together they say how far lines differ by
+more than is stated.
 """
 
 from __future__ import annotations
@@ -31,6 +39,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
@@ -38,31 +47,39 @@ from ...estimation.arrays import FloatArray
 from ...recordings.positions import read_positions
 from ...recordings.reader import BagReader
 from ...recordings.sources import BagError
-from ..run_folder import RunFolder
+from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from ..run_folder import read_measurements, RunFolder
 
-REACH = 25.0
+AT, REACH, LEAST = 5.0, 25.0, 5
 _EARTH = 6_371_008.8
 
 
 class Line(NamedTuple):
     """A tracked line: its records in order of time that have a place; east and north (T,) m;
-    separation: `min_separation` of the run, m."""
+    separation: `min_separation` of the run, m; first and last depth that is tracked, and the step
+    of depths, m."""
 
     name: str
     records: tuple[Estimate, ...]
     longitude: FloatArray
     latitude: FloatArray
     separation: float
+    first: float
+    last: float
+    step: float
 
 
 class Horizon(NamedTuple):
-    """A horizon at a crossing: depth and std m, slope in m per m along the line."""
+    """A horizon at a crossing: depth and std m, slope in m per m along the line; cut: it lies at
+    the end of the depths that are tracked."""
 
     track_id: int
     depth: float
     std: float
     slope: float
     is_bottom: float
+    multiple: float
+    cut: bool
 
 
 def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[str, Any]:
@@ -77,6 +94,8 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
             for line, track, row, share in zip(lines, tracks, (i, j), (s, t))
         ]
         limit = max(line.separation for line in lines)
+        directions = np.array([track[row + 1] - track[row] for track, row in zip(tracks, (i, j))])
+        directions /= np.hypot(*directions.T)[:, None]
         crossings.append(
             {
                 'stamp_a_ns': lines[0].records[i].stamp_ns,
@@ -84,21 +103,42 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
                 'longitude': _between(lines[0].longitude, i, s),
                 'latitude': _between(lines[0].latitude, i, s),
                 'angle_deg': angle,
-                **_compared(*found, limit),
+                **_compared(*found, limit, directions, position_std),
             }
         )
-    sigmas = [one['sigmas'] for crossing in crossings for one in crossing['horizons']]
-    differences = [one['difference_m'] for crossing in crossings for one in crossing['horizons']]
+    matched = [one for crossing in crossings for one in crossing['horizons']]
     return {
         'line_a': lines[0].name,
         'line_b': lines[1].name,
         'position_std_m': position_std,
         'crossings': crossings,
-        'matched': len(sigmas),
-        'rms_difference_m': _rms(differences),
-        'rms_sigmas': _rms(sigmas),
-        'inside_2_sigmas': float(np.mean(np.abs(sigmas) <= 2.0)) if sigmas else float('nan'),
+        'matched': len(matched),
+        **summary([one for one in matched if one['judged']]),
     }
+
+
+def summary(judged: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Numbers of horizons that are judged. between_lines_m: standard deviation that, added to what
+    is stated, makes their mean square 1 (Paule and Mandel); 0 where none is missing."""
+    sigmas = np.array([one['sigmas'] for one in judged])
+    difference, std = (np.array([one[key] for one in judged]) for key in ('difference_m', 'std_m'))
+    return {
+        'judged': len(judged),
+        'rms_difference_m': _rms(difference),
+        'rms_sigmas': _rms(sigmas),
+        'inside_2_sigmas': float(np.mean(np.abs(sigmas) <= 2.0)) if len(sigmas) else float('nan'),
+        'between_lines_m': _missing(difference, std) if len(judged) else float('nan'),
+    }
+
+
+def _missing(difference: FloatArray, std: FloatArray) -> float:
+    from scipy.optimize import brentq
+
+    def excess(missing: float) -> float:
+        return float(np.mean(difference**2 / (std**2 + missing**2))) - 1.0
+
+    # With all of the differences for it, nothing is left.
+    return float(brentq(excess, 0.0, _rms(difference))) if excess(0.0) > 0.0 else 0.0
 
 
 def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
@@ -114,16 +154,30 @@ def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
         )
         for h in one['horizons']:
             depths = f'{h["depth_a_m"]:8.2f} m and {h["depth_b_m"]:8.2f} m'
+            marks = {'bottom': h['bottom'], 'multiple': h['multiple'], 'cut': h['cut']}
             lines.append(
                 f'  {depths}: {h["difference_m"]:+.2f} m = {h["sigmas"]:+.1f} stated sigma of '
-                f'{h["std_m"]:.2f} m' + (', bottom' if h['bottom'] else '')
+                f'{h["std_m"]:.2f} m' + ''.join(f', {name}' for name, has in marks.items() if has)
             )
-    if metrics['matched']:
+        if one['floor_cut']:
+            lines.append(
+                '  not judged: the floor lies at the first depth that is tracked, or above it, so '
+                'that what is below may be multiples of it'
+            )
+        if 'shift_m' in one:
+            lines.append(
+                f'  common shift {one["shift_m"]:+.2f} m +- {one["shift_std_m"]:.2f} m; after it '
+                f'{one["residual_rms_m"]:.2f} m rms, {one["residual_rms_sigmas"]:.1f} stated '
+                'sigmas rms'
+            )
+    if metrics['judged']:
         lines.append(
-            f'{metrics["matched"]} horizons: {metrics["rms_difference_m"]:.2f} m rms, '
+            f'{metrics["judged"]} horizons: {metrics["rms_difference_m"]:.2f} m rms, '
             f'{metrics["rms_sigmas"]:.1f} stated sigmas rms, '
             f'{100.0 * metrics["inside_2_sigmas"]:.0f} % within two'
         )
+        if metrics['between_lines_m'] > 0.0:
+            lines.append(f'lines differ by {metrics["between_lines_m"]:.2f} m more than is stated')
     return lines
 
 
@@ -144,8 +198,29 @@ def _line(folder: RunFolder) -> Line:
     if there.sum() < 2:
         raise BagError(f'{folder.path}: fewer than two records have a place')
     kept = tuple(one for one, good in zip(records, there) if good)
-    separation = float(run['parameters'].get('min_separation', 0.4))
-    return Line(folder.path.name, kept, east[there], north[there], separation)
+    config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    depth = tracked_depths(run, config)
+    return Line(
+        folder.path.name,
+        kept,
+        east[there],
+        north[there],
+        config.min_separation,
+        float(depth[0]),
+        float(depth[-1]),
+        float(depth[1] - depth[0]),
+    )
+
+
+def tracked_depths(run: Mapping[str, Any], config: FathometerConfig) -> FloatArray:
+    """The depths (n,) m on which a run looked for reflectors: as its tracker has them after the
+    first record. Raises `BagError`."""
+    tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
+    for measurement in read_measurements(run):
+        tracker.process(measurement)
+        if tracker.response is not None:
+            return tracker.response.depth
+    raise BagError(f'{run["bag"]} holds no record of the fathometer')
 
 
 def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
@@ -177,7 +252,7 @@ def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> 
     """The horizons of a line around the fractional record `at`."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(track, axis=0).T)))
     here = float(np.interp(at, np.arange(len(way)), way))
-    seen: dict[int, list[tuple[float, float, float, float]]] = {}
+    seen: dict[int, list[tuple[float, ...]]] = {}
     for k in np.flatnonzero(np.abs(way - here) <= REACH):
         columns = line.records[k].columns()
         for row in np.flatnonzero(np.isfinite(columns['depth'])):
@@ -187,33 +262,63 @@ def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> 
                     float(columns['depth'][row]),
                     float(columns['cov_depth_depth'][row]),
                     float(columns['is_bottom'][row]),
+                    float(columns['multiple_probability'][row]),
                 )
             )
     horizons = []
     for track_id, rows in seen.items():
-        ahead, depth, variance, bottom = (np.array(column) for column in zip(*rows))
+        ahead, depth, variance, bottom, multiple = (np.array(column) for column in zip(*rows))
         near = int(np.argmin(np.abs(ahead)))
-        slope = 0.0
+        # Of two records side by side the slope is noise, and without one the error of a place
+        # says nothing.
+        if len(rows) < LEAST or np.ptp(ahead) <= 0.5 * REACH:
+            continue
+        if abs(ahead[near]) > max(AT, 2.0 * position_std):
+            continue
         spread = ahead - ahead.mean()
-        # Of two records side by side the slope is noise.
-        if len(rows) >= 5 and np.ptp(ahead) > 0.5 * REACH:
-            slope = float(spread @ depth / (spread @ spread))
-        std = float(np.sqrt(variance[near] + (slope * position_std) ** 2))
+        slope = float(spread @ depth / (spread @ spread))
+        left = depth - depth.mean() - slope * spread
+        scatter = float(left @ left / (len(rows) - 2))
+        std = float(np.sqrt(max(variance[near], scatter)))
         place = float(depth[near] - slope * ahead[near])
-        horizons.append(Horizon(track_id, place, std, slope, float(bottom[near])))
+        within = min(depth[near] - line.first, line.last - depth[near])
+        horizons.append(
+            Horizon(
+                track_id,
+                place,
+                std,
+                slope,
+                float(bottom[near]),
+                float(multiple[near]),
+                bool(within <= line.step),
+            )
+        )
     return sorted(horizons, key=lambda one: one.depth)
 
 
-def _compared(a: Sequence[Horizon], b: Sequence[Horizon], limit: float) -> dict[str, Any]:
+def _compared(
+    a: Sequence[Horizon],
+    b: Sequence[Horizon],
+    limit: float,
+    directions: FloatArray,
+    position_std: float,
+) -> dict[str, Any]:
+    """directions (2, 2): unit vectors along both lines."""
     from scipy.optimize import linear_sum_assignment
 
     depth_a, depth_b = np.array([one.depth for one in a]), np.array([one.depth for one in b])
     distance = np.abs(depth_a.reshape(-1, 1) - depth_b.reshape(1, -1))
     rows, columns = linear_sum_assignment(np.minimum(distance, limit))
     pairs = [(a[i], b[j]) for i, j in zip(rows, columns) if distance[i, j] < limit]
+    floor_cut = any(one.cut and one.is_bottom > 0.5 for one in (*a, *b))
     horizons = []
     for one, other in pairs:
-        std = float(np.hypot(one.std, other.std))
+        # Lines that are nearly parallel say nothing of the slope across them.
+        slopes = np.array([one.slope, other.slope])
+        gradient = np.linalg.lstsq(directions, slopes, rcond=0.3)[0]
+        place = np.sqrt(2.0) * position_std * np.hypot(*gradient)
+        std = float(np.sqrt(one.std**2 + other.std**2 + place**2))
+        cut = one.cut or other.cut
         horizons.append(
             {
                 'track_id_a': one.track_id,
@@ -224,12 +329,36 @@ def _compared(a: Sequence[Horizon], b: Sequence[Horizon], limit: float) -> dict[
                 'std_m': std,
                 'sigmas': (one.depth - other.depth) / std,
                 'bottom': one.is_bottom > 0.5 and other.is_bottom > 0.5,
+                'multiple': max(one.multiple, other.multiple) > 0.5,
+                'cut': cut,
+                'judged': not (cut or floor_cut),
             }
         )
     return {
         'horizons': horizons,
         'only_a': len(a) - len(pairs),
         'only_b': len(b) - len(pairs),
+        'floor_cut': floor_cut,
+        **common_shift([one for one in horizons if one['judged']]),
+    }
+
+
+def common_shift(judged: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The shift of line a against line b that horizons have in common, weighted by what they
+    state, its standard deviation, and what it leaves; nothing for fewer than two."""
+    if len(judged) < 2:
+        return {}
+    difference, std = (np.array([one[key] for one in judged]) for key in ('difference_m', 'std_m'))
+    weight = std**-2
+    shift = float(weight @ difference / weight.sum())
+    left = difference - shift
+    # One number of them went into the shift.
+    free = len(left) - 1
+    return {
+        'shift_m': shift,
+        'shift_std_m': float(weight.sum() ** -0.5),
+        'residual_rms_m': float(np.sqrt(left @ left / free)),
+        'residual_rms_sigmas': float(np.sqrt(weight @ left**2 / free)),
     }
 
 
@@ -237,5 +366,5 @@ def _between(values: FloatArray, row: int, share: float) -> float:
     return float(values[row] + share * (values[row + 1] - values[row]))
 
 
-def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else float('nan')
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float('nan')

@@ -26,6 +26,7 @@ from pathlib import Path
 from attrs import frozen
 import numpy as np
 
+from ...estimates import PLACES
 from ...estimation.arrays import FloatArray, IntArray
 from ...soundings import COLUMNS
 from ..sources import BagError
@@ -43,7 +44,8 @@ _LAS_EXTRAS = (
 
 @frozen(eq=False)
 class Points:
-    """All soundings of a run: stamp_ns (n,), columns (n,) by name as in `soundings.COLUMNS`."""
+    """All soundings of a run: stamp_ns (n,), columns (n,) by name as in `soundings.COLUMNS`, but
+    x y z in float64 in place of px py pz."""
 
     stamp_ns: IntArray
     columns: dict[str, FloatArray]
@@ -62,7 +64,7 @@ class Points:
 
 def read_points(path: Path) -> Points:
     """The soundings of a soundings.csv. Raises `BagError` for a file that is none."""
-    wanted = ['stamp_ns', *COLUMNS]
+    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in PLACES)]
     try:
         with path.open(encoding='utf-8', newline='') as file:
             reader = csv.reader(file)
@@ -75,10 +77,14 @@ def read_points(path: Path) -> Points:
     try:
         stamps = np.array([int(row[header.index('stamp_ns')]) for row in rows], np.int64)
         columns = {
-            name: np.array([float(row[header.index(name)]) for row in rows]) for name in COLUMNS
+            name: np.array([float(row[header.index(name)]) for row in rows])
+            for name in COLUMNS
+            if name in header
         }
     except (ValueError, IndexError):
         raise BagError(f'{path} has a row that is not numbers throughout') from None
+    for name, exact in zip('xyz', PLACES):
+        columns[name] = columns.pop(exact, columns[name])  # older tables have the coarse ones only
     return Points(stamps, columns)
 
 

@@ -29,7 +29,14 @@ import numpy as np
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...estimation.history import StampGate
-from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
+from ...measurements import (
+    Altitude,
+    FrameGuard,
+    nanoseconds,
+    Navigation,
+    Rejection,
+    Snapshot,
+)
 from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 
@@ -56,7 +63,7 @@ class PoseQueue:
     def __init__(self, counts: Counter[str]):
         self.counts = counts
         self.heard = False
-        self._frame_id = ''
+        self.frames = FrameGuard()
         self._gate: StampGate[Navigation] = StampGate(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
         self._buffer = NavigationBuffer()
         self._altitudes: list[Altitude] = []
@@ -68,7 +75,9 @@ class PoseQueue:
 
     def add_pose(self, sample: Navigation) -> None:
         """Take one pose in. A clock that was set back forgets all poses."""
-        if self._frame_id and sample.frame_id != self._frame_id:
+        try:
+            self.frames.check(sample)
+        except Rejection:
             self.counts['other_frame'] += 1
             return
         decision = self._gate.decide(sample.stamp_ns, sample)
@@ -77,7 +86,8 @@ class PoseQueue:
             self.counts['navigation_gap'] += len(self._waiting)
             self._buffer, self._altitudes, self._waiting = NavigationBuffer(), [], []
         for one in decision.released:
-            self.heard, self._frame_id = True, one.frame_id
+            self.heard = True
+            self.frames.settle(one)
             self.counts['poses'] += 1
             self._buffer = self._buffer.inserted(one)
         if self._buffer.stamps:
@@ -110,7 +120,7 @@ class PoseQueue:
             else:
                 poses = self._buffer.poses(stamps)
                 altitude = self._altitude(int(stamps[-1]))
-                done.append(PosedPing(snapshot, poses, self._frame_id, altitude))
+                done.append(PosedPing(snapshot, poses, self.frames.frame_id, altitude))
         self._waiting = waiting
         return done
 

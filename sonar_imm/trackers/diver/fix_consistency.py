@@ -15,11 +15,12 @@
 """When a stated covariance of fixes cannot be true, and what innovations cannot tell.
 
 Innovations of a filter with true covariances have a mean NIS of their number of coordinates (2)
-and are white. Larger: the covariances are optimistic, and may be scaled up. Smaller, or correlated
-from fix to fix: the source filters its output, so that its errors last, or its covariances are
-pessimistic. These two look the same. And a source that states only the white part of errors that
-last looks perfect: from one sensor, a bias slower than the motion is not in the innovations. So a
-covariance is never scaled down on this evidence; `warnings` says what the user has to state.
+and are white; one beyond three sigmas for each coordinate is a sharp turn and counts as that.
+Larger: the covariances are optimistic, and may be scaled up. Smaller, or correlated from fix to
+fix: the source filters its output, so that its errors last, or its covariances are pessimistic.
+These two look the same. And a source that states only the white part of errors that last looks
+perfect: from one sensor, a bias slower than the motion is not in the innovations. So a covariance
+is never scaled down on this evidence; `warnings` says what the user has to state.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from .fix_kernels import Sums
 MEMORY = 50.0
 """Fixes over which the evidence is gathered and forgotten."""
 
-OPTIMISTIC, PESSIMISTIC, CORRELATED = 2.0, 0.5, 0.3
+OPTIMISTIC, PESSIMISTIC, CORRELATED = 1.7, 0.5, 0.3
 """Mean NIS for each coordinate above and below which, and lag-1 correlation above which, a
-covariance is not what it says."""
+covariance is not what it says. Of `MEMORY` fixes with true covariances the mean has a standard
+deviation of 0.14, so that the first is five sigmas away: motion takes up a part of errors that are
+larger than stated, and leaves a mean of about 2 however much larger they are."""
 
 
 @frozen

@@ -27,6 +27,7 @@ import numpy as np
 from ...estimation import imm_kernels
 from ...estimation.adaptation_kernels import row_sum
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.consistency import FARTHEST
 from ...estimation.jit import kernel
 
 Sums = tuple[float, float, float, float, float]
@@ -117,6 +118,13 @@ def keep_score(
 
 
 @kernel
+def _shortening(first: float, second: float) -> float:
+    """What a whitened innovation is multiplied by, so that it is as long as it may be."""
+    square = first * first + second * second
+    return math.sqrt(2.0 * FARTHEST / square) if square > 2.0 * FARTHEST else 1.0
+
+
+@kernel
 def watch(
     x: FloatArray,
     P: FloatArray,
@@ -133,7 +141,10 @@ def watch(
 ) -> Sums:
     """Whiten the innovations that the mixture of each of `tracks` (t,) sees in its `detection`
     (t,), into white (T, 2), in place. Gives the sums with those of confirmed tracks, of which
-    about the last `memory` count; tentative (T,), the rest as in `take`."""
+    about the last `memory` count; tentative (T,), the rest as in `take`.
+
+    An innovation longer than `FARTHEST` allows is a sharp turn and says nothing of noise: in the
+    sums it is shortened to that."""
     mean, covariance = imm_kernels.combine(x[tracks], P[tracks], mu[tracks], H[0])
     one, other = np.empty((len(tracks), 2)), np.empty((len(tracks), 2))
     count, pairs = 0, 0
@@ -146,10 +157,12 @@ def watch(
         first = (z[row, 0] - mean[k, 0]) / a
         second = (z[row, 1] - mean[k, 1] - b * first) / c
         if not tentative[t] and math.isfinite(first) and math.isfinite(second):
-            one[count, 0], one[count, 1] = first, second
+            kept = _shortening(first, second)
+            one[count, 0], one[count, 1] = kept * first, kept * second
             count += 1
             if math.isfinite(white[t, 0]) and math.isfinite(white[t, 1]):
-                other[pairs] = white[t]
+                kept = _shortening(white[t, 0], white[t, 1])
+                other[pairs, 0], other[pairs, 1] = kept * white[t, 0], kept * white[t, 1]
                 # Those that have a partner come first.
                 one[count - 1], one[pairs] = one[pairs].copy(), one[count - 1].copy()
                 pairs += 1

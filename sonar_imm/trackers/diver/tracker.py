@@ -45,7 +45,15 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks
 from ...estimation.association_kernels import TENTATIVE
-from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
+from ...measurements import (
+    Arrivals,
+    Fix,
+    Fixes,
+    Frames,
+    Measurement,
+    NOBODY,
+    Start,
+)
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
 from . import fix_kernels, soft
@@ -97,6 +105,10 @@ class DiverTracker:
     def origin(self) -> Origin | None:
         """Where the frame of the tracks lies on Earth, None when that is not known."""
         return self._placer.origin
+
+    @property
+    def frames(self) -> Frames:
+        return Frames(self._stream.frames, self._stream.accepts)
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
@@ -341,7 +353,7 @@ class DiverTracker:
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._stream.frame_id,
-            xyz=np.column_stack([mean[:, :2], depth]).astype(np.float32),
+            xyz=np.column_stack([mean[:, :2], depth]),
             state_names=self.models.outputs,
             state=mean,
             covariance=covariance,

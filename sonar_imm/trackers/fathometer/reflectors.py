@@ -116,7 +116,12 @@ def nearest_ids(
     depth: FloatArray, earlier: Sequence[Identified], config: FathometerConfig
 ) -> IdArray:
     """Ids (K,) for reflectors at `depth` (K,): those of the `earlier` ones that are near enough,
-    the nearest pairs first; 0: none."""
+    the most probable pairs first; 0: none.
+
+    A reflector walks by `depth_std` a record: of those seen equally long ago the nearest is the
+    most probable, and one that has been missed could be anywhere in a wider range, so that it is
+    less so at any one place. By distance alone, what was lost takes over from what is still seen.
+    """
     ids = np.zeros(len(depth), np.uint32)
     taken = np.zeros(len(earlier), np.bool_)
     if not len(depth) or not earlier:
@@ -124,7 +129,8 @@ def nearest_ids(
     distance = np.abs(depth[:, None] - np.array([one.depth for one in earlier]))
     records = 1.0 + np.array([one.missed for one in earlier])
     reach = np.maximum(config.min_separation, _REACH * config.depth_std * np.sqrt(records))
-    for place in np.argsort(distance, axis=None, kind='stable'):
+    surprise = np.square(distance / config.depth_std) / records + np.log(records)
+    for place in np.argsort(surprise, axis=None, kind='stable'):
         row, column = divmod(int(place), len(earlier))
         if not ids[row] and not taken[column] and distance[row, column] <= reach[column]:
             ids[row], taken[column] = earlier[column].track_id, True

@@ -44,8 +44,15 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_members import find_members
-from ...estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
-from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from ...estimation.set_model import banded_transition, gaussian_move, SetModel
+from ...measurements import (
+    ArrayDepth,
+    CrossSpectra,
+    Frames,
+    Pressure,
+    Rejection,
+    Trace,
+)
 from ..stream import OnceStream, StreamRules
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
 from .array_response import array_response, rank_deficient
@@ -144,6 +151,10 @@ class FathometerTracker:
         """Build anew what follows from the lattice, after a state was put in."""
         if self._lattice is not None:
             self._begin(self._lattice)
+
+    @property
+    def frames(self) -> Frames:
+        return Frames(self._stream.frames, self._stream.accepts)
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
@@ -278,7 +289,7 @@ class FathometerTracker:
         reflectors of a first round leave."""
         step = self._step(response)
         if response.noise_unknown:
-            found, _ = self._reflectors(step, step.w, step.sets, response)
+            found, _ = self._reflectors(step, response)
             away = response.depth[:, None] - (found.depth + found.heave)
             response = residual_sigma(response, self.pulse(away) @ found.amplitude)
             step = self._step(response)
@@ -303,7 +314,7 @@ class FathometerTracker:
         self._before = step.after if step.ok else None
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
-        reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
+        reflectors, pmf = self._reflectors(step, response)
         self._ids, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
@@ -319,19 +330,18 @@ class FathometerTracker:
 
     def _preview(self, response: Response) -> Estimate:
         response, step = self._try(response)
-        reflectors, pmf = self._reflectors(step, step.w, step.sets, response)
+        reflectors, pmf = self._reflectors(step, response)
         _, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self.counts['previews'] += 1
         return self._write(reflectors, ids, pmf, response, preview=True)
 
     def _smoothed(self, newest: SetStep) -> list[Estimate]:
         """The record `smoothing_lag` ago, seen with all since."""
-        found = self._smoother.push(newest)
-        if found is None:
+        step = self._smoother.push(newest)
+        if step is None:
             return []
-        step, w = found
         response = self._taken[0].response
-        reflectors, pmf = self._reflectors(step, w, step.sets, response)
+        reflectors, pmf = self._reflectors(step, response)
         # A reflector that only smoothing finds so early has its id from a later record.
         ids = np.zeros(len(reflectors.depth), np.uint32)
         for taken in self._taken:
@@ -359,19 +369,17 @@ class FathometerTracker:
             reflectors, ids, pmf, multiple, response, self.config, preview=preview
         )
 
-    def _reflectors(
-        self, step: SetStep, w: FloatArray, sets: Sets, response: Response
-    ) -> tuple[Reflectors, FloatArray]:
+    def _reflectors(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
         """Those of the most probable number, and the PMF (orders,) of the number."""
         assert self._filter is not None and self._lattice is not None
-        pmf, sums = self._filter.summary(step, w, sets)
+        pmf, sums = self._filter.summary(step)
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
         modes = bool(self.config.scatter_decay)
         members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
         if self._filter.model.shift:
-            mean, std = self._filter.shift(step, w, sets)
+            mean, std = self._filter.shift(step)
             heave = self._lattice.step * mean, self._lattice.step * std
         pulse = response.pulse or self.pulse
         found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)

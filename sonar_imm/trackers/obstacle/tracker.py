@@ -36,7 +36,7 @@ from attrs import evolve
 import numpy as np
 
 from ...acoustics import geometry
-from ...estimates import Estimate
+from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import (
@@ -45,7 +45,14 @@ from ...estimation.association import (
     Tracks,
     TrackStatus,
 )
-from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
+from ...measurements import (
+    Altitude,
+    Detections,
+    Frames,
+    Measurement,
+    nanoseconds,
+    Navigation,
+)
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
 from ..stream import ReplayStream, StreamRules
@@ -102,6 +109,10 @@ class ObstacleTracker:
             survivor=identities,
         )
         self.counts = self._stream.counts
+
+    @property
+    def frames(self) -> Frames:
+        return Frames(self._stream.frames, self._stream.accepts)
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)
@@ -375,6 +386,7 @@ class ObstacleTracker:
             'vertical_offset_lo': view.low,
             'vertical_offset_hi': view.high,
             'nis': ping.nis,
+            **places(place),
         }
         for i, a in enumerate('xyz'):
             for j, b in enumerate('xyz'[i:], start=i):

@@ -21,7 +21,7 @@ import pytest
 
 from msg_adapters.array_records import write_trace
 from sonar_imm.cli import main
-from sonar_imm.evaluation.fathometer.crossing import crossing_metrics
+from sonar_imm.evaluation.fathometer.crossing import common_shift, crossing_metrics, summary
 from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.measurements import Trace
 from sonar_imm.recordings.conversion import ConversionReport, write_bag
@@ -41,15 +41,18 @@ def floor(east, north):
     return 12.0 + 0.01 * east, 20.0 + 0.05 * north
 
 
-def line(folder, name, places, shift=0.0, positions=True):
-    """A tracked line past `places` (T, 2) m, of traces that are too deep by `shift`."""
+def line(folder, name, places, shift=0.0, positions=True, first=0, lower=None):
+    """A tracked line past `places` (T, 2) m, of traces that are too deep by `shift` and begin with
+    sample `first`; lower: which of the places see the lower layer."""
     rng, records = np.random.default_rng(len(name)), []
     for k, (east, north) in enumerate(places):
         stamp = (1000 + k) * SECOND
         echo = 0.01 * np.abs(rng.standard_normal(len(DEPTH)))
-        for depth in floor(east, north):
+        for depth in floor(east, north)[: 1 if lower is not None and k not in lower else 2]:
             echo += np.exp(-0.5 * np.square((DEPTH - depth - shift) / 0.5))
-        trace = Trace(stamp_ns=stamp, depth=DEPTH, amplitude=echo, reference_depth=0.0)
+        trace = Trace(
+            stamp_ns=stamp, depth=DEPTH[first:], amplitude=echo[first:], reference_depth=0.0
+        )
         if positions:
             place = LON + east * METRE / np.cos(np.radians(LAT)), LAT + north * METRE
             records.append((stamp, '/position', write_position(stamp, *place)))
@@ -70,6 +73,10 @@ def lines(tmp_path_factory):
         'we': line(folder, 'we', np.column_stack([way, np.full(41, 5.0)])),
         'sn': line(folder, 'sn', np.column_stack([np.full(41, -8.0), way])),
         'deep': line(folder, 'deep', np.column_stack([np.full(41, -8.0), way]), shift=0.6),
+        'cut': line(folder, 'cut', np.column_stack([np.full(41, -8.0), way]), first=48),
+        'late': line(
+            folder, 'late', np.column_stack([np.full(41, -8.0), way]), lower=range(27, 41)
+        ),
         'far': line(folder, 'far', np.column_stack([np.full(41, 90.0), way])),
         'lost': line(folder, 'lost', np.column_stack([way, way]), positions=False),
     }
@@ -99,8 +106,9 @@ def test_the_error_of_a_position_counts_by_the_slope(lines):
         np.sqrt(b['std_m'] ** 2 - a['std_m'] ** 2)
         for a, b in zip(without['horizons'], with_it['horizons'])
     )
-    # Only along the line to the north the lower layer slopes, by 0.05; the upper one by 0.01.
-    assert steep == pytest.approx(20.0 * 0.05, abs=0.25) and level < 0.4
+    # The lower layer slopes by 0.05 to the north, the upper one by 0.01 to the east, whatever line
+    # sees it; the place of either line can be wrong.
+    assert steep == pytest.approx(np.sqrt(2.0) * 20.0 * 0.05, abs=0.3) and level < 0.5
 
 
 def test_a_line_that_is_too_deep_shows(lines):
@@ -108,6 +116,58 @@ def test_a_line_that_is_too_deep_shows(lines):
     for horizon in metrics['crossings'][0]['horizons']:
         assert horizon['difference_m'] == pytest.approx(-0.6, abs=0.3)
     assert metrics['rms_sigmas'] > 2.0
+    # All of it is common to both horizons.
+    assert metrics['crossings'][0]['shift_m'] == pytest.approx(-0.6, abs=0.15)
+    assert metrics['crossings'][0]['residual_rms_m'] < 0.25
+    assert metrics['between_lines_m'] == pytest.approx(0.6, abs=0.2)
+    assert 'between_lines_m' in metrics and crossed(lines, 'we', 'sn')['between_lines_m'] < 0.2
+
+
+def test_below_a_floor_that_is_cut_nothing_is_judged(lines, capsys):
+    """The traces of one line begin at 12 m, below the floor there: what they show at their first
+    depth is no depth of the floor."""
+    metrics = crossed(lines, 'we', 'cut')
+    [one] = metrics['crossings']
+    assert one['floor_cut'] and len(one['horizons']) == 2
+    assert [h['cut'] for h in one['horizons']] == [True, False]
+    assert not any(h['judged'] for h in one['horizons'])
+    assert metrics['matched'] == 2 and metrics['judged'] == 0
+    assert np.isnan(metrics['rms_sigmas']) and 'shift_m' not in one
+    assert main(['evaluate', str(lines['we']), str(lines['cut']), '--crossing']) == 0
+    said = capsys.readouterr().out
+    assert 'bottom, cut' in said and 'not judged' in said
+
+
+def test_what_was_not_seen_at_the_crossing_is_not_compared(lines):
+    """This line has the lower layer from 9 m beyond the crossing on."""
+    [one] = crossed(lines, 'we', 'late')['crossings']
+    assert [h['bottom'] for h in one['horizons']] == [True]
+    # Where places may be wrong by so much it is.
+    assert len(crossed(lines, 'we', 'late', 10.0)['crossings'][0]['horizons']) == 2
+
+
+def test_shift_and_spread_of_differences_that_are_known():
+    """Many made-up crossings: what comes out has the mean and the variances that went in."""
+    rng = np.random.default_rng(3)
+    shifts, chi2, missing = [], [], []
+    std = np.array([0.1, 0.2, 0.3, 0.4])
+    for _ in range(2000):
+        off = 0.5 + std * rng.standard_normal(4)
+        rows = [{'difference_m': d, 'std_m': s, 'sigmas': d / s} for d, s in zip(off, std)]
+        one = common_shift(rows)
+        shifts.append((one['shift_m'] - 0.5) / one['shift_std_m'])
+        chi2.append(one['residual_rms_sigmas'] ** 2)
+        missing.append(off)
+    assert np.mean(shifts) == pytest.approx(0.0, abs=0.08)
+    assert np.std(shifts) == pytest.approx(1.0, abs=0.06)
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.07)
+    everything = [
+        {'difference_m': d, 'std_m': s, 'sigmas': d / s}
+        for off in missing
+        for d, s in zip(off, std)
+    ]
+    assert summary(everything)['between_lines_m'] == pytest.approx(0.5, abs=0.02)
+    assert common_shift(rows[:1]) == {} and summary([])['judged'] == 0
 
 
 def test_no_crossing_and_no_places_are_said(lines, capsys):

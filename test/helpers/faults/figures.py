@@ -20,10 +20,13 @@ and each part writes a file there. `make reliability` does that.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 import json
 import os
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 FOLDER = os.environ.get('SONAR_IMM_FIGURES', '')
 SHARE = float(os.environ.get('SONAR_IMM_SHARE', '1.0'))
@@ -41,16 +44,30 @@ def count(short: int, long: int) -> int:
 
 
 class Figures:
-    """The rows of one part, written as they come; nothing in the short form."""
+    """The rows of one part, written as they come; nothing in the short form. What is in the folder
+    already is taken over: a long form that was broken off goes on."""
 
     def __init__(self, part: str):
-        self.part = part
+        self._path = Path(FOLDER) / f'{part}.json' if FOLDER else None
         self.rows: list[dict[str, Any]] = []
+        if self._path and self._path.is_file():
+            self.rows = json.loads(self._path.read_text(encoding='utf-8'))
 
-    def add(self, **row: Any) -> None:
-        self.rows.append(row)
-        if FOLDER:
-            folder = Path(FOLDER)
-            folder.mkdir(parents=True, exist_ok=True)
+    def skip_if_measured(self, tries: int = 0, **key: Any) -> None:
+        """Skip the test when its row is there, of as many `tries`."""
+        if any(_is_of(row, key) and row.get('tried', tries) >= tries for row in self.rows):
+            pytest.skip('measured already')
+
+    def add(self, key: Mapping[str, Any], **values: Any) -> None:
+        """Add the row of `key`, instead of one that is there."""
+        self.rows = [row for row in self.rows if not _is_of(row, key)] + [{**key, **values}]
+        if self._path:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
             told = json.dumps(self.rows, indent=1, sort_keys=True)
-            (folder / f'{self.part}.json').write_text(told + '\n', encoding='utf-8')
+            whole = self._path.with_suffix('.tmp')
+            whole.write_text(told + '\n', encoding='utf-8')
+            whole.replace(self._path)
+
+
+def _is_of(row: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
+    return all(row.get(name) == value for name, value in key.items())

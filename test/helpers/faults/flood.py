@@ -100,7 +100,7 @@ class Told:
         self.latency: dict[int, float] = {}
         topic = f'/{rig.case.system}/estimate'
         rig.link.node.create_subscription(PointCloud2, topic, self._heard, lockstep_qos())
-        rig.lockstep.wait_for(lambda: rig.link.node.count_subscribers(topic) > 1)
+        rig.wait_for(lambda: rig.link.node.count_subscribers(topic) > 1)
         rig.diagnostics.forget()
 
     def send(self, one: Message) -> None:

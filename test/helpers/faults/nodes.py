@@ -36,7 +36,7 @@ from sonar_imm.nodes.qos import lockstep_qos
 
 from .cases import CASES
 
-END_LIMIT = 30.0
+END_LIMIT = 120.0
 """Seconds a node may take to end."""
 
 
@@ -46,16 +46,9 @@ class Running:
     def __init__(self, systems: Iterable[str]):
         self._stack = contextlib.ExitStack()
         self._domain = self._stack.enter_context(reserved_domain_id())
-        with local_discovery():
-            self._link = self._stack.enter_context(Link('rig', domain_id=self._domain))
         self.nodes: dict[str, NodeProcess] = {}
         self._lockstep: dict[str, LockStep] = {}
         self._publishers: dict[tuple[str, str], Any] = {}
-        for system in systems:
-            for topic, cls in {m.topic: type(m.content) for m in CASES[system].messages()}.items():
-                self._publishers[system, topic] = self._link.node.create_publisher(
-                    cls, f'/{system}/{topic}', lockstep_qos()
-                )
         try:
             self._start([*systems])
         except BaseException:
@@ -79,7 +72,8 @@ class Running:
         self._lockstep[system].step(self._publishers[system, one.topic], one.content)
 
     def start_again(self) -> None:
-        """Start all nodes anew, under the names of those that ended."""
+        """Start all nodes anew, under the names of those that ended, and a new link: that of
+        before takes killed nodes for alive for a while."""
         systems = [*self.nodes]
         self._start(systems)
 
@@ -90,7 +84,13 @@ class Running:
         return [why for node in self.nodes.values() for why in reason_unclean(node, 0)]
 
     def _start(self, systems: list[str]) -> None:
-        arguments = []
+        with local_discovery():
+            self._link = self._stack.enter_context(Link('rig', domain_id=self._domain))
+        for system in systems:
+            for topic, cls in {m.topic: type(m.content) for m in CASES[system].messages()}.items():
+                self._publishers[system, topic] = self._link.node.create_publisher(
+                    cls, f'/{system}/{topic}', lockstep_qos()
+                )
         for system in systems:
             topics = [topic for name, topic in self._publishers if name == system]
             remaps = [f'{topic}:=/{system}/{topic}' for topic in topics]
@@ -142,7 +142,7 @@ def heeds_signals(process: subprocess.Popen[bytes]) -> bool:
     return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
 
 
-def ended(limit: float = 5.0) -> bool:
+def ended(limit: float = END_LIMIT) -> bool:
     """Whether this process has no children left, zombies not counted."""
     end = time.monotonic() + limit
     while time.monotonic() < end:

@@ -50,6 +50,8 @@ from .closeness import agrees
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 NO_LOSS = re.compile(r'count: (used|late|poses|restarts|bins.*)$|.* received$|doubtful: .*')
 """Counts of what was not lost."""
+_PATIENCE = 120.0
+"""Seconds of waiting for what comes soon where a machine is not loaded."""
 _REPORTS = 12
 """Reports of /diagnostics in a disturbed part, a third or more of which is the fault."""
 
@@ -145,6 +147,10 @@ class Rig:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    def wait_for(self, predicate: Callable[[], Any]) -> bool:
+        """Serve the link until `predicate` holds; False when it never does."""
+        return self.lockstep.wait_for(predicate, _PATIENCE)
+
     # -- what a fault may do ---------------------------------------------------------------------
 
     def send(self, message: Message) -> None:
@@ -190,7 +196,7 @@ class Rig:
             self.tell_clock(stamp_ns)
             return not back or self.node.log().count('/clock is back') > logged
 
-        assert self.lockstep.wait_for(there)
+        assert self.wait_for(there)
 
     def set_parameters(self, atomically: bool = False, **values: Any) -> list[Any]:
         """Set parameters from outside; gives a result each, or one when `atomically`."""
@@ -212,9 +218,9 @@ class Rig:
         """Call a service of the node."""
         client = self.link.node.create_client(service, f'/{self.case.system}/{name}')
         try:
-            assert self.lockstep.wait_for(client.service_is_ready)
+            assert self.wait_for(client.service_is_ready)
             future = client.call_async(request)
-            assert self.lockstep.wait_for(future.done)
+            assert self.wait_for(future.done)
             return future.result()
         finally:
             self.link.node.destroy_client(client)
@@ -222,11 +228,11 @@ class Rig:
     def fresh_diagnostics(self) -> None:
         """Wait for a report of what is so now."""
         now_ns = time.time_ns()
-        assert self.lockstep.wait_for(lambda: self.diagnostics.newest_ns > now_ns)
+        assert self.wait_for(lambda: self.diagnostics.newest_ns > now_ns)
 
     def heard_of(self, words: str) -> None:
         """Wait until /diagnostics says `words`."""
-        assert self.lockstep.wait_for(lambda: words in ' '.join(self.diagnostics.words))
+        assert self.wait_for(lambda: words in ' '.join(self.diagnostics.words))
 
     # -- a whole run -----------------------------------------------------------------------------
 
@@ -288,7 +294,7 @@ class Rig:
     def _advertise(self) -> None:
         self.publishers = {topic: self.peer(topic, lockstep_qos()) for topic in self._classes}
         if self.lockstep.counts.messages:
-            heard = self.lockstep.wait_for(
+            heard = self.wait_for(
                 lambda: all(p.get_subscription_count() for p in self.publishers.values())
             )
             assert heard

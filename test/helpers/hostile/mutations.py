@@ -28,7 +28,10 @@ ODD = np.array([
     np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 1.0, 5e-324, 1e-45, 1e-30, 1e-12, 1e-6, 0.5, 3.0,
     np.pi, 90.0, 360.0, 1e5, 1e12, 1e30, 3e38, 1.7e308, -1e5, -1e30, 2.0**24, 2.0**53,
 ])  # fmt: skip
-TEXTS = ['', ' ', 'map', 'other', 'map_ned', '/map', '<script>alert(1)</script>', 'ü' * 200, 'a/b']
+TEXTS = [
+    '', ' ', 'map', 'other', 'map_ned', '/map', '<script>alert(1)</script>', 'ü' * 200, 'a/b',
+    'a\nb', '\x1b[2J', 'z' * 5000,
+]  # fmt: skip
 _CODES = {name: code for code, name in DATATYPES.items()}
 TABLE = 'sensor_msgs/msg/PointCloud2'
 

@@ -38,9 +38,10 @@ BATCH = 50
 """Bad messages in one run of a tracker."""
 
 REFUSALS = {
-    'doubted', 'too_late', 'duplicate', 'other_frame', 'unknown_type', 'other_spacing', 'full',
+    'too_late', 'duplicate', 'other_frame', 'unknown_type', 'other_spacing', 'full',
 }  # fmt: skip
-"""What trackers count of a measurement that changes nothing."""
+"""What trackers count of a measurement that changes nothing; ``doubted`` is counted of earlier
+ones when one is believed."""
 
 
 class Bad(NamedTuple):
@@ -172,6 +173,8 @@ def _check_nothing_lost(tracker, kept, estimates):
 
 def _at(message, stamp_ns):
     """The message, its stamp moved; what is below is shared, since a mutation copies it."""
+    if not hasattr(message, 'header'):
+        return message  # transforms, each with a stamp of its own
     stamp = message.header.stamp
     stamp.sec, stamp.nanosec = divmod(stamp_ns, 10**9)
     return message

@@ -239,9 +239,8 @@ def templates(system):
                 if table
                 else plausible(type_name)
             )
-            if not hasattr(message, 'header'):
-                continue  # a list of transforms; one of them is tried as TransformStamped
-            message.header.frame_id = FRAMES.get((system, entry.name), 'map')
+            if hasattr(message, 'header'):
+                message.header.frame_id = FRAMES.get((system, entry.name), 'map')
             found[entry.name, type_name] = message
     return tuple((name, type_name, one) for (name, type_name), one in found.items())
 

@@ -15,6 +15,7 @@
 import numpy as np
 import pytest
 
+from sonar_imm.estimates import PLACES
 from sonar_imm.recordings.export.grid import grid_of, write_geotiff
 from sonar_imm.recordings.export.points import Points, read_points, write_las, write_xyz
 from sonar_imm.recordings.sources import BagError
@@ -146,3 +147,14 @@ def test_broken_tables_are_refused(tmp_path, text, word):
         read_points(path)
     with pytest.raises(BagError, match='cannot be read'):
         read_points(tmp_path / 'none.csv')
+
+
+@pytest.mark.parametrize('exact', [True, False])
+def test_places_of_a_table_are_the_exact_ones_where_it_has_them(tmp_path, exact):
+    names = [name for name in COLUMNS if exact or name not in PLACES]
+    row = dict.fromkeys(names, '1') | {'x': '500000.0', 'px': '500000.001'}
+    lines = [','.join(['stamp_ns', *names]), ','.join(['7', *(row[name] for name in names)])]
+    (tmp_path / 'soundings.csv').write_text('\n'.join(lines) + '\n')
+    read = read_points(tmp_path / 'soundings.csv')
+    assert read['x'].tolist() == [500000.001 if exact else 500000.0]
+    assert not set(PLACES) & set(read.columns)

@@ -67,11 +67,12 @@ def damage(folder, kind, rng):
 @pytest.mark.parametrize('kind', KINDS)
 def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
     """What is tracked without a word is what would have been tracked without the damage."""
+    tries, silent, failed, said_so = count(3, 60), [], [], 0
+    figures.skip_if_measured(tries, what=kind)
     rng = np.random.default_rng(len(kind))
     names = ['diver_table1', 'obstacle_movers'] if long_form() else ['diver_table1']
     whole = {name: tracked(BAGS / name, tmp_path / f'whole_{name}') for name in names}
     assert all(code == 0 for code, _, _ in whole.values())
-    tries, silent, failed, said_so = count(3, 60), [], [], 0
     for turn in range(tries):
         name = names[turn % len(names)]
         bag = tmp_path / f'{turn}' / name
@@ -84,7 +85,7 @@ def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
         said_so += bool(problem)
         if not problem and estimates != whole[name][2]:
             silent.append((turn, said[-300:]))
-    figures.add(what=kind, tried=tries, said=said_so, silent=len(silent), failed=len(failed))
+    figures.add({'what': kind}, tried=tries, said=said_so, silent=len(silent), failed=len(failed))
     assert not failed and not silent
 
 
@@ -100,23 +101,28 @@ def limited(size, *words):
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing_that_looks_whole(tmp_path, figures):
+    tries, bad = count(1, 12), []
+    figures.skip_if_measured(tries, what='full disk')
     rng = np.random.default_rng(3)
     whole = tmp_path / 'whole'
     run('track', BAGS / 'diver_table1', whole)
     largest = max(file.stat().st_size for file in whole.rglob('*') if file.is_file())
-    tries, bad = count(1, 12), []
     for turn in range(tries):
         out = tmp_path / f'out_{turn}'
         done = limited(int(rng.integers(0, largest)), 'track', BAGS / 'diver_table1', out)
         words = [line for line in done.stderr.splitlines() if line.startswith('sonar-imm:')]
         if done.returncode != 2 or len(words) != 1 or 'Traceback' in done.stderr or out.exists():
             bad.append((turn, done.returncode, done.stderr[-300:]))
-    figures.add(what='full disk', tried=tries, said=tries - len(bad), silent=0, failed=len(bad))
+    figures.add(
+        {'what': 'full disk'}, tried=tries, said=tries - len(bad), silent=0, failed=len(bad)
+    )
     assert not bad
 
 
 def test_a_folder_that_may_not_be_written_to_is_one_sentence(figures):
     # /sys belongs to the kernel: not even root makes a folder there
     code, said = run('track', BAGS / 'diver_table1', '/sys/sonar_imm')
-    figures.add(what='read-only folder', tried=1, said=int(code == 2), silent=0, failed=code != 2)
+    figures.add(
+        {'what': 'read-only folder'}, tried=1, said=int(code == 2), silent=0, failed=code != 2
+    )
     assert code == 2 and len(said.splitlines()) == 1 and '/sys/sonar_imm' in said

@@ -52,6 +52,7 @@ def rigs():
 
 @pytest.mark.parametrize('fault, system', list(pairs()), ids=lambda one: getattr(one, 'name', one))
 def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
+    figures.skip_if_measured(fault=fault.name, system=system)
     key = system, *fault.arguments
     if key not in rigs:
         fresh = Rig(CASES[system], fault.arguments)
@@ -60,8 +61,7 @@ def test_a_fault_is_survived_counted_and_said(fault, system, rigs, figures):
     outcome = rig.suffer(fault.disturb(CASES[system]), expected)
     limit = CASES[system].settle if fault.settle is None else fault.settle
     figures.add(
-        fault=fault.name,
-        system=system,
+        {'fault': fault.name, 'system': system},
         recovered=outcome.recovered,
         limit=limit,
         estimates=outcome.estimates,

@@ -28,10 +28,12 @@ SYSTEMS = ('fathometer', 'bathymetry') if long_form() else ('fathometer',)
 
 @pytest.mark.parametrize('system', SYSTEMS)
 def test_a_flooded_node_answers_soon_counts_what_it_drops_and_recovers(system, figures):
+    figures.skip_if_measured(system=system)
     flood = flooded(CASES[system], MAX_WAIT, times=10.0, seconds=3.0)
-    figures.add(system=system, max_wait=MAX_WAIT, **flood._asdict())
+    figures.add({'system': system}, max_wait=MAX_WAIT, **flood._asdict())
     assert flood.rate > 5.0 * flood.capacity
     assert flood.sent == flood.used + flood.dropped + flood.lost
     assert flood.dropped + flood.lost > 0.3 * flood.sent and flood.warned
-    assert flood.latency_max < MAX_WAIT + 1.0  # of a loaded machine
-    assert flood.recovered < 1.0
+    patience = max(1.0, 6.0 / flood.capacity)  # a loaded machine is slow with each message
+    assert flood.latency_max < MAX_WAIT + patience
+    assert flood.recovered < patience

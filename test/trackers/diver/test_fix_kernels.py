@@ -58,6 +58,7 @@ def test_the_account_of_innovations():
     tentative = np.array([False, False, False, True, False, False])
     white = rng.normal(size=(T, 2))
     white[2] = np.nan  # never seen before
+    white[5], z[detection[-1]] = [9.0, -12.0], z[detection[-1]] + 40.0  # sharp turns
     before, memory = white.copy(), 50.0
     old = (49.0, 30.0, 40.0, 5.0, 35.0)
     new = fix_kernels.watch(x, P, mu, H, z, R, tracks, detection, tentative, white, old, memory)
@@ -66,7 +67,12 @@ def test_the_account_of_innovations():
     now = np.linalg.solve(root, (z[detection] - mean)[..., None])[..., 0]
     np.testing.assert_allclose(white[tracks], now)
     np.testing.assert_array_equal(np.delete(white, tracks, 0), np.delete(before, tracks, 0))
-    firm, paired = now[[0, 1, 3]], (now[[0, 3]], before[[0, 5]])
+
+    def short(one):
+        return one * np.minimum(1.0, np.sqrt(18.0) / np.linalg.norm(one, axis=1))[:, None]
+
+    firm, paired = short(now[[0, 1, 3]]), (short(now[[0, 3]]), short(before[[0, 5]]))
+    assert np.sum(now[3] ** 2) > 18.0 and np.sum(now[0] ** 2) < 18.0
     want = np.array(old) + [
         3.0,
         0.5 * np.sum(firm**2),

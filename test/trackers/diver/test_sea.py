@@ -173,6 +173,18 @@ def test_covariances_of_fixes_that_cannot_be_true_are_named():
     assert run_fixes(0.25, 0.5, 1.0, fix_bias_std=1.0).warnings() == []
 
 
+def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
+    """A diver who turns by up to 170 degrees: innovations of nine sigmas, true covariances."""
+    tracker, farthest = DiverTracker(DiverConfig(max_tracks=1)), 0.0
+    for seed in (1006, 1014):
+        tracker.reset()
+        for one in simulate(scenario('table1', {}), seed).measurements:
+            tracker.process(one.measurement)
+            assert tracker.warnings() == []
+            farthest = max(farthest, float(np.sum(tracker._stream.state.white[:1] ** 2)))
+    assert farthest > 50.0
+
+
 def test_without_anything_stated_no_state_is_added():
     tracker = DiverTracker(DiverConfig())
     tracker.process(simulate(scenario('multistatic'), 1).measurements[0].measurement)

@@ -134,6 +134,46 @@ def test_the_heave_is_known_as_a_kalman_filter_knows_it(scene, heave, seed, dept
     assert rms(away) < 0.1 and np.abs(away).max() < 0.2
 
 
+def known_later(seen, layers, depth_std, std, memory, lag):
+    """As `kalman`, by what is `seen` up to `lag` records later: all of it is jointly Gaussian."""
+    records = np.arange(len(seen))
+    walk = 1e4 + depth_std**2 / layers * np.minimum.outer(records, records)
+    shift = std**2 * np.where(np.eye(len(seen)) > 0, 1.0, 0.0)
+    if memory:
+        shift = std**2 * memory ** np.abs(np.subtract.outer(records, records))
+    found, off = [], np.array(seen) - seen[0]
+    for k in range(len(seen) - lag):
+        upto = slice(0, k + lag + 1)
+        gain = np.linalg.solve((walk + shift)[upto, upto], shift[upto, k])
+        found.append((gain @ off[upto], np.sqrt(std**2 - gain @ shift[upto, k])))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(('heave', 'lag'), [('independent', 5), ('memory', 2)])
+def test_the_heave_of_revised_records_is_known_as_what_came_later_tells(scene, heave, lag):
+    """The offset that depths and shifts share, as the newest record knows it, not as the revised
+    one did, which would state twice the error at first."""
+    traces, wrong = lasting(scene, 1)
+    if heave == 'independent':
+        traces = list(scene.traces(range(40)))
+        wrong = scene.file['array_depth_error'][:40]
+    options = {'heave': heave, 'array_depth_std': 0.5, 'smoothing_lag': lag, **WINDOW}
+    _, found = run(traces, particles=3000, seed=1, **options)
+    memory = 0.9 if heave == 'memory' else 0.0
+    seen = [scene.depth_at(one.stamp_ns).mean() + w for one, w in zip(traces, wrong)]
+    layers = len(scene.amplitude)
+    expected = known_later(seen, layers, 0.1, 0.5, memory, lag)
+    # Without a lag it is the filter of above.
+    assert known_later(seen, layers, 0.1, 0.5, memory, 0) == pytest.approx(
+        kalman(seen, layers, 0.1, 0.5, memory), abs=2e-3
+    )
+    revised = list(found.values())[: len(expected)]
+    heaves = np.array([[one.extras[k][0] for k in ('heave', 'heave_std')] for one in revised])
+    assert heaves[:, 1] == pytest.approx(expected[:, 1], rel=0.08)
+    away = (heaves[:, 0] - expected[:, 0]) / expected[:, 1]
+    assert rms(away) < 0.1 and np.abs(away).max() < 0.25
+
+
 def test_an_error_that_lasts_is_followed_with_a_memory(scene):
     traces, _ = lasting(scene, 2)
     _, found = run(traces, particles=3000, heave='memory', array_depth_std=0.5, **WINDOW)

@@ -25,6 +25,8 @@ from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.reflectors import (
+    Identified,
+    nearest_ids,
     Reflectors,
     relative_amplitude,
     sediment_depths,
@@ -136,3 +138,15 @@ def test_where_the_window_leaves_nothing_amplitudes_are_not_relative():
     relative = relative_amplitude(found, response, config)
     assert relative[0] == pytest.approx((2.0 * 20.0 + 3.0) / (1.0 - 40.0 / 150.0))
     assert np.isnan(relative[1])
+
+
+def test_what_was_lost_does_not_take_over_from_what_is_still_seen():
+    """Reflector 6 was lost five records ago, a hand's breadth nearer than 7 was a record ago."""
+    config = FathometerConfig(depth_std=0.1)
+    lost, seen = Identified(6, 22.78, 4), Identified(7, 22.92, 0)
+    assert list(nearest_ids(np.array([22.83]), [lost, seen], config)) == [7]
+    # Far more probable where it was than a walk of four standard deviations.
+    assert list(nearest_ids(np.array([22.53]), [Identified(6, 22.54, 4), seen], config)) == [6]
+    # Of two that were seen equally long ago the nearest, whatever the order.
+    for earlier in ([seen, Identified(8, 22.8, 0)], [Identified(8, 22.8, 0), seen]):
+        assert list(nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]

@@ -14,15 +14,20 @@
 
 """What obstacles do, through the whole tracker: clutter, several at once, drift, settings."""
 
+from types import SimpleNamespace
+
 from attrs import evolve
 from helpers.obstacle_runs import track_scene
 import numpy as np
 import pytest
 
+from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm.trackers.obstacle.behaviours import behaviour_columns, build_filter
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
 
@@ -140,3 +145,34 @@ def test_the_order_of_the_behaviours_does_not_matter():
         assert list(a.columns()) == list(b.columns())
         for name, values in a.columns().items():
             assert np.array_equal(values, b.columns()[name], equal_nan=True)
+
+
+def test_the_depth_of_the_sea_floor_is_that_of_the_first_sight():
+    """Relief: the altitude is that of the floor below the vehicle, wherever the obstacle lies."""
+    filter_ = build_filter(ObstacleConfig())
+    first, later = (
+        Sonar(Pose(np.array([north, 0.0, 20.0]), np.eye(3)), altitude)
+        for north, altitude in ((0.0, 6.0), (1.0, 4.5))
+    )
+    begun = filter_.begin(np.array([[60.0, 0.1]]), np.diag([0.02, 2e-5])[None], first)
+    after, _ = filter_.advance(begun, first, later, 0.5)
+    assert begun.x[0, -1, 2] == pytest.approx(26.0)
+    np.testing.assert_allclose(after.x[..., 2], begun.x[..., 2])
+
+
+def test_north_and_east_become_y_and_x():
+    view = SimpleNamespace(
+        behaviour=np.array([[0.7, 0.3]]),
+        velocity=np.array([[1.0, -2.0]]),
+        velocity_covariance=np.array([[[4.0, 0.5], [0.5, 9.0]]]),
+    )
+    columns = behaviour_columns(view, ('fixed', 'moving'))
+    assert {name: float(value[0]) for name, value in columns.items()} == {
+        'prob_fixed': 0.7,
+        'prob_moving': 0.3,
+        'vx': -2.0,
+        'vy': 1.0,
+        'vel_cov_x_x': 9.0,
+        'vel_cov_x_y': 0.5,
+        'vel_cov_y_y': 4.0,
+    }

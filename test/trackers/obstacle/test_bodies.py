@@ -15,21 +15,17 @@
 
 """Echoes of bodies wander, and some errors are the same in every ping: what is published knows."""
 
-from attrs import evolve
 from helpers.obstacle_runs import navigation, rows, SECOND
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
+from benchmarks.image_tracks import detected, tracked
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.estimates import Estimate
-from sonar_imm.evaluation.obstacle.scoring import score
-from sonar_imm.evaluation.obstacle.series import series_of, truth_of
-from sonar_imm.measurements import Detections, SonarImage
+from sonar_imm.measurements import Detections
 from sonar_imm.simulation.obstacle.simulator import scenario, simulate
 from sonar_imm.trackers.obstacle.bodies import Bodies, CENTRE, considered
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 from sonar_imm.trackers.obstacle.filters import Sonar, View
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
@@ -135,32 +131,12 @@ def test_a_track_that_was_missed_keeps_its_size():
 
 
 def image_run(setting, seed):
-    """NEES (rows, 3) of range, bearing and offset alone, of all together, and coverage, of the
-    tracks through the images of a scene."""
+    """NEES of range, bearing and offset alone, of all together over 3, and coverage, of the track
+    through the images of a scene."""
     scene = simulate(setting, seed)
-    feeder = setting.told_feeder()
-    detector = ImageDetector(
-        DetectorConfig(
-            beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']
-        )
-    )
-    tracker = ObstacleTracker(evolve(ObstacleConfig(), max_range=setting.max_range))
-    final = {}
-    for received in scene.measurements:
-        one = received.measurement
-        ping = detector.process(one) if isinstance(one, SonarImage) else one
-        final |= {estimate.stamp_ns: estimate for estimate in tracker.process(ping)}
-    tables = [table for truth in scene.truth for table in truth.tables('odom')]
-    truth = [Estimate.from_columns(one.columns, stamp_ns=one.stamp_ns) for one in tables]
-    metrics, found = score(series_of(final.values()), truth_of(truth), cutoff=5.0, gap=60.0)
-    covariance = found.series.covariance[found.row]
-    alone = np.square(found.error) / np.diagonal(covariance, axis1=1, axis2=2)
-    consistency = metrics['consistency']
-    return (
-        *alone.mean(axis=0),
-        consistency['nees_state']['mean'] / 3.0,
-        consistency['band_coverage'],
-    )
+    row = tracked(setting, scene, detected(setting, scene))
+    alone = [row[f'NEES {name}'] for name in ('range', 'bearing', 'offset')]
+    return (*alone, row['NEES state'] / 3.0, row['cover'])
 
 
 @pytest.fixture(scope='module')

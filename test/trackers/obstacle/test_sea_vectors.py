@@ -49,6 +49,19 @@ def test_answers_are_those_of_an_independent_filter(name, number):
         assert_allclose(stated, data[f'ref_{end}'][pings], atol=0.2)
 
 
+@pytest.mark.parametrize('number', [0, 1])
+def test_a_new_obstacle_is_believed_to_be_where_the_study_believes_it(number):
+    """The slices end at the sea floor, and the sea floor is a slice: while little is known, the
+    offset is 0.7 to 1 m another and the sea floor 0.2 less probable without."""
+    data = encounter('seabed_and_fixed', number)
+    estimates = track(data)
+    pings = np.arange(4, SETTLED)
+    offset = column(estimates, 'vertical_offset', pings)
+    assert_allclose(offset, data['ref_offset'][pings], atol=0.35)
+    seabed = column(estimates, 'prob_seabed', pings)
+    assert_allclose(seabed, data['ref_prob'][pings, KINDS.index('seabed')], atol=0.06)
+
+
 @pytest.mark.parametrize('name, number', ENCOUNTERS)
 def test_the_true_behaviour_is_found(name, number):
     kind = {'sway': 'swaying', 'move': 'moving', 'go': 'moving'}

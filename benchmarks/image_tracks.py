@@ -1,0 +1,154 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Images, detector, tracker: how well the offset is known, and whether the covariance is right.
+
+    python -m benchmarks.image_tracks --runs 62 --out docs/results/image_tracks.json
+    python -m benchmarks.image_tracks --runs 24 --first 1001 --cases beam --centre 0 .1 .2 .4
+
+Each run is the scene `images` under a seed of its own, through `fls_detector_node`'s detector and
+the whole tracker, scored as `sonar-imm evaluate` does. NEES are means over a run, then over the
+runs: right are 1 for one number and 3 for range, bearing and offset together, if the truth is
+drawn as the tracker believes it to be. In the scene it never is, as the obstacle always lies 3 m
+below; `over the beam` draws it over what the first images can show.
+`--centre` tracks the same detections with other shares of `bodies.CENTRE`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from attrs import evolve
+import numpy as np
+
+from benchmarks.obstacle_sea import told
+from benchmarks.tables import markdown, write_json
+from sonar_imm.evaluation.obstacle.motion import motion_metrics
+from sonar_imm.evaluation.obstacle.scoring import score
+from sonar_imm.evaluation.obstacle.series import series_of, truth_of
+from sonar_imm.measurements import Measurement, SonarImage
+from sonar_imm.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
+from sonar_imm.simulation.scene import Scene
+from sonar_imm.trackers.obstacle import bodies
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+CASES: dict[str, dict[str, Any]] = {
+    'float, 3 m below': {},
+    'float, over the beam': {'vertical_offset': 0.0, 'offset_spread': 5.5},
+    'point of 18 dB, 3 m below': {'target': 'point', 'target_snr_db': 18.0},
+    'point of 18 dB, over the beam': {
+        'target': 'point',
+        'target_snr_db': 18.0,
+        'vertical_offset': 0.0,
+        'offset_spread': 5.5,
+    },
+}
+NUMBERS = ('range', 'bearing', 'offset')
+
+
+def detected(setting: ObstacleScenario, scene: Scene) -> list[Measurement]:
+    """The measurements of a scene with detections in place of its images."""
+    feeder = setting.told_feeder()
+    detector = ImageDetector(
+        DetectorConfig(
+            beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']
+        )
+    )
+    given = [one.measurement for one in scene.measurements]
+    found = [detector.process(one) if isinstance(one, SonarImage) else one for one in given]
+    return [one for one in found if one is not None]
+
+
+def tracked(
+    setting: ObstacleScenario, scene: Scene, measurements: list[Measurement]
+) -> dict[str, float]:
+    """The scores of one run."""
+    config = evolve(ObstacleConfig(), max_range=setting.max_range)
+    tracker, final = ObstacleTracker(config), {}
+    for one in measurements:
+        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(one))
+    truth = truth_of([table for one in scene.truth for table in told(one)])
+    metrics, found = score(series_of(final.values()), truth, cutoff=5.0, gap=60.0)
+    tracks, near = metrics['tracks'], metrics['vertical_offset_near']
+    row = {
+        'found': tracks['found_obstacles'] / tracks['true_obstacles'],
+        'tracks': float(tracks['tracks']),
+        'false tracks': float(tracks['false_tracks']),
+    }
+    if found is None or not near['n']:
+        return row
+    covariance = found.series.covariance[found.row]
+    alone = np.mean(found.error**2 / np.diagonal(covariance, axis1=1, axis2=2), axis=0)
+    row |= {'RMSE within 50 m': near['rmse_m']}
+    row |= {f'NEES {name}': float(value) for name, value in zip(NUMBERS, alone)}
+    row |= {
+        'NEES state': metrics['consistency']['nees_state']['mean'],
+        'cover': metrics['consistency']['band_coverage'],
+    }
+    if collisions := motion_metrics(found, truth, config).get('collisions'):
+        row |= {'Brier': collisions['brier'], 'happened': collisions['happened']}
+    return row
+
+
+def summary(rows: list[dict[str, float]]) -> dict[str, float]:
+    table = {
+        name: float(np.mean([row.get(name, np.nan) for row in rows if name in row]))
+        for name in max(rows, key=len)
+    }
+    table |= {'runs': float(len(rows))}
+    rmse = np.array([row['RMSE within 50 m'] for row in rows if 'RMSE within 50 m' in row])
+    nees = np.array([row['NEES state'] for row in rows if 'NEES state' in row])
+    if len(rmse):
+        table['RMSE median'] = float(np.median(rmse))
+        table['RMSE of all'] = float(np.sqrt(np.mean(rmse**2)))
+        table['NEES state, worst'] = float(nees.max())
+        table['NEES state, error'] = float(nees.std() / np.sqrt(len(nees)))
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--runs', type=int, default=62)
+    parser.add_argument('--first', type=int, default=1, help='first seed')
+    parser.add_argument('--cases', nargs='*', default=[''], help='parts of names of cases')
+    parser.add_argument('--centre', type=float, nargs='*', default=[bodies.CENTRE])
+    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
+    options = parser.parse_args()
+    tables: dict[str, dict[str, float]] = {}
+    for name, changes in CASES.items():
+        if not any(part in name for part in options.cases):
+            continue
+        setting = scenario('images', changes)
+        rows: dict[float, list[dict[str, float]]] = {share: [] for share in options.centre}
+        for seed in range(options.first, options.first + options.runs):
+            scene = simulate(setting, seed)
+            measurements = detected(setting, scene)
+            for share, each in rows.items():
+                bodies.CENTRE = share
+                each.append(tracked(setting, scene, measurements))
+        for share, each in rows.items():
+            label = name if len(rows) == 1 else f'{name}, centre {share:g}'
+            tables[label] = summary(each)
+            print(f'\n{markdown({label: tables[label]}, 2)}', flush=True)
+        write_json(options.out, {'first seed': options.first, **tables})
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,136 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Where a sonar is on its vehicle is kept by a node that is started again."""
+
+import numpy as np
+import pytest
+
+from msg_adapters.inputs import inputs_of
+from msg_adapters.transforms import write_transforms
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.measurements import Detections, Fix, Snapshot, StaticTransforms
+from sonar_imm.nodes.bathymetry import BathymetryNode
+from sonar_imm.nodes.diver import DiverNode
+from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.obstacle import ObstacleNode
+from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
+from sonar_imm.recordings.messages import ros_message
+from sonar_imm.simulation.bathymetry import simulator as swath
+from sonar_imm.simulation.obstacle import simulator as ahead
+
+LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -5.0, 8.0)
+ALONE = 'geometry_msgs/msg/TransformStamped'
+
+
+class Life:
+    """One life of a node that keeps its state, and what is sent to it."""
+
+    def __init__(self, make_bench, node_type, state, *more):
+        words = [f'state_file:={state}', f'tf_static_type:={ALONE}', *more]
+        self.bench = make_bench(*[word for one in words for word in ('-p', one)])
+        self.node = self.bench.add(node_type(context=self.bench.context))
+        self.sent = 0
+
+    def send(self, topic, message, type_name, qos=None):
+        kind = message_class(type_name)
+        publisher = self.bench.peer.create_publisher(kind, topic, qos or lockstep_qos())
+        self.bench.spin_until(publisher.get_subscription_count)
+        publisher.publish(message)
+        self.sent += 1
+        self.bench.spin_until(lambda: self.node._meter.received.total() == self.sent)
+
+    def tell(self, child, parent, position, rpy):
+        pose = Pose(np.array(position), geometry.rotation(*np.radians(rpy)))
+        # a TransformStamped is installed everywhere, tf2_msgs is not
+        told = write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
+        one = told.transforms[0]
+        where = {
+            'translation': make('geometry_msgs/msg/Vector3', **dict(zip('xyz', position))),
+            'rotation': make(
+                'geometry_msgs/msg/Quaternion',
+                **{name: getattr(one.transform.rotation, name) for name in 'xyzw'},
+            ),
+        }
+        message = make(
+            ALONE,
+            header=make('std_msgs/msg/Header', frame_id=parent),
+            child_frame_id=child,
+            transform=make('geometry_msgs/msg/Transform', **where),
+        )
+        self.send('/tf_static', message, ALONE, transforms_qos())
+
+    def end(self):
+        self.bench.nodes.remove(self.node)
+        self.bench.executor.remove_node(self.node)
+        self.node.destroy_node()
+
+
+def a_ping(name):
+    made = {'obstacle': (ahead, 'approach', Detections), 'bathymetry': (swath, 'paper', Snapshot)}
+    scenes, scenario, kind = made[name]
+    scene = scenes.simulate(scenes.scenario(scenario, {}), 1)
+    ping = next(one.measurement for one in scene.measurements if isinstance(one.measurement, kind))
+    entry = next(one for one in inputs_of(name) if one.measurement is kind)
+    return f'/{entry.name}', entry.write(ping, make), next(iter(entry.readers))
+
+
+@pytest.mark.parametrize(
+    'name, node', [('obstacle', ObstacleNode), ('bathymetry', BathymetryNode)]
+)
+def test_the_place_of_the_sonar_outlives_who_said_it(name, node, make_bench, tmp_path, capfd):
+    frames = 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
+    ping = a_ping(name)
+    first = Life(make_bench, node, tmp_path / 'state', *frames)
+    first.send(*ping)
+    assert first.node._meter.refused['no_mounting'] == 1  # nobody has said it
+    first.tell('sonar', 'base_link', LEVER, RPY)
+    first.send(*ping)
+    assert first.node._meter.refused.total() == 1
+    first.end()
+    again = Life(make_bench, node, tmp_path / 'state', *frames)
+    assert 'goes on from the state' in capfd.readouterr().err
+    again.send(*ping)
+    assert not again.node._meter.refused
+    config = again.node.tracker.config
+    assert config.sonar_lever == LEVER and config.sonar_mount_rpy_deg == pytest.approx(RPY)
+    again.tell('sonar', 'base_link', (0.0, 0.0, 1.0), RPY)  # mounted elsewhere meanwhile
+    assert again.node.tracker.config.sonar_lever == (0.0, 0.0, 1.0)
+
+
+def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, tmp_path, capfd):
+    def told(topic, seconds, frame_id, x, y):
+        fix = Fix(
+            stamp_ns=round(seconds * 1e9),
+            position=(x, y, 0.0),
+            covariance=np.eye(2),
+            frame_id=frame_id,
+        )
+        entry = next(one for one in inputs_of('diver') if one.name == topic.rpartition('/')[2])
+        return topic, entry.write(fix, make), next(iter(entry.readers))
+
+    more = 'use_tf_static:=true', 'frame_id:=map'
+    first = Life(make_bench, DiverNode, tmp_path / 'state', *more)
+    first.tell('odom', 'map', (100.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    first.send(*told('/diver/initial', 1.0, 'map', 105.0, 7.0))
+    first.end()
+    again = Life(make_bench, DiverNode, tmp_path / 'state', *more)
+    again.send(*told('/fix', 2.0, 'odom', 5.5, 7.0))
+    state = again.node.tracker._stream.state
+    assert not again.node._meter.refused
+    assert len(state.x) == 1 and state.x[0, :, 0] == pytest.approx(105.4, abs=0.5)
+    assert state.life.track_id.tolist() == [1] and state.life.status.tolist() == [1]
+    again.send(*told('/diver/initial', 1.0, 'map', 105.0, 7.0))  # it need not be told again
+    assert len(again.node.tracker._stream.state.x) == 1
