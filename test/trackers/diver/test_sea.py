@@ -57,7 +57,7 @@ def test_a_diver_at_an_unknown_depth_is_found_and_its_covariance_is_true():
     assert estimates[-1].state_names == ('px', 'py', 'pz', 'vx', 'vy', 'vz')
     assert estimates[-1].model_names[0] == 'heading_000'
     np.testing.assert_allclose(estimates[-1].probabilities.sum(axis=1), 1.0)
-    assert estimates[-1].xyz[0, 2] == np.float32(estimates[-1].state[0, 2])
+    assert estimates[-1].xyz[0, 2] == estimates[-1].state[0, 2]
 
 
 def test_a_depth_report_fixes_the_depth():
