@@ -116,6 +116,7 @@ def row(bag: Path, factor: float, seeds: range) -> dict[str, float]:
     found = list(runs(bag, factor, seeds))
     hours, raised = (sum(column) for column in zip(*found))
     return {
+        'stated': factor,
         'runs': len(found),
         'minutes': 60.0 * hours,
         'warnings': raised,

@@ -18,8 +18,8 @@
 
 Images are those of the simulated sonar (256 beams, 600 ranges), which knows nothing of the
 detector. `study` is what an independent prototype reached on images of its own. `margins` are
-false detections by `threshold_margin_db` on images of other seeds than those that are scored: from
-it the margin was chosen, as the smallest whose false detections are not above the study's.
+false detections by `threshold_margin_db` on images of other seeds than those that are scored, so
+that the margin can be chosen on images it is not scored on.
 `--parts` makes some of the tables only.
 """
 

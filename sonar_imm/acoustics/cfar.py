@@ -140,39 +140,31 @@ def quiet_level(
     # Of the first rows no level is known; theirs is about that of the first for which one is.
     first = level[np.argmax(known.any(axis=1))]
     about = np.where(known, level, np.where(np.isfinite(first) & (first > 0.0), first, 1.0))
-    logarithm = np.log(np.maximum(power, _SILENT * about) + _TINY)
+    heard = np.log(power + _TINY)
+    logarithm = np.maximum(heard, np.log(_SILENT * about))
     around, _ = noise_level(logarithm, **window)
     off = np.where(known, logarithm - around, np.nan)
     half = max(beams // 2, 0)
-    usual = _usual(around, known)
-    quiet = ~known | (power <= CENSORED * usual)
+    # The mean of a Rayleigh law lies above its mean logarithm.
+    above = np.log(CENSORED) + np.euler_gamma
+    quiet = ~known | (heard <= around + above)
     # Again, by the mean logarithm of what was kept: something long has lifted the first one.
-    around = _mean_of(quiet, logarithm, around, half, training, guard)
-    usual = _usual(around, known)
-    quiet = ~known | (power <= CENSORED * usual)
-    censored = _mean_of(quiet, power, usual, half, training, guard)
+    kept, few = _kept(quiet, logarithm, half)
+    kept[few] = around[few]
+    around, _ = greatest_of_level(kept, 0, training, guard)
+    quiet = ~known | (heard <= around + above)
+    kept, few = _kept(quiet, power, half)
+    kept[few] = np.exp(np.where(known, around, 0.0)[few] + np.euler_gamma)
+    censored, _ = greatest_of_level(kept, 0, training, guard)
     return np.minimum(censored, floor), sides, roughness(off)
 
 
-def _usual(around: FloatArray, known: BoolArray) -> FloatArray:
-    """Mean power (R, B) of a Rayleigh law whose mean logarithm is `around`, 1.8 where unknown."""
-    return np.exp(np.where(known, around, 0.0) + np.euler_gamma)
-
-
-def _mean_of(
-    quiet: BoolArray,
-    value: FloatArray,
-    instead: FloatArray,
-    half: int,
-    training: int,
-    guard: int,
-) -> FloatArray:
-    """`noise_level` of the quiet cells alone, (R, B); `instead` of the mean of beams of which
-    fewer than one in ten is quiet."""
+def _kept(quiet: BoolArray, value: FloatArray, half: int) -> tuple[FloatArray, BoolArray]:
+    """Mean (R, B) of the quiet cells of the beams within `half` of each, and where these are fewer
+    than one in ten and tell nothing."""
     share = across_beams(quiet.astype(np.float64), half)
     kept = across_beams(np.where(quiet, value, 0.0), half) / np.maximum(share, 0.1)
-    kept = np.where(share < 0.1, instead, kept)
-    return greatest_of_level(np.ascontiguousarray(kept), 0, training, guard)[0]
+    return kept, share < 0.1
 
 
 def roughness(logarithm: FloatArray) -> FloatArray:

@@ -48,7 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
-from .association_kernels import COASTING, CONFIRMED, count, TENTATIVE
+from .association_kernels import choose, COASTING, CONFIRMED, count, TENTATIVE
 from .kalman import BoolArray, factorise, log_density
 
 
@@ -193,6 +193,20 @@ def assign_by_rank(
         chosen = np.where(found >= 0, found, chosen)
         free[found[found >= 0]] = False
     return chosen
+
+
+def assign_fits(
+    fit: FloatArray, tentative: BoolArray, detection_probability: float, clutter_density: float
+) -> IntArray:
+    """The detection (T,) of each target, -1 for none, from a table fit (T, D) of `imm.gate`;
+    those that are not `tentative` (T,) choose first. The rest as in `association_cost`."""
+    missed = math.log1p(-detection_probability) - math.log(detection_probability)
+    chosen, clear = choose(fit, tentative, missed, math.log(clutter_density))
+    if clear:
+        return chosen
+    target, detection = np.nonzero(fit > -np.inf)
+    cost = association_cost(fit[target, detection], detection_probability, clutter_density)
+    return assign_by_rank(target, detection, cost, tentative.astype(np.int64), fit.shape[1])
 
 
 def _solve_cluster(

@@ -111,15 +111,14 @@ class NisMemory:
 
     def after(self, nis: FloatArray, dof: FloatArray | int) -> NisMemory:
         """With the hits nis (K,) of dof (K,) degrees of freedom."""
-        keep, now = 1.0 - 1.0 / NIS_MEMORY, self
+        keep = 1.0 - 1.0 / NIS_MEMORY
+        gathered, freedom, square, count = self.nis, self.dof, self.square, self.count
         for value, m in zip(nis.tolist(), np.broadcast_to(dof, nis.shape).tolist()):
-            now = NisMemory(
-                keep * now.nis + min(value, FARTHEST * m),
-                keep * now.dof + m,
-                keep * keep * now.square + m,
-                keep * now.count + 1.0,
-            )
-        return now
+            gathered = keep * gathered + min(value, FARTHEST * m)
+            freedom = keep * freedom + m
+            square = keep * keep * square + m
+            count = keep * count + 1.0
+        return NisMemory(gathered, freedom, square, count)
 
     @property
     def mean(self) -> float:

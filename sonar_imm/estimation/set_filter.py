@@ -207,15 +207,9 @@ class SetFilter:
         if shift is None or known.path is None:
             return known
         u = rng.random((self.particles, 2))
-        last = np.take_along_axis(sets.cell, np.maximum(sets.order - 1, 0)[:, None], 1)[:, 0]
-        # A set without members has no place that could leave the lattice.
-        some = sets.order > 0
-        low = np.where(some, last - (self.model.cells - 1), -self.model.cells)
-        high = np.where(some, sets.cell[:, 0], self.model.cells)
+        low, high = kernels.free(sets, self.model.cells)
         d, path = known.path.draw(shift, sets.shift, (low, high), u)
-        there = np.arange(sets.cell.shape[1]) < sets.order[:, None]
-        cell = np.where(there, sets.cell - d[:, None], sets.cell)
-        moved = sets._replace(cell=cell, shift=sets.shift + d)
+        moved = sets._replace(cell=kernels.lowered(sets, d), shift=sets.shift + d)
         return known._replace(sets=moved, path=path)
 
     def _gains(self, b: FloatArray, fit: ScatterFit | None) -> FloatArray:
@@ -240,7 +234,7 @@ class SetFilter:
         g = self._gains(b, fit)
         proposals = self._proposals(g)
         if model.shift:
-            kernels.fill_all_moves(g, model.move, model.move_share, proposals)
+            kernels.fill_all_moves(old, g, model.move, model.move_share, proposals)
         else:
             filled = np.zeros(len(self._move), np.bool_)
             kernels.fill_moves(old, g, model.move, model.move_share, filled, proposals)

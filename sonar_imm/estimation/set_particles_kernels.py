@@ -49,9 +49,16 @@ class SetMotion(NamedTuple):
 
 @kernel
 def _fill_row(
-    row: int, z: int, g: FloatArray, move: FloatArray, share: float, proposals: Proposals
+    row: int,
+    z: int,
+    g: FloatArray,
+    move: FloatArray,
+    share: float,
+    wanted: bool,
+    proposals: Proposals,
 ) -> float:
-    """Row `row` of move and move_ratio of `proposals`, from the cell z; log Z of it."""
+    """Row `row` of move and move_ratio of `proposals`, from the cell z, as far as it is wanted;
+    log Z of it."""
     n, width = len(g), len(move)
     radius = width // 2
     low, high = max(0, radius - z), min(width, n + radius - z)
@@ -59,14 +66,19 @@ def _fill_row(
     for step in range(low, high):
         best = max(best, g[z + step - radius])
         inside += move[step]
+    # Of the places within reach; the row of ratios is scratch until its own numbers come.
+    driven = proposals.move_ratio[row]
     data_driven = 0.0
     for step in range(low, high):
-        data_driven += move[step] * math.exp(g[z + step - radius] - best)
+        driven[step] = math.exp(g[z + step - radius] - best)
+        data_driven += move[step] * driven[step]
+    if not wanted:
+        return best + math.log(data_driven)
     total = 0.0
     for step in range(width):
         q = 0.0
         if low <= step < high:
-            q = share * move[step] * math.exp(g[z + step - radius] - best) / data_driven
+            q = share * move[step] * driven[step] / data_driven
             q += (1.0 - share) * move[step] / inside
         total += q
         proposals.move[row, step] = total
@@ -92,16 +104,30 @@ def fill_moves(
             row = z + gain.shape[1] * negative
             if not filled[row]:
                 filled[row] = True
-                _fill_row(row, z, gain[negative], move, share, proposals)
+                _fill_row(row, z, gain[negative], move, share, True, proposals)
 
 
 @kernel
-def fill_all_moves(gain: FloatArray, move: FloatArray, share: float, proposals: Proposals) -> None:
-    """All rows of `set_particles.propose`, and log_sum of its shifts."""
+def fill_all_moves(
+    sets: Sets, gain: FloatArray, move: FloatArray, share: float, proposals: Proposals
+) -> None:
+    """As `fill_moves`, where a shift is drawn before the moves: the rows that some particle may
+    come to by one, and log_sum of all rows."""
+    n, step, reached = gain.shape[1], proposals.shifts.step, np.zeros(gain.shape, np.bool_)
+    last = step * (len(proposals.shifts.start) - 1)
+    for i in range(sets.order.shape[0]):
+        for k in range(sets.order[i]):
+            reached[int(sets.sign[i, k] < 0), sets.cell[i, k]] = True
+    wanted = np.zeros(n, np.bool_)
     for negative in range(gain.shape[0]):
-        for z in range(gain.shape[1]):
-            row = z + gain.shape[1] * negative
-            found = _fill_row(row, z, gain[negative], move, share, proposals)
+        wanted[:] = False
+        for z in range(n):
+            if reached[negative, z]:
+                wanted[z : z + last + 1 : step] = True
+        for z in range(n):
+            found = _fill_row(
+                z + n * negative, z, gain[negative], move, share, wanted[z], proposals
+            )
             proposals.shifts.log_sum[negative, z] = found
 
 
@@ -279,6 +305,28 @@ def propagate(
                 new.prior_mean[i, k] = 0.0 if born else old.prior_mean[i, j]
                 variance = amplitudes.variance if born else old.prior_variance[i, j]
                 new.prior_variance[i, k] = variance
+
+
+@kernel
+def free(sets: Sets, cells: int) -> tuple[IntArray, IntArray]:
+    """The least and the greatest offset (N,), in cells, by which all members of a set can be
+    lowered and stay on the lattice of so many cells."""
+    low, high = np.full(len(sets.order), -cells), np.full(len(sets.order), cells)
+    for i in range(len(sets.order)):
+        if sets.order[i] > 0:
+            low[i] = sets.cell[i, sets.order[i] - 1] - (cells - 1)
+            high[i] = sets.cell[i, 0]
+    return low, high
+
+
+@kernel
+def lowered(sets: Sets, offset: IntArray) -> IntArray:
+    """The cells (N, J), those of each set less by its offset (N,)."""
+    cell = sets.cell.copy()
+    for i in range(len(sets.order)):
+        for k in range(sets.order[i]):
+            cell[i, k] -= offset[i]
+    return cell
 
 
 @kernel

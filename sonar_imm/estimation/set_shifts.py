@@ -47,12 +47,14 @@ from typing import NamedTuple
 
 from attrs import frozen
 import numpy as np
-from scipy.special import log_ndtr, ndtri
+from scipy.special import log_ndtr, ndtr, ndtri
 
 from .arrays import FloatArray, IntArray
 from .jit import kernel
 
 _REACH = 4.0
+_TINY = 1e-280
+"""A probability that is less is had by its logarithm."""
 MAX_SHIFTS = 401
 SLOTS = 256
 
@@ -149,8 +151,13 @@ class ShiftPath(NamedTuple):
 def _log_share(d: FloatArray | float, middle: FloatArray, std: float, step: int) -> FloatArray:
     """log of the normal density at d over the share of it that is rounded to d."""
     x, half = np.abs(d - middle) / std, 0.5 * step / std
-    above, below = log_ndtr(half - x), log_ndtr(-half - x)
-    return np.asarray(-0.5 * x * x - above - np.log1p(-np.exp(below - above)))
+    share = ndtr(half - x) - ndtr(-half - x)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        log_share = np.log(share)
+    far = np.flatnonzero(~(share > _TINY))
+    above, below = log_ndtr(half - x[far]), log_ndtr(-half - x[far])
+    log_share[far] = above + np.log1p(-np.exp(below - above))
+    return np.asarray(-0.5 * x * x - log_share)
 
 
 def _log_normal(x: FloatArray, std: float) -> FloatArray:
@@ -220,15 +227,19 @@ def score_shifts(
     `cells` (n + 2 pad) where they are negative: driven (2, G) gets its weights and their running
     sums, both divided by their total, from the first place that has any to the last, which are
     given."""
-    step, (weight, running) = tables.step, driven
+    step, weight, running = tables.step, driven[0], driven[1]
     G = len(weight)
     weight[:] = tables.log_prior[before]
     for k in range(count):
         negative = rows[k] // cells
         z = rows[k] - negative * cells
-        there = tables.log_sum[negative, z : z + (G - 1) * step + 1 : step]
-        for g in range(G):
-            weight[g] += there[g]
+        if step == 1:  # neighbours in memory: added several at a time
+            near = tables.log_sum[negative, z : z + G]
+            for g in range(G):
+                weight[g] += near[g]
+        else:
+            for g in range(G):
+                weight[g] += tables.log_sum[negative, z + g * step]
     best = weight[0]
     for g in range(1, G):
         best = weight[g] if weight[g] > best else best

@@ -161,6 +161,15 @@ def test_the_unit_of_power_does_not_matter_where_nothing_is_quiet():
         assert_allclose(same, rough, rtol=1e-9)
 
 
+def test_rows_without_a_quiet_beam_count_as_the_others_do():
+    """Two rings, loud in every beam, nearer and farther: they are neither noise nor silence."""
+    rng = np.random.default_rng(10)
+    power = rng.exponential(size=(200, 100))
+    power[80:84] = power[100:104] = 60.0
+    quiet, _, _ = quiet_level(power, beams=25, training=16, guard=4)
+    assert np.median(quiet[91:93]) == pytest.approx(np.median(quiet[140:160]), rel=0.15)
+
+
 def test_silence_and_one_huge_cell_are_survived():
     for power in (np.zeros((60, 40)), np.full((60, 40), 1e76), np.zeros((0, 40)), np.ones((3, 2))):
         level, sides, rough = quiet_level(power, beams=25, training=16, guard=4)

@@ -22,7 +22,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.cli import checking  # noqa: E402
+from sonar_imm.cli import checking, main  # noqa: E402
+from sonar_imm.evaluation.judging import Check  # noqa: E402
 from sonar_imm.evaluation.run_folder import RunFolder  # noqa: E402
 from sonar_imm.nodes.harness import LockstepResult  # noqa: E402
 from sonar_imm.nodes.lockstep import Counts  # noqa: E402
@@ -121,3 +122,17 @@ def test_a_recording_may_state_its_own_limit(check, dive):
     accuracy = checks['position RMSE against truth']
     assert not good and accuracy.wanted == 'at most 0.001 m'
     assert check()[0]['position RMSE against truth'].wanted == 'at most 1.25 m'
+
+
+@pytest.mark.parametrize('as_json', [False, True])
+@pytest.mark.parametrize('good', [(True, True), (True, False), (False, True)])
+def test_the_exit_code_is_one_when_anything_fell_short(dive, monkeypatch, capsys, good, as_json):
+    checked = [
+        checking.CheckedRecording(
+            'diver', dive, dive, (Check('a', '1', '1', one),), {'p50': 1.0, 'p99': 2.0}, None
+        )
+        for one in good
+    ]
+    monkeypatch.setattr('sonar_imm.cli.check.run_checks', lambda *_, **__: checked)
+    assert main(['check', 'diver', *(['--json'] if as_json else [])]) == int(not all(good))
+    assert as_json or capsys.readouterr().out.count('FAIL') == len(good) - sum(good)

@@ -104,7 +104,7 @@ def _first_return(
     """The first bin with an echo of the floor. Few staves need a stated noise to tell it from one
     bin."""
     P, false_alarm = snapshot.staves, config.gate_false_alarm
-    noise = _stated_noise(snapshot, config)
+    noise = stated_noise(snapshot, config)
     if P < coherence.FEWEST_STAVES_ALONE and np.isfinite(noise).all():
         ratio = variances.mean_power(iq) / noise
         return coherence.first_of(_loud(ratio, P, false_alarm, snapshot.usable))
@@ -233,7 +233,7 @@ def _noise(
 ) -> tuple[FloatArray, BoolArray]:
     """Noise variance (T,) at a stave, and where it is known (T,): from the snapshot, the config or
     the water column; else it is taken blindly from what is not coherent."""
-    stated = _stated_noise(snapshot, config)
+    stated = stated_noise(snapshot, config)
     missing = np.isnan(stated)
     if not missing.any():
         return stated, ~missing
@@ -250,7 +250,7 @@ def _noise(
     return np.where(missing, level, stated), ~missing | measured
 
 
-def _stated_noise(snapshot: Snapshot, config: BathymetryConfig) -> FloatArray:
+def stated_noise(snapshot: Snapshot, config: BathymetryConfig) -> FloatArray:
     """Noise variance (T,) that the snapshot or the config states; NaN where neither does."""
     level = config.noise_variance if config.noise_variance > 0.0 else math.nan
     given = snapshot.noise_variance

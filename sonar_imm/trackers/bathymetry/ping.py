@@ -29,6 +29,7 @@ from attrs import evolve, frozen
 import numpy as np
 
 from ...acoustics import variances
+from ...acoustics.coherence import FEWEST_STAVES_ALONE
 from ...acoustics.geometry import Pose
 from ...acoustics.rays import profile_of
 from ...estimates import Estimate, places
@@ -37,9 +38,10 @@ from ...estimation.mode_smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
+from .consistency import residual_ratio
 from .engines import run_grid, run_particles
 from .kernels import PingLikelihood, Track
-from .likelihood import ping_likelihood, spacing_of
+from .likelihood import ping_likelihood, spacing_of, stated_noise
 from .models import build_models, grid_cells, TerrainModels
 from .pose_queue import PosedPing, sound_speed_of
 from .swath import Floor, level_swath, ship_swath, Swath
@@ -80,13 +82,14 @@ class LoudBins(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """The estimate of one ping, what to count of it, numbers for diagnostics, and what its loud
-    bins show."""
+    """The estimate of one ping, what to count of it, numbers for diagnostics, what its loud bins
+    show, and its `consistency.residual_ratio`, NaN where no noise is stated."""
 
     estimate: Estimate
     counts: Counter[str]
     health: dict[str, float]
     loud: LoudBins
+    residual: float
 
 
 def track_ping(ping: Ping) -> Answer:
@@ -156,7 +159,20 @@ def answer_of(seen: Look, track: Track) -> Answer:
         variances.decorrelation(snapshot.iq, seen.loud & heard),
     )
     health['decorrelation'] = loud.decorrelation
-    return Answer(estimate_of(seen, track), counts, health, loud)
+    health['residual_ratio'] = _residual(seen, track)
+    return Answer(estimate_of(seen, track), counts, health, loud, health['residual_ratio'])
+
+
+def _residual(seen: Look, track: Track) -> float:
+    """`residual_ratio` of a ping whose noise is stated. Few staves leave too little beside the
+    echo, and echoes by way of the surface are no white noise."""
+    config, snapshot, likelihood = seen.config, seen.ping.snapshot, seen.likelihood
+    few = snapshot.staves < FEWEST_STAVES_ALONE
+    if few or config.multipath or not np.isfinite(stated_noise(snapshot, config)).all():
+        return math.nan
+    sines = np.sin(floor_of(seen, track).angle)
+    spacing = seen.swath.geometry.spacing
+    return residual_ratio(snapshot.iq, sines, spacing, likelihood.noise, likelihood.heard)
 
 
 def floor_of(seen: Look, track: Track) -> Floor:

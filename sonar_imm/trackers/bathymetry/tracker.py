@@ -51,6 +51,7 @@ from ...measurements import (
     Snapshot,
 )
 from .config import BathymetryConfig
+from .consistency import noise_warnings
 from .coupling import Alone, Coupling, Favoured
 from .ping import Answer, answer_of, look, LoudBins, Ping, run, track_ping
 from .pose_queue import PoseQueue
@@ -68,7 +69,7 @@ class BathymetryTracker:
     """The tracker of `trackers.Tracker` for the sea floor: `process` takes `Snapshot`,
     `Navigation` and `Altitude`."""
 
-    STATE = ('counts', '_queue', '_coupling', '_health', '_loud')
+    STATE = ('counts', '_queue', '_coupling', '_health', '_loud', '_residuals')
 
     def __init__(self, config: BathymetryConfig):
         self.config = config
@@ -80,6 +81,7 @@ class BathymetryTracker:
         self._coupling = Coupling()
         self._health: dict[str, float] = {}
         self._loud: deque[LoudBins] = deque(maxlen=PINGS_JUDGED)
+        self._residuals: deque[float] = deque(maxlen=PINGS_JUDGED)
 
     @property
     def frames(self) -> Frames:
@@ -116,8 +118,9 @@ class BathymetryTracker:
 
     def health(self) -> dict[str, float]:
         """Numbers of the last ping: bins, share of bins heard, mean effective sample size of the
-        particles of a model (NaN for the grid), mean log likelihood of a bin, noise variance; and
-        how many pings wait for navigation."""
+        particles of a model (NaN for the grid), mean log likelihood of a bin, noise variance, what
+        is left beside the echo in stated noises (`consistency`); and how many pings wait for
+        navigation."""
         waiting = {'pings_waiting': len(self._queue)} if self._moving else {}
         held = {'pings_held': len(self._coupling)} if len(self._coupling) else {}
         return {**self._health, **waiting, **held}
@@ -125,11 +128,12 @@ class BathymetryTracker:
     def warnings(self) -> list[str]:
         """What of the last pings makes most echoes useless, or more sure than they are."""
         loud = sum(one.count for one in self._loud)
+        stated = noise_warnings(self._residuals)
         if loud < FEWEST_LOUD:
-            return []
+            return stated
         silent = sum(one.silent for one in self._loud) / loud
         differ = sum(one.count * one.decorrelation for one in self._loud if one.count) / loud
-        told, sentences = self.config.decorrelation, []
+        told, sentences = self.config.decorrelation, stated
         if silent > 0.5:
             sentences.append(
                 f'{silent:.0%} of the bins that stand 20 dB above the quiet ones were passed '
@@ -193,6 +197,7 @@ class BathymetryTracker:
         self.counts.update(answer.counts)
         self._health = answer.health
         self._loud.append(answer.loud)
+        self._residuals.append(answer.residual)
         return answer.estimate
 
     @property

@@ -22,16 +22,16 @@ import math
 import numpy as np
 
 from ...acoustics.multistatic import difference_projection
-from ...estimation import imm, imm_kernels
+from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import (
     assign,
-    assign_by_rank,
+    assign_fits,
     association_cost,
     gate_threshold,
 )
-from ...estimation.association_kernels import choose, TENTATIVE
+from ...estimation.association_kernels import TENTATIVE
 from ...estimation.consider import consider_models
 from ...estimation.small_matrices import lift_all
 from ...measurements import Arrivals, NOBODY
@@ -169,16 +169,7 @@ class Scan:
 
     def _associate(self, fit: FloatArray, clutter: float) -> IntArray:
         """The detection of each track (T,), -1 for none; confirmed tracks choose first."""
-        p = self.config.detection_probability
-        chosen, clear = choose(
-            fit, self.tentative, math.log1p(-p) - math.log(p), math.log(clutter)
-        )
-        if clear:
-            return chosen
-        target, detection = imm.pairs_inside(fit)
-        cost = association_cost(fit[target, detection], p, clutter)
-        rank = self.tentative.astype(np.int64)
-        return assign_by_rank(target, detection, cost, rank, fit.shape[1])
+        return assign_fits(fit, self.tentative, self.config.detection_probability, clutter)
 
     def _update(
         self,

@@ -27,6 +27,7 @@ there are share the prior probability evenly. A multiple is marked, never delete
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 from attrs import evolve, frozen
@@ -103,7 +104,16 @@ class Multiples:
 
 def ways_above(depth: FloatArray, sign: FloatArray, target: int) -> Ways:
     """Pairs and triples of the reflectors above `target`; depth (K,) ascending, sign (K,)."""
-    first, second = np.triu_indices(target)
+    member, factor, datum = _combinations(target)
+    signs = sign[member]
+    product = -signs[:, 0] * signs[:, 1] * np.where(factor[:, 2] != 0.0, signs[:, 2], 1.0)
+    return Ways(member, factor, datum, product)
+
+
+@cache
+def _combinations(count: int) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Members, factors and share in the datum of `Ways`, of the first `count` reflectors."""
+    first, second = np.triu_indices(count)
     # k above j and q: every pair has as many triples as there are reflectors above its upper one.
     upper = np.repeat(np.arange(len(first)), first)
     above = np.concatenate([np.arange(j) for j in first]) if len(first) else np.arange(0)
@@ -112,9 +122,7 @@ def ways_above(depth: FloatArray, sign: FloatArray, target: int) -> Ways:
     member = np.concatenate([pairs, triples]).astype(np.int64)
     factor = np.repeat([[1.0, 1.0, 0.0], [1.0, 1.0, -1.0]], [len(pairs), len(triples)], axis=0)
     datum = np.repeat([1.0, 0.0], [len(pairs), len(triples)])
-    signs = sign[member]
-    product = -signs[:, 0] * signs[:, 1] * np.where(factor[:, 2] != 0.0, signs[:, 2], 1.0)
-    return Ways(member, factor, datum, product)
+    return member, factor, datum
 
 
 def _offsets(

@@ -25,11 +25,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.jit import kernel
-from ...estimation.small_matrices import semidefinite_root
-from .behaviour_kernels import COMMON, PLACED
-from .kernels import along, moments, NEGLIGIBLE, normal, point_towards, to_world
+from ...estimation.lanes import lanes_for, roots, turn_of
+from .behaviour_kernels import COMMON
+from .kernels import KAPPA, NEGLIGIBLE, normal
+from .sigma_kernels import beside, fan, PLACED, PLACES, places, product, turned, weighted
 
 SIZE = 5
 SLICES = 16
@@ -71,38 +72,63 @@ def relative(
     weight mu (T, K) is negligible."""
     T, K, size = x.shape
     mean, covariance = np.zeros((T, K, SIZE)), np.zeros((T, K, SIZE, SIZE))
-    L, images = np.zeros((size, size)), np.zeros((SIZE, 2 * COMMON + 1))
-    y, m, world = np.empty(3), np.empty(3), np.empty(3)
+    live, which = 0, np.empty((T * K, 2), dtype=np.int64)
     for t in range(T):
         for j in range(K):
-            if mu[t, j] <= NEGLIGIBLE:
-                continue
-            n = size if moves[j] else COMMON
-            semidefinite_root(P[t, j, :n, :n], L[:n, :n])
-            images[3:] = 0.0
-            towards = math.cos(x[t, j, 1]), math.sin(x[t, j, 1])
-            for number in range(2 * COMMON + 1):
-                column, reach = along(number, COMMON)
-                for a in range(3):
-                    y[a] = x[t, j, a] + reach * L[a, column]
-                for a in range(COMMON, n):
-                    images[a - 1, number] = x[t, j, a] + reach * L[a, column]
-                images[2, number] = y[2] - p[2]
-                if column < PLACED:
-                    cosine, sine = towards
-                    if column < 2 and number > 0:
-                        cosine, sine = math.cos(y[1]), math.sin(y[1])
-                    point_towards(y[0], cosine, sine, images[2, number], R, cone, m)
-                    to_world(R, m, world)
-                    images[0, number], images[1, number] = world[0], world[1]
-                else:
-                    images[0, number], images[1, number] = images[0, 0], images[1, 0]
-            moments(images, 2 * COMMON + 1, mean[t, j], covariance[t, j])
-            # What of the velocity the place does not tell.
-            for a in range(COMMON, n):
-                for b in range(COMMON, n):
-                    for i in range(COMMON, n):
-                        covariance[t, j, a - 1, b - 1] += L[a, i] * L[b, i]
+            if mu[t, j] > NEGLIGIBLE:
+                which[live, 0], which[live, 1] = t, j
+                live += 1
+    if live == 0:
+        return mean, covariance
+    lanes = lanes_for(live)
+    y, S, F = np.empty((size, lanes)), np.zeros((size, size, lanes)), np.zeros((size, size, lanes))
+    g, C = np.empty((SIZE, lanes)), np.zeros((SIZE, SIZE, lanes))
+    seen, world = np.empty((3, PLACES, lanes)), np.empty((3, PLACES, lanes))
+    scratch = np.empty((9, PLACES, lanes))
+    # Points on the other columns lie at the centre.
+    reach, others = math.sqrt(COMMON + KAPPA), 2.0 * (COMMON - PLACED)
+    apart = np.full((PLACED, lanes), 0.5 / (COMMON + KAPPA))
+    centre = np.full(lanes, (KAPPA + 0.5 * others) / (COMMON + KAPPA))
+    for turn in range(0, live, lanes):
+        first = turn_of(turn, live, lanes)
+        some = which[first : first + lanes]
+        for k in range(lanes):
+            t, j = some[k]
+            for a in range(size):
+                own = 1.0 if a < COMMON or moves[j] else 0.0
+                y[a, k] = own * x[t, j, a]
+                for b in range(a + 1):
+                    S[a, b, k] = own * P[t, j, a, b]
+        roots(S, F, scratch[0, 0])
+        for a in range(size):
+            for b in range(PLACED):
+                for k in range(lanes):
+                    F[a, b, k] *= reach
+        places(y, F, p[2], R, cone, scratch, seen)
+        turned(R, seen, world)
+        for i in range(2):
+            weighted(world[i], centre, apart, g[i])
+        for i in range(2):
+            for b in range(i + 1):
+                product(world[i], world[b], centre, apart, C[i, b])
+            for a in range(2, SIZE):
+                state = a if a == 2 else a + 1
+                if state < size:
+                    beside(world[i], F[state, :PLACED], apart[0], C[a, i])
+        for a in range(2, SIZE):
+            state = a if a == 2 else a + 1
+            for k in range(lanes):
+                g[a, k] = y[state, k] if state < size else 0.0
+            for b in range(2, a + 1):
+                other = b if b == 2 else b + 1
+                for k in range(lanes):
+                    C[a, b, k] = S[state, other, k] if state < size else 0.0
+        for k in range(lanes):
+            t, j = some[k]
+            for a in range(SIZE):
+                mean[t, j, a] = g[a, k] - p[2] if a == 2 else g[a, k]
+                for b in range(a + 1):
+                    covariance[t, j, a, b] = covariance[t, j, b, a] = C[a, b, k]
     return mean, covariance
 
 
@@ -181,31 +207,43 @@ def sampled(g: FloatArray, L: FloatArray, safety: Safety) -> float:
 
 
 @kernel
-def closed_form(g: FloatArray, L: FloatArray, safety: Safety) -> float:
-    """Probability that a component, g (5,) with the root L of its covariance, collides with a
-    vehicle that keeps its depth: miss distance, vertical offset and the time of the closest
-    approach as Gaussians by sigma points."""
-    V, horizon = safety.velocity, safety.horizon
-    images, y = np.empty((3, 2 * SIZE + 1)), np.empty(SIZE)
-    mean, spread = np.empty(3), np.empty((3, 3))
-    for number in range(2 * SIZE + 1):
-        column, reach = along(number, SIZE)
-        for a in range(SIZE):
-            y[a] = g[a] + reach * L[a, column]
-        w0, w1 = y[3] - V[0], y[4] - V[1]
-        square = max(w0 * w0 + w1 * w1, LITTLE)
-        images[0, number] = (y[0] * w1 - y[1] * w0) / math.sqrt(square)
-        images[1, number] = y[2]
-        images[2, number] = -(y[0] * w0 + y[1] * w1) / square
-    moments(images, 2 * SIZE + 1, mean, spread)
+def _passing(
+    g: FloatArray, F: FloatArray, safety: Safety, scratch: FloatArray, images: FloatArray
+) -> None:
+    """Signed miss distance and time of the closest approach of all sigma points: images (2,
+    2 SIZE + 1, lanes). g (5, lanes), F (5, 5, lanes) as in `sigma_kernels`."""
+    for row, state in enumerate((0, 1, 3, 4)):
+        fan(g[state], F[state, : state + 1], scratch[row])
+    x, y = scratch[0].reshape(-1), scratch[1].reshape(-1)
+    v, w = scratch[2].reshape(-1), scratch[3].reshape(-1)
+    miss, when = images[0].reshape(-1), images[1].reshape(-1)
+    for k in range(len(x)):
+        v[k] -= safety.velocity[0]
+        w[k] -= safety.velocity[1]
+    for k in range(len(x)):
+        square = v[k] * v[k] + w[k] * w[k]
+        square = square if square > LITTLE else LITTLE
+        miss[k] = (x[k] * w[k] - y[k] * v[k]) / math.sqrt(square)
+    for k in range(len(x)):
+        square = v[k] * v[k] + w[k] * w[k]
+        square = square if square > LITTLE else LITTLE
+        when[k] = -(x[k] * v[k] + y[k] * w[k]) / square
+
+
+@kernel
+def _within(
+    mean: FloatArray, var_b: float, var_z: float, var_t: float, both: float, safety: Safety
+) -> float:
+    """Probability that a component passes within the radius and the height, before the horizon:
+    miss distance, vertical offset and time are Gaussians of that mean (3,); both: covariance of
+    the first two."""
     b, z, t = mean
-    var_b, var_z, var_t, both = spread[0, 0], spread[1, 1], spread[2, 2], spread[0, 1]
     std_z, R = math.sqrt(var_z), safety.radius
     low, high = max(-safety.height, z - 6.0 * std_z), min(safety.height, z + 6.0 * std_z)
     # Most obstacles are passed far off: what follows would find the same.
     if not low <= high or abs(b) - R > FAR * math.sqrt(var_b):
         return 0.0
-    in_time = _between(0.0, horizon, t, math.sqrt(var_t))
+    in_time = _between(0.0, safety.horizon, t, math.sqrt(var_t))
     if in_time < LITTLE:
         return 0.0
     slope = both / var_z if var_z > LITTLE else 0.0
@@ -225,20 +263,20 @@ def closed_form(g: FloatArray, L: FloatArray, safety: Safety) -> float:
     return total * in_time
 
 
-@kernel
-def probability(g: FloatArray, C: FloatArray, safety: Safety) -> float:
-    """Probability that one component, mean g (5,) and covariance C (5, 5), collides."""
-    L, total = np.zeros((SIZE, SIZE)), C.copy()
-    for i in (3, 4):
-        total[i, i] += safety.std * safety.std
-    semidefinite_root(total, L)
-    w0, w1 = g[3] - safety.velocity[0], g[4] - safety.velocity[1]
-    # A course that may be any has no miss distance to be Gaussian in.
-    unsure = w0 * w0 + w1 * w1 <= 4.0 * (total[3, 3] + total[4, 4])
-    inside = g[0] * g[0] + g[1] * g[1] <= safety.radius * safety.radius
-    if safety.velocity[2] != 0.0 or inside or unsure:
-        return sampled(g, L, safety)
-    return closed_form(g, L, safety)
+class _Lanes(NamedTuple):
+    """Components that are judged together: g (5, lanes), S (5, 5, lanes) its covariance with the
+    error of the course, L the root of that, F the root times the reach of the sigma points;
+    points (4, 2 SIZE + 1, lanes): scratch; images: see `_passing`; moments (5, lanes): mean of
+    miss distance and of time, their variances, covariance of the first with the vertical
+    offset."""
+
+    g: FloatArray
+    S: FloatArray
+    L: FloatArray
+    F: FloatArray
+    points: FloatArray
+    images: FloatArray
+    moments: FloatArray
 
 
 @kernel
@@ -246,21 +284,94 @@ def assess(
     mean: FloatArray, covariance: FloatArray, mu: FloatArray, safety: Safety
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distance (T,) m and time (T,) s of the closest approach, and the probability (T,) of a
-    collision, of mixtures (T, K) of g."""
+    collision, of mixtures (T, K) of g.
+
+    Miss distance, vertical offset and the time of the closest approach are Gaussian, by sigma
+    points, where a vehicle keeps its depth and a course that is certain; else draws are counted.
+    """
     T, K, _ = mean.shape
     distance, when, risk = np.zeros(T), np.zeros(T), np.zeros(T)
-    V = safety.velocity
+    live, which = 0, np.empty((T * K, 2), dtype=np.int64)
     for t in range(T):
-        known = 0.0
         for j in range(K):
-            if mu[t, j] < WEIGHT:
-                continue
-            g = mean[t, j]
-            time, near = closest(g[0], g[1], g[3] - V[0], g[4] - V[1], safety.horizon)
-            distance[t] += mu[t, j] * near
-            when[t] += mu[t, j] * time
-            risk[t] += mu[t, j] * probability(g, covariance[t, j], safety)
-            known += mu[t, j]
-        distance[t], when[t], risk[t] = distance[t] / known, when[t] / known, risk[t] / known
-        risk[t] = min(max(risk[t], 0.0), 1.0)
+            if mu[t, j] >= WEIGHT:
+                which[live, 0], which[live, 1] = t, j
+                live += 1
+    chance = np.zeros(live)
+    if live:
+        lanes = lanes_for(live)
+        shape, numbers = (SIZE, SIZE, lanes), 2 * SIZE + 1
+        work = _Lanes(
+            np.empty((SIZE, lanes)), np.empty(shape), np.zeros(shape), np.zeros(shape),
+            np.empty((4, numbers, lanes)), np.empty((2, numbers, lanes)), np.empty((5, lanes)),
+        )  # fmt: skip
+        for turn in range(0, live, lanes):
+            first = turn_of(turn, live, lanes)
+            some = which[first : first + lanes]
+            _gather(mean, covariance, some, safety, work)
+            _judge(safety, work, chance[first : first + lanes])
+    V, known = safety.velocity, np.zeros(T)
+    for k in range(live):
+        t, j = which[k]
+        g = mean[t, j]
+        time, near = closest(g[0], g[1], g[3] - V[0], g[4] - V[1], safety.horizon)
+        distance[t] += mu[t, j] * near
+        when[t] += mu[t, j] * time
+        risk[t] += mu[t, j] * chance[k]
+        known[t] += mu[t, j]
+    for t in range(T):
+        distance[t], when[t] = distance[t] / known[t], when[t] / known[t]
+        risk[t] = min(max(risk[t] / known[t], 0.0), 1.0)
     return distance, when, risk
+
+
+@kernel
+def _gather(
+    mean: FloatArray, covariance: FloatArray, which: IntArray, safety: Safety, work: _Lanes
+) -> None:
+    """Components `which` (lanes, 2), of which target and which of its own, into the lanes."""
+    lanes = len(which)
+    for k in range(lanes):
+        t, j = which[k]
+        for a in range(SIZE):
+            work.g[a, k] = mean[t, j, a]
+            for b in range(a + 1):
+                work.S[a, b, k] = covariance[t, j, a, b]
+    for a in (3, 4):
+        for k in range(lanes):
+            work.S[a, a, k] += safety.std * safety.std
+    roots(work.S, work.L, work.moments[0])
+    reach = math.sqrt(SIZE + KAPPA)
+    for a in range(SIZE):
+        for b in range(a + 1):
+            for k in range(lanes):
+                work.F[a, b, k] = reach * work.L[a, b, k]
+
+
+@kernel
+def _judge(safety: Safety, work: _Lanes, chance: FloatArray) -> None:
+    """The probability (lanes,) that each component collides."""
+    g, S, moments = work.g, work.S, work.moments
+    lanes, V = len(chance), safety.velocity
+    centre = np.full(lanes, KAPPA / (SIZE + KAPPA))
+    weight = np.full((SIZE, lanes), 0.5 / (SIZE + KAPPA))
+    _passing(g, work.F, safety, work.points, work.images)
+    for i in range(2):
+        image = work.images[i]
+        weighted(image, centre, weight, moments[i])
+        product(image, image, centre, weight, moments[2 + i])
+    beside(work.images[0], work.F[2, :3], weight[0], moments[4])
+    L, at = np.empty((SIZE, SIZE)), np.empty(SIZE)
+    for k in range(lanes):
+        w0, w1 = g[3, k] - V[0], g[4, k] - V[1]
+        # A course that may be any has no miss distance to be Gaussian in.
+        unsure = w0 * w0 + w1 * w1 <= 4.0 * (S[3, 3, k] + S[4, 4, k])
+        inside = g[0, k] * g[0, k] + g[1, k] * g[1, k] <= safety.radius * safety.radius
+        if V[2] != 0.0 or inside or unsure:
+            at[:], L[:] = g[:, k], work.L[:, :, k]
+            chance[k] = sampled(at, L, safety)
+        else:
+            at[0], at[1], at[2] = moments[0, k], g[2, k], moments[1, k]
+            chance[k] = _within(
+                at[:3], moments[2, k], S[2, 2, k], moments[3, k], moments[4, k], safety
+            )

@@ -28,16 +28,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.jit import kernel
-from ...estimation.small_matrices import lift, semidefinite_root
-from .kernels import along, echo, echo_beside, moments, point_towards, to_world
+from ...estimation.lanes import lanes_for, roots, turn_of, unsound
+from ...estimation.small_matrices import lift
+from .kernels import KAPPA
+from .sigma_kernels import beside, echoes, fan, PLACES, places, product, turned, weighted
 
 STATES = 6
 COMMON = 4
 """The states d, delta, z, s that all behaviours have."""
-PLACED = 3
-"""The first of them say where the obstacle is."""
 
 
 class Motion(NamedTuple):
@@ -143,18 +143,23 @@ def mix(
     return x1, P1, mu1
 
 
-@kernel
-def slopes(m: FloatArray, R: FloatArray, cone: bool, J: FloatArray) -> None:
-    """How range and azimuth of m (3,), seen by a sonar turned by R, change with the obstacle's
-    north and east: J (2, 2)."""
-    d = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    level = m[0] * m[0] + m[1] * m[1]
-    for i in range(2):
-        J[0, i] = (R[i, 0] * m[0] + R[i, 1] * m[1] + R[i, 2] * m[2]) / d
-        if cone:
-            J[1, i] = (R[i, 1] - m[1] / d * J[0, i]) / math.sqrt(d * d - m[1] * m[1])
-        else:
-            J[1, i] = (R[i, 1] * m[0] - R[i, 0] * m[1]) / level
+class _Lanes(NamedTuple):
+    """Components that are predicted together. y (n, lanes), their covariance S (n, n, lanes) and
+    F, the root of it times the reach of the sigma points; motion (4, lanes): keep, step, push,
+    noise; centre (lanes,): weight of the centre; apart (lanes,), weight (n, lanes): of each other
+    point, and by columns, where those of states that a component has not weigh nothing; images
+    (2, numbers, lanes): range and azimuth; J: see `slopes`."""
+
+    y: FloatArray
+    S: FloatArray
+    F: FloatArray
+    motion: FloatArray
+    centre: FloatArray
+    apart: FloatArray
+    weight: FloatArray
+    images: FloatArray
+    J: FloatArray
+    scratch: FloatArray
 
 
 @kernel
@@ -168,63 +173,41 @@ def advance(
     probable one, so that all stay finite.
     """
     T, C, size = x.shape
-    p0, R0, p1, R1, noise, cone = step
     x1, P1 = np.zeros((T, C, size)), np.zeros((T, C, size, size))
     repaired = np.zeros((T, C), dtype=np.bool_)
-    L, images = np.zeros((size, size)), np.empty((size, 2 * size + 1))
-    y, m, J = np.empty(size), np.empty(3), np.empty((2, 2))
-    middle, world, scratch = np.empty(3), np.empty(3), np.empty((size, size))
+    live, which = 0, np.empty((T * C, 2), dtype=np.int64)
     for t in range(T):
-        best = 0
         for j in range(C):
-            if mu[t, j] > mu[t, best]:
-                best = j
-            if mu[t, j] <= 0.0:
-                continue
+            if not mu[t, j] <= 0.0:
+                which[live, 0], which[live, 1] = t, j
+                live += 1
+    if live == 0:
+        return x1, P1, repaired
+    lanes, numbers = lanes_for(live), 2 * size + 1
+    work = _Lanes(
+        np.empty((size, lanes)), np.zeros((size, size, lanes)), np.zeros((size, size, lanes)),
+        np.empty((4, lanes)), np.empty(lanes), np.empty(lanes), np.empty((size, lanes)),
+        np.empty((2, numbers, lanes)), np.empty((2, 2, lanes)), np.empty((3, numbers, lanes)),
+    )  # fmt: skip
+    bad, scratch = np.empty(lanes, dtype=np.int64), np.empty((size, size))
+    for turn in range(0, live, lanes):
+        first = turn_of(turn, live, lanes)
+        some = which[first : first + lanes]
+        _gather(x, P, motion, some, work)
+        _look(step, work)
+        _spread(step, work)
+        unsound(work.S, work.F, work.centre, bad)
+        for k in range(lanes):
+            t, j = some[k]
             n = size if motion.prior[j] > 0.0 else COMMON
-            centre, mean, spread, root = x[t, j], x1[t, j, :n], P1[t, j, :n, :n], L[:n, :n]
-            semidefinite_root(P[t, j, :n, :n], root)
-            towards = math.cos(centre[1]), math.sin(centre[1])
-            for number in range(2 * n + 1):
-                column, reach = along(number, n)
-                for a in range(n):
-                    y[a] = centre[a] + reach * root[a, column]
-                # The root is triangular: on its later columns a point is where the centre is.
-                if column < PLACED:
-                    cosine, sine = towards
-                    if column < 2 and number > 0:
-                        cosine, sine = math.cos(y[1]), math.sin(y[1])
-                    point_towards(y[0], cosine, sine, y[2] - p0[2], R0, cone, m)
-                    to_world(R0, m, world)
-                    if number == 0:
-                        middle[:] = world
-                else:
-                    world[:] = middle
-                for i in range(2):
-                    world[i] += (p0[i] - p1[i]) * (1.0 + y[3])
-                    if n > COMMON:
-                        world[i] += motion.step[j] * y[COMMON + i]
-                        images[COMMON + i, number] = motion.keep[j] * y[COMMON + i]
-                world[2] += p0[2] - p1[2]
-                for i in range(3):
-                    m[i] = R1[0, i] * world[0] + R1[1, i] * world[1] + R1[2, i] * world[2]
-                images[2, number], images[3, number] = y[2], y[3]
-                if number == 0:
-                    seen = m[0], m[1]
-                    images[0, 0], images[1, 0] = echo(m, cone)
-                    if n > COMMON:
-                        slopes(m, R1, cone, J)
-                else:
-                    images[0, number], images[1, number] = echo_beside(
-                        m, cone, seen[0], seen[1], images[1, 0]
-                    )
-            moments(images, 2 * n + 1, mean, spread)
-            P1[t, j, 0, 0] += noise[0]
-            P1[t, j, 1, 1] += noise[0] / (x1[t, j, 0] * x1[t, j, 0]) + noise[1]
-            P1[t, j, 2, 2] += noise[2]
-            if n > COMMON:
-                _add_push(P1[t, j], J, motion.push[j], motion.noise[j])
-            repaired[t, j] = lift(P1[t, j, :n, :n], scratch[:n, :n])
+            for a in range(n):
+                x1[t, j, a] = work.y[a, k]
+                for b in range(a + 1):
+                    P1[t, j, a, b] = P1[t, j, b, a] = work.S[a, b, k]
+            if bad[k]:
+                repaired[t, j] = lift(P1[t, j, :n, :n], scratch[:n, :n])
+    for t in range(T):
+        best = np.argmax(mu[t])
         for j in range(C):
             if mu[t, j] <= 0.0:
                 x1[t, j], P1[t, j] = x1[t, best], P1[t, best]
@@ -232,11 +215,131 @@ def advance(
 
 
 @kernel
-def _add_push(P: FloatArray, J: FloatArray, push: float, noise: float) -> None:
-    """Add what w brings to P (6, 6): to range and azimuth, to e, and to both together."""
+def _gather(x: FloatArray, P: FloatArray, motion: Motion, which: IntArray, work: _Lanes) -> None:
+    """Components `which` (lanes, 2), of which target and which of its own, into the lanes."""
+    size, lanes = work.y.shape
+    for k in range(lanes):
+        t, j = which[k]
+        n = size if motion.prior[j] > 0.0 else COMMON
+        for a in range(size):
+            work.y[a, k] = x[t, j, a]
+            for b in range(a + 1):
+                work.S[a, b, k] = P[t, j, a, b]
+            work.weight[a, k] = 0.5 / (n + KAPPA) if a < n else 0.0
+        work.centre[k], work.apart[k] = KAPPA / (n + KAPPA), 0.5 / (n + KAPPA)
+        work.motion[0, k], work.motion[1, k] = motion.keep[j], motion.step[j]
+        work.motion[2, k], work.motion[3, k] = motion.push[j], motion.noise[j]
+    reach = work.scratch[0, 0]
+    roots(work.S, work.F, reach)
+    for k in range(lanes):
+        reach[k] = math.sqrt(0.5 / work.apart[k])
+    for a in range(size):
+        for b in range(a + 1):
+            for k in range(lanes):
+                work.F[a, b, k] *= reach[k]
+
+
+@kernel
+def _look(step: Step, work: _Lanes) -> None:
+    """Range and azimuth after the step of all sigma points, and their slopes at the centre."""
+    p0, R0, p1, R1, _, cone = step
+    y, F, go, scratch = work.y, work.F, work.motion[1], work.scratch
+    size, lanes = y.shape
+    _, numbers, _ = scratch.shape
+    M, across, down = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    for i in range(3):
+        down[i] = R1[2, i] * (p0[2] - p1[2])
+        across[i] = R1[0, i] * (p0[0] - p1[0]) + R1[1, i] * (p0[1] - p1[1])
+        for j in range(3):
+            for k in range(3):
+                M[i, j] += R1[k, i] * R0[k, j]
+    seen, m = np.empty((3, PLACES, lanes)), np.empty((3, numbers, lanes))
+    places(y, F, p0[2], R0, cone, np.empty((9, PLACES, lanes)), seen)
+    turned(M, seen, m)
+    for i in range(3):
+        for number in range(PLACES, numbers):
+            for k in range(lanes):
+                m[i, number, k] = m[i, 0, k]
+    scale, north, east = scratch[0].reshape(-1), scratch[1].reshape(-1), scratch[2].reshape(-1)
+    fan(y[3], F[3, :4], scratch[0])
+    if size > COMMON:
+        for a in range(COMMON, size):
+            fan(y[a], F[a, : a + 1], scratch[a - 3])
+            for number in range(numbers):
+                for k in range(lanes):
+                    scratch[a - 3, number, k] *= go[k]
+    for i in range(3):
+        to = m[i].reshape(-1)
+        for k in range(numbers * lanes):
+            to[k] += across[i] * (1.0 + scale[k]) + down[i]
+        if size > COMMON:
+            for k in range(numbers * lanes):
+                to[k] += R1[0, i] * north[k] + R1[1, i] * east[k]
+    echoes(y[1], m, cone, scratch, work.images[0], work.images[1])
+    if size > COMMON:
+        slopes(m[:, 0], R1, cone, work.J)
+
+
+@kernel
+def _spread(step: Step, work: _Lanes) -> None:
+    """What the sigma points say: mean and covariance of the components after the step."""
+    y, S, images, keep = work.y, work.S, work.images, work.motion[0]
+    size, lanes = y.shape
+    noise, push, extra = step.noise, work.motion[2], work.motion[3]
+    for i in range(2):
+        weighted(images[i], work.centre, work.weight, y[i])
+    for i in range(2):
+        for b in range(i + 1):
+            product(images[i], images[b], work.centre, work.weight, S[i, b])
+        for a in range(2, size):
+            beside(images[i], work.F[a, : a + 1], work.apart, S[a, i])
+    for k in range(lanes):
+        S[0, 0, k] += noise[0]
+    for k in range(lanes):
+        S[1, 1, k] += noise[0] / (y[0, k] * y[0, k]) + noise[1]
+    for k in range(lanes):
+        S[2, 2, k] += noise[2]
+    for a in range(COMMON, size):
+        for k in range(lanes):
+            y[a, k] *= keep[k]
+        for b in range(a + 1):
+            for k in range(lanes):
+                S[a, b, k] *= keep[k] * keep[k] if b >= COMMON else keep[k]
+    if size > COMMON:
+        _add_push(S, work.J, push, extra)
+
+
+@kernel
+def slopes(m: FloatArray, R: FloatArray, cone: bool, J: FloatArray) -> None:
+    """How range and azimuth of m (3, lanes), seen by a sonar turned by R, change with the
+    obstacle's north and east: J (2, 2, lanes)."""
+    x, y, z = m[0], m[1], m[2]
+    for i in range(2):
+        for k in range(len(x)):
+            d = math.sqrt(x[k] * x[k] + y[k] * y[k] + z[k] * z[k])
+            J[0, i, k] = (R[i, 0] * x[k] + R[i, 1] * y[k] + R[i, 2] * z[k]) / d
+        for k in range(len(x)):
+            if cone:
+                square = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
+                rest = R[i, 1] - y[k] / math.sqrt(square) * J[0, i, k]
+                J[1, i, k] = rest / math.sqrt(square - y[k] * y[k])
+            else:
+                level = x[k] * x[k] + y[k] * y[k]
+                J[1, i, k] = (R[i, 1] * x[k] - R[i, 0] * y[k]) / level
+
+
+@kernel
+def _add_push(S: FloatArray, J: FloatArray, push: FloatArray, noise: FloatArray) -> None:
+    """Add what w brings to S (6, 6, lanes), its lower triangle: to range and azimuth, to e, and to
+    both together."""
+    lanes = len(push)
     for a in range(2):
+        for b in range(a + 1):
+            for k in range(lanes):
+                both = J[a, 0, k] * J[b, 0, k] + J[a, 1, k] * J[b, 1, k]
+                S[a, b, k] += push[k] * push[k] * noise[k] * both
         for b in range(2):
-            P[a, b] += push * push * noise * (J[a, 0] * J[b, 0] + J[a, 1] * J[b, 1])
-            P[a, COMMON + b] += push * noise * J[a, b]
-            P[COMMON + b, a] += push * noise * J[a, b]
-        P[COMMON + a, COMMON + a] += noise
+            for k in range(lanes):
+                S[COMMON + b, a, k] += push[k] * noise[k] * J[a, b, k]
+        for k in range(lanes):
+            S[COMMON + a, COMMON + a, k] += noise[k]

@@ -12,15 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The arithmetic of the obstacle filter, compiled: sigma points through the sonar's geometry.
+"""The arithmetic of the obstacle filter, compiled: updates, bands and outlook.
 
 A target is K components of four states (d, delta, z, s): range m, azimuth rad positive to
 starboard, depth m of the obstacle, scale of the navigation's horizontal distances. A kernel takes
 x (T, K, 4) and P (T, K, 4, 4) of all targets at once; `cone` says which azimuth is meant. What a
 point and a projection are is told in `acoustics.geometry`; here they are written out again for
 speed, and where no point exists, as can happen at a sigma point, the nearest existing one is
-taken. Sigma points are on the columns of the Cholesky root with kappa = 1, so that no weight is
-negative and the centre weighs 1/5.
+taken. Sigma points (`sigma_kernels`) are on the columns of the Cholesky root with kappa = 1, so
+that no weight is negative and the centre of four states weighs 1/5.
 """
 
 from __future__ import annotations
@@ -51,14 +51,7 @@ NORMAL_95 = 1.645
 @kernel
 def point(d: float, delta: float, d_st: float, R: FloatArray, cone: bool, m: FloatArray) -> None:
     """`geometry.reconstruct` into m (3,)."""
-    point_towards(d, math.cos(delta), math.sin(delta), d_st, R, cone, m)
-
-
-@kernel
-def point_towards(
-    d: float, cosine: float, sine: float, d_st: float, R: FloatArray, cone: bool, m: FloatArray
-) -> None:
-    """`point` at the azimuth of which cosine and sine are known."""
+    cosine, sine = math.cos(delta), math.sin(delta)
     a, b, c = R[2, 0], R[2, 1], R[2, 2]
     if cone:
         m_y, r = d * sine, d * cosine
@@ -81,72 +74,6 @@ def _level(k: float, c: float, drop: float, r: float) -> tuple[float, float]:
     else:
         k, c = 0.0, 1.0
     return r * (cosine * c + sine * k), r * (sine * c - cosine * k)
-
-
-@kernel
-def echo(m: FloatArray, cone: bool) -> tuple[float, float]:
-    """`geometry.project`: range and azimuth of m (3,)."""
-    d = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    if cone:
-        return d, math.asin(min(1.0, max(-1.0, m[1] / d)))
-    return d, math.atan2(m[1], m[0])
-
-
-@kernel
-def echo_beside(
-    m: FloatArray, cone: bool, x: float, y: float, azimuth: float
-) -> tuple[float, float]:
-    """`echo` of a point whose azimuth is within half a turn of `azimuth`, which is that of (x, y).
-    The difference of two near directions needs no arc tangent: its series ends below 1e-17."""
-    if cone:
-        return echo(m, cone)
-    d = math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
-    dot, cross = x * m[0] + y * m[1], x * m[1] - y * m[0]
-    if abs(cross) >= 0.03 * dot:
-        return d, azimuth + math.atan2(cross, dot)
-    t = cross / dot
-    u = t * t
-    return d, azimuth + t * (1.0 - u * (1.0 / 3.0 - u * (0.2 - u * (1.0 / 7.0 - u / 9.0))))
-
-
-@kernel
-def to_world(R: FloatArray, m: FloatArray, world: FloatArray) -> None:
-    for i in range(3):
-        world[i] = R[i, 0] * m[0] + R[i, 1] * m[1] + R[i, 2] * m[2]
-
-
-@kernel
-def along(number: int, n: int) -> tuple[int, float]:
-    """Sigma point `number` of 2 n + 1 lies on this column of the root, and so far along it: the
-    centre, then the points ahead on each column, then those behind."""
-    if number == 0:
-        return 0, 0.0
-    reach = math.sqrt(n + KAPPA)
-    return (number - 1, reach) if number <= n else (number - n - 1, -reach)
-
-
-@kernel
-def moments(images: FloatArray, points: int, mean: FloatArray, covariance: FloatArray) -> None:
-    """Mean (n,) and covariance (n, n), into the latter two, of sigma points: the first `points`
-    columns of images (n, ..), the centre first. Leaves in images how far off the mean they are."""
-    n = len(mean)
-    # Of 2 s + 1 points on s states the others weigh 1 / (2 (s + kappa)).
-    weight = 0.5 / (0.5 * (points - 1) + KAPPA)
-    centre = KAPPA / (0.5 * (points - 1) + KAPPA)
-    for a in range(n):
-        total = centre * images[a, 0]
-        for number in range(1, points):
-            total += weight * images[a, number]
-        mean[a] = total
-        for number in range(points):
-            images[a, number] -= total
-    for a in range(n):
-        for b in range(a + 1):
-            total = centre * images[a, 0] * images[b, 0]
-            for number in range(1, points):
-                total += weight * images[a, number] * images[b, number]
-            covariance[a, b] = total
-            covariance[b, a] = total
 
 
 @kernel

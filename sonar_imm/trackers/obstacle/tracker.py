@@ -40,8 +40,7 @@ from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import (
-    assign_by_rank,
-    association_cost,
+    assign_fits,
     gate_threshold,
     Tracks,
     TrackStatus,
@@ -302,12 +301,9 @@ class ObstacleTracker:
             return np.full(len(h), -1), h
         threshold = gate_threshold(self.config.gate_probability, 2)
         fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
-        target, detection = np.nonzero(np.isfinite(fit))
-        cost = association_cost(
-            fit[target, detection], self.config.detection_probability, self.config.clutter_density
-        )
         tentative = now.life.status == TrackStatus.TENTATIVE
-        chosen = assign_by_rank(target, detection, cost, tentative.astype(np.int64), len(z))
+        config = self.config
+        chosen = assign_fits(fit, tentative, config.detection_probability, config.clutter_density)
         return chosen, h
 
     def _update(

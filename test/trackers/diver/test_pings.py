@@ -64,6 +64,20 @@ def case(seed=0):
     return x, P, numbers, [plain(c) for c in range(6)]
 
 
+@pytest.mark.parametrize('turns', [-1, 1, 3])
+def test_a_bearing_is_the_same_after_a_whole_turn(turns):
+    """Else a diver behind a receiver, where the bearing jumps by a turn, would be an outlier."""
+    x, P, numbers, _ = case()
+    turned = numbers._replace(value=numbers.value + 2.0 * np.pi * turns * (numbers.kind == 2))
+    mask = np.ones(N, bool)
+    for update in (
+        lambda told: subset_ping(x[None], P[None], mask, 0.0, told, 0.05, 128)[:2],
+        lambda told: student_t_ping(x[None], P[None], mask, 0.0, told, x[None, :2], 4.0)[:2],
+    ):
+        for one, other in zip(update(numbers), update(turned)):
+            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize('considered', [0, 6])
 def test_the_subset_kernel_is_the_plain_update(considered):
     x, P, numbers, plain = case()

@@ -1,0 +1,178 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What of the acceptance vectors is no recording: how far our numbers are from theirs.
+
+`benchmarks.fathometer_acceptance` prints it with the rest.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from sonar_imm.acoustics.fathometer import sediment_thickness
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimation.set_filter import SetFilter
+from sonar_imm.estimation.set_model import gaussian_move, SetModel, Sets
+from sonar_imm.measurements import Pressure
+from sonar_imm.trackers.fathometer.array_response import (
+    array_coherence,
+    array_response,
+    processor_pulse,
+)
+from sonar_imm.trackers.fathometer.pressure import PressureStream
+from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig
+
+EXACT_LOG_EVIDENCE = 298.6663117
+"""Of the records of exact_hmm.npz, by summing over all sets (test_set_particles.py)."""
+
+
+def exact_hmm(folder: Path, seed: int) -> dict[str, float]:
+    """Total variation of the PMF and error of the log evidence, with 20,000 particles."""
+    lag = np.arange(60)
+    model = SetModel(
+        cells=60,
+        separation=3,
+        order_min=1,
+        transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
+        move=gaussian_move(0.8),
+        gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
+        amplitude_std=3.0,
+    )
+    with np.load(folder / 'fathometer' / 'exact_hmm.npz') as file:
+        records, exact = file['B'], file['exP']
+    tracker, before, off, evidence = SetFilter(model, 20_000), None, [], 0.0
+    for name, b in enumerate(records):
+        step = tracker.step(before, b, (seed, name))
+        before = step.after
+        off.append(0.5 * np.abs(tracker.summary(step)[0] - exact[name]).sum())
+        evidence += step.log_evidence
+    return {
+        'exact_hmm: PMF, total variation': float(np.mean(off)),
+        'exact_hmm: log evidence': abs(evidence - EXACT_LOG_EVIDENCE),
+    }
+
+
+def signed_likelihood(folder: Path) -> dict[str, float]:
+    """Largest error of the finite ones; how many of all are rejected as they should not be, or not
+    as they should."""
+    with np.load(folder / 'fathometer_sea' / 'signed_likelihood.npz') as file:
+        v = {name: file[name] for name in file}
+    n = v['response'].shape[1]
+    pulse = band_pulse(
+        float(v['frequency_min']), float(v['frequency_max']), float(v['sound_speed'])
+    )
+    found = np.zeros(len(v['order']))
+    for k, order in enumerate(v['order']):
+        model = SetModel(
+            cells=n,
+            separation=1,
+            order_min=int(order),
+            transition=np.eye(1),
+            move=np.ones(1),
+            gram=pulse(float(v['depth_step']) * np.arange(n)),
+            amplitude_std=float(v['amplitude_std_sigmas']),
+            negative_probability=0.05,
+        )
+        sets = Sets.empty(model, 1)
+        sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
+        sets.sign[0] = v['sign'][k, :order]
+        single = SetFilter(model, 1)
+        # The kernel that weighs sets, without moving them.
+        single._weigh(sets, v['response'][k], found[k : k + 1], single._amplitudes)
+    finite = np.isfinite(v['log_likelihood'])
+    return {
+        'signed_likelihood: error': float(
+            np.abs(found[finite] - v['log_likelihood'][finite]).max()
+        ),
+        'signed_likelihood: wrongly rejected or not': float((finite != np.isfinite(found)).sum()),
+    }
+
+
+def sediment(folder: Path) -> dict[str, float]:
+    with np.load(folder / 'fathometer_sea' / 'sediment.npz') as file:
+        found = [
+            sediment_thickness(file['two_way_time_below_bottom'], float(speed), float(gradient))
+            for speed, gradient in zip(file['sound_speed'], file['gradient'])
+        ]
+        return {'sediment: m': float(np.abs(np.array(found) - file['thickness']).max())}
+
+
+def pressure(folder: Path) -> dict[str, float]:
+    """Largest relative errors of what is made of pressure.npz, of both records."""
+    with np.load(folder / 'fathometer_sea' / 'pressure.npz') as file:
+        v = {name: file[name] for name in file}
+    names = ('snapshot_seconds', 'record_seconds', 'frequency_min', 'frequency_max')
+    config = FathometerConfig(
+        phones=16,
+        element_spacing=float(v['element_spacing']),
+        noise_depth_min=0.0,
+        noise_depth_max=0.0,
+        **{name: float(v[name]) for name in names},
+    )
+    depth = v['depth']
+    lattice = Lattice(float(depth[0]), float(depth[1] - depth[0]), len(depth))
+    worst: dict[str, float] = {}
+    for k in range(len(v['p'])):
+        block = Pressure(
+            stamp_ns=1, pressure=v['p'][k] * v['scale'][k], sample_rate=float(v['sample_rate'])
+        )
+        (collected,), _ = PressureStream(config, Counter()).push(block, 40.0)
+        heard = array_coherence(collected.spectra, config)
+        found = array_response(collected.spectra, lattice, config, float(v['array_depth'][k]))
+        pulse = processor_pulse(heard, Lattice(40.0, lattice.step, 320), config.sound_speed)
+        rows = np.searchsorted(collected.spectra.frequency, v['csdm_frequency'] - 0.1)
+        pairs: Mapping[str, tuple[np.ndarray, np.ndarray]] = {
+            'R': (levelled(collected.spectra.csdm[rows]), levelled(v['csdm'][k])),
+            'gamma': (heard.gamma, v['gamma_mvdr'][k]),
+            'W': (levelled(heard.weight), levelled(v['weight'][k])),
+            'b': (found.amplitude, v['response'][k]),
+            'mirror sigma': (found.sigma[:1], v['sigma_mirror'][k : k + 1]),
+            'pulse': (pulse(lattice.step * np.arange(320)), v['pulse_processor'][k]),
+        }
+        for name, (ours, theirs) in pairs.items():
+            error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
+            worst[f'pressure: {name}'] = max(worst.get(f'pressure: {name}', 0.0), error)
+    return worst
+
+
+def levelled(values: np.ndarray) -> np.ndarray:
+    """Of any level: only ratios of cross-spectra count."""
+    return values / np.abs(values).max()
+
+
+LIMITS = {
+    'exact_hmm: PMF, total variation': 0.008,
+    'exact_hmm: log evidence': 0.5,
+    'signed_likelihood: error': 1e-9,
+    'signed_likelihood: wrongly rejected or not': 0.0,
+    'sediment: m': 1e-9,
+    **{f'pressure: {name}': 1e-4 for name in ('R', 'gamma', 'W', 'b', 'mirror sigma', 'pulse')},
+}
+
+
+def rows(folder: Path, seeds: int) -> dict[str, list[float]]:
+    """Errors by name, of each seed where there are some."""
+    found: dict[str, list[float]] = {}
+    for one in [exact_hmm(folder, seed) for seed in range(seeds)]:
+        for name, value in one.items():
+            found.setdefault(name, []).append(value)
+    for name, value in (signed_likelihood(folder) | sediment(folder) | pressure(folder)).items():
+        found[name] = [value]
+    return found
