@@ -299,12 +299,12 @@ def run(name: str, folder: Path) -> None:
 
 
 def _merged(old: Part, new: Part) -> Part:
-    """The rows of `new`, and those of `old` that are of something else, in a fixed order."""
+    """The rows of `old`, those that `new` has replaced by it, and what is new after them."""
     if isinstance(new, Mapping):
         both = {**(old or {}), **new}
         return {system: both[system] for system in SYSTEMS if system in both}
     rows = {_key(row): row for row in [*(old or []), *new]}
-    return sorted(rows.values(), key=lambda row: [*SYSTEMS, None].index(row.get('system')))
+    return list(rows.values())
 
 
 def _key(row: Mapping[str, Any]) -> tuple[Any, ...]:

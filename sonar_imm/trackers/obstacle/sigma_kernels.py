@@ -143,7 +143,7 @@ def echoes(
     azimuth: FloatArray,
 ) -> None:
     """Range and azimuth (numbers, lanes) of m (3, numbers, lanes), seen by the sonar
-    (`kernels.echo`). near (lanes,): azimuths of the centres as they were a moment ago. scratch
+    (`geometry.project`). near (lanes,): azimuths of the centres as they were a moment ago. scratch
     (3, numbers, lanes)."""
     numbers, lanes = distance.shape
     x, y, z = m[0].reshape(-1), m[1].reshape(-1), m[2].reshape(-1)
