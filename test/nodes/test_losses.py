@@ -104,6 +104,9 @@ def test_a_publisher_that_left_is_not_continued_by_another():
     line.send('gone', received_ns=queued)  # was still in the queue
     assert sum(line.send('other', received_ns=time.time_ns()) for _ in range(5)) == 0
     assert line.send('other', skip=3, received_ns=time.time_ns()) == 3
+    line.publishers = 2
+    line.numbers['third'] = line.numbers['gone'] + 10
+    assert line.send('third', received_ns=time.time_ns()) == 0
 
 
 def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_bench, capfd):
