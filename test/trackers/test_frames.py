@@ -26,6 +26,7 @@ from sonar_imm.measurements import (
     FrameGuard,
     Navigation,
     Rejection,
+    Snapshot,
     StaticTransforms,
 )
 from sonar_imm.parameters import ConfigError
@@ -145,3 +146,14 @@ def test_a_late_altitude_does_not_shut_out_the_later_ones():
     assert tracker.counts['used'] == 6
     with pytest.raises(Rejection, match="'another' is not the frame 'altimeter'"):
         take(5006, 'another')
+
+
+def test_an_array_keeps_to_its_first_frame():
+    scene, received = scene_of('bathymetry')
+    snapshot = next(one.measurement for one in received if isinstance(one.measurement, Snapshot))
+    config = SYSTEMS['bathymetry'].config_type()(**scene.told())
+    door = FrameDoor(SYSTEMS['bathymetry'].build(config), FrameGuard())
+    first = evolve(snapshot, frame_id='array')
+    assert door.admit(first) is first
+    with pytest.raises(Rejection, match="'hull' is not the frame 'array'"):
+        door.admit(evolve(snapshot, frame_id='hull'))
