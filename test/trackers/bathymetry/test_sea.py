@@ -21,6 +21,7 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.likelihood_kernels import likelihood_table
+from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Altitude, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
@@ -237,6 +238,7 @@ def test_without_navigation_nothing_changes_and_with_it_the_columns_say_more():
         'horizontal_uncertainty',
         'intensity',
         'beam_angle',
+        *PLACES,
         'side',
     ]
 
