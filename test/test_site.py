@@ -59,6 +59,12 @@ def test_every_page_is_in_the_navigation(made) -> None:
     }
 
 
+def test_every_recording_is_on_their_page(made) -> None:
+    page = made.recordings()
+    for path in (ROOT / 'bags').glob('*/README.md'):
+        assert f'| [{path.parent.name}](#' in page and f'## {path.parent.name}\n' in page
+
+
 def test_the_api_has_every_public_module(made) -> None:
     described = set().union(*(made.modules(package) for package, _ in made.API.values()))
     files = [*(ROOT / 'sonar_imm').rglob('*.py'), *(ROOT / 'msg_adapters').rglob('*.py')]
