@@ -20,7 +20,7 @@ import subprocess
 import sys
 import time
 
-from helpers.ready import wait_until_ready
+from helpers.live import own_words, wait_until_ready
 import numpy as np
 import pytest
 
@@ -149,9 +149,10 @@ def test_unusable_arguments_end_in_one_line_and_exit_code_2(arguments, sentence)
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
     ):
-        assert node.process.wait(30.0) == 2
+        assert node.process.wait(120.0) == 2
         own = ('[rcl]', 'compiling numerical kernels')
-        lines = [line for line in node.log().splitlines() if not any(w in line for w in own)]
+        said = own_words(node.log()).splitlines()
+        lines = [line for line in said if not any(word in line for word in own)]
     assert len(lines) == 1
     assert sentence in lines[0]
 
@@ -161,8 +162,8 @@ def assert_clean_end(nodes, how):
         node.process.send_signal(how)
     for node in nodes:
         assert node.process.wait(120.0) == 0, node.log()
-        assert 'Traceback' not in node.log()
-        assert 'Error' not in node.log()
+        said = own_words(node.log())
+        assert 'Traceback' not in said and 'Error' not in said
 
 
 def test_sigterm_ends_the_diver_node_cleanly():
@@ -214,7 +215,7 @@ def test_help_is_said_without_starting():
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=('--', '--help')) as node,
     ):
-        assert node.process.wait(30.0) == 0
+        assert node.process.wait(120.0) == 0
         assert node.log().startswith('usage: diver [--ros-args')
 
 

@@ -24,6 +24,7 @@ import subprocess
 import time
 from typing import Any
 
+from helpers.live import own_words
 from sonar_imm.nodes.harness import (
     local_discovery,
     NodeProcess,
@@ -122,8 +123,9 @@ def reason_unclean(node: NodeProcess, expected: int) -> list[tuple[str, str]]:
         return [(node.system, told[-1000:])]
     if code != expected:
         return [(node.system, f'exit code {code}: {node.log()[-500:]}')]
-    words = [word for word in ('Traceback', 'Error', 'terminate called') if word in node.log()]
-    return [(node.system, f'{words}: {node.log()[-500:]}')] if words else []
+    said = own_words(node.log())
+    words = [word for word in ('Traceback', 'Error', 'terminate called') if word in said]
+    return [(node.system, f'{words}: {said[-500:]}')] if words else []
 
 
 def _doing(pid: int) -> str:

@@ -74,7 +74,7 @@ def killed(case, arguments, path, messages, at_once, rng):
             rig.publishers[one.topic].publish(one.content)
         time.sleep(0.1 * rng.random())
         rig.node.process.kill()
-        assert rig.node.process.wait(30.0) == -9
+        assert rig.node.process.wait(120.0) == -9
     return estimates
 
 

@@ -20,6 +20,7 @@ import time
 from helpers.faults.cases import CASES
 from helpers.faults.figures import count
 from helpers.faults.nodes import ended, heeds_signals, reason_unclean, Running
+from helpers.live import own_words
 import numpy as np
 import pytest
 
@@ -79,7 +80,8 @@ def test_signals_end_a_node_cleanly_at_any_moment_of_its_start(system, figures):
             node.process.send_signal(ASKING[turn % 3])
             node.process.send_signal(ASKING[turn % 3])  # as launch and a terminal do together
             unclean += reason_unclean(node, 0)
-            said = [line for line in node.log().splitlines() if '[INFO]' not in line]
+            lines = own_words(node.log()).splitlines()
+            said = [line for line in lines if '[INFO]' not in line]
             unclean += [(system, line) for line in said]
     figures.add(
         {'system': system, 'signal': STARTING},
