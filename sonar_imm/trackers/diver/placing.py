@@ -44,6 +44,7 @@ from ...measurements import (
     Measurement,
     nanoseconds,
     Navigation,
+    Rejection,
     RelativeFix,
     VesselFix,
     VesselHeading,
@@ -234,7 +235,10 @@ class Placer:
             elif known == 'gap':
                 self._counts['vessel_pose_gap'] += 1
             elif self._on_earth() if self._by_places() else self._in_metres():
-                done.append(self._composed(fix, self._vessel(fix.stamp_ns)))
+                try:
+                    done.append(self._composed(fix, self._vessel(fix.stamp_ns)))
+                except Rejection:  # poses that leap within nanoseconds lead beyond the Earth
+                    self._counts['vessel_pose_gap'] += 1
         self._waiting = waiting
         return sorted(done, key=lambda one: one.stamp_ns)
 

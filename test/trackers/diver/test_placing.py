@@ -199,6 +199,15 @@ def test_a_gap_in_the_poses_and_a_stamp_before_them_are_counted():
     assert not made and tracker.counts['vessel_pose_gap'] == 2
 
 
+def test_poses_that_leap_cost_the_fixes_between_and_nothing_later():
+    tracker = DiverTracker(DiverConfig(vessel_max_extrapolation=0.6))
+    leap = [pose(5.0, (0, 0, 0), 0.0), pose(5.00000001, (1e7, 0, 0), 0.0)]
+    assert not run(tracker, [*leap, relative(5.05, (10.0, 0.0, 0.0))])
+    assert tracker.counts['vessel_pose_gap'] == 1
+    after = [pose(6, (0, 0, 0), 0.0), pose(7, (0, 0, 0), 0.0), relative(6.5, (10.0, 0.0, 0.0))]
+    assert run(tracker, after)
+
+
 def test_waiting_is_bounded_and_said():
     tracker = DiverTracker(DiverConfig())
     for k in range(1, 251):
