@@ -41,6 +41,9 @@ ANSWER_LIMIT = 15.0
 """Seconds a node may take over one message. Its kernels are warm before it listens."""
 _ANSWERS = '/processed'
 _SECOND_LOOK = 0.5
+_OTHER_INPUTS = 4.0
+"""Seconds in which further inputs of a node may be found. They become known one by one, and what
+was lost of them on the way is sent again after three."""
 
 
 def only_node(link: Link) -> str:
@@ -133,7 +136,8 @@ class LockStep:
         """Wait until the node is there and hears; gives the topics of `publishers` it hears.
 
         The node may take `limit` seconds to appear, a new node has to compile its kernels first.
-        Raises `LinkError` saying what is missing.
+        Where it hears some only, four seconds are given to find the others: a message that is not
+        waited for could be taken for somebody else's. Raises `LinkError` saying what is missing.
         """
         publishers = list(publishers)
         if not self._link.wait_for(lambda: self._counts is not None, limit, self._trouble):
@@ -141,12 +145,18 @@ class LockStep:
                 f"no answer from a node '{self._name}': is it running, in this ROS "
                 'domain, and one of this package?'
             )
+        topics = {p.topic_name for p in publishers}
         heard: set[str] = set()
+        last = time.monotonic()
 
         def connected() -> bool:
-            heard.update(self._heard(publishers))
+            nonlocal last
+            if fresh := self._heard(publishers) - heard:
+                heard.update(fresh)
+                last = time.monotonic()
             return (
                 bool(heard)
+                and (heard == topics or time.monotonic() - last > _OTHER_INPUTS)
                 and all(p.get_subscription_count() for p in publishers if p.topic_name in heard)
                 and self._recorded()
             )

@@ -21,6 +21,9 @@ from helpers import walker
 import pytest
 import rclpy
 
+from sonar_imm.nodes.harness import reserved_domain_id
+from sonar_imm.nodes.link import Link
+
 
 @pytest.fixture(name='walker')
 def _walker(monkeypatch):
@@ -87,3 +90,17 @@ def make_bench():
             return bench
 
         yield make
+
+
+@pytest.fixture
+def domain(monkeypatch):
+    """A ROS domain of this test's own: a player brings a context of its own."""
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    with reserved_domain_id() as domain_id:
+        yield domain_id
+
+
+@pytest.fixture
+def link(domain):
+    with Link('listener', domain_id=domain) as link:
+        yield link

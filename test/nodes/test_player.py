@@ -14,83 +14,28 @@
 
 """Playing bags: pace, selection, clock, pause and lock-step, with real publishers."""
 
-from contextlib import ExitStack
 import threading
 import time
 
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from helpers.fix_bags import COUNT, Ear, START, STEP, write_fixes
 import numpy as np
 import pytest
-from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from msg_adapters.fixes import write_fix
-from sonar_imm.measurements import Fix
-from sonar_imm.nodes import lockstep as lockstep_module
 from sonar_imm.nodes import player as player_module
-from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.harness import reserved_domain_id
-from sonar_imm.nodes.link import Link, LinkError
-from sonar_imm.nodes.lockstep import LockStep, Recorder
+from sonar_imm.nodes.link import Link
 from sonar_imm.nodes.player import NAME, Pace, play, Player, PlayOptions
-from sonar_imm.nodes.qos import lockstep_qos, profiles_of
+from sonar_imm.nodes.qos import profiles_of
 from sonar_imm.parameters import ConfigError
-from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.reader import BagError, BagReader
 from sonar_imm.recordings.writer import BagWriter
-
-START = 1_700_000_000 * 10**9
-STEP = 10**7
-COUNT = 20
-
-
-@pytest.fixture
-def domain(monkeypatch):
-    """A ROS domain of this test's own: a player brings a context of its own."""
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    with reserved_domain_id() as domain_id:
-        yield domain_id
 
 
 @pytest.fixture
 def bag(tmp_path):
-    """Twenty fixes 10 ms apart, the fourth not a number, and a second topic with one message."""
-    path = tmp_path / 'bag'
-    with BagWriter(path) as writer:
-        for k in range(COUNT):
-            message = write_fix(
-                Fix(
-                    stamp_ns=START + k * STEP,
-                    position=(float(k), 0.0, 0.0),
-                    covariance=np.eye(2),
-                    frame_id='map',
-                ),
-                ros_message,
-            )
-            if k == 3:
-                message.pose.pose.position.x = float('nan')
-            writer.write('/fix', message, START + k * STEP)
-        writer.write('/other', ros_message('std_msgs/msg/Float64', data=1.5), START)
-    return path
-
-
-class Ear:
-    """Hears everything on a topic, though it only listens when asked."""
-
-    def __init__(self, link, message_type, topic):
-        self.link, self.heard = link, []
-        link.node.create_subscription(message_type, topic, self.heard.append, lockstep_qos())
-
-    def positions(self, count):
-        assert self.link.wait_for(lambda: len(self.heard) >= count, 10.0)
-        return [message.pose.pose.position.x for message in self.heard]
-
-
-@pytest.fixture
-def link(domain):
-    with Link('listener', domain_id=domain) as link:
-        yield link
+    return write_fixes(tmp_path / 'bag')
 
 
 def test_a_bag_is_played_in_order_with_its_stamps(bag, link, domain):
@@ -233,155 +178,6 @@ def test_a_bag_without_messages_is_said(tmp_path, domain):
         pass
     with pytest.raises(BagError, match='nothing to publish'):
         play(tmp_path / 'empty', PlayOptions(), domain_id=domain)
-
-
-class Live:
-    """A walker node that runs in a thread, as if it were a process of its own."""
-
-    def __init__(self, domain_id, *arguments):
-        self.link = Link(f'beside_{len(arguments)}', domain_id=domain_id)
-        self.node = TrackerNode(
-            'walker', context=self.link.context, cli_args=['--ros-args', *arguments]
-        )
-        self.executor = SingleThreadedExecutor(context=self.link.context)
-        self.executor.add_node(self.node)
-        self.thread = threading.Thread(target=self.executor.spin)
-        self.thread.start()
-
-    def end(self):
-        self.executor.shutdown()
-        self.thread.join(10.0)
-        self.node.destroy_node()
-        self.link.__exit__()
-
-
-RELIABLE = (
-    '-p',
-    'qos_overrides./fix.subscription.reliability:=reliable',
-    '-p',
-    'qos_overrides./fix.subscription.history:=keep_all',
-)
-
-
-@pytest.fixture
-def start(walker, domain):
-    """Start live walkers, all ended with the test."""
-    started = []
-
-    def start(*parameters):
-        started.append(Live(domain, *parameters))
-        return started[-1]
-
-    yield start
-    for live in started:
-        live.end()
-
-
-@pytest.fixture
-def stepping(bag, link):
-    """Make a player in lock-step with the walker, and the recorder of its estimates."""
-    with ExitStack() as stack:
-
-        def stepping(**options):
-            reader = stack.enter_context(BagReader(bag))
-            recorder = Recorder(link, '/walker')
-            step = LockStep(link, '/walker', recorder=recorder)
-            chosen = PlayOptions(lockstep='/walker', **options)
-            return Player(reader, link, chosen, step), recorder, step
-
-        yield stepping
-
-
-def test_lockstep_gets_the_estimate_of_every_message(link, start, stepping):
-    start(*RELIABLE)
-    player, recorder, step = stepping()
-    player.run()
-    assert player.result().published == COUNT + 1  # the other topic goes along, unanswered
-    assert step.counts == (COUNT, 1, COUNT - 1)
-    assert len(player.result().delays) == COUNT - 1
-    used = [float(k) for k in range(COUNT) if k != 3]
-    assert [e.state[0, 0] for e in recorder.estimates()] == [
-        pytest.approx(np.mean(used[: k + 1])) for k in range(COUNT - 1)
-    ]
-
-
-def test_a_second_player_counts_from_where_the_node_stands(link, start, stepping):
-    start(*RELIABLE)
-    first, _, _ = stepping()
-    first.run()
-    second, recorder, step = stepping(start_offset=0.1)
-    second.run()
-    assert step.counts == (COUNT - 10, 0, 0)  # all duplicates: answered without an estimate
-    assert len(recorder) == 0
-
-
-def test_lockstep_finds_the_only_node_and_asks_where_there_are_two(
-    bag, start, domain, monkeypatch
-):
-    start(*RELIABLE)
-    result = play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
-    assert len(result.delays) == COUNT - 1
-    start('-r', '__node:=other')
-    monkeypatch.setattr(lockstep_module, '_SECOND_LOOK', 15.0)
-    with pytest.raises(LinkError, match='several nodes run: say which of /other, /walker'):
-        play(bag, PlayOptions(lockstep='auto'), domain_id=domain)
-
-
-def test_lockstep_without_a_node_says_so(link, stepping):
-    player, _, _ = stepping()
-    with pytest.raises(LinkError, match="no answer from a node '/walker'"):
-        player.run(start_limit=0.3)
-
-
-def test_lockstep_names_the_type_the_node_expects(link, start, monkeypatch, stepping):
-    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 3.0)
-    start('-p', 'fix_type:=geometry_msgs/msg/PointStamped')
-    player, _, _ = stepping(topics=('/fix',))
-    with pytest.raises(LinkError, match='expects geometry_msgs/msg/PointStamped on /fix'):
-        player.run()
-
-
-def test_lockstep_says_when_no_topic_fits(link, start, monkeypatch, stepping):
-    monkeypatch.setattr(lockstep_module, 'MATCH_LIMIT', 0.5)
-    start()
-    player, _, _ = stepping(topics=('/other',))
-    with pytest.raises(LinkError, match=r'listens to none of the topics of the bag \(/other\)'):
-        player.run()
-
-
-def test_lockstep_notices_a_node_that_does_not_answer(link, start, monkeypatch, stepping):
-    monkeypatch.setattr(lockstep_module, 'ANSWER_LIMIT', 0.3)
-    live = start(*RELIABLE)
-    release = threading.Event()
-    monkeypatch.setattr(live.node.tracker, 'process', lambda m: release.wait(20.0) and [])
-    player, _, _ = stepping()
-    try:
-        with pytest.raises(LinkError, match='did not answer message 1 on /fix within 0.3 s'):
-            player.run()
-    finally:
-        release.set()
-
-
-def test_lockstep_notices_somebody_else_who_publishes(link, start, stepping):
-    start(*RELIABLE)
-    other = link.node.create_publisher(PoseWithCovarianceStamped, '/fix', lockstep_qos())
-    player, _, _ = stepping()
-    link.wait_for(other.get_subscription_count, 15.0)
-
-    def meddle(count):
-        other.publish(PoseWithCovarianceStamped())
-
-    with pytest.raises(LinkError, match="something else publishes to the node '/walker'"):
-        player.run(meddle)
-
-
-def test_recorded_estimates_read_back(link, start, stepping):
-    start(*RELIABLE)
-    player, recorder, _ = stepping(topics=('/fix',))
-    player.run()
-    estimate = recorder.estimates()[0]
-    assert estimate.frame_id == 'map'
-    assert estimate.model_names == ('slow', 'fast')
 
 
 def test_a_ros_1_bag_is_played_as_ros_2_messages(tmp_path, link, domain):
