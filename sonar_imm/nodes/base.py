@@ -83,7 +83,7 @@ class TrackerNode(Node):
         super().__init__(system, **options)
         self._system, self._full_name = system, self.get_fully_qualified_name().lstrip('/')
         self._topics = inputs_of(system)
-        config_type = SYSTEMS[system].config_type()
+        config_type = self._config_type = SYSTEMS[system].config_type()
         self._node_config_type = node_config_type(SYSTEMS[system])
         self._settings = NodeParameters(
             self, (config_type, self._node_config_type), type_specs(system)
@@ -95,7 +95,7 @@ class TrackerNode(Node):
         guards = (self._guard, self._repeats, tree)
         self._keeper = StateKeeper(self, system, self._node_config, guards)
         self.tracker = self._keeper.begin(config)
-        self._door = FrameDoor(self.tracker, self._guard, tree, config)
+        self._door = FrameDoor(self.tracker, self._guard, tree)
         self._warm()
 
         self._enabled = True
@@ -129,7 +129,7 @@ class TrackerNode(Node):
             self._report,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
-        self._keeper.save_every_now_and_then(lambda: (self.tracker, self._door.given))
+        self._keeper.save_every_now_and_then(lambda: (self.tracker, self._settings[config_type]))
         self._settings.on_change(lambda: self._door.reconfigure(self._settings[config_type]))
         self._settings.warn_of_unknown()
         self._acknowledge(None)
@@ -137,7 +137,7 @@ class TrackerNode(Node):
 
     def destroy_node(self) -> None:
         """Save the state, then end."""
-        self._keeper.save(self.tracker, self._door.given, wait=True)
+        self._keeper.save(self.tracker, self._settings[self._config_type], wait=True)
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:

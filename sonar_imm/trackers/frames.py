@@ -47,25 +47,16 @@ SEEN_FROM_THE_SONAR = (Detections, Snapshot)
 class FrameDoor:
     """Lets measurements through to a tracker.
 
-    given: the parameters as they were given, without the place of the sonar that /tf_static says;
-    mounting: that place as parameters, None before it is known.
+    mounting: the parameters of the place of the sonar, as /tf_static says them, None before.
     """
 
-    def __init__(
-        self,
-        tracker: Any,
-        guard: FrameGuard,
-        tree: FrameTree | None = None,
-        given: Config | None = None,
-    ):
+    def __init__(self, tracker: Any, guard: FrameGuard, tree: FrameTree | None = None):
         """guard: the frame that was told, and those of what the tracker uses whatever its stamp.
         Of everything else the tracker says what it used, since what is refused must not decide.
-        tree: what is known of frames already, as after a restart; given: None for the parameters
-        of `tracker`."""
+        tree: what is known of frames already, as after a restart."""
         self._tracker = tracker
         self._guard = guard
         self._tree = FrameTree() if tree is None else tree
-        self.given: Config = tracker.config if given is None else given
         self._frames = _sonar_frames(tracker.config)
         self.mounting: dict[str, tuple[float, ...]] | None = None
         self._mount()
@@ -93,7 +84,6 @@ class FrameDoor:
 
     def reconfigure(self, config: Config) -> None:
         """Give `config` to the tracker, with the place of the sonar where that is known."""
-        self.given = config
         self._tracker.reconfigure(evolve(config, **(self.mounting or {})))
 
     def _turned(self, measurement: Any) -> Any:
