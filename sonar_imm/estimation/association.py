@@ -49,6 +49,7 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray, IntArray
 from .association_kernels import choose, COASTING, CONFIRMED, count, TENTATIVE
+from .imm import pairs_inside
 from .kalman import BoolArray, factorise, log_density
 
 
@@ -204,7 +205,7 @@ def assign_fits(
     chosen, clear = choose(fit, tentative, missed, math.log(clutter_density))
     if clear:
         return chosen
-    target, detection = np.nonzero(fit > -np.inf)
+    target, detection = pairs_inside(fit)
     cost = association_cost(fit[target, detection], detection_probability, clutter_density)
     return assign_by_rank(target, detection, cost, tentative.astype(np.int64), fit.shape[1])
 
