@@ -15,8 +15,8 @@
 """The state of a tracker in a file, so that a restart forgets nothing.
 
 A file is one line that says what it is, the SHA-256 of the rest, and the rest: an npz of
-``header`` (JSON) and ``block`` (the bytes of all arrays). It is written under another name and
-renamed when it is on the disk: whatever happens, there is a whole file, the old or the new one.
+``header`` (JSON) and ``block`` (the bytes of all arrays). Whatever happens, there is a whole file,
+the old or the new one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -33,7 +32,7 @@ from attrs import frozen
 import numpy as np
 
 from .. import __version__
-from ..files import sync_folder
+from ..files import whole
 from ..parameters import Config, ConfigError
 from . import System, Tracker
 from .state_values import Decoder, Encoder, restore, StateError
@@ -79,18 +78,9 @@ def write_state(path: Path, saved: Saved) -> int:
     np.savez(buffer, header=text, block=encoder.block)
     body = buffer.getvalue()
     line = _MAGIC + f'{FORMAT} {hashlib.sha256(body).hexdigest()}\n'.encode()
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}.tmp')
-    try:
-        with temporary.open('wb') as stream:
-            stream.write(line)
-            stream.write(body)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(path.parent)
+    with whole(path) as place, place.open('wb') as stream:
+        stream.write(line)
+        stream.write(body)
     return len(line) + len(body)
 
 
