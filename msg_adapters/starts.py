@@ -23,13 +23,7 @@ import numpy as np
 
 from sonar_imm.measurements import Rejection, Start
 
-from .fixes import (
-    LEAST_VARIANCE,
-    make_position,
-    MOST_VARIANCE,
-    UNKNOWN_VARIANCE,
-    xy_covariance,
-)
+from .fixes import LEAST_VARIANCE, make_position, MOST_VARIANCE, UNKNOWN_VARIANCE, xy_covariance
 from .headers import Make, stamp_ns, swap_axes, to_enu
 
 

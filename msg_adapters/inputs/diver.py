@@ -32,13 +32,7 @@ from sonar_imm.measurements import (
 
 from ..arrivals import read_arrivals, write_arrivals
 from ..fixes import doubt_fix, read_fix, write_fix
-from ..geodetic import (
-    doubt_geodetic,
-    is_geodetic,
-    read_geodetic,
-    read_vessel_fix,
-    write_geodetic,
-)
+from ..geodetic import doubt_geodetic, is_geodetic, read_geodetic, read_vessel_fix, write_geodetic
 from ..headers import Make
 from ..navigation import write_navigation
 from ..relative import read_beacon, read_modem, read_relative, read_usbl_data, write_relative

@@ -22,12 +22,7 @@ makes them from messages.
 from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
-from .checks import (
-    check_covariance,
-    check_stamp,
-    nanoseconds,
-    Rejection,
-)
+from .checks import check_covariance, check_stamp, nanoseconds, Rejection
 from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
 from .frames import frame_role, FrameGuard, Frames

@@ -19,14 +19,7 @@ import math
 
 import numpy as np
 
-from sonar_imm.measurements import (
-    Arrivals,
-    Detections,
-    Fixes,
-    Navigation,
-    Snapshot,
-    Trace,
-)
+from sonar_imm.measurements import Arrivals, Detections, Fixes, Navigation, Snapshot, Trace
 from sonar_imm.trackers import SYSTEMS
 
 SECOND = 10**9

@@ -28,14 +28,7 @@ from ...estimation.arrays import FloatArray
 from ..scene import Received, Scene, TrueTrack
 from .afloat import namespace_of
 from .crossing import crossing_paths
-from .scenarios import (
-    DiverScenario,
-    FIRST_STAMP_NS,
-    RECEIVERS,
-    scenario,
-    SCENARIOS,
-    TRANSMITTER,
-)
+from .scenarios import DiverScenario, FIRST_STAMP_NS, RECEIVERS, scenario, SCENARIOS, TRANSMITTER
 from .sensors import draw_errors, SENSE
 
 __all__ = [

@@ -29,14 +29,7 @@ import numpy as np
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...estimation.history import StampGate
-from ...measurements import (
-    Altitude,
-    FrameGuard,
-    nanoseconds,
-    Navigation,
-    Rejection,
-    Snapshot,
-)
+from ...measurements import Altitude, FrameGuard, nanoseconds, Navigation, Rejection, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 

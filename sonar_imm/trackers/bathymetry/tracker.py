@@ -44,12 +44,7 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...measurements import (
-    Altitude,
-    Frames,
-    Navigation,
-    Snapshot,
-)
+from ...measurements import Altitude, Frames, Navigation, Snapshot
 from .config import BathymetryConfig
 from .consistency import noise_warnings
 from .coupling import Alone, Coupling, Favoured

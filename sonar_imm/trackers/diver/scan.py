@@ -25,12 +25,7 @@ from ...acoustics.multistatic import difference_projection
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import (
-    assign,
-    assign_fits,
-    association_cost,
-    gate_threshold,
-)
+from ...estimation.association import assign, assign_fits, association_cost, gate_threshold
 from ...estimation.association_kernels import TENTATIVE
 from ...estimation.consider import consider_models
 from ...estimation.small_matrices import lift_all

@@ -35,25 +35,12 @@ import numpy as np
 
 from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
-from ...estimation import (
-    adaptation_kernels,
-    association_kernels,
-    imm_kernels,
-    jipda_kernels,
-)
+from ...estimation import adaptation_kernels, association_kernels, imm_kernels, jipda_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks
 from ...estimation.association_kernels import TENTATIVE
-from ...measurements import (
-    Arrivals,
-    Fix,
-    Fixes,
-    Frames,
-    Measurement,
-    NOBODY,
-    Start,
-)
+from ...measurements import Arrivals, Fix, Fixes, Frames, Measurement, NOBODY, Start
 from ..model_checks import track_rules
 from ..stream import ReplayStream, StreamRules
 from . import fix_kernels, soft

@@ -45,14 +45,7 @@ from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_model import banded_transition, gaussian_move, SetModel
-from ...measurements import (
-    ArrayDepth,
-    CrossSpectra,
-    Frames,
-    Pressure,
-    Rejection,
-    Trace,
-)
+from ...measurements import ArrayDepth, CrossSpectra, Frames, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
 from .array_response import array_response, rank_deficient

@@ -32,12 +32,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.covariance import LIMIT
 from ...estimation.jit import kernel
-from ...estimation.small_matrices import (
-    careful_update,
-    lift,
-    sound,
-    whitened_square,
-)
+from ...estimation.small_matrices import careful_update, lift, sound, whitened_square
 
 KAPPA = 1.0
 NEGLIGIBLE = 1e-12

@@ -25,12 +25,7 @@ import time
 from typing import Any
 
 from helpers.live import own_words
-from sonar_imm.nodes.harness import (
-    local_discovery,
-    NodeProcess,
-    reserved_domain_id,
-    START_LIMIT,
-)
+from sonar_imm.nodes.harness import local_discovery, NodeProcess, reserved_domain_id, START_LIMIT
 from sonar_imm.nodes.link import Link
 from sonar_imm.nodes.lockstep import LockStep
 from sonar_imm.nodes.qos import lockstep_qos
