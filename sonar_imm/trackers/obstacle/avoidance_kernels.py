@@ -235,20 +235,12 @@ def _off(edge: float, std: float, inside: bool) -> float:
 
 
 @kernel
-def _edges(
-    mean: FloatArray,
-    var_b: float,
-    var_z: float,
-    var_t: float,
-    both: float,
-    safety: Safety,
-    row: FloatArray,
-) -> int:
-    """What has to be known of the normal distribution for `_within` of a component whose miss
-    distance, vertical offset and time are Gaussians of that mean (3,); both: covariance of the
-    first two. Into row: the edges of the time; those of n slices of the vertical offset; the two
-    of the miss distance, given each slice. Gives n, 0 where nothing is near."""
-    b, z, t = mean
+def _edges(moments: FloatArray, z: float, var_z: float, safety: Safety, row: FloatArray) -> int:
+    """What has to be known of the normal distribution for `_within` of a component with these
+    moments (5,), see `_Lanes`, and a vertical offset of that mean and variance. Into row: the
+    edges of the time; those of n slices of the vertical offset; the two of the miss distance,
+    given each slice. Gives n, 0 where nothing is near."""
+    b, t, var_b, var_t, both = moments
     std_z, R = math.sqrt(var_z), safety.radius
     low, high = max(-safety.height, z - 6.0 * std_z), min(safety.height, z + 6.0 * std_z)
     # Most obstacles are passed far off: what follows would find the same.
@@ -402,12 +394,9 @@ def _judge(safety: Safety, work: _Lanes, chance: FloatArray) -> None:
             at[:], L[:] = g[:, k], work.L[:, :, k]
             chance[k] = sampled(at, L, safety)
         else:
-            at[0], at[1], at[2] = moments[0, k], g[2, k], moments[1, k]
             chance[k] = 0.0
-            work.slices[k] = slices = _edges(
-                at[:3], moments[2, k], S[2, 2, k], moments[3, k], moments[4, k], safety,
-                rows[0, end:],
-            )  # fmt: skip
+            slices = _edges(moments[:, k], g[2, k], S[2, 2, k], safety, rows[0, end:])
+            work.slices[k] = slices
             end += 3 + 3 * slices if slices else 0
     gaussians(rows[0, :end], rows[1, :end], rows[2, :end], rows[3, :end])
     first = 0
