@@ -14,6 +14,7 @@
 
 """The node around a tracker, with real publishers and subscriptions in one process."""
 
+from diagnostic_msgs.msg import DiagnosticArray
 from helpers.rig import a_fix, FIX, Rig
 import pytest
 from rcl_interfaces.msg import Log
@@ -25,6 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 from msg_adapters.estimates import read_estimate
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.qos import output_qos
 
 POINT = 'geometry_msgs/msg/PointStamped'
 SECOND = 10**9
@@ -148,6 +150,30 @@ def test_disabled_input_is_answered_but_not_used(rig):
     rig.send(a_fix(2.0, 1.0, 2.0))
     assert rig.means() == [(2.0, 1.0, 2.0)]
     assert rig.answer == (2, 0, 1)
+
+
+def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench):
+    rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
+    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    rig.bench.spin_until(lambda: rig.node.count_subscribers('/diagnostics'))
+    rig.node.set_parameters([Parameter('max_revisions', value=1)])
+    rig.send(*map(a_fix, (1.0, 3.0, 4.0, 2.0)))
+    rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=False))
+    rig.send(a_fix(5.0), a_fix(6.0))
+    rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=True))
+    rig.node.tracker.explode = True
+    rig.send(a_fix(7.0), a_fix(8.0), a_fix(9.0))
+    rig.node._keeper.trouble = 'the state cannot be saved'
+    heard.clear()
+
+    rig.bench.spin_until(lambda: any('cannot be saved' in one.status[1].message for one in heard))
+    tracker = heard[-1].status[1]
+    counts = {pair.key: pair.value for pair in tracker.values}
+    assert counts['count: revisions_withheld'] == '1'
+    assert counts['count: ignored_while_disabled'] == '2'
+    assert counts['count: internal_error'] == '3'
+    assert counts['count: used'] == '4'
+    assert 'an internal error was caught' in tracker.message
 
 
 def test_best_effort_publishers_are_heard(make_bench):
