@@ -312,6 +312,17 @@ def test_what_came_later_corrects_what_was_known(model, exact):
     assert np.mean(right_later) > np.mean(right_then) + 0.01
 
 
+def test_nothing_is_corrected_across_a_record_that_nothing_explains(model, exact):
+    """The filter begins anew there: what comes after it has no ancestors before it."""
+    tracker, smoother, before = SetFilter(model, 20), LagSmoother(2), None
+    found = []
+    for name, b in enumerate([*exact['B'][:3], np.full(60, -5.0), *exact['B'][3:6]]):
+        step = tracker.step(before, b, (4, name))
+        before = step.after if step.ok else None
+        found.append(smoother.push(step) is not None)
+    assert found == [False, False, True, False, False, False, True]
+
+
 def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):
     """Resampling costs variety: below half of the sample it is worth it, above it is not, and the
     weights are carried on instead."""

@@ -198,6 +198,7 @@ def test_a_dead_hydrophone_is_left_out_and_changes_little(spectra, dead):
     assert np.corrcoef(whole.amplitude, masked.amplitude)[0, 1] > 0.5
     tracker, found = run([changed(spectra, csdm)], **SMALL)
     assert found and tracker.counts['dead_hydrophones_masked'] == 1
+    assert tracker.health()['dead_hydrophones'] == 1.0
 
 
 def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
