@@ -14,6 +14,9 @@
 
 """The node around a tracker, with real publishers and subscriptions in one process."""
 
+import time
+from types import SimpleNamespace
+
 from diagnostic_msgs.msg import DiagnosticArray
 from helpers.rig import a_fix, FIX, Rig
 import pytest
@@ -24,6 +27,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import read_estimate
+from sonar_imm.nodes import base
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import output_qos
@@ -174,6 +178,27 @@ def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench)
     assert counts['count: internal_error'] == '3'
     assert counts['count: used'] == '4'
     assert 'an internal error was caught' in tracker.message
+
+
+def test_what_waited_too_long_is_answered_and_counted_but_not_used(
+    make_bench, monkeypatch, capfd
+):
+    rig = Rig(make_bench('-p', 'max_wait:=50.0'))
+    late_s = 40
+
+    def time_ns():
+        return time.time_ns() + late_s * SECOND
+
+    clock = SimpleNamespace(time_ns=time_ns, monotonic=time.monotonic)
+    monkeypatch.setattr(base, 'time', clock)
+    rig.send(a_fix(1.0))
+    late_s = 60
+    rig.send(a_fix(2.0), a_fix(3.0))
+    assert rig.answer == (3, 0, 1) and rig.node._meter.dropped == {'fix': 2}
+    assert capfd.readouterr().err.count('those that waited more than 50 s are dropped') == 1
+    rig.node.set_parameters([Parameter('max_wait', value=0.0)])  # never
+    rig.send(a_fix(4.0))
+    assert rig.answer == (4, 0, 2)
 
 
 def test_best_effort_publishers_are_heard(make_bench):
