@@ -180,9 +180,7 @@ def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench)
     assert 'an internal error was caught' in tracker.message
 
 
-def test_what_waited_too_long_is_answered_and_counted_but_not_used(
-    make_bench, monkeypatch, capfd
-):
+def test_what_waited_too_long_is_answered_and_counted_but_not_used(make_bench, monkeypatch, capfd):
     rig = Rig(make_bench('-p', 'max_wait:=50.0'))
     late_s = 40
 

@@ -233,6 +233,15 @@ def test_a_sound_state_under_another_checksum_is_damaged(tmp_path):
         read_state(path)
 
 
+def test_a_file_larger_than_any_state_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / 'state'
+    path.write_bytes(b'x' * 1001)
+    monkeypatch.setattr(state_file, '_LARGEST', 1000)
+    monkeypatch.setattr(Path, 'read_bytes', lambda path: pytest.fail('it was read'))
+    with pytest.raises(StateError, match='larger than any state'):
+        read_state(path)
+
+
 def rewrite(path, change):
     """Change the header of a state and make its checksum right again."""
     _, _, body = path.read_bytes().partition(b'\n')
