@@ -259,7 +259,9 @@ def test_qos_overrides_reach_the_endpoints(make_bench):
 
 
 def test_an_incompatible_publisher_is_named(make_bench, capfd):
-    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable')
+    told = '-p', 'diagnostics_period:=0.05'
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable', *told)
+    heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     node = bench.add(TrackerNode('walker', context=bench.context))
     bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)
     bench.spin_until(lambda: node._endpoints.incompatible)
@@ -267,6 +269,10 @@ def test_an_incompatible_publisher_is_named(make_bench, capfd):
     said = capfd.readouterr().err
     assert "a peer on '/fix' cannot be heard: its RELIABILITY" in said
     assert '-p qos_overrides./fix.subscription.reliability' in said
+    heard.clear()
+    bench.spin_until(lambda: heard)
+    values = {pair.key: pair.value for pair in heard[0].status[0].values}
+    assert values['incompatible peer on fix'] == 'RELIABILITY'
 
 
 def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, capfd):
