@@ -40,7 +40,11 @@ def test_files_of_qualities_of_service_are_checked(text, sentence):
 
 
 def test_a_file_of_qualities_of_service_says_what_it_says_and_the_rest_is_reliable():
-    lines = '/all: {history: keep_all}', '/quick: {reliability: best_effort, depth: 3}', '/rest: {}'
+    lines = (
+        '/all: {history: keep_all}',
+        '/quick: {reliability: best_effort, depth: 3}',
+        '/rest: {}',
+    )
     profiles = profiles_of('\n'.join(lines))
     told = {
         topic: (one.history.name, one.reliability.name, one.durability.name)
