@@ -156,6 +156,7 @@ def test_a_record_has_random_numbers_of_its_own(model, exact):
         {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3},
         {'shift': Shift(std=1.5, memory=0.9)},
         {'transition': banded_transition(3, 0.3), 'order_min': 0},
+        {'transition': np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]])},
     ],
 )
 def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change):
