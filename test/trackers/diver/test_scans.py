@@ -14,6 +14,8 @@
 
 """Scans: empty ones, soft association, and fixes that say whose they are."""
 
+from types import SimpleNamespace
+
 from attrs import evolve
 from helpers.diver_runs import fix, run, SECOND
 from helpers.estimates import same
@@ -24,6 +26,8 @@ from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
 from sonar_imm.simulation.diver.simulator import scenario, simulate
 from sonar_imm.trackers.diver import fix_kernels, soft
+from sonar_imm.trackers.diver import scan as scan_module
+from sonar_imm.trackers.diver.fix_consistency import FixConsistency, MEMORY
 from sonar_imm.trackers.diver.scan import SCALE_MEMORY
 from sonar_imm.trackers.diver.sensing import position_groups
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
@@ -301,3 +305,59 @@ def test_arrivals_are_judged_where_no_fix_says_the_same():
     assert np.isnan(tracker.health()['arrivals_mean_nis'])
     tracker.process(ping(9))
     assert tracker.health()['arrivals_mean_nis'] < 1.0
+
+
+def test_the_score_of_a_track_is_that_of_its_last_scans():
+    tracker, scores = DiverTracker(DiverConfig(history=0.0)), []
+    for second in range(1, 101):
+        tracker.process(scan(second, (0.0, 0.0)))
+        scores.append(tracker._stream.state.score[0])
+    assert scores[9] > 5.0 * scores[1] > 0.0
+    assert scores[-1] == pytest.approx(scores[-2], rel=1e-3)  # it does not grow with the dive
+
+
+def test_repairs_of_every_step_of_a_gap_are_counted(monkeypatch):
+    tracker = DiverTracker(DiverConfig(history=0.0))
+    for second in (1, 2):
+        tracker.process(scan(second, (0.0, 0.0)))
+    real, crossed = scan_module.cross, []
+
+    def cross(*told):
+        for step in real(*told):
+            crossed.append(step)
+            yield step._replace(repairs=len(crossed))
+
+    monkeypatch.setattr(scan_module, 'cross', cross)
+    tracker.process(scan(8, (0.0, 0.0)))
+    steps = len(crossed)
+    assert steps > 2
+    assert tracker.health()['covariance_repairs'] == steps * (steps + 1) // 2
+
+
+def test_scans_near_another_track_are_counted_for_each_partner_alone():
+    """1 and 2 lie apart, 3 beside 2, 4 beside 1; who each was near before, and for how long."""
+    names = DiverTracker(DiverConfig())._stream.state.life
+    mean = np.array([[0.0, 0.0], [50.0, 0.0], [50.1, 0.0], [0.1, 0.0]])
+    now = SimpleNamespace(
+        life=evolve(names, track_id=np.array([1, 2, 3, 4], np.uint32)),
+        target_id=np.full(4, NOBODY),
+        near_to=np.array([0, 1, 1, 1]),
+        near_for=np.array([0, 5, 5, 5]),
+    )
+    tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
+    near_to, near_for = soft.coalescence(now, tentative, mean, wide)
+    assert near_to.tolist() == [0, 0, 2, 1]
+    assert near_for.tolist() == [0, 0, 1, 6]
+
+
+def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
+    pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
+    lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
+    for one in (pessimistic, lasting):
+        assert 'state fix_bias_std' in one.warnings(False)[0]
+        assert one.warnings(True) == []
+        assert evolve(one, count=0.9 * MEMORY).warnings(False) == []
+    optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
+    for stated in (False, True):
+        assert 'raise covariance_scale' in optimistic.warnings(stated)[0]
+    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False) == []
