@@ -22,14 +22,13 @@ from attrs import evolve
 import numpy as np
 import pytest
 
+from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
 from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
 from sonar_imm.estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
 from sonar_imm.estimation.set_particles import propagate, propose, start, weigh
 from sonar_imm.estimation.set_shifts import Shift
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
-EXACT_LOG_EVIDENCE = 298.6663117
-"""By enumeration of all sets of up to three members on the 60 cells, in a program of its own."""
 
 
 @pytest.fixture(scope='module')
@@ -40,16 +39,7 @@ def exact():
 
 @pytest.fixture(scope='module')
 def model():
-    lag = np.arange(60)
-    return SetModel(
-        cells=60,
-        separation=3,
-        order_min=1,
-        transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
-        move=gaussian_move(0.8),
-        gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
-        amplitude_std=3.0,
-    )
+    return exact_hmm_model()
 
 
 def run(model, records, particles, seed, threads=1):

@@ -21,47 +21,31 @@ from helpers.sea_scenes import score_scene, sea_scene
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.pulse import band_pulse
+from benchmarks.fathometer_vectors import signed_sets
 from sonar_imm.estimation.set_filter import SetFilter
-from sonar_imm.estimation.set_model import SetModel, Sets
+from sonar_imm.estimation.set_model import SetModel
 from sonar_imm.estimation.set_particles import weigh
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 
-SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
+VECTORS = Path(__file__).parents[2] / 'vectors'
 
 
 @pytest.mark.parametrize('compiled', [False, True])
 def test_a_set_with_a_wrong_sign_is_impossible(compiled):
-    with np.load(SEA / 'signed_likelihood.npz') as file:
-        v = {name: file[name] for name in file}
-    n = v['response'].shape[1]
-    edges = float(v['frequency_min']), float(v['frequency_max'])
-    pulse = band_pulse(*edges, float(v['sound_speed']))
-    for k, order in enumerate(v['order']):
-        model = SetModel(
-            cells=n,
-            separation=1,
-            order_min=int(order),
-            transition=np.eye(1),
-            move=np.ones(1),
-            gram=pulse(float(v['depth_step']) * np.arange(n)),
-            amplitude_std=float(v['amplitude_std_sigmas']),
-            negative_probability=0.05,
-        )
-        sets = Sets.empty(model, 1)
-        sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
-        sets.sign[0] = v['sign'][k, :order]
+    impossible = 0
+    for one in signed_sets(VECTORS):
         if compiled:
             found = np.zeros(1)
-            filter_ = SetFilter(model, 1)
-            amplitude = filter_._weigh(sets, v['response'][k], found, filter_._amplitudes)
+            filter_ = SetFilter(one.model, 1)
+            amplitude = filter_._weigh(one.sets, one.response, found, filter_._amplitudes)
         else:
-            found, amplitude = weigh(model, v['response'][k], sets)
-        assert found[0] == pytest.approx(v['log_likelihood'][k], abs=1e-9)
-        if np.isfinite(v['log_likelihood'][k]):
-            assert amplitude[0] == pytest.approx(v['amplitude_mean'][k, :order], abs=1e-9)
-    assert np.count_nonzero(np.isinf(v['log_likelihood'])) == 24
+            found, amplitude = weigh(one.model, one.response, one.sets)
+        assert found[0] == pytest.approx(one.log_likelihood, abs=1e-9)
+        impossible += np.isinf(one.log_likelihood)
+        if np.isfinite(one.log_likelihood):
+            assert amplitude[0] == pytest.approx(one.amplitude, abs=1e-9)
+    assert impossible == 24
 
 
 def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
