@@ -31,6 +31,7 @@ optimal sub-pattern assignment metric*, FUSION 2017.
 
 from __future__ import annotations
 
+from itertools import repeat
 import math
 from typing import NamedTuple
 
@@ -113,7 +114,8 @@ class NisMemory:
         """With the hits nis (K,) of dof (K,) degrees of freedom."""
         keep = 1.0 - 1.0 / NIS_MEMORY
         gathered, freedom, square, count = self.nis, self.dof, self.square, self.count
-        for value, m in zip(nis.tolist(), np.broadcast_to(dof, nis.shape).tolist()):
+        each = repeat(dof) if isinstance(dof, int) else dof.tolist()
+        for value, m in zip(nis.tolist(), each):
             gathered = keep * gathered + min(value, FARTHEST * m)
             freedom = keep * freedom + m
             square = keep * keep * square + m

@@ -23,6 +23,7 @@ extrapolated from the last two where the user allows it, up to a limit.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from itertools import pairwise
 from typing import Literal
 
 from attrs import field, frozen
@@ -77,8 +78,8 @@ class NavigationBuffer:
             return 'gap'
         begin = bisect_right(self.stamps, first_ns) - 1
         end = min(bisect_left(self.stamps, last_ns), len(self.stamps) - 1)
-        steps = np.diff(self.stamps[begin : end + 1])
-        if len(steps) and steps.max() > max_gap_ns:
+        steps = pairwise(self.stamps[begin : end + 1])
+        if any(newer - older > max_gap_ns for older, newer in steps):
             return 'gap'
         beyond = last_ns - self.stamps[-1]
         if beyond <= 0:

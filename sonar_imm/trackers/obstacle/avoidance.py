@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from functools import cache
+import math
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def course(buffer: NavigationBuffer, stamp_ns: int, window: float) -> FloatArray
     if len(stamps) < 2 or (stamps[-1] - stamps[0]) * 1e-9 < _SHORTEST:
         return np.full(3, np.nan)
     t = (np.array(stamps) - stamp_ns) * 1e-9
-    positions = np.array([sample.position for sample in buffer.samples[first:last]])
+    positions = np.concatenate([one.position for one in buffer.samples[first:last]]).reshape(-1, 3)
     t -= t.sum() / len(t)
     return np.asarray(t @ (positions - positions[0]) / (t @ t))
 
@@ -68,7 +69,7 @@ def closest_approach(
     mean (T, K, 5), covariance (T, K, 5, 5), mu (T, K) (`avoidance_kernels`) before a vehicle of
     that velocity (3,), NED. NaN where the velocity is."""
     names = ('cpa_distance', 'cpa_time', 'collision_probability')
-    if not np.isfinite(velocity).all():
+    if not all(map(math.isfinite, velocity.tolist())):
         return {name: np.full(len(mu), np.nan) for name in names}
     return dict(
         zip(names, avoidance_kernels.assess(mean, covariance, mu, _safety(velocity, config)))

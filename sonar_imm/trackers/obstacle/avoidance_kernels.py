@@ -26,15 +26,18 @@ from typing import NamedTuple
 import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.elementary import gaussians
 from ...estimation.jit import kernel
 from ...estimation.lanes import lanes_for, roots, turn_of
 from .behaviour_kernels import COMMON
-from .kernels import KAPPA, NEGLIGIBLE, normal
+from .kernels import KAPPA, NEGLIGIBLE
 from .sigma_kernels import beside, fan, PLACED, PLACES, places, product, turned, weighted
 
 SIZE = 5
 SLICES = 16
 """Of the vertical offset, in the closed form, at most."""
+EDGES = 3 + 3 * SLICES
+"""What a component needs to know of the normal distribution, at most: see `_edges`."""
 FINE = 20.0
 """Slices for each standard deviation of the miss distance, given the offset, by which its mean
 differs from one end of the offset to the other. Half as many change a probability by 1e-4."""
@@ -179,14 +182,6 @@ def collides(
 
 
 @kernel
-def _between(low: float, high: float, mean: float, std: float) -> float:
-    """Probability of a Gaussian in an interval."""
-    if std <= 1e-12:
-        return 1.0 if low <= mean <= high else 0.0
-    return normal((high - mean) / std) - normal((low - mean) / std)
-
-
-@kernel
 def sampled(g: FloatArray, L: FloatArray, safety: Safety) -> float:
     """Share of the draws of a component, g (5,) with the root L of its covariance, that collide;
     the error of the course is in L."""
@@ -231,36 +226,59 @@ def _passing(
 
 
 @kernel
-def _within(
-    mean: FloatArray, var_b: float, var_z: float, var_t: float, both: float, safety: Safety
-) -> float:
-    """Probability that a component passes within the radius and the height, before the horizon:
-    miss distance, vertical offset and time are Gaussians of that mean (3,); both: covariance of
-    the first two."""
-    b, z, t = mean
+def _off(edge: float, std: float, inside: bool) -> float:
+    """How many standard deviations an edge lies above the mean; one that is on it, where there is
+    no spread, as if the mean were `inside` below it or not."""
+    if std > 1e-12:
+        return edge / std
+    return math.inf if edge > 0.0 or (edge == 0.0 and inside) else -math.inf
+
+
+@kernel
+def _edges(moments: FloatArray, z: float, var_z: float, safety: Safety, row: FloatArray) -> int:
+    """What has to be known of the normal distribution for `_within` of a component with these
+    moments (5,), see `_Lanes`, and a vertical offset of that mean and variance. Into row: the
+    edges of the time; those of n slices of the vertical offset; the two of the miss distance,
+    given each slice. Gives n, 0 where nothing is near."""
+    b, t, var_b, var_t, both = moments
     std_z, R = math.sqrt(var_z), safety.radius
     low, high = max(-safety.height, z - 6.0 * std_z), min(safety.height, z + 6.0 * std_z)
     # Most obstacles are passed far off: what follows would find the same.
     if not low <= high or abs(b) - R > FAR * math.sqrt(var_b):
-        return 0.0
-    in_time = _between(0.0, safety.horizon, t, math.sqrt(var_t))
-    if in_time < LITTLE:
-        return 0.0
+        return 0
+    std_t = math.sqrt(var_t)
+    row[0], row[1] = _off(-t, std_t, False), _off(safety.horizon - t, std_t, True)
     slope = both / var_z if var_z > LITTLE else 0.0
     rest = math.sqrt(max(var_b - slope * both, 0.0))
     if std_z <= 1e-9:
-        return _between(-R, R, b, rest) * in_time
+        row[2], row[3] = -math.inf, math.inf
+        row[4], row[5] = _off(-R - b, rest, False), _off(R - b, rest, True)
+        return 1
     change = abs(slope) * (high - low)
     slices = SLICES if change * FINE >= SLICES * rest else 1 + int(change * FINE / rest)
-    total, width, before = 0.0, (high - low) / slices, normal((low - z) / std_z)
+    width = (high - low) / slices
+    row[2] = (low - z) / std_z
     for k in range(slices):
         end = low + (k + 1) * width
-        until = normal((end - z) / std_z)
-        if until - before > LITTLE:
-            given = b + slope * (end - 0.5 * width - z)
-            total += (until - before) * _between(-R, R, given, rest)
-        before = until
-    return total * in_time
+        row[3 + k] = (end - z) / std_z
+        given = b + slope * (end - 0.5 * width - z)
+        at = 3 + slices + 2 * k
+        row[at] = _off(-R - given, rest, False)
+        row[at + 1] = _off(R - given, rest, True)
+    return slices
+
+
+@kernel
+def _within(below: FloatArray, slices: int) -> float:
+    """Probability that a component passes within the radius and the height, before the horizon,
+    from the probabilities below all of its `_edges`."""
+    total = 0.0
+    for k in range(slices):
+        share, at = below[3 + k] - below[2 + k], 3 + slices + 2 * k
+        if share > LITTLE:
+            total += share * (below[at + 1] - below[at])
+    in_time = below[1] - below[0]
+    return total * in_time if in_time >= LITTLE else 0.0
 
 
 class _Lanes(NamedTuple):
@@ -268,7 +286,7 @@ class _Lanes(NamedTuple):
     error of the course, L the root of that, F the root times the reach of the sigma points;
     points (4, 2 SIZE + 1, lanes): scratch; images: see `_passing`; moments (5, lanes): mean of
     miss distance and of time, their variances, covariance of the first with the vertical
-    offset."""
+    offset; slices (lanes,) and rows (4, EDGES lanes): see `_edges` and `gaussians`."""
 
     g: FloatArray
     S: FloatArray
@@ -277,6 +295,8 @@ class _Lanes(NamedTuple):
     points: FloatArray
     images: FloatArray
     moments: FloatArray
+    slices: IntArray
+    rows: FloatArray
 
 
 @kernel
@@ -304,6 +324,7 @@ def assess(
         work = _Lanes(
             np.empty((SIZE, lanes)), np.empty(shape), np.zeros(shape), np.zeros(shape),
             np.empty((4, numbers, lanes)), np.empty((2, numbers, lanes)), np.empty((5, lanes)),
+            np.empty(lanes, dtype=np.int64), np.empty((4, EDGES * lanes)),
         )  # fmt: skip
         for turn in range(0, live, lanes):
             first = turn_of(turn, live, lanes)
@@ -362,7 +383,9 @@ def _judge(safety: Safety, work: _Lanes, chance: FloatArray) -> None:
         product(image, image, centre, weight, moments[2 + i])
     beside(work.images[0], work.F[2, :3], weight[0], moments[4])
     L, at = np.empty((SIZE, SIZE)), np.empty(SIZE)
+    rows, end = work.rows, 0
     for k in range(lanes):
+        work.slices[k] = 0
         w0, w1 = g[3, k] - V[0], g[4, k] - V[1]
         # A course that may be any has no miss distance to be Gaussian in.
         unsure = w0 * w0 + w1 * w1 <= 4.0 * (S[3, 3, k] + S[4, 4, k])
@@ -371,7 +394,14 @@ def _judge(safety: Safety, work: _Lanes, chance: FloatArray) -> None:
             at[:], L[:] = g[:, k], work.L[:, :, k]
             chance[k] = sampled(at, L, safety)
         else:
-            at[0], at[1], at[2] = moments[0, k], g[2, k], moments[1, k]
-            chance[k] = _within(
-                at[:3], moments[2, k], S[2, 2, k], moments[3, k], moments[4, k], safety
-            )
+            chance[k] = 0.0
+            slices = _edges(moments[:, k], g[2, k], S[2, 2, k], safety, rows[0, end:])
+            work.slices[k] = slices
+            end += 3 + 3 * slices if slices else 0
+    gaussians(rows[0, :end], rows[1, :end], rows[2, :end], rows[3, :end])
+    first = 0
+    for k in range(lanes):
+        slices = work.slices[k]
+        if slices:
+            chance[k] = _within(rows[3, first:], slices)
+            first += 3 + 3 * slices

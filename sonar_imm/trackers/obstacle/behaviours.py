@@ -113,7 +113,7 @@ class BehaviourSlices(DepthSlices):
         noise = np.array(self._noise) * dt
         step = Step(*before.pose, *after.pose, noise, self.cone)
         x, P, repaired = behaviour_kernels.advance(*mixed, motion, step)
-        return Mixture(x, P, mixed[2]), int(repaired.sum())
+        return Mixture(x, P, mixed[2]), int(np.count_nonzero(repaired))
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         return np.asarray(mu @ self._of)
@@ -159,6 +159,8 @@ def build_filter(config: ObstacleConfig) -> Filter:
 def moving_alike(filter_: Filter, mixture: Mixture, confirmed: np.ndarray) -> bool:
     """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
     is more probably the navigation that drifts: an error of its velocity moves all alike."""
+    if not filter_.moves.any():
+        return False
     which = np.flatnonzero(confirmed)
     which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]
     if len(which) < ALIKE_AT_LEAST:
@@ -180,10 +182,11 @@ def _velocity(mixture: Mixture, moves: BoolArray) -> tuple[FloatArray, FloatArra
 
 def behaviour_columns(view: View, behaviours: tuple[str, ...]) -> dict[str, FloatArray]:
     """``prob_<behaviour>``, and the velocity with its covariance, east then north (ENU)."""
-    columns = {f'prob_{name}': view.behaviour[:, i] for i, name in enumerate(behaviours)}
-    columns |= {'vx': view.velocity[:, 1], 'vy': view.velocity[:, 0]}
     covariance = view.velocity_covariance
-    return columns | {
+    return {
+        **{f'prob_{name}': view.behaviour[:, i] for i, name in enumerate(behaviours)},
+        'vx': view.velocity[:, 1],
+        'vy': view.velocity[:, 0],
         'vel_cov_x_x': covariance[:, 1, 1],
         'vel_cov_x_y': covariance[:, 0, 1],
         'vel_cov_y_y': covariance[:, 0, 0],

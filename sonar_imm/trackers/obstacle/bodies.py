@@ -43,6 +43,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from .filters import put, Sonar, View
+from .ping_kernels import widen
 
 CENTRE = 0.1
 """That of ten glints of equal strength."""
@@ -93,22 +94,14 @@ class Bodies(NamedTuple):
 
 def considered(view: View, sonar: Sonar, bodies: Bodies, scale_std: float) -> View:
     """The view with the errors that are the same in every ping."""
-    scale = scale_std**2
-    covariance, place_covariance = view.covariance.copy(), view.place_covariance.copy()
-    reach = view.state * [1.0, 0.0, 1.0]
-    covariance += scale * (reach[:, :, None] * reach[:, None, :])
-    away = view.place - sonar.pose.position
-    place_covariance += scale * (away[:, :, None] * away[:, None, :])
-    if bodies.count.any():
-        centre = CENTRE * np.square(bodies.std)
-        covariance[:, 0, 0] += centre[:, 0]
-        covariance[:, 1, 1] += centre[:, 1] / np.square(view.state[:, 0])
-        level = away[:, :2] / np.maximum(np.linalg.norm(away[:, :2], axis=1), 1e-9)[:, None]
-        for axis, variance in (
-            (level, centre[:, 0]),
-            (level[:, ::-1] * [-1.0, 1.0], centre[:, 1]),
-        ):
-            place_covariance[:, :2, :2] += variance[:, None, None] * (
-                axis[:, :, None] * axis[:, None, :]
-            )
+    position, centre = sonar.pose.position, CENTRE * np.square(bodies.std)
+    covariance, place_covariance = widen(
+        view.covariance,
+        view.place_covariance,
+        view.state,
+        view.place,
+        position,
+        scale_std**2,
+        centre,
+    )
     return view._replace(covariance=covariance, place_covariance=place_covariance)

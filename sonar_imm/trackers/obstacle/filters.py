@@ -40,7 +40,7 @@ from ...acoustics.geometry import Pose
 from ...estimation import kalman, unscented
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
-from . import avoidance_kernels, behaviour_kernels, kernels
+from . import behaviour_kernels, kernels, ping_kernels
 from .behaviour_kernels import Motion, Step
 from .config import ObstacleConfig
 
@@ -178,7 +178,7 @@ class DepthSlices:
         mixture = self._clamp_to_seafloor(mixture, before)
         step = Step(*before.pose, *after.pose, np.array(self._noise) * dt, self.cone)
         x, P, repaired = behaviour_kernels.advance(*mixture, self._still, step)
-        return Mixture(x, P, mixture.mu), int(repaired.sum())
+        return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         """Range and azimuth (T, K, 2) a detection would show, and their covariance (T, K, 2, 2)
@@ -194,20 +194,15 @@ class DepthSlices:
         *after, nis, repaired = kernels.soft_update(
             *mixture, h, z, R, outlier, self.outlier_density
         )
-        return Mixture(*after), nis, int(repaired.sum())
+        return Mixture(*after), nis, int(np.count_nonzero(repaired))
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
-        x, P, mu = mixture
-        state, covariance = kernels.matched(x, P, mu, 3)
-        state[:, 2] -= sonar.pose.position[2]
-        offset, std = x[..., 2] - sonar.pose.position[2], np.sqrt(P[..., 2, 2])
-        band = kernels.bands(offset, std, mu, 0.5 * (1.0 - BAND))
-        near = avoidance_kernels.relative(*mixture, self.moves, *sonar.pose, self.cone)
-        together, spread = kernels.matched(*near, mu, avoidance_kernels.SIZE)
-        place = sonar.pose.position + together[:, :3], spread[:, :3, :3]
-        velocity = together[:, 3:], spread[:, 3:, 3:]
-        return View(state, covariance, *band, *place, self.behaviour(mu), *velocity, near)
+        *words, place, velocity, both, mean, covariance = ping_kernels.describe(
+            *mixture, self.moves, *sonar.pose, self.cone, 0.5 * (1.0 - BAND)
+        )
+        behaviour, near = self.behaviour(mixture.mu), (mean, covariance)
+        return View(*words, place, both[:, :3, :3], behaviour, velocity, both[:, 3:, 3:], near)
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         """Probability of each behaviour, (T, B)."""
@@ -215,9 +210,7 @@ class DepthSlices:
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
-        m = kernels.points(mixture.x, *sonar.pose, self.cone)
-        spread = np.sqrt(mixture.P[..., 2, 2]) / mixture.x[..., 0]
-        return kernels.outlook(m, spread, mixture.mu, *self._beam)
+        return ping_kernels.outlook(*mixture, *sonar.pose, self.cone, self._beam)
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo
@@ -282,7 +275,7 @@ class Landmark:
         x, P, repaired = kalman.predict(
             mixture.x, mixture.P, F, np.diag([level, level, depth, 0.0])
         )
-        return Mixture(x, P, mixture.mu), int(repaired.sum())
+        return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
 
     def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
         seen = unscented.unscented_transform(
@@ -297,7 +290,11 @@ class Landmark:
             mixture.x, mixture.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
             angles=_ANGLES,
         )  # fmt: skip
-        return Mixture(after.x, after.P, mixture.mu), after.nis[:, 0], int(after.repaired.sum())
+        return (
+            Mixture(after.x, after.P, mixture.mu),
+            after.nis[:, 0],
+            int(np.count_nonzero(after.repaired)),
+        )
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         x, P = mixture.x[:, 0], mixture.P[:, 0]

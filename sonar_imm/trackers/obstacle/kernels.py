@@ -31,6 +31,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.covariance import LIMIT
+from ...estimation.elementary import gaussians
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import careful_update, lift, sound, whitened_square
 
@@ -39,6 +40,7 @@ NEGLIGIBLE = 1e-12
 """A component that weighs less plays no part in a quantile or a place."""
 AHEAD = 0.2
 """Cosine to the axis of the sonar, 78 degrees: beyond, range and azimuth fix nothing."""
+ROOT_2PI = math.sqrt(2.0 * math.pi)
 NORMAL_95 = 1.645
 """Where the search for a quantile begins, standard deviations off the mean."""
 
@@ -83,12 +85,6 @@ def points(x: FloatArray, p: FloatArray, R: FloatArray, cone: bool) -> FloatArra
 
 
 @kernel
-def normal(u: float) -> float:
-    """The probability of a standard normal value below u."""
-    return 0.5 * math.erfc(-u / math.sqrt(2.0))
-
-
-@kernel
 def outlook(
     m: FloatArray,
     spread: FloatArray,
@@ -102,6 +98,10 @@ def outlook(
     whether they lie `AHEAD` (T,)."""
     T, K, _ = m.shape
     inside, ahead, mean = np.zeros(T), np.zeros(T, dtype=np.bool_), np.empty(3)
+    # Of all components in a beam: whose they are, and how far off the two edges.
+    which, end = np.empty((T * K, 2), dtype=np.int64), 0
+    rows = np.empty((4, 2 * T * K))
+    across, along = math.cos(horizontal), math.sin(horizontal)
     for t in range(T):
         mean[:] = 0.0
         for j in range(K):
@@ -109,12 +109,20 @@ def outlook(
                 mean[i] += mu[t, j] * m[t, j, i]
             x, y, z = m[t, j]
             d = math.sqrt(x * x + y * y + z * z)
-            if mu[t, j] > 0.0 and d <= reach and abs(math.atan2(y, x)) <= horizontal:
+            # The sine of how far inside the edge the azimuth lies.
+            if mu[t, j] > 0.0 and d <= reach and along * x - across * abs(y) >= 0.0:
                 elevation, std = math.asin(z / d), max(spread[t, j], 1e-6)
-                high = normal((vertical - elevation) / std)
-                inside[t] += mu[t, j] * (high - normal((-vertical - elevation) / std))
+                rows[0, 2 * end] = (vertical - elevation) / std
+                rows[0, 2 * end + 1] = (-vertical - elevation) / std
+                which[end, 0], which[end, 1] = t, j
+                end += 1
         d = math.sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2])
         ahead[t] = mean[0] > AHEAD * d
+    n = 2 * end
+    gaussians(rows[0, :n], rows[1, :n], rows[2, :n], rows[3, :n])
+    for k in range(end):
+        t, j = which[k]
+        inside[t] += mu[t, j] * (rows[3, 2 * k] - rows[3, 2 * k + 1])
     return inside, ahead
 
 
@@ -252,69 +260,89 @@ def _careful_soft_update(
 
 
 @kernel
-def below(mean: FloatArray, std: FloatArray, mu: FloatArray, value: float) -> float:
-    """Probability of a Gaussian mixture (K,) below `value`."""
-    probability = 0.0
-    for j in range(len(mu)):
-        if mu[j] > NEGLIGIBLE:
-            probability += mu[j] * normal((value - mean[j]) / std[j])
-    return probability
-
-
-@kernel
-def quantile(
-    mean: FloatArray, std: FloatArray, mu: FloatArray, probability: float, first: float
-) -> float:
-    """The value (K components) below which a mixture lies with `probability`: Halley's steps from
-    `first`, halving the bracket where they leave it."""
-    low, high = np.inf, -np.inf
-    for j in range(len(mu)):
-        if mu[j] > NEGLIGIBLE:
-            low = min(low, mean[j] - 9.0 * std[j])
-            high = max(high, mean[j] + 9.0 * std[j])
-    value = min(max(first, low), high)
-    for _ in range(100):
-        reached = density = slope = 0.0
-        for j in range(len(mu)):
-            if mu[j] > NEGLIGIBLE:
-                u = (value - mean[j]) / std[j]
-                height = mu[j] * math.exp(-0.5 * u * u) / (std[j] * math.sqrt(2.0 * math.pi))
-                reached += mu[j] * normal(u)
-                density += height
-                slope -= height * u / std[j]
-        if reached < probability:
-            low = value
-        else:
-            high = value
-        step = (probability - reached) / density if density > 0.0 else np.inf
-        # A step e of Halley's leaves an error of e^3, but where the density bends within it.
-        bend = 0.5 * step * slope / density if density > 0.0 else 0.0
-        if abs(step) <= 1e-5 * (1.0 + abs(value)) and abs(bend) <= 1e-3:
-            return value + step / (1.0 + bend)
-        if abs(bend) < 0.5:
-            step /= 1.0 + bend
-        value += step
-        if not low < value < high:
-            value = 0.5 * (low + high)
-    return value
+def halley(
+    value: float,
+    bracket: FloatArray,
+    missing: float,
+    density: float,
+    slope: float,
+) -> tuple[float, bool]:
+    """A step of Halley's towards a quantile of a mixture that has this density there, with this
+    slope, and is `missing` so much probability below `value`; halves the bracket (2,) where it
+    would leave it. The next value, and whether it is the last."""
+    bracket[0 if missing > 0.0 else 1] = value
+    step = missing / density if density > 0.0 else np.inf
+    # A step e leaves an error of e^3, but where the density bends within it.
+    bend = 0.5 * step * slope / density if density > 0.0 else 0.0
+    if abs(step) <= 1e-5 * (1.0 + abs(value)) and abs(bend) <= 1e-3:
+        return value + step / (1.0 + bend), True
+    if abs(bend) < 0.5:
+        step /= 1.0 + bend
+    value += step
+    if not bracket[0] < value < bracket[1]:
+        value = 0.5 * (bracket[0] + bracket[1])
+    return value, False
 
 
 @kernel
 def bands(
     mean: FloatArray, std: FloatArray, mu: FloatArray, tail: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of mixtures (T, K): the quantiles `tail` and 1 - `tail`, and the probability below zero."""
-    T = len(mean)
-    low, high, negative = np.empty(T), np.empty(T), np.empty(T)
+    """Of mixtures (T, K): the quantiles `tail` and 1 - `tail`, and the probability below zero.
+
+    All that is asked goes on together, since `gaussians` is quick with long rows only: question
+    3 t is the lower quantile of target t, 3 t + 1 the upper one, 3 t + 2 the probability."""
+    T, K = mean.shape
+    count, parts = np.zeros(T, dtype=np.int64), np.empty((T, 3, K))
+    value, bracket = np.zeros(3 * T), np.empty((T, 2, 2))
+    negative, rows = np.zeros(T), np.empty((4, 3 * T * K))
     for t in range(T):
-        # Where the quantiles of a Gaussian as wide as the mixture would be.
         middle = square = 0.0
-        for j in range(len(mu[t])):
+        low, high = np.inf, -np.inf
+        for j in range(K):
             middle += mu[t, j] * mean[t, j]
             square += mu[t, j] * (std[t, j] * std[t, j] + mean[t, j] * mean[t, j])
+            if mu[t, j] > NEGLIGIBLE:
+                n = count[t]
+                parts[t, 0, n], parts[t, 1, n], parts[t, 2, n] = mean[t, j], std[t, j], mu[t, j]
+                count[t] += 1
+                low = min(low, mean[t, j] - 9.0 * std[t, j])
+                high = max(high, mean[t, j] + 9.0 * std[t, j])
+        # The search begins where the quantiles of a Gaussian as wide as the mixture would be.
         reach = NORMAL_95 * math.sqrt(max(square - middle * middle, 0.0))
-        low[t] = quantile(mean[t], std[t], mu[t], tail, middle - reach)
-        high[t] = quantile(mean[t], std[t], mu[t], 1.0 - tail, middle + reach)
-        # Weights add up to one but for rounding: no probability may leave [0, 1] for that.
-        negative[t] = min(below(mean[t], std[t], mu[t], 0.0), 1.0)
-    return low, high, negative
+        value[3 * t] = min(max(middle - reach, low), high)
+        value[3 * t + 1] = min(max(middle + reach, low), high)
+        bracket[t, :, 0], bracket[t, :, 1] = low, high
+    waiting, still = np.arange(3 * T), 3 * T
+    for _ in range(100):
+        end = 0
+        for question in waiting[:still]:
+            own = parts[question // 3]
+            for j in range(count[question // 3]):
+                rows[0, end] = (value[question] - own[0, j]) / own[1, j]
+                end += 1
+        gaussians(rows[0, :end], rows[1, :end], rows[2, :end], rows[3, :end])
+        end, asked, still = 0, still, 0
+        for question in waiting[:asked]:
+            t, kind = question // 3, question % 3
+            own, reached, density, slope = parts[t], 0.0, 0.0, 0.0
+            for j in range(count[t]):
+                height = own[2, j] * rows[2, end] / (own[1, j] * ROOT_2PI)
+                reached += own[2, j] * rows[3, end]
+                density += height
+                slope -= height * rows[0, end] / own[1, j]
+                end += 1
+            if kind == 2:
+                # Weights add up to one but for rounding: no probability may leave [0, 1] for it.
+                negative[t] = min(reached, 1.0)
+                continue
+            missing = (tail if kind == 0 else 1.0 - tail) - reached
+            value[question], done = halley(
+                value[question], bracket[t, kind], missing, density, slope
+            )
+            if not done:
+                waiting[still] = question
+                still += 1
+        if still == 0:
+            break
+    return value[0::3].copy(), value[1::3].copy(), negative

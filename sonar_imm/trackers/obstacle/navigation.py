@@ -22,6 +22,7 @@ from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from .config import ObstacleConfig
+from .ping_kernels import turned_round
 
 
 class Mount:
@@ -43,5 +44,4 @@ class Mount:
     @staticmethod
     def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:
         """Points (T, 3) and covariances (T, 3, 3) in ENU, from NED."""
-        halfway = np.swapaxes(geometry.flip_world(covariance), -1, -2)
-        return geometry.flip_world(points), geometry.flip_world(halfway)
+        return turned_round(points, covariance)

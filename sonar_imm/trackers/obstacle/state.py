@@ -17,7 +17,9 @@
 
 from __future__ import annotations
 
-from attrs import evolve, frozen
+from typing import NamedTuple
+
+from attrs import frozen
 import numpy as np
 
 from ...estimation.arrays import FloatArray
@@ -30,8 +32,7 @@ from .filters import Mixture, Sonar
 from .intensity import Strengths
 
 
-@frozen(eq=False, kw_only=True)
-class PingState:
+class PingState(NamedTuple):
     """T obstacles after a ping: nis (T,), NaN without a hit; repairs: covariances repaired;
     alike: whether most obstacles move alike (`behaviours.moving_alike`); strengths: of echoes, as
     each component assumes them; bodies: how far their echoes wander."""
@@ -50,8 +51,7 @@ class PingState:
         """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
         if kept.all():
             return self
-        return evolve(
-            self,
+        return self._replace(
             mixture=self.mixture.rows(kept),
             nis=self.nis[kept],
             strengths=self.strengths.rows(kept),
@@ -60,7 +60,7 @@ class PingState:
 
     def only(self, kept: np.ndarray) -> PingState:
         """The obstacles where `kept` (T,) is True."""
-        return self if kept.all() else evolve(self.rows(kept), life=self.life.only(kept))
+        return self if kept.all() else self.rows(kept)._replace(life=self.life.only(kept))
 
 
 @frozen(eq=False, kw_only=True)
@@ -88,4 +88,4 @@ def identities(state: ObstacleState) -> ObstacleState:
     if state.last is None:
         return ObstacleState()
     nobody = np.zeros(len(state.last.life), bool)
-    return ObstacleState(last=evolve(state.last, stamp_ns=0).only(nobody))
+    return ObstacleState(last=state.last._replace(stamp_ns=0).only(nobody))

@@ -39,11 +39,13 @@ from ...acoustics import geometry
 from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign_fits, gate_threshold, Tracks, TrackStatus
+from ...estimation.association import assign_fits, gate_threshold, Tracks
+from ...estimation.association_kernels import TENTATIVE
 from ...measurements import Altitude, Detections, Frames, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
 from ..stream import ReplayStream, StreamRules
+from . import ping_kernels
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
 from .bodies import Bodies, considered
@@ -61,10 +63,14 @@ IN_BEAM = 0.9
 """A confirmed obstacle less probable than this to be in the beam is not missed when it gives no
 echo. Where it lies in the vertical is uncertain by about the beam's height for most of the
 approach: at 0.5, one in five obstacles that leave the beam above or below would be given up."""
-_EYE = np.eye(2)
-_TINY, _WIDEST = 1e-12, 0.25
-"""Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
-nothing."""
+_SIDE = np.array([1.0, -1.0, 1.0])
+"""ROS counts bearings to port."""
+_SIDES = np.outer(_SIDE, _SIDE)
+_PLACE_COVARIANCES = tuple(
+    (f'place_cov_{a}_{b}', i, j)
+    for i, a in enumerate('xyz')
+    for j, b in enumerate('xyz'[i:], start=i)
+)
 
 
 class ObstacleTracker:
@@ -129,7 +135,7 @@ class ObstacleTracker:
         nis = state.last.nis[np.isfinite(state.last.nis)] if state.last else np.empty(0)
         return {
             'tracks': len(status),
-            'confirmed': int((status != TrackStatus.TENTATIVE).sum()),
+            'confirmed': int((status != TENTATIVE).sum()),
             'nis_mean': float(nis.mean() / 2.0) if len(nis) else float('nan'),
             'nis_memory': state.innovations.mean,
             'pings_waiting': len(state.waiting),
@@ -180,7 +186,7 @@ class ObstacleTracker:
             last, lost = self._ping(last, ping, self._sonar(buffer, ping, height))
             broken += lost
             alike += last.alike
-            sure = np.isfinite(last.nis) & (last.life.status != TrackStatus.TENTATIVE)
+            sure = np.isfinite(last.nis) & (last.life.status != TENTATIVE)
             innovations = innovations.after(last.nis[sure], 2)
             done.append(last)
         oldest = waiting[0][0].stamp_ns if waiting else stamp_ns
@@ -241,43 +247,38 @@ class ObstacleTracker:
             told = by_intensity(
                 *now.mixture, now.strengths, now.sonar.pose, heard, dt, self.config
             )
-            now = evolve(now, mixture=now.mixture._replace(mu=told[0]), strengths=told[1])
-        now = self._prune(now, chosen >= 0)
-        free = np.ones(len(z), bool)
-        free[chosen[chosen >= 0]] = False
-        now = self._spawn(now, z[free], R[free], extended[free])
-        confirmed = now.life.status != TrackStatus.TENTATIVE
-        return evolve(now, alike=moving_alike(self.filter, now.mixture, confirmed)), broken
+            now = now._replace(mixture=now.mixture._replace(mu=told[0]), strengths=told[1])
+        hit = chosen >= 0
+        now = self._prune(now, hit)
+        if np.count_nonzero(hit) < len(z):
+            free = np.ones(len(z), bool)
+            free[chosen[hit]] = False
+            now = self._spawn(now, z[free], R[free], extended[free])
+        confirmed = now.life.status != TENTATIVE
+        return now._replace(alike=moving_alike(self.filter, now.mixture, confirmed)), broken
 
     def _predict(self, before: PingState, stamp_ns: int, sonar: Sonar) -> tuple[PingState, int]:
         """The tracks as this ping should show them, and how many had numbers not finite."""
         dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
         mixture, repairs = self.filter.advance(before.mixture, before.sonar, sonar, dt)
-        sound = np.isfinite(mixture.x).all(axis=(1, 2))
-        sound &= np.isfinite(mixture.P).all(axis=(1, 2, 3))
-        now = evolve(
-            before,
+        now = before._replace(
             stamp_ns=stamp_ns,
             sonar=sonar,
             mixture=mixture,
             repairs=before.repairs + repairs,
         )
-        return now.only(sound), int((~sound).sum())
+        sound = ping_kernels.finite(mixture.x, mixture.P)
+        return now.only(sound), len(sound) - int(np.count_nonzero(sound))
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
         """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is told (D,), of the rows
         that are echoes, azimuth positive to starboard. A row that is as uncertain as it is far
         says nothing and is left out."""
-        z = np.column_stack([ping.range, -ping.bearing])  # REP-103 counts bearings to port
-        stated = np.column_stack([ping.var_range, ping.var_bearing])
-        variance = np.where(np.isfinite(stated) & (stated > _TINY), stated, self._own_variance)
-        real = np.isfinite(z).all(axis=1) & (z[:, 0] > 2.0 * np.sqrt(variance[:, 0]))
-        real &= (np.abs(z[:, 1]) < 0.5 * np.pi) & (variance[:, 1] < _WIDEST)
-        columns = z, variance, ping.intensity, np.isfinite(ping.extent_range)
-        if not real.all():
-            columns = tuple(column[real] for column in columns)
-        z, variance, intensity, extended = columns
-        return z, variance[:, :, None] * _EYE, intensity, extended
+        *echoes, real = ping_kernels.echoes(
+            ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
+        )
+        columns = *echoes, ping.intensity, np.isfinite(ping.extent_range)
+        return columns if real.all() else tuple(column[real] for column in columns)
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray
@@ -289,7 +290,7 @@ class ObstacleTracker:
             return np.full(len(h), -1), h
         threshold = gate_threshold(self.config.gate_probability, 2)
         fit = imm_kernels.gate(h, self._H, C, now.mixture.mu, z, R, threshold)
-        tentative = now.life.status == TrackStatus.TENTATIVE
+        tentative = now.life.status == TENTATIVE
         config = self.config
         chosen = assign_fits(fit, tentative, config.detection_probability, config.clutter_density)
         return chosen, h
@@ -306,7 +307,7 @@ class ObstacleTracker:
         nis = np.full(len(chosen), np.nan)
         hit = np.flatnonzero(chosen >= 0)
         if not len(hit):
-            return evolve(now, nis=nis)
+            return now._replace(nis=nis)
         every = len(hit) == len(chosen)
         mixture, bodies = now.mixture, now.bodies
         if not every:
@@ -318,15 +319,15 @@ class ObstacleTracker:
             mixture = now.mixture.replaced(hit, mixture)
             bodies = now.bodies.replaced(hit, bodies)
         repairs += now.repairs
-        return evolve(now, mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
+        return now._replace(mixture=mixture, bodies=bodies, nis=nis, repairs=repairs)
 
     def _prune(self, now: PingState, hit: np.ndarray) -> PingState:
         """End the tracks that are over or passed; `hit` (T,): those that got a detection."""
-        tentative = now.life.status == TrackStatus.TENTATIVE
+        tentative = now.life.status == TENTATIVE
         in_beam, ahead = self.filter.outlook(now.mixture, now.sonar)
         looked = tentative | (in_beam > IN_BEAM)
         life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked)
-        return evolve(now.rows(kept), life=life).only(ahead[kept])
+        return now.rows(kept)._replace(life=life).only(ahead[kept])
 
     def _spawn(
         self, now: PingState, z: FloatArray, R: FloatArray, extended: np.ndarray
@@ -338,8 +339,7 @@ class ObstacleTracker:
         if not len(z):
             return now
         bodies, R = Bodies.unknown(len(z)).seen(extended, z, R, self._own_variance)
-        return evolve(
-            now,
+        return now._replace(
             life=now.life.born(len(z), now.stamp_ns, self.rules),
             mixture=now.mixture.joined(self.filter.begin(z, R, now.sonar)),
             nis=np.append(now.nis, np.full(len(z), np.nan)),
@@ -364,7 +364,6 @@ class ObstacleTracker:
     def _estimate(self, ping: PingState) -> Estimate:
         view = self.filter.view(ping.mixture, ping.sonar)
         view = considered(view, ping.sonar, ping.bodies, self.config.range_scale_std)
-        side = np.array([1.0, -1.0, 1.0])  # ROS counts bearings to port
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
         extras = {
             **behaviour_columns(view, self.filter.behaviours),
@@ -375,17 +374,15 @@ class ObstacleTracker:
             'vertical_offset_hi': view.high,
             'nis': ping.nis,
             **places(place),
+            **{name: place_covariance[:, i, j] for name, i, j in _PLACE_COVARIANCES},
         }
-        for i, a in enumerate('xyz'):
-            for j, b in enumerate('xyz'[i:], start=i):
-                extras[f'place_cov_{a}_{b}'] = place_covariance[:, i, j]
         return Estimate(
             stamp_ns=ping.stamp_ns,
             frame_id=self._stream.frame_id,
             xyz=place,
             state_names=STATES,
-            state=view.state * side,
-            covariance=view.covariance * np.outer(side, side),
+            state=view.state * _SIDE,
+            covariance=view.covariance * _SIDES,
             model_names=MODELS,
             probabilities=np.column_stack([view.above, 1.0 - view.above]),
             extras=extras,

@@ -1,0 +1,181 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is done once in every ping, beside the filter, compiled: rows of detections in, rows of
+estimates out. Done with one array operation after another, it would take as long as the filter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...estimation.arrays import BoolArray, FloatArray
+from ...estimation.jit import kernel
+from . import avoidance_kernels, kernels
+
+SMALLEST, WIDEST = 1e-12, 0.25
+"""Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
+nothing."""
+
+
+@kernel
+def echoes(
+    distance: FloatArray,
+    bearing: FloatArray,
+    var_range: FloatArray,
+    var_bearing: FloatArray,
+    own: FloatArray,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """z (D, 2), R (D, 2, 2), azimuth positive to starboard, of detections, each (D,), and which of
+    them (D,) are echoes: a row that is as uncertain as it is far says nothing. own (2,): variances
+    of a detection that comes without."""
+    D = len(distance)
+    z, R, real = np.empty((D, 2)), np.zeros((D, 2, 2)), np.empty(D, dtype=np.bool_)
+    for k in range(D):
+        z[k, 0], z[k, 1] = distance[k], -bearing[k]  # REP-103 counts bearings to port
+        R[k, 0, 0], R[k, 1, 1] = var_range[k], var_bearing[k]
+        for i in range(2):
+            if not (math.isfinite(R[k, i, i]) and R[k, i, i] > SMALLEST):
+                R[k, i, i] = own[i]
+        real[k] = math.isfinite(z[k, 0]) and abs(z[k, 1]) < 0.5 * math.pi
+        real[k] &= z[k, 0] > 2.0 * math.sqrt(R[k, 0, 0]) and R[k, 1, 1] < WIDEST
+    return z, R, real
+
+
+@kernel
+def finite(x: FloatArray, P: FloatArray) -> BoolArray:
+    """Which of the mixtures x (T, K, n), P (T, K, n, n) have finite numbers throughout, (T,)."""
+    T = len(x)
+    sound = np.empty(T, dtype=np.bool_)
+    for t in range(T):
+        flaws = 0
+        for value in x[t].reshape(-1):
+            flaws += not math.isfinite(value)
+        for value in P[t].reshape(-1):
+            flaws += not math.isfinite(value)
+        sound[t] = flaws == 0
+    return sound
+
+
+@kernel
+def outlook(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    p: FloatArray,
+    R: FloatArray,
+    cone: bool,
+    beam: tuple[float, float, float],
+) -> tuple[FloatArray, BoolArray]:
+    """`kernels.outlook` of mixtures whose first states are (d, delta, z)."""
+    T, K, _ = x.shape
+    spread = np.empty((T, K))
+    for t in range(T):
+        for j in range(K):
+            spread[t, j] = math.sqrt(P[t, j, 2, 2]) / x[t, j, 0]
+    m = kernels.points(x, p, R, cone)
+    return kernels.outlook(m, spread, mu, beam[0], beam[1], beam[2])
+
+
+@kernel
+def describe(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    moves: BoolArray,
+    p: FloatArray,
+    R: FloatArray,
+    cone: bool,
+    tail: float,
+) -> tuple[FloatArray, ...]:
+    """What `filters.View` says of mixtures whose first states are (d, delta, z), seen by a sonar
+    at p (3,), turned by R (3, 3): state and covariance; the two quantiles and the probability of
+    `kernels.bands`; place, velocity, and the covariance (T, 5, 5) of both; mean and covariance of
+    the components as `avoidance_kernels.relative` has them."""
+    T, K, _ = x.shape
+    state, covariance = kernels.matched(x, P, mu, 3)
+    offset, std = np.empty((T, K)), np.empty((T, K))
+    for t in range(T):
+        state[t, 2] -= p[2]
+        for j in range(K):
+            offset[t, j] = x[t, j, 2] - p[2]
+            std[t, j] = math.sqrt(P[t, j, 2, 2])
+    low, high, above = kernels.bands(offset, std, mu, tail)
+    mean, spread = avoidance_kernels.relative(x, P, mu, moves, p, R, cone)
+    together, both = kernels.matched(mean, spread, mu, avoidance_kernels.SIZE)
+    place, velocity = np.empty((T, 3)), np.empty((T, 2))
+    for t in range(T):
+        for i in range(3):
+            place[t, i] = p[i] + together[t, i]
+        for i in range(2):
+            velocity[t, i] = together[t, 3 + i]
+    return state, covariance, low, high, above, place, velocity, both, mean, spread
+
+
+@kernel
+def widen(
+    covariance: FloatArray,
+    place_covariance: FloatArray,
+    state: FloatArray,
+    place: FloatArray,
+    position: FloatArray,
+    scale: float,
+    centre: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances of state and place, (T, 3, 3) each, with errors that are the same in every ping.
+
+    state (T, 3): range, azimuth, vertical offset; place (T, 3) and position (3,) of the sonar;
+    scale: variance of the factor that all ranges are wrong by; centre (T, 2): variances m^2 along
+    and across the line of sight.
+    """
+    wide, wide_place = covariance.copy(), place_covariance.copy()
+    away, reach, axis = np.empty(3), np.empty(3), np.empty((2, 2))
+    for t in range(len(state)):
+        reach[0], reach[1], reach[2] = state[t, 0], 0.0, state[t, 2]
+        for a in range(3):
+            away[a] = place[t, a] - position[a]
+        for a in range(3):
+            for b in range(3):
+                wide[t, a, b] += scale * (reach[a] * reach[b])
+                wide_place[t, a, b] += scale * (away[a] * away[b])
+        if not (centre[t, 0] > 0.0 or centre[t, 1] > 0.0):
+            continue
+        wide[t, 0, 0] += centre[t, 0]
+        wide[t, 1, 1] += centre[t, 1] / (state[t, 0] * state[t, 0])
+        level = max(math.sqrt(away[0] * away[0] + away[1] * away[1]), 1e-9)
+        axis[0, 0], axis[0, 1] = away[0] / level, away[1] / level
+        axis[1, 0], axis[1, 1] = -axis[0, 1], axis[0, 0]
+        for i in range(2):
+            for a in range(2):
+                for b in range(2):
+                    wide_place[t, a, b] += centre[t, i] * (axis[i, a] * axis[i, b])
+    return wide, wide_place
+
+
+@kernel
+def turned_round(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`geometry.flip_world` of points (T, 3) and of both axes of their covariances (T, 3, 3)."""
+    T = len(points)
+    there, spread = np.empty((T, 3)), np.empty((T, 3, 3))
+    for t in range(T):
+        for a in range(3):
+            i = 1 - a if a < 2 else 2
+            there[t, a] = 0.0 + points[t, i] if a < 2 else 0.0 - points[t, i]
+            for b in range(3):
+                j = 1 - b if b < 2 else 2
+                same = (a < 2) == (b < 2)
+                spread[t, a, b] = 0.0 + (covariance[t, i, j] if same else -covariance[t, i, j])
+    return there, spread
