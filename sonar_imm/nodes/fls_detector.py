@@ -97,6 +97,7 @@ class FlsDetectorNode(Node):
             self.get_fully_qualified_name().lstrip('/'),
             {topic.name: heard.topic_name},
             self._meter,
+            required=(topic.name,),
         )
         self.create_timer(
             self._node_config.diagnostics_period,

@@ -206,7 +206,7 @@ def profiles_of(text: str) -> dict[str, QoSProfile]:
 
 
 def _profile(topic: str, policies: dict[str, Any]) -> QoSProfile:
-    profile = lockstep_qos() if policies.get('history') == 'keep_all' else output_qos()
+    profile = output_qos()
     for name, value in policies.items():
         if name == 'depth':
             if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 10**6:

@@ -97,6 +97,13 @@ def test_what_are_no_weights_is_refused(name, weights):
         SCHEMES[name](weights, 3, np.random.default_rng(0))
 
 
+def test_a_point_on_a_boundary_belongs_to_what_begins_there():
+    """A point of zero, which a generator gives now and then, is not of a particle without weight
+    that happens to be the first."""
+    cumulative = np.cumsum([0.0, 0.25, 0.0, 0.25, 0.5])
+    assert invert(cumulative, np.array([0.0, 0.25, 0.375, 0.5])).tolist() == [1, 3, 3, 4]
+
+
 def test_a_point_at_the_very_end_belongs_to_the_last_particle_with_weight():
     cumulative = np.cumsum([0.3, 0.7, 0.0])
     assert invert(cumulative, np.array([0.0, 1.0 - 2.0**-53, 1.0])).tolist() == [0, 1, 1]

@@ -146,6 +146,7 @@ def test_a_record_has_random_numbers_of_its_own(model, exact):
         {'shift': Shift(std=2.0, step=2), 'negative_probability': 0.3},
         {'shift': Shift(std=1.5, memory=0.9)},
         {'transition': banded_transition(3, 0.3), 'order_min': 0},
+        {'transition': np.array([[0.6, 0.3, 0.1], [0.15, 0.5, 0.35], [0.05, 0.15, 0.8]])},
     ],
 )
 def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change):
@@ -300,6 +301,17 @@ def test_what_came_later_corrects_what_was_known(model, exact):
             right_later.append(tracker.summary(earlier)[0][true])
             right_then.append(pmfs[name - 3][true])
     assert np.mean(right_later) > np.mean(right_then) + 0.01
+
+
+def test_nothing_is_corrected_across_a_record_that_nothing_explains(model, exact):
+    """The filter begins anew there: what comes after it has no ancestors before it."""
+    tracker, smoother, before = SetFilter(model, 20), LagSmoother(2), None
+    found = []
+    for name, b in enumerate([*exact['B'][:3], np.full(60, -5.0), *exact['B'][3:6]]):
+        step = tracker.step(before, b, (4, name))
+        before = step.after if step.ok else None
+        found.append(smoother.push(step) is not None)
+    assert found == [False, False, True, False, False, False, True]
 
 
 def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):

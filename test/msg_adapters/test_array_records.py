@@ -177,6 +177,27 @@ def test_pressure_comes_back_as_floats_or_as_scaled_whole_numbers():
 
 
 @pytest.mark.parametrize(
+    'peak, kept, whole',
+    [
+        (127, 127, np.int8),
+        (128, 128, np.int16),
+        (32_767, 32_767, np.int16),
+        (32_768, 32_767, np.int16),
+        (-40_000, -32_768, np.int16),
+    ],
+)
+def test_pressure_at_the_limit_of_its_whole_numbers_is_clipped_and_keeps_its_sign(
+    peak, kept, whole
+):
+    samples = np.outer((-1.0) ** np.arange(40), [1.0, -2.0, 3.0, -4.0])
+    samples[7, 1] = peak
+    block = Pressure(stamp_ns=STAMP, frame_id='array', pressure=samples, sample_rate=12e3, scale=1)
+    message = write_pressure(block, ros_message)
+    assert decode_table(message)['p'].dtype == whole
+    assert read_pressure(message).pressure[7].tolist() == [-1.0, kept, -3.0, 4.0]
+
+
+@pytest.mark.parametrize(
     'changes, expected',
     [
         ({'p': np.zeros((50, N), np.int16)}, 'missing_column'),
@@ -257,6 +278,9 @@ def test_the_depth_of_the_array_is_down_whatever_the_frame():
     )
     assert message.point.z == -73.5
     assert read_array_depth(message).depth == 73.5
+    message.header.frame_id = 'map_ned'
+    assert read_array_depth(message).depth == -73.5
+    message.header.frame_id = 'map'
     pose = ros_message('geometry_msgs/msg/PoseWithCovarianceStamped', header=message.header)
     pose.pose.pose.position.z = 40.0
     assert read_array_depth(pose, world_frame='ned').depth == 40.0

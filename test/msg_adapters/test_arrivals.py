@@ -76,12 +76,31 @@ def test_without_any_transmitter_the_target_emits():
         message(tx_x=nowhere, tx_y=nowhere, tx_z=nowhere, toa=np.array([0.0, -0.01, 0.2]))
     )
     assert arrivals.passive and len(arrivals) == 3
+    # Nothing is known of the instant but that it is near the stamp.
+    arrivals = read_arrivals(
+        message(tx_x=nowhere, tx_y=nowhere, tx_z=nowhere, toa=np.array([0.0, -1e4, 0.2]))
+    )
+    assert arrivals.rx_id.tolist() == [0, 2]
 
 
 def test_variances_that_are_none_become_unknown():
     variances = np.float32([1e-6, 0.0, -1.0, np.nan, np.inf])
     arrivals = read_arrivals(message(rows=5, var_toa=variances))
     assert arrivals.var_toa[0] == np.float32(1e-6) and np.isnan(arrivals.var_toa[1:]).all()
+
+
+def test_each_kind_of_variance_has_its_own_least_value():
+    arrivals = read_arrivals(
+        message(
+            var_toa=np.float32([1e-14, 1e-19, 1e-14]),
+            bearing=np.zeros(3),
+            var_bearing=np.float32([1e-11, 1e-14, 1e-11]),
+            depth=np.zeros(3),
+            var_depth=np.float32([1e-7, 1e-11, 1e-7]),
+        )
+    )
+    for variance in (arrivals.var_toa, arrivals.var_bearing, arrivals.var_depth):
+        assert np.isnan(variance).tolist() == [False, True, False]
 
 
 def test_elevation_and_depth_come_and_go_and_degrees_are_refused():
@@ -99,14 +118,16 @@ def test_elevation_and_depth_come_and_go_and_degrees_are_refused():
         np.testing.assert_array_equal(one.var_depth, np.float32([0.04, 0.04, np.nan]))
         np.testing.assert_array_equal(one.var_elevation, told['var_elevation'])
     assert np.isnan(read_arrivals(message()).depth).all()
-    assert reason(elevation=np.array([0.1, 45.0, 0.1])) == 'out_of_range'
+    for degrees in (45.0, -45.0):
+        assert reason(elevation=np.array([0.1, degrees, 0.1])) == 'out_of_range'
 
 
 def test_bearings_are_wrapped_and_degrees_are_refused():
     arrivals = read_arrivals(message(bearing=np.array([0.5, 1.5 * np.pi, np.nan])))
     assert arrivals.bearing[0] == 0.5 and arrivals.bearing[1] == pytest.approx(-0.5 * np.pi)
     assert np.isnan(arrivals.bearing[2])
-    assert reason(bearing=np.array([0.1, 45.0, 0.1])) == 'out_of_range'
+    for degrees in (45.0, -45.0):
+        assert reason(bearing=np.array([0.1, degrees, 0.1])) == 'out_of_range'
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,15 @@ def test_rows_that_are_no_echo_are_dropped_and_their_columns_with_them():
     assert ping.var_range.tolist() == [8.0] and np.isnan(ping.var_bearing).all()
 
 
+def test_a_variance_that_was_not_filled_in_is_unknown():
+    variances = [1e-13, 0.25, 2e6, np.inf]
+    ping = read_detections(
+        table(range=[5.0] * 4, bearing=[0.1] * 4, var_range=variances, var_bearing=variances)
+    )
+    for variance in (ping.var_range, ping.var_bearing):
+        assert np.isnan(variance).tolist() == [True, False, True, True]
+
+
 @pytest.mark.parametrize(
     'message, code',
     [

@@ -51,15 +51,19 @@ def arrivals(**changes):
     )
 
 
-@pytest.mark.parametrize('stamp', [0, 7, 1_000_000_007, 2**31 * 10**9 - 1, 1700000000123456789])
+@pytest.mark.parametrize(
+    'stamp',
+    [0, 7, 1_000_000_007, 2**31 * 10**9 - 1, 1700000000123456789, -1, -(2**31) * 10**9],
+)
 def test_stamps_round_trip_exactly(stamp):
     header = make_header(stamp, 'map', ros_message)
     assert stamp_ns(SimpleNamespace(header=header)) == stamp
 
 
-def test_a_stamp_beyond_2038_is_no_header():
-    with pytest.raises(ValueError, match='cannot hold'):
-        make_header(2**31 * 10**9, 'map', ros_message)
+def test_a_stamp_that_32_bits_of_seconds_cannot_hold_is_no_header():
+    for beyond in (2**31 * 10**9, -(2**31) * 10**9 - 1):
+        with pytest.raises(ValueError, match='cannot hold'):
+            make_header(beyond, 'map', ros_message)
 
 
 def test_a_nanosecond_field_of_a_second_is_refused():

@@ -14,6 +14,10 @@
 
 """The node around a tracker, with real publishers and subscriptions in one process."""
 
+import time
+from types import SimpleNamespace
+
+from diagnostic_msgs.msg import DiagnosticArray
 from helpers.rig import a_fix, FIX, Rig
 import pytest
 from rcl_interfaces.msg import Log
@@ -23,8 +27,10 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import read_estimate
+from sonar_imm.nodes import base
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.messages import make, message_class
+from sonar_imm.nodes.qos import output_qos
 
 POINT = 'geometry_msgs/msg/PointStamped'
 SECOND = 10**9
@@ -150,6 +156,49 @@ def test_disabled_input_is_answered_but_not_used(rig):
     assert rig.answer == (2, 0, 1)
 
 
+def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench):
+    rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
+    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    rig.bench.spin_until(lambda: rig.node.count_subscribers('/diagnostics'))
+    rig.node.set_parameters([Parameter('max_revisions', value=1)])
+    rig.send(*map(a_fix, (1.0, 3.0, 4.0, 2.0)))
+    rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=False))
+    rig.send(a_fix(5.0), a_fix(6.0))
+    rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=True))
+    rig.node.tracker.explode = True
+    rig.send(a_fix(7.0), a_fix(8.0), a_fix(9.0))
+    rig.node._keeper.trouble = 'the state cannot be saved'
+    heard.clear()
+
+    rig.bench.spin_until(lambda: any('cannot be saved' in one.status[1].message for one in heard))
+    tracker = heard[-1].status[1]
+    counts = {pair.key: pair.value for pair in tracker.values}
+    assert counts['count: revisions_withheld'] == '1'
+    assert counts['count: ignored_while_disabled'] == '2'
+    assert counts['count: internal_error'] == '3'
+    assert counts['count: used'] == '4'
+    assert 'an internal error was caught' in tracker.message
+
+
+def test_what_waited_too_long_is_answered_and_counted_but_not_used(make_bench, monkeypatch, capfd):
+    rig = Rig(make_bench('-p', 'max_wait:=50.0'))
+    late_s = 40
+
+    def time_ns():
+        return time.time_ns() + late_s * SECOND
+
+    clock = SimpleNamespace(time_ns=time_ns, monotonic=time.monotonic)
+    monkeypatch.setattr(base, 'time', clock)
+    rig.send(a_fix(1.0))
+    late_s = 60
+    rig.send(a_fix(2.0), a_fix(3.0))
+    assert rig.answer == (3, 0, 1) and rig.node._meter.dropped == {'fix': 2}
+    assert capfd.readouterr().err.count('those that waited more than 50 s are dropped') == 1
+    rig.node.set_parameters([Parameter('max_wait', value=0.0)])  # never
+    rig.send(a_fix(4.0))
+    assert rig.answer == (4, 0, 2)
+
+
 def test_best_effort_publishers_are_heard(make_bench):
     rig = Rig(make_bench(), qos=qos_profile_sensor_data)
     rig.send(a_fix(1.0))
@@ -210,7 +259,9 @@ def test_qos_overrides_reach_the_endpoints(make_bench):
 
 
 def test_an_incompatible_publisher_is_named(make_bench, capfd):
-    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable')
+    told = '-p', 'diagnostics_period:=0.05'
+    bench = make_bench('-p', 'qos_overrides./fix.subscription.reliability:=reliable', *told)
+    heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     node = bench.add(TrackerNode('walker', context=bench.context))
     bench.peer.create_publisher(message_class(FIX), '/fix', qos_profile_sensor_data)
     bench.spin_until(lambda: node._endpoints.incompatible)
@@ -218,6 +269,10 @@ def test_an_incompatible_publisher_is_named(make_bench, capfd):
     said = capfd.readouterr().err
     assert "a peer on '/fix' cannot be heard: its RELIABILITY" in said
     assert '-p qos_overrides./fix.subscription.reliability' in said
+    heard.clear()
+    bench.spin_until(lambda: heard)
+    values = {pair.key: pair.value for pair in heard[0].status[0].values}
+    assert values['incompatible peer on fix'] == 'RELIABILITY'
 
 
 def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, capfd):

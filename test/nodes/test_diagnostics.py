@@ -163,6 +163,22 @@ def test_what_is_not_needed_is_missed_once_it_was_heard_and_not_when_it_is_slow(
     assert desk.input.level == DiagnosticStatus.OK
 
 
+def test_one_input_of_several_that_serve_is_enough(desk):
+    for second in (0, 10, 20):
+        desk.meter.arrived('arrivals', second)
+    for second in range(60):
+        desk.meter.arrived('fix', second)
+    assert (desk.meter.interval('arrivals'), desk.meter.interval('fix')) == (10.0, 1.0)
+    assert desk.meter.interval('altitude') == 0.0
+    desk.report(59.5)  # five times ten seconds after the last one are not over
+    assert desk.input.level == desk.tracker.level == DiagnosticStatus.OK
+    for second in range(60, 72):
+        desk.meter.arrived('fix', second)
+    desk.report(71.5)
+    assert desk.tracker.level == DiagnosticStatus.OK
+    assert desk.input.message == 'nothing more on /arrivals for 51.5 s'
+
+
 @pytest.mark.parametrize(
     'system, settings, required, one_of',
     [
@@ -221,13 +237,30 @@ def test_compute_time_and_a_tracker_that_cannot_keep_up(desk):
     for k in range(10):
         desk.meter.arrived('fix', k / 10.0)
         desk.meter.spent(0.05)
+    for seconds in (0.25, 0.25) + (0.05,) * 89:
+        desk.meter.spent(seconds)
     desk.report(1.0)
     assert desk.values['compute time p50 [ms]'] == '50'
+    assert desk.values['compute time p99 [ms]'] == '250'  # two of 101
     assert desk.tracker.level == DiagnosticStatus.OK
     for k in range(30):
         desk.meter.arrived('fix', 1.0 + k / 30.0)
     desk.report(2.0)
     assert desk.tracker.level == DiagnosticStatus.WARN
+
+
+def test_what_is_lost_counts_as_input_that_cannot_be_kept_up_with(desk):
+    desk.report(0.0)
+    for k in range(10):
+        desk.meter.arrived('fix', k / 10.0)
+        desk.meter.spent(0.05)
+    desk.report(1.0, lost={'fix': 9})  # 19 a second at 50 ms each are no second of work
+    assert desk.tracker.level == DiagnosticStatus.OK
+    for k in range(10):
+        desk.meter.arrived('fix', 1.0 + k / 10.0)
+    desk.report(2.0, lost={'fix': 9 + 11})
+    assert desk.tracker.level == DiagnosticStatus.WARN
+    assert desk.tracker.message == 'input comes faster than it can be processed'
 
 
 def test_dropped_messages_warn_while_they_are_dropped(desk):
@@ -248,7 +281,11 @@ def test_internal_errors_and_disabling_show(desk):
     desk.report(1.0, enabled=False)
     assert desk.tracker.message == 'disabled'
     assert 'disabled' in desk.input.message
-    desk.report(2.0, counts={'internal_error': 1})
+    desk.report(60.0, enabled=False)  # without input, which it does not wait for
+    assert desk.tracker.level == DiagnosticStatus.OK
+    assert desk.input.level == DiagnosticStatus.STALE
+    desk.meter.arrived('fix', 60.5)
+    desk.report(61.0, counts={'internal_error': 1})
     assert desk.tracker.level == DiagnosticStatus.ERROR
 
 
@@ -332,8 +369,21 @@ def test_the_health_of_a_node_is_its_worst_entry(desk):
     assert {pair.key for pair in told.values} == {'input', 'tracker'}
     desk.report(2.0, counts={'internal_error': 1})
     assert summary('diver', [desk.input, desk.tracker]).level == DiagnosticStatus.ERROR
-    desk.report(60.0)
+    desk.report(60.0, counts={'internal_error': 1})
     assert desk.input.level == DiagnosticStatus.STALE
+    told = summary('diver', [desk.input, desk.tracker])
+    assert told.level == DiagnosticStatus.ERROR  # a caught error is worse than silence
+    assert told.message == desk.tracker.message != desk.input.message
+
+
+def test_a_warning_is_the_same_one_when_its_numbers_change():
+    desk = Desk(rise=2, fall=5)
+    levels = []
+    for second, share in enumerate((12, 15, 9)):
+        desk.meter.arrived('fix', second)
+        desk.report(second + 0.9, warnings=[f'{share} % of the pings were passed over'])
+        levels.append(desk.tracker.level[0])
+    assert levels == [0, 1, 1] and desk.tracker.message.startswith('9 %')
 
 
 def test_health_waits_for_those_who_ask_later(make_bench, walker):

@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix, PointCloud2
+from std_srvs.srv import Trigger
 
 from msg_adapters.estimates import read_estimate
 from msg_adapters.geodetic import read_geodetic, write_geodetic
@@ -95,6 +96,19 @@ def test_what_has_no_fix_and_what_is_repeated_is_in_diagnostics(make_bench):
     bench.spin_until(lambda: len(heard) > count + 1)
     values = {one.key: one.value for status in heard[-1].status for one in status.values}
     assert values['refused: repeated'] == '1' and values['refused: no_fix'] == '1'
+
+
+def test_after_a_reset_nothing_is_a_repetition(make_bench):
+    bench, node = start(make_bench, 'fix_type:=sensor_msgs/msg/NavSatFix')
+    fixes = publisher(bench, 'sensor_msgs/msg/NavSatFix', '/fix')
+    for k in (1, 2):
+        fixes.publish(on_earth(k, 0.0))
+        bench.spin_until(lambda want=k: received(node) == want)
+    assert node._meter.refused == {'repeated': 1}
+    bench.call(Trigger, '/diver/reset', Trigger.Request())
+    fixes.publish(on_earth(3, 0.0))
+    bench.spin_until(lambda: received(node) == 3)
+    assert node._meter.refused == {'repeated': 1} and node._published == 2
 
 
 def test_relative_fixes_are_composed_with_nav(make_bench):

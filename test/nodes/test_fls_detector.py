@@ -14,7 +14,7 @@
 
 """The detector node on images as a driver would send them."""
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from helpers import marine
 import numpy as np
 import pytest
@@ -42,14 +42,14 @@ def pixels():
     return samples
 
 
-def picture(second=100, spoilt=False):
+def picture(second=100, spoilt=False, frame_id='sonar'):
     message = write_picture(
         SonarImage(
             stamp_ns=second * 10**9,
             range=np.arange(50.0),
             bearing=np.arange(9.0),
             amplitude=pixels().astype(float),
-            frame_id='sonar',
+            frame_id=frame_id,
         ),
         make,
     )
@@ -120,6 +120,25 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
     values = {pair.key: pair.value for pair in told[-1].status[0].values}
     assert values['image received'] == '3' and values['refused: short_data'] == '1'
     assert {pair.key: pair.value for pair in told[-1].status[1].values}['count: published'] == '2'
+
+
+def test_images_of_another_sonar_are_refused(make_bench):
+    node = FlsDetectorNode(context=make_bench(*PARAMETERS).context)
+    for second, frame_id in ((100, 'sonar'), (101, 'stern_sonar'), (102, 'sonar')):
+        node.receive(picture(second, frame_id=frame_id))
+    assert node.refused == {'frame': 1} and node._published == 2
+    node.destroy_node()
+
+
+def test_without_images_the_node_waits_for_them(make_bench):
+    bench = make_bench(*PARAMETERS)
+    told = bench.listen(DiagnosticArray, '/diagnostics')
+    node = bench.add(FlsDetectorNode(context=bench.context))
+    bench.spin_until(lambda: told)
+    assert told[0].status[0].level == told[0].status[1].level == DiagnosticStatus.STALE
+    assert told[0].status[0].message == 'no message yet on /image'
+    node.receive(picture())
+    bench.spin_until(lambda: told[-1].status[0].message == 'receiving')
 
 
 def test_a_package_that_is_there_is_used(make_bench, monkeypatch):

@@ -127,18 +127,31 @@ def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(sta
     other.send(*[a_fix(5000.0 + k, 1.0, 1.0) for k in range(4)])
     assert 'are +4002 s from the last one of the state' in capfd.readouterr().err
     assert sorted(other.node.tracker.fixes) == [5002 * 10**9, 5003 * 10**9]
+    end(other)
+    earlier = start()
+    earlier.send(*[a_fix(100.0 + k, 1.0, 1.0) for k in range(3)])
+    assert 'are -4901 s from the last one of the state' in capfd.readouterr().err
+    assert sorted(earlier.node.tracker.fixes) == [102 * 10**9]
 
 
 def test_a_disk_that_is_full_is_said(start, monkeypatch, capfd):
     def full(path, saved):
         raise OSError(28, 'No space left on device')
 
-    monkeypatch.setattr('sonar_imm.nodes.keeping.write_state', full)
     rig = start()
-    rig.send(a_fix(1.0))
-    rig.node._keeper.save(rig.node.tracker, rig.node.tracker.config, wait=True)
-    assert 'No space left on device' in rig.node._keeper.trouble
-    assert capfd.readouterr().err.count('the state cannot be saved') == 1
+
+    def save(seconds):
+        rig.send(a_fix(seconds))
+        rig.node._keeper.save(rig.node.tracker, rig.node.tracker.config, wait=True)
+
+    with monkeypatch.context() as disk:
+        disk.setattr('sonar_imm.nodes.keeping.write_state', full)
+        save(1.0)
+        save(2.0)
+        assert 'No space left on device' in rig.node._keeper.trouble
+        assert capfd.readouterr().err.count('the state cannot be saved') == 1
+    save(3.0)  # somebody made room
+    assert rig.node._keeper.trouble == ''
 
 
 def test_a_folder_that_is_not_there_ends_the_node(make_bench):

@@ -27,7 +27,7 @@ from std_msgs.msg import Float64
 from sonar_imm.nodes import lockstep as lockstep_module
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.link import Link, LinkError
-from sonar_imm.nodes.lockstep import LockStep, Recorder
+from sonar_imm.nodes.lockstep import Counts, LockStep, Recorder
 from sonar_imm.nodes.player import play, Player, PlayOptions
 from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm.recordings.reader import BagReader
@@ -192,6 +192,25 @@ def test_lockstep_waits_for_an_input_that_is_found_late(link, start, stepping, m
 
     monkeypatch.setattr(step, '_heard', heard)
     assert player._meet(15.0) == {'/fix', '/other'}
+
+
+def test_a_step_waits_until_the_estimates_of_the_message_are_here(link):
+    """The answer and the estimates come on two topics: which is first, nobody says."""
+    recorder = []
+    step = LockStep(link, '/walker', recorder=recorder)
+    said = []
+
+    def spin(seconds):
+        said.append(len(recorder))
+        if len(said) == 1:
+            step._counts = Counts(messages=1, refused=0, estimates=2)
+        else:
+            recorder.append(b'an estimate')
+
+    link.spin = spin
+    step._lost = lambda: 'the step never ends' if len(said) > 9 else None
+    step.follow(1, '/fix', 0.0)
+    assert said == [0, 0, 1] and len(step.delays) == 1
 
 
 def test_recorded_estimates_read_back(link, start, stepping):

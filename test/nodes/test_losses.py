@@ -16,6 +16,7 @@
 
 import itertools
 import time
+from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
@@ -133,6 +134,18 @@ def test_the_real_middleware_numbers_messages_and_the_queue_is_counted(make_benc
     assert endpoints.lost == {'depth': 202 - len(heard)}
     assert len(heard) <= 2 + 10
     assert capfd.readouterr().err.count("'depth' are lost before") == 1
+
+
+def test_a_middleware_without_numbers_is_believed_what_it_says_was_lost(make_bench):
+    endpoints = Endpoints(make_bench().peer)
+    endpoints.subscribe(Float64, 'depth', lambda *_: None, input_qos(10))
+    endpoints._lost('depth', SimpleNamespace(total_count=7))
+    endpoints._gaps['depth'].heard({'publication_sequence_number': None, 'received_timestamp': 1})
+    assert endpoints.lost == {'depth': 7}
+    for number in (1, 4):  # with numbers they count alone, since both may know of the same
+        info = {'publication_sequence_number': number, 'received_timestamp': 1}
+        endpoints._gaps['depth'].heard(info)
+    assert endpoints.lost == {'depth': 2}
 
 
 def test_a_node_warns_of_the_share_that_it_lost(make_bench, walker):

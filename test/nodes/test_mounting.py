@@ -35,6 +35,25 @@ LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -5.0, 8.0)
 ALONE = 'geometry_msgs/msg/TransformStamped'
 
 
+def transform(child, parent, position, rpy):
+    """A TransformStamped, which is installed everywhere; tf2_msgs is not."""
+    pose = Pose(np.array(position), geometry.rotation(*np.radians(rpy)))
+    told = write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
+    turn = told.transforms[0].transform.rotation
+    where = {
+        'translation': make('geometry_msgs/msg/Vector3', **dict(zip('xyz', position))),
+        'rotation': make(
+            'geometry_msgs/msg/Quaternion', **{name: getattr(turn, name) for name in 'xyzw'}
+        ),
+    }
+    return make(
+        ALONE,
+        header=make('std_msgs/msg/Header', frame_id=parent),
+        child_frame_id=child,
+        transform=make('geometry_msgs/msg/Transform', **where),
+    )
+
+
 class Life:
     """One life of a node that keeps its state, and what is sent to it."""
 
@@ -52,25 +71,8 @@ class Life:
         self.sent += 1
         self.bench.spin_until(lambda: self.node._meter.received.total() == self.sent)
 
-    def tell(self, child, parent, position, rpy):
-        pose = Pose(np.array(position), geometry.rotation(*np.radians(rpy)))
-        # a TransformStamped is installed everywhere, tf2_msgs is not
-        told = write_transforms(StaticTransforms(poses={child: (parent, pose)}), ros_message)
-        one = told.transforms[0]
-        where = {
-            'translation': make('geometry_msgs/msg/Vector3', **dict(zip('xyz', position))),
-            'rotation': make(
-                'geometry_msgs/msg/Quaternion',
-                **{name: getattr(one.transform.rotation, name) for name in 'xyzw'},
-            ),
-        }
-        message = make(
-            ALONE,
-            header=make('std_msgs/msg/Header', frame_id=parent),
-            child_frame_id=child,
-            transform=make('geometry_msgs/msg/Transform', **where),
-        )
-        self.send('/tf_static', message, ALONE, transforms_qos())
+    def tell(self, *where):
+        self.send('/tf_static', transform(*where), ALONE, transforms_qos())
 
     def end(self):
         self.bench.nodes.remove(self.node)
@@ -108,6 +110,16 @@ def test_the_place_of_the_sonar_outlives_who_said_it(name, node, make_bench, tmp
     assert config.sonar_lever == LEVER and config.sonar_mount_rpy_deg == pytest.approx(RPY)
     again.tell('sonar', 'base_link', (0.0, 0.0, 1.0), RPY)  # mounted elsewhere meanwhile
     assert again.node.tracker.config.sonar_lever == (0.0, 0.0, 1.0)
+
+
+def test_a_place_that_was_said_before_the_node_was_there_is_heard(make_bench):
+    words = f'tf_static_type:={ALONE}', 'vehicle_frame:=base_link', 'sonar_frame:=sonar'
+    bench = make_bench(*[word for one in words for word in ('-p', one)])
+    said = bench.peer.create_publisher(message_class(ALONE), '/tf_static', transforms_qos())
+    said.publish(transform('sonar', 'base_link', LEVER, RPY))
+    node = bench.add(BathymetryNode(context=bench.context))
+    bench.spin_until(lambda: node._meter.received.total())
+    assert node.tracker.config.sonar_lever == LEVER
 
 
 def test_a_track_that_was_told_and_frames_outlive_their_publishers(make_bench, tmp_path, capfd):

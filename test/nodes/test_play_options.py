@@ -39,6 +39,25 @@ def test_files_of_qualities_of_service_are_checked(text, sentence):
         profiles_of(text)
 
 
+def test_a_file_of_qualities_of_service_says_what_it_says_and_the_rest_is_reliable():
+    lines = (
+        '/all: {history: keep_all}',
+        '/quick: {reliability: best_effort, depth: 3}',
+        '/rest: {}',
+    )
+    profiles = profiles_of('\n'.join(lines))
+    told = {
+        topic: (one.history.name, one.reliability.name, one.durability.name)
+        for topic, one in profiles.items()
+    }
+    assert told == {
+        '/all': ('KEEP_ALL', 'RELIABLE', 'VOLATILE'),
+        '/quick': ('KEEP_LAST', 'BEST_EFFORT', 'VOLATILE'),
+        '/rest': ('KEEP_LAST', 'RELIABLE', 'VOLATILE'),
+    }
+    assert (profiles['/quick'].depth, profiles['/rest'].depth) == (3, 10)
+
+
 @pytest.mark.parametrize(
     'words, topics, excluded, remaps',
     [

@@ -31,6 +31,7 @@ from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.evaluation.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm.measurements import Fix, Fixes, GeodeticFix, VesselPose
 from sonar_imm.recordings.messages import ros_message
+from sonar_imm.recordings.positions import GAP_S, Positions, read_positions, write_position
 from sonar_imm.recordings.reader import BagReader
 from sonar_imm.recordings.topics import fitting_topics
 from sonar_imm.trackers import SYSTEMS
@@ -248,3 +249,39 @@ def test_the_navigation_comes_along_with_a_chosen_topic(tmp_path):
     run, estimates = tracked(bag, tmp_path / 'run', {'/usbl_info': 'relative'})
     assert run['topics'] == {'/usbl_info': 'relative', '/nav': 'nav'}
     assert estimates[-1].state[0, :2] == pytest.approx([10.0, 20.0], abs=0.3)
+
+
+def at(seconds, longitude, latitude, when):
+    """Longitude and latitude `when`, s after the start, by fixes at `seconds`."""
+    stamps = (START + np.array(seconds)) * SECOND
+    positions = Positions(stamps, np.array(longitude), np.array(latitude))
+    return positions.at(np.array([round((START + one) * SECOND) for one in when]))
+
+
+def test_a_place_between_two_fixes_goes_the_short_way_over_the_date_line():
+    east, north = at([0, 10], [179.9, -179.7], [1.0, 2.0], [0.0, 2.5, 5.0, 7.5, 10.0])
+    assert east == pytest.approx([179.9, -180.0, -179.9, -179.8, -179.7])
+    assert north == pytest.approx([1.0, 1.25, 1.5, 1.75, 2.0])
+    east, _ = at([0, 10], [-0.1, 0.1], [1.0, 2.0], [5.0])  # and over Greenwich
+    assert east == pytest.approx([0.0])
+
+
+def test_far_from_all_fixes_there_is_no_place():
+    near, far = GAP_S - 0.5, GAP_S + 0.5
+    when = [-far, -near, 0.0, near, far, 100.0 - near, 100.0, 100.0 + near, 100.0 + far]
+    for column in at([0, 100], [10.0, 11.0], [59.0, 60.0], when):
+        wanted = [True, False, False, False, True, False, False, False, True]
+        assert np.isnan(column).tolist() == wanted
+
+
+def test_only_fixes_of_a_receiver_that_has_one_are_places(tmp_path):
+    records = []
+    for k, status in enumerate((0, -1, 2, 0)):
+        message = write_position((START + k) * SECOND, 10.0 + k, 59.0)
+        message.status.status = status
+        records.append(((START + k) * SECOND, '/position', message))
+    records[3][2].latitude = 91.0
+    with BagReader(write_bag(tmp_path / 'bag', records)) as reader:
+        found = read_positions(reader)
+    assert found.stamp_ns.tolist() == [START * SECOND, (START + 2) * SECOND]
+    assert found.longitude.tolist() == [10.0, 12.0]

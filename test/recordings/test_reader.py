@@ -221,14 +221,17 @@ class TestDamage:
 
     def test_a_flipped_bit_costs_one_message_not_the_bag(self, tmp_path, fix_message):
         with BagWriter(tmp_path / 'bag') as bag:
-            for i in range(3):
+            for i in range(5):
                 raw = bytearray(typestore().serialize_cdr(fix_message(i), FIX))
-                if i == 1:
+                topic = '/other' if i == 4 else '/fix'
+                if i in (1, 3, 4):
                     raw[12:16] = struct.pack('<I', 2**31)  # length of frame_id
-                bag.write_raw('/fix', FIX, bytes(raw), i)
+                bag.write_raw(topic, FIX, bytes(raw), i)
         items, problems = read(tmp_path / 'bag')
         assert [item.index for item in items] == [0, 2]
-        assert problems[0].startswith('topic /fix: 1 message could not be decoded')
+        told = '/fix: 2 messages could not be decoded (the first: message 1,'
+        assert problems[0].startswith(f'topic {told}')
+        assert problems[1].startswith('topic /other: 1 message could not be decoded')
         with pytest.raises(BagError, match='message 1'):
             read(tmp_path / 'bag', strict=True)
 

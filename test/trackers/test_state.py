@@ -217,6 +217,31 @@ def test_damaged_files_are_one_sentence(tmp_path):
             read_state(path)
 
 
+def test_a_sound_state_under_another_checksum_is_damaged(tmp_path):
+    """The npz has checksums of its own, which know nothing of each other and not of the line."""
+    run, path = case('diver_table1'), tmp_path / 'state'
+    lines, bodies = [], []
+    for count in (5, 6):
+        write_state(path, run.saved(run.until(count)))
+        line, _, body = path.read_bytes().partition(b'\n')
+        lines.append(line)
+        bodies.append(body)
+    path.write_bytes(lines[0] + b'\n' + bodies[0])
+    read_state(path)
+    path.write_bytes(lines[0] + b'\n' + bodies[1])
+    with pytest.raises(StateError, match='it is damaged: the checksum does not fit'):
+        read_state(path)
+
+
+def test_a_file_larger_than_any_state_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / 'state'
+    path.write_bytes(b'x' * 1001)
+    monkeypatch.setattr(state_file, '_LARGEST', 1000)
+    monkeypatch.setattr(Path, 'read_bytes', lambda path: pytest.fail('it was read'))
+    with pytest.raises(StateError, match='larger than any state'):
+        read_state(path)
+
+
 def rewrite(path, change):
     """Change the header of a state and make its checksum right again."""
     _, _, body = path.read_bytes().partition(b'\n')

@@ -296,8 +296,9 @@ def test_what_is_no_snapshot_is_counted():
 def test_a_snapshot_of_another_array_is_counted():
     tracker = BathymetryTracker(BathymetryConfig(element_spacing_wavelengths=0.5))
     other = {'element_spacing': 0.01, 'frequency': 300e3, 'sound_speed': 1500.0}
-    assert tracker.process(floor(0.0, **other)) == []
-    assert tracker.counts == {'other_spacing': 1}
+    for frequency in (300e3, 37.5e3):  # two wavelengths, and a quarter of one
+        assert tracker.process(floor(0.0, **{**other, 'frequency': frequency})) == []
+    assert tracker.counts == {'other_spacing': 2}
     follows = BathymetryTracker(BathymetryConfig())
     assert rmse(follows.process(floor(0.0, spacing=2.0, **other))[0], 0.0) < 0.1
 

@@ -14,15 +14,22 @@
 
 """Scans: empty ones, soft association, and fixes that say whose they are."""
 
+from types import SimpleNamespace
+
+from attrs import evolve
 from helpers.diver_runs import fix, run, SECOND
 from helpers.estimates import same
 import numpy as np
 import pytest
 
 from sonar_imm.estimation.association import TrackStatus
-from sonar_imm.measurements import Fixes
+from sonar_imm.measurements import Arrivals, Fixes, NOBODY
 from sonar_imm.simulation.diver.simulator import scenario, simulate
-from sonar_imm.trackers.diver import soft
+from sonar_imm.trackers.diver import fix_kernels, soft
+from sonar_imm.trackers.diver import scan as scan_module
+from sonar_imm.trackers.diver.fix_consistency import FixConsistency, MEMORY
+from sonar_imm.trackers.diver.scan import SCALE_MEMORY
+from sonar_imm.trackers.diver.sensing import position_groups
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
@@ -227,3 +234,130 @@ def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
     status = np.array([TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED])
     known = soft.known_existence(np.array([np.nan, np.nan, 0.3]), status)
     assert known.tolist() == [0.5, 0.9, 0.3]
+
+
+def test_what_is_stated_is_scaled_in_scans_as_in_single_fixes():
+    config = DiverConfig(fix_std=2.0)
+    places = (0.0, 0.0), (9.0, 0.0), (0.0, 9.0)
+    stated = np.array([0.25, np.nan, 1.0])[:, None, None] * np.eye(2)
+    expected = 3.0 * np.array([0.25, 4.0, 1.0])[:, None, None] * np.eye(2)
+    for ids in (None, [6, 7, 8], [NOBODY] * 3):
+        one = evolve(scan(1, *places, ids=ids), covariance=stated)
+        (group,) = position_groups([one], config, 3.0)
+        assert group.factor == 3.0
+        assert group.R == pytest.approx(expected)
+
+
+def test_a_named_diver_is_never_the_one_too_many():
+    tracker = DiverTracker(DiverConfig(max_tracks=1))
+    for second in range(1, 12):
+        tracker.process(scan(second, (0.1 * second, 0.0)))
+    for second in range(12, 20):
+        both = scan(second, (0.1 * second, 0.0), (60.0, 5.0), ids=[NOBODY, 6])
+        (estimate,) = tracker.process(both)
+    followed = estimate.extras['track_state'] != TrackStatus.TENTATIVE
+    assert estimate.extras['target_id'][followed].tolist() == [6]
+
+
+def test_tracks_whose_numbers_are_not_finite_end_and_are_counted(monkeypatch):
+    tracker = DiverTracker(DiverConfig())
+    for second in range(1, 6):
+        tracker.process(scan(second, (0.1 * second, 0.0), (40.0, 0.0)))
+    with monkeypatch.context() as patch:
+        patch.setattr(fix_kernels, 'finite', lambda x, P: np.arange(len(x)) != 1)
+        (estimate,) = tracker.process(scan(6, (0.6, 0.0), (40.0, 0.0)))
+    assert ids_of(estimate) == [1] and tracker.health()['broken_tracks'] == 1
+    (estimate,) = tracker.process(scan(7, (0.7, 0.0), (40.0, 0.0)))
+    assert 2 not in ids_of(estimate) and tracker.health()['broken_tracks'] == 1
+
+
+def test_the_learnt_scale_is_that_of_the_last_fixes():
+    tracker = DiverTracker(DiverConfig(estimate_covariance_scale=True, history=0.0))
+    for second in range(1, int(SCALE_MEMORY)):
+        tracker.process(scan(second, (0.0, 0.0)))
+    total, count = tracker._stream.state.scale[0]
+    assert count == SCALE_MEMORY and 0.0 < total < count
+    assert not tracker._stream.state.scale[1].any()  # of arrivals nothing is known
+
+
+def test_arrivals_are_judged_where_no_fix_says_the_same():
+    rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+    leg = np.linalg.norm(rx - [20.0, 30.0, -2.0], axis=1)
+    tracker = DiverTracker(DiverConfig(target_z=-2.0))
+
+    def ping(second):
+        return Arrivals(
+            stamp_ns=second * SECOND,
+            tx_id=np.zeros(4),
+            rx_id=np.arange(4),
+            tx=np.tile(rx[0], (4, 1)),
+            rx=rx,
+            toa=(leg + leg[0]) / 1500.0,
+            var_toa=np.full(4, 1e-8),
+            bearing=np.full(4, np.nan),
+            var_bearing=np.full(4, np.nan),
+            frame_id='map',
+        )
+
+    for second in range(1, 9):
+        tracker.process(scan(second, (20.0, 30.0)))
+        tracker.process(ping(second))
+    assert np.isnan(tracker.health()['arrivals_mean_nis'])
+    tracker.process(ping(9))
+    assert tracker.health()['arrivals_mean_nis'] < 1.0
+
+
+def test_the_score_of_a_track_is_that_of_its_last_scans():
+    tracker, scores = DiverTracker(DiverConfig(history=0.0)), []
+    for second in range(1, 101):
+        tracker.process(scan(second, (0.0, 0.0)))
+        scores.append(tracker._stream.state.score[0])
+    assert scores[9] > 5.0 * scores[1] > 0.0
+    assert scores[-1] == pytest.approx(scores[-2], rel=1e-3)  # it does not grow with the dive
+
+
+def test_repairs_of_every_step_of_a_gap_are_counted(monkeypatch):
+    tracker = DiverTracker(DiverConfig(history=0.0))
+    for second in (1, 2):
+        tracker.process(scan(second, (0.0, 0.0)))
+    real, crossed = scan_module.cross, []
+
+    def cross(*told):
+        for step in real(*told):
+            crossed.append(step)
+            yield step._replace(repairs=len(crossed))
+
+    monkeypatch.setattr(scan_module, 'cross', cross)
+    tracker.process(scan(8, (0.0, 0.0)))
+    steps = len(crossed)
+    assert steps > 2
+    assert tracker.health()['covariance_repairs'] == steps * (steps + 1) // 2
+
+
+def test_scans_near_another_track_are_counted_for_each_partner_alone():
+    """1 and 2 lie apart, 3 beside 2, 4 beside 1; who each was near before, and for how long."""
+    names = DiverTracker(DiverConfig())._stream.state.life
+    mean = np.array([[0.0, 0.0], [50.0, 0.0], [50.1, 0.0], [0.1, 0.0]])
+    now = SimpleNamespace(
+        life=evolve(names, track_id=np.array([1, 2, 3, 4], np.uint32)),
+        target_id=np.full(4, NOBODY),
+        near_to=np.array([0, 1, 1, 1]),
+        near_for=np.array([0, 5, 5, 5]),
+    )
+    tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
+    near_to, near_for = soft.coalescence(now, tentative, mean, wide)
+    assert near_to.tolist() == [0, 0, 2, 1]
+    assert near_for.tolist() == [0, 0, 1, 6]
+
+
+def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
+    pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
+    lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
+    for one in (pessimistic, lasting):
+        assert 'state fix_bias_std' in one.warnings(False)[0]
+        assert one.warnings(True) == []
+        assert evolve(one, count=0.9 * MEMORY).warnings(False) == []
+    optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
+    for stated in (False, True):
+        assert 'raise covariance_scale' in optimistic.warnings(stated)[0]
+    assert FixConsistency(MEMORY, MEMORY, MEMORY, 0.0, MEMORY).warnings(False) == []

@@ -107,6 +107,9 @@ def test_unexplained_records_are_said():
     for second in range(1, 13):
         amplitude = -np.exp(-0.5 * np.square(depth - 10.0))
         tracker.process(Trace(stamp_ns=second * SECOND, depth=depth, amplitude=amplitude))
+        assert tracker.counts['unexplained'] == second
+        assert tracker._before is None  # the next one begins anew
+        assert bool(tracker.warnings()) == (second >= 10)  # a few records are no evidence
     assert any('no set of reflectors explains 100 %' in one for one in tracker.warnings())
 
 

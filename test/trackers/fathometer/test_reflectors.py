@@ -16,22 +16,26 @@
 
 from pathlib import Path
 
+from attrs import evolve
 from helpers.fathometer_runs import run
 import numpy as np
 import pytest
 
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimation.set_members import Members
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.reflectors import (
     Identified,
+    Identities,
     nearest_ids,
     Reflectors,
+    reflectors_of,
     relative_amplitude,
     sediment_depths,
 )
-from sonar_imm.trackers.fathometer.response import Response
+from sonar_imm.trackers.fathometer.response import Lattice, pulse_of, Response
 from sonar_imm.trackers.fathometer.tracker import FathometerTracker
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
@@ -150,3 +154,59 @@ def test_what_was_lost_does_not_take_over_from_what_is_still_seen():
     # Of two that were seen equally long ago the nearest, whatever the order.
     for earlier in ([seen, Identified(8, 22.8, 0)], [Identified(8, 22.8, 0), seen]):
         assert list(nearest_ids(np.array([22.84, 23.0]), earlier, config)) == [8, 7]
+
+
+def test_a_reflector_is_waited_for_as_many_records_as_is_told():
+    config = FathometerConfig(track_memory=3)
+    here, nothing = (np.array([22.8]), np.ones(1)), (np.empty(0), np.empty(0))
+    for missed, expected in ((3, 1), (4, 2)):
+        ids, (first,) = Identities().name(*here, config)
+        for _ in range(missed):
+            ids, _ = ids.name(*nothing, config)
+        assert [one.missed for one in ids.reflectors] == ([3] if missed == 3 else [])
+        assert (first, *ids.name(*here, config)[1]) == (1, expected)
+
+
+def members(count):
+    """Reflectors far apart, as the particles know them: in cells and units of the noise."""
+    return Members(
+        place=20.0 * np.arange(1, count + 1),
+        amplitude=np.full(count, 5.0),
+        covariance=np.tile([[0.25, 0.125], [0.125, 4.0]], (count, 1, 1)),
+        prior_variance=np.full(count, 9.0),
+        foremost=np.ones(count),
+        existence=np.ones(count),
+    )
+
+
+def test_members_of_sets_become_metres_and_amplitudes_with_what_is_not_known_of_them():
+    config = FathometerConfig(amplitude_prior='marginal', array_depth_std=0.5)
+    lattice = Lattice(50.0, 0.1, 200)
+    sigma = 2.0 + np.arange(200) / 100.0
+    response = Response(1, 'array', lattice.depth, np.zeros(200), sigma)
+    found = reflectors_of(members(2), response, lattice, pulse_of(config), config)
+    assert found.depth == pytest.approx([52.0, 54.0])
+    assert found.amplitude == pytest.approx(5.0 * sigma[[20, 40]])
+    for covariance, noise in zip(found.covariance, sigma[[20, 40]]):
+        # The cell's own width; the depth of the array; the amplitude given the place.
+        depth = 0.1**2 * (0.25 + 1.0 / 12.0) + 0.5**2
+        amplitude = noise**2 * (4.0 + 1.0 / (1.0 + 1.0 / 9.0))
+        expected = [[depth, 0.1 * noise * 0.125], [0.1 * noise * 0.125, amplitude]]
+        assert covariance == pytest.approx(np.array(expected), rel=1e-3)
+    # Where heave is a state the particles are spread by it, and the noise is that of the place
+    # where the echo lies in the record.
+    heaved = reflectors_of(
+        members(2), response, lattice, pulse_of(config), config, heave=(1.0, 0.25)
+    )
+    assert heaved.covariance[:, 0, 0] == pytest.approx(0.1**2 * (0.25 + 1.0 / 12.0))
+    assert heaved.amplitude == pytest.approx(5.0 * sigma[[30, 50]])
+    assert (heaved.heave, heaved.heave_std) == (1.0, 0.25)
+
+
+def test_amplitudes_are_freed_of_spreading_over_the_height_that_is_true():
+    config = FathometerConfig()
+    grid = np.arange(0.0, 100.0, 1.0)
+    response = Response(1, 'a', grid, grid, grid, 25.0)
+    for heave, height in ((0.0, 30.0), (0.5, 30.5)):
+        found = evolve(reflectors([55.0], [1.0]), heave=heave, heave_std=0.1)
+        assert relative_amplitude(found, response, config) == pytest.approx([2.0 * height])

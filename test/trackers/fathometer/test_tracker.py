@@ -239,6 +239,12 @@ def test_late_repeated_and_restarted_input(vectors):
     estimates = [tracker.process(one[k]) for k in (7, 0, 1, 2, 3)]
     assert [len(each) for each in estimates] == [1, 0, 0, 3, 1]
     assert tracker.counts['restarts'] == 1
+    # Nothing says that what is seen now is what was seen before: no identity is used again.
+    before, after = (
+        {int(one) for each in part for e in each for one in e.extras['track_id'] if one}
+        for part in (estimates[:3], estimates[3:])
+    )
+    assert before and after and max(before) < min(after)
 
 
 def test_reset_equals_a_fresh_tracker(vectors):

@@ -59,6 +59,56 @@ def test_variances_of_the_detections_win():
     assert_allclose(first(var_range=[0.0], var_bearing=[np.nan]), own)
 
 
+def still(seconds, x=0.0):
+    """A level vehicle, bow to the east, 20 m deep."""
+    return Navigation(
+        stamp_ns=seconds * SECOND, position=[x, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
+    )
+
+
+def test_an_echo_that_is_as_uncertain_as_it_is_far_says_nothing():
+    for std, begun in ((4.9, 1), (5.1, 0)):
+        tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1))
+        tracker.process(still(1))
+        ping = Detections(stamp_ns=SECOND, range=[10.0], bearing=[0.1], var_range=[std**2])
+        assert len(tracker.process(ping)[0]) == begun
+
+
+def test_no_more_obstacles_than_allowed_are_followed():
+    tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1, max_tracks=2))
+    for second in (1, 2):
+        tracker.process(still(second))
+        bearing = [0.4, 0.2, 0.0, -0.2]
+        ping = Detections(stamp_ns=second * SECOND, range=[40.0] * 4, bearing=bearing)
+        (estimate,) = tracker.process(ping)
+        assert estimate.extras['track_id'].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize('side', [1, -1])
+def test_range_and_bearing_are_correlated_as_the_place_is(side):
+    """The vehicle passes by: what it knew of the range before becomes knowledge of the bearing."""
+    tracker = ObstacleTracker(ObstacleConfig(confirm_hits=1, range_scale_std=0.0))
+    for second in range(1, 13):
+        tracker.process(still(second, x=1.5 * second))
+        east, north = 80.0 - 1.5 * second, 40.0 * side
+        ping = Detections(
+            stamp_ns=second * SECOND,
+            range=[np.hypot(east, north)],
+            bearing=[np.arctan2(north, east)],
+            var_range=[25.0],
+            var_bearing=[1e-4],
+        )
+        (estimate,) = tracker.process(ping)
+    place = {name: value[0] for name, value in estimate.extras.items() if name.startswith('p')}
+    P = [[place[f'place_cov_{min(a, b)}_{max(a, b)}'] for b in 'xyz'] for a in 'xyz']
+    x, y, z = place['px'] - 18.0, place['py'], place['pz'] + 20.0
+    far, level = np.sqrt(x**2 + y**2 + z**2), x**2 + y**2
+    J = np.array([[x / far, y / far, z / far], [-y / level, x / level, 0.0]])
+    for covariance in (J @ P @ J.T, estimate.covariance[0]):
+        correlation = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
+        assert correlation == pytest.approx(-0.25 * side, abs=0.05)
+
+
 def test_strangers_are_counted():
     tracker = ObstacleTracker(ObstacleConfig())
     run(tracker, approach(NAME)[:6])
