@@ -18,9 +18,10 @@
     python -m benchmarks.false_warnings --bags diver_table1 --first-seed 1000
 
 The scene of every shipped recording is simulated anew with other seeds, and tracked with true
-standard deviations, with twice those, and with half. Told are the warnings raised (through the
-hysteresis of diagnostics, one message being one period), in how much sensor time, and the share
-of the runs in which there was one. Rows that are in the file already are not made again.
+standard deviations, with twice those, and with half, where somebody states them. Images go
+through the detector. Told are the warnings raised (through the hysteresis of diagnostics, one
+message being one period), in how much sensor time, and the share of the runs in which there was
+one. Rows that are in the file already are not made again.
 """
 
 from __future__ import annotations
@@ -35,9 +36,10 @@ from typing import Any
 from attrs import evolve
 import yaml
 
+from benchmarks.image_tracks import detected
 from benchmarks.tables import write_json
 from sonar_imm.cli.common import load_config
-from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, Trace
+from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarImage, Trace
 from sonar_imm.nodes.health import Finding, Hysteresis, WARN
 from sonar_imm.recordings.own_parameters import own_parameters
 from sonar_imm.trackers import SYSTEMS
@@ -65,6 +67,8 @@ SCALED = {
 """What a measurement states of its noise; variances, but for `sigma`."""
 STATED = {'obstacle': ('range_std', 'range_step', 'bearing_std_deg', 'bearing_step_deg')}
 """Parameters that state noise where the measurements of the scenes do not."""
+MEASURED = ('fathometer_array', 'fathometer_pressure')
+"""Scenes where nobody states the noise, because the tracker measures it."""
 
 
 def misstated(measurement: Any, factor: float) -> Any:
@@ -93,21 +97,26 @@ def runs(bag: Path, factor: float, seeds: range) -> Iterator[tuple[float, int]]:
     """Hours and warnings of each run."""
     system, name, changes = scene_of(bag)
     scenes = import_module(SYSTEMS[system].scenes)
+    setting = scenes.scenario(name, changes)
     config = load_config(SYSTEMS[system], own_parameters(bag), {})[0]
     stated = {name: factor * getattr(config, name) for name in STATED.get(system, ())}
     tracker = SYSTEMS[system].build(evolve(config, **stated))
     for seed in seeds:
-        scene = scenes.simulate(scenes.scenario(name, changes), seed)
-        items = sorted(scene.measurements, key=lambda one: one.received_ns)
+        items = sorted(
+            scenes.simulate(setting, seed).measurements, key=lambda one: one.received_ns
+        )
+        measurements = [one.measurement for one in items]
+        if any(isinstance(one, SonarImage) for one in measurements):
+            measurements = detected(setting, measurements)
         tracker.reset()
         hysteresis, raised, active = Hysteresis(), 0, set()
-        for one in items:
-            tracker.process(misstated(one.measurement, factor))
+        for one in measurements:
+            tracker.process(misstated(one, factor))
             said = getattr(tracker, 'warnings', list)()
             found = hysteresis.settle([Finding(text[:20], WARN, text) for text in said])
             raised += len({one.key for one in found} - active)
             active = {one.key for one in found}
-        stamps = [one.measurement.stamp_ns for one in items]
+        stamps = [one.stamp_ns for one in measurements]
         yield (max(stamps) - min(stamps)) / 3.6e12, raised
 
 
@@ -139,7 +148,7 @@ def main() -> None:
         if not bag.is_dir() or (told.bags and bag.name not in told.bags):
             continue
         count = told.runs or RUNS.get(bag.name, USUAL_RUNS)
-        for factor in FACTORS:
+        for factor in (1.0,) if bag.name in MEASURED else FACTORS:
             name = f'{bag.name} {factor:g}'
             if name not in rows:
                 seeds = range(told.first_seed, told.first_seed + count)

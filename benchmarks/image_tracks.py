@@ -61,7 +61,7 @@ CASES: dict[str, dict[str, Any]] = {
 NUMBERS = ('range', 'bearing', 'offset')
 
 
-def detected(setting: ObstacleScenario, scene: Scene) -> list[Measurement]:
+def detected(setting: ObstacleScenario, given: list[Measurement]) -> list[Measurement]:
     """The measurements of a scene with detections in place of its images."""
     feeder = setting.told_feeder()
     detector = ImageDetector(
@@ -69,7 +69,6 @@ def detected(setting: ObstacleScenario, scene: Scene) -> list[Measurement]:
             beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']
         )
     )
-    given = [one.measurement for one in scene.measurements]
     found = [detector.process(one) if isinstance(one, SonarImage) else one for one in given]
     return [one for one in found if one is not None]
 
@@ -139,7 +138,7 @@ def main() -> None:
         rows: dict[float, list[dict[str, float]]] = {share: [] for share in options.centre}
         for seed in range(options.first, options.first + options.runs):
             scene = simulate(setting, seed)
-            measurements = detected(setting, scene)
+            measurements = detected(setting, [one.measurement for one in scene.measurements])
             for share, each in rows.items():
                 bodies.CENTRE = share
                 each.append(tracked(setting, scene, measurements))

@@ -91,7 +91,7 @@ def flip_quaternion(q: ArrayLike) -> FloatArray:
 
 
 def flip_pose(pose: Pose) -> Pose:
-    """A pose in NED and FRD given in ENU and FLU, and the other way round."""
+    """Oracle for tests: a pose in NED and FRD given in ENU and FLU, and the other way round."""
     return Pose(flip_world(pose.position), flip_rotation(pose.R))
 
 

@@ -36,6 +36,7 @@ from ..navigation import NavigationBuffer
 from . import avoidance_kernels
 from .avoidance_kernels import Safety
 from .config import ObstacleConfig
+from .ping_kernels import slope
 
 DRAWS = 256
 CLIMBING = 0.15
@@ -54,8 +55,7 @@ def course(buffer: NavigationBuffer, stamp_ns: int, window: float) -> FloatArray
         return np.full(3, np.nan)
     t = (np.array(stamps) - stamp_ns) * 1e-9
     positions = np.concatenate([one.position for one in buffer.samples[first:last]]).reshape(-1, 3)
-    t -= t.sum() / len(t)
-    return np.asarray(t @ (positions - positions[0]) / (t @ t))
+    return slope(t, positions)
 
 
 def closest_approach(

@@ -104,7 +104,7 @@ class DetectorConfig(Config):
         1e-6, 'that a cell of Rayleigh noise is taken for an echo', low=1e-15, high=0.1
     )
     threshold_margin_db: float = parameter(
-        1.5,
+        0.5,
         'that much higher, beside what the roughness of the sea floor asks for',
         unit='dB',
         low=0.0,

@@ -22,7 +22,7 @@ from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from .config import ObstacleConfig
-from .ping_kernels import turned_round
+from .ping_kernels import mounted, turned_round
 
 
 class Mount:
@@ -39,7 +39,7 @@ class Mount:
 
     def sonar(self, vehicle: Pose) -> Pose:
         """The sonar in NED and FRD, from a vehicle in ENU and FLU."""
-        return geometry.flip_pose(geometry.mounted(vehicle, self.lever, self.R))
+        return Pose(*mounted(*vehicle, self.lever, vehicle.R @ self.R))
 
     @staticmethod
     def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:

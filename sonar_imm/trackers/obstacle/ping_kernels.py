@@ -32,6 +32,40 @@ nothing."""
 
 
 @kernel
+def mounted(
+    position: FloatArray, R: FloatArray, lever: FloatArray, turned: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Position (3,) and rotation (3, 3), NED and FRD, of a sensor at `lever` (3,) of a vehicle at
+    `position`, turned by R, itself turned by `turned` (3, 3), all of these ENU and FLU
+    (`geometry.mounted`, `geometry.flip_pose`)."""
+    there, look = np.empty(3), np.empty((3, 3))
+    for a in range(3):
+        i, sign = (1 - a, 1.0) if a < 2 else (2, -1.0)
+        outward = R[i, 0] * lever[0] + R[i, 1] * lever[1] + R[i, 2] * lever[2]
+        there[a] = 0.0 + sign * (position[i] + outward)
+        for b in range(3):
+            look[a, b] = 0.0 + sign * turned[i, b]
+            if b > 0:
+                look[a, b] = -look[a, b]
+    return there, look
+
+
+@kernel
+def slope(t: FloatArray, positions: FloatArray) -> FloatArray:
+    """Slope (3,) of the straight line through positions (N, 3) at times t (N,), N > 1."""
+    N, middle, square, v = len(t), 0.0, 0.0, np.zeros(3)
+    for k in range(N):
+        middle += t[k]
+    middle /= N
+    for k in range(N):
+        since = t[k] - middle
+        square += since * since
+        for a in range(3):
+            v[a] += since * (positions[k, a] - positions[0, a])
+    return v / square
+
+
+@kernel
 def echoes(
     distance: FloatArray,
     bearing: FloatArray,

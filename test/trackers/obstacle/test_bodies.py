@@ -134,7 +134,8 @@ def image_run(setting, seed):
     """NEES of range, bearing and offset alone, of all together over 3, and coverage, of the track
     through the images of a scene."""
     scene = simulate(setting, seed)
-    row = tracked(setting, scene, detected(setting, scene))
+    given = [one.measurement for one in scene.measurements]
+    row = tracked(setting, scene, detected(setting, given))
     alone = [row[f'NEES {name}'] for name in ('range', 'bearing', 'offset')]
     return (*alone, row['NEES state'] / 3.0, row['cover'])
 
