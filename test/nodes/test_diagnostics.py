@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from helpers.rig import a_fix, FIX
 import numpy as np
 import pytest
+from rclpy.qos import DurabilityPolicy
 
 from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.base import TrackerNode
@@ -397,3 +398,6 @@ def test_health_waits_for_those_who_ask_later(make_bench, walker):
     late = bench.listen(DiagnosticStatus, '/walker/health', latched_qos())
     bench.spin_until(lambda: late)
     assert (late[0].name, late[0].message) == ('walker', 'receiving; tracking')
+    for topic in ('/walker/health', '/walker/processed'):
+        (offered,) = bench.peer.get_publishers_info_by_topic(topic)
+        assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL

@@ -20,6 +20,7 @@ import pytest
 
 from sonar_imm.measurements import Snapshot
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.trackers.bathymetry.ping import LoudBins
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 WIDE = {'staves': 2, 'spacing_wavelengths': 3.66, 'pings': 4, 'last_range': 57.0}
@@ -145,3 +146,10 @@ def test_a_ping_without_any_noise_is_answered(staves):
     for values in ({}, {'multipath': True}, {'multipath': True, 'noise_variance': 1e-30}):
         tracker = BathymetryTracker(BathymetryConfig(particles_per_model=10, **values))
         assert np.isfinite(tracker.process(ping)[0].state).all()
+
+
+def test_a_few_loud_bins_are_no_evidence():
+    tracker = BathymetryTracker(BathymetryConfig())
+    for count, said in ((150, 0), (49, 0), (1, 2)):  # 200 in all are enough
+        tracker._loud.append(LoudBins(count=count, silent=count, decorrelation=0.5))
+        assert len(tracker.warnings()) == said
