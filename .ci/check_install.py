@@ -27,7 +27,7 @@ import sys
 import threading
 import time
 
-START_LIMIT = 120.0  # an empty kernel cache makes the first start slow on a small machine
+START_LIMIT = 300.0  # an empty kernel cache makes the first start slow on a small machine
 STOP_LIMIT = 20.0
 
 
@@ -53,58 +53,68 @@ def main(prefix: Path) -> None:
         (prefix / 'lib' / 'sonar_imm' / 'fls_detector_node').is_file(),
         'fls_detector_node is installed',
     )
-    for system in SYSTEMS:
-        start_and_interrupt(prefix / 'lib' / 'sonar_imm' / f'{system}_node')
-
-
-def start_and_interrupt(executable: Path) -> None:
-    """Start the node, wait until it says it is ready, press Ctrl-C: it has to leave with 0."""
-    node = subprocess.Popen(
-        [executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    lines: queue.Queue[str] = queue.Queue()
-    reader = threading.Thread(target=forward, args=(node, lines), daemon=True)
-    reader.start()
-    said = wait_for('ready', lines, node, executable)
-    node.send_signal(signal.SIGINT)
+    nodes = [Started(prefix / 'lib' / 'sonar_imm' / f'{system}_node') for system in SYSTEMS]
     try:
-        status = node.wait(STOP_LIMIT)
-    except subprocess.TimeoutExpired:
-        node.kill()
-        raise SystemExit(
-            f'{executable.name} did not stop on SIGINT within {STOP_LIMIT} s'
-        ) from None
-    reader.join(STOP_LIMIT)
-    while not lines.empty():
-        said += lines.get()
-    expect(
-        status == 0 and 'Traceback' not in said, f'{executable.name} stops on SIGINT with {status}'
-    )
+        for node in nodes:
+            node.wait_for('ready')
+        for node in nodes:
+            node.interrupt()
+    finally:
+        for node in nodes:
+            node.kill()
 
 
-def forward(node: subprocess.Popen[str], lines: queue.Queue[str]) -> None:
-    for line in node.stdout:
-        lines.put(line)
+class Started:
+    """A node that was started, and what it says. All start at once, since each compiles its
+    kernels first."""
 
+    def __init__(self, executable: Path):
+        self._name, self._said = executable.name, ''
+        self._process = subprocess.Popen(
+            [executable], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._reader = threading.Thread(target=self._forward, daemon=True)
+        self._reader.start()
 
-def wait_for(
-    word: str, lines: queue.Queue[str], node: subprocess.Popen[str], executable: Path
-) -> str:
-    """Collect what the node says until a line holds `word`; fail when it does not come."""
-    said, end = '', time.monotonic() + START_LIMIT
-    while time.monotonic() < end:
+    def wait_for(self, word: str) -> None:
+        """Wait until a line holds `word`; fail when it does not come."""
+        end = time.monotonic() + START_LIMIT
+        while time.monotonic() < end:
+            try:
+                line = self._lines.get(timeout=0.5)
+            except queue.Empty:
+                if self._process.poll() is not None:
+                    break
+                continue
+            print(f'  {line}', end='')
+            self._said += line
+            if word in line:
+                return
+        raise SystemExit(f"{self._name} never said '{word}'")
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C: the node has to leave with 0."""
+        self._process.send_signal(signal.SIGINT)
         try:
-            line = lines.get(timeout=0.5)
-        except queue.Empty:
-            if node.poll() is not None:
-                break
-            continue
-        print(f'  {line}', end='')
-        said += line
-        if word in line:
-            return said
-    node.kill()
-    raise SystemExit(f"{executable.name} never said '{word}'")
+            status = self._process.wait(STOP_LIMIT)
+        except subprocess.TimeoutExpired:
+            raise SystemExit(
+                f'{self._name} did not stop on SIGINT within {STOP_LIMIT} s'
+            ) from None
+        self._reader.join(STOP_LIMIT)
+        while not self._lines.empty():
+            self._said += self._lines.get()
+        clean = status == 0 and 'Traceback' not in self._said
+        expect(clean, f'{self._name} stops on SIGINT with {status}')
+
+    def kill(self) -> None:
+        """Leave nothing behind."""
+        self._process.kill()
+
+    def _forward(self) -> None:
+        for line in self._process.stdout:
+            self._lines.put(line)
 
 
 def expect(fact: bool, what: str) -> None:

@@ -41,7 +41,6 @@ class Running:
 
     def __init__(self, systems: Iterable[str]):
         self._stack = contextlib.ExitStack()
-        self._domain = self._stack.enter_context(reserved_domain_id())
         self.nodes: dict[str, NodeProcess] = {}
         self._lockstep: dict[str, LockStep] = {}
         self._publishers: dict[tuple[str, str], Any] = {}
@@ -68,10 +67,10 @@ class Running:
         self._lockstep[system].step(self._publishers[system, one.topic], one.content)
 
     def start_again(self) -> None:
-        """Start all nodes anew, under the names of those that ended, and a new link: that of
-        before takes killed nodes for alive for a while."""
-        systems = [*self.nodes]
-        self._start(systems)
+        """Start all nodes anew, under the names of those that were killed, with a new link and in
+        another domain: that of before takes them for alive for a while, and Fast DDS 2.14 may spin
+        without end on the shared memory that they left there."""
+        self._start([*self.nodes])
 
     def stop(self) -> list[tuple[str, str]]:
         """End all nodes; gives what was wrong with that."""
@@ -80,8 +79,9 @@ class Running:
         return [why for node in self.nodes.values() for why in reason_unclean(node, 0)]
 
     def _start(self, systems: list[str]) -> None:
+        domain = self._stack.enter_context(reserved_domain_id())
         with local_discovery():
-            self._link = self._stack.enter_context(Link('rig', domain_id=self._domain))
+            self._link = self._stack.enter_context(Link('rig', domain_id=domain))
         for system in systems:
             for topic, cls in {m.topic: type(m.content) for m in CASES[system].messages()}.items():
                 self._publishers[system, topic] = self._link.node.create_publisher(
@@ -100,7 +100,7 @@ class Running:
             ]
             with local_discovery():
                 self.nodes[system] = self._stack.enter_context(
-                    NodeProcess(system, domain_id=self._domain, arguments=arguments)
+                    NodeProcess(system, domain_id=domain, arguments=arguments)
                 )
         for system in systems:
             step = LockStep(self._link, f'/{system}', trouble=self.nodes[system].trouble)
