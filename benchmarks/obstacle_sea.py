@@ -65,12 +65,14 @@ CALM = {
     if name not in ('vertical_offset', 'offset_spread')
 }
 FLOOR = {'altitude': 6.0}
-"""The sonar of the study is 0.3 m below the navigation reference, and the floor 5.7 m below it."""
+"""The sonar of the study is 0.3 m below the navigation reference, and the floor 5.7 m below it, in
+its recordings; its table does not say."""
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     'fixed': ('approach', {}),
     'fixed, roll 4 deg': ('rolling', {}),
     'swaying': ('swaying', {}),
     'swaying, roll 4 deg': ('swaying', {'roll_rms_deg': 4.0}),
+    'swaying, roll 4 deg, shallow': ('swaying', {'roll_rms_deg': 4.0, **FLOOR}),
     'swaying, calm': ('swaying', CALM),
     'smooth sway': ('swaying', {'obstacle_motion': 'swinging'}),
     'moving .3-1.5 m/s': ('mover', {}),
