@@ -81,8 +81,10 @@ def start(walker, domain):
 
 
 @pytest.fixture
-def stepping(bag, link):
-    """Make a player in lock-step with the walker, and the recorder of its estimates."""
+def stepping(bag, link, monkeypatch):
+    """Make a player in lock-step with the walker, and the recorder of its estimates. The walker
+    never hears the other topic of the bag, and nobody waits for that."""
+    monkeypatch.setattr(lockstep_module, '_OTHER_INPUTS', 0.0)
     with ExitStack() as stack:
 
         def stepping(**options):
@@ -183,6 +185,7 @@ def test_lockstep_waits_for_an_input_that_is_found_late(link, start, stepping, m
     would be taken for somebody else's."""
     start(*RELIABLE)
     player, _, step = stepping()
+    monkeypatch.setattr(lockstep_module, '_OTHER_INPUTS', 60.0)
     Ear(link, Float64, '/other')
     looks = []
 

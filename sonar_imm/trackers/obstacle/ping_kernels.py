@@ -14,6 +14,8 @@
 
 """What is done once in every ping, beside the filter, compiled: rows of detections in, rows of
 estimates out. Done with one array operation after another, it would take as long as the filter.
+
+`0.0 +` makes a plain zero of a minus zero, as the products with matrices in `geometry` do.
 """
 
 from __future__ import annotations
