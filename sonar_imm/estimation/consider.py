@@ -38,7 +38,7 @@ import math
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
-from .covariance import LIFT, LIMIT
+from .covariance import JITTER, LIMIT
 from .jit import kernel
 
 
@@ -90,7 +90,7 @@ def consider_scalar(
     if not (S > 0.0 and math.isfinite(S)):
         return -math.inf
     if not R > LIMIT * S:  # the rule of `covariance` for values that are too good
-        S += LIFT * S
+        S += JITTER * S
     for a in range(n):
         if estimated[a]:
             x[a] += PHt[a] * innovation / S

@@ -27,12 +27,12 @@ the limit is passed they repair, and tell, so that callers can count:
 
 1. The step is computed again in square-root form, from ``P = L L'``. The result is a sum of
    squares whose rounding is small beside its *own* diagonal, however small that has become.
-2. The diagonal is lifted by the share `LIFT`, more if need be. Nothing is thereby claimed to be
+2. The diagonal is lifted by the share `JITTER`, more if need be. Nothing is thereby claimed to be
    known better than before.
 
 The innovation covariance ``S = H P H' + R`` obeys the same limit, and no measured value has less
-than `LIMIT` of it as its own noise: there R is lifted by `LIFT` of S's diagonal, so that a perfect
-measurement leaves a variance, and can be repeated.
+than `LIMIT` of it as its own noise: there R is raised by `JITTER` of S's diagonal, so that a
+perfect measurement leaves a variance, and can be repeated.
 
 `small_matrices` compiles the same rules. Reference: Bierman, *Factorization Methods for Discrete
 Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation* (2000), ch. 12.
@@ -51,7 +51,7 @@ LIMIT = 1e-14
 n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a sound covariance has a
 factor."""
 
-LIFT = 1e-13
+JITTER = 1e-13
 """What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
 
 
@@ -100,7 +100,7 @@ def solve(matrix: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(matrix, stack), dtype=np.float64)
 
 
-def sound(P: FloatArray) -> BoolArray:
+def is_psd(P: FloatArray) -> BoolArray:
     """Whether each P (..., n, n) keeps to the limit, (...,). False where it is not finite."""
     n = P.shape[-1]
     root = np.zeros_like(P)
@@ -120,18 +120,18 @@ def sound(P: FloatArray) -> BoolArray:
     return np.asarray(good)
 
 
-def lift(P: FloatArray) -> tuple[FloatArray, BoolArray]:
+def add_jitter(P: FloatArray) -> tuple[FloatArray, BoolArray]:
     """`P` (..., n, n) with the diagonals of those lifted that are not sound, and which (...,).
 
     What no lift makes sound, because it is no covariance at all, stays as it is.
     """
-    bad = ~sound(P)
+    bad = ~is_psd(P)
     lifted = np.array(P)
     own = np.where(np.eye(P.shape[-1], dtype=bool), P, 0.0)
-    left, share = bad.copy(), LIFT
+    left, share = bad.copy(), JITTER
     while left.any() and share < 2.0 * P.shape[-1]:
         lifted[left] = P[left] + share * own[left]
-        left &= ~sound(lifted)
+        left &= ~is_psd(lifted)
         share *= 10.0
     lifted[left] = P[left]
     return lifted, bad
@@ -151,11 +151,11 @@ def semidefinite_root(P: FloatArray) -> FloatArray:
 def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, BoolArray]:
     """``F P F' + Q`` (..., n, n), and which had to be repaired (...,)."""
     moved = symmetrise(F @ P @ transpose(F) + Q)
-    bad = np.asarray(~sound(moved) & np.isfinite(moved).all(axis=(-1, -2)))
+    bad = np.asarray(~is_psd(moved) & np.isfinite(moved).all(axis=(-1, -2)))
     if bad.any():
         F, P, Q = (np.broadcast_to(each, moved.shape)[bad] for each in (F, P, Q))
         root = F @ semidefinite_root(P)
-        moved[bad] = lift(symmetrise(root @ transpose(root) + Q))[0]
+        moved[bad] = add_jitter(symmetrise(root @ transpose(root) + Q))[0]
     return moved, bad
 
 
@@ -166,12 +166,12 @@ def correct(P: FloatArray, H: FloatArray, R: FloatArray) -> Corrected:
     """
     cross = H @ P
     S = symmetrise(cross @ transpose(H) + R)
-    trusted = sound(S) & (_diagonal(R) > LIMIT * _diagonal(S)).all(axis=-1)
+    trusted = is_psd(S) & (_diagonal(R) > LIMIT * _diagonal(S)).all(axis=-1)
     factor = np.linalg.cholesky(np.where(trusted[..., None, None], S, np.eye(S.shape[-1])))
     gain = transpose(solve(transpose(factor), solve(factor, cross)))
     kept = np.eye(P.shape[-1]) - gain @ H
     updated = symmetrise(kept @ P @ transpose(kept) + gain @ R @ transpose(gain))
-    bad = np.asarray(~(trusted & sound(updated)))
+    bad = np.asarray(~(trusted & is_psd(updated)))
     usable = np.ones(bad.shape, bool)
     if bad.any():
         shapes = (updated.shape, (*bad.shape, *H.shape[-2:]), S.shape)
@@ -197,14 +197,14 @@ def _correct_root(
     seen = safe[1] @ root
     own = np.square(seen).sum(axis=-1) + np.square(noise).sum(axis=-1)
     usable = finite & (own > 0.0).all(axis=-1)
-    floor = np.where(_diagonal(safe[2]) > LIMIT * own, 0.0, LIFT * own)
+    floor = np.where(_diagonal(safe[2]) > LIMIT * own, 0.0, JITTER * own)
     after = _triangular(noise, seen, root, floor)
     singular = (np.square(_diagonal(after)[:, :m]) <= LIMIT * own).any(axis=1)
     if singular.any():
-        after = _triangular(noise, seen, root, np.where(singular[:, None], LIFT * own, floor))
+        after = _triangular(noise, seen, root, np.where(singular[:, None], JITTER * own, floor))
     factor = np.where(usable[:, None, None], after[:, :m, :m], np.eye(m))
     gain = transpose(solve(transpose(factor), transpose(after[:, m:, :m])))
-    updated, _ = lift(symmetrise(after[:, m:, m:] @ transpose(after[:, m:, m:])))
+    updated, _ = add_jitter(symmetrise(after[:, m:, m:] @ transpose(after[:, m:, m:])))
     return (
         np.where(usable[:, None, None], updated, P),
         np.where(usable[:, None, None], gain, 0.0),

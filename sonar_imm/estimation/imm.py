@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import BoolArray, FloatArray
-from .covariance import correct, lift, propagate, sound, symmetrise
+from .covariance import add_jitter, correct, is_psd, propagate, symmetrise
 from .kalman import log_density
 
 DEAD = 1e-200
@@ -186,7 +186,7 @@ def gate(
     sensor that is accurate in one direction, and loses the track there.
     """
     possible = c >= MIN_GATE_PROBABILITY
-    S, _ = lift((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
+    S, _ = add_jitter((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
     v = z[None, :, None] - h[:, None]
     nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
     log_density = -0.5 * (nis + h.shape[-1] * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1])
@@ -236,6 +236,6 @@ def _mixture_nis(c: FloatArray, innovation: FloatArray, S: FloatArray) -> FloatA
     mean = np.einsum('tj,tjm->tm', c, innovation)
     spread = innovation - mean[:, None, :]
     total = np.einsum('tj,tjmk->tmk', c, S) + np.einsum('tj,tjm,tjk->tmk', c, spread, spread)
-    total, _ = lift(symmetrise(total))
-    total = np.where(sound(total)[:, None, None], total, np.nan)
+    total, _ = add_jitter(symmetrise(total))
+    total = np.where(is_psd(total)[:, None, None], total, np.nan)
     return np.asarray(np.einsum('tm,tm->t', mean, np.linalg.solve(total, mean[..., None])[..., 0]))

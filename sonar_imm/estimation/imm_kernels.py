@@ -31,14 +31,14 @@ from .covariance import LIMIT
 from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import (
-    careful_predict,
-    careful_update,
     cholesky,
     cholesky_lifted,
     gain,
     innovation_covariance,
+    is_psd,
     joseph,
-    sound,
+    square_root_predict,
+    square_root_update,
     whitened_square,
 )
 
@@ -100,7 +100,7 @@ def mix(
                 if not total[a, a, j] <= most * P0[t, j, a, a]:
                     positive = P0[t, j, a, a] > 0.0
                     most = total[a, a, j] / P0[t, j, a, a] if positive else np.inf
-            if not (most <= CANCELLED or (most <= MOST_CANCELLED and sound(P0[t, j], L))):
+            if not (most <= CANCELLED or (most <= MOST_CANCELLED and is_psd(P0[t, j], L))):
                 _mix_directly(x[t], P[t], W[:, j], mu[t], reach[j], x0[t, j], P0[t, j])
     return x0, P0, c
 
@@ -153,8 +153,8 @@ def predict(
                         value += FP[a, k] * F[j, b, k]
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
-            if not sound(P1[t, j], L) and np.isfinite(P1[t, j]).all():
-                careful_predict(P[t, j], F[j], Q[j], P1[t, j])
+            if not is_psd(P1[t, j], L) and np.isfinite(P1[t, j]).all():
+                square_root_predict(P[t, j], F[j], Q[j], P1[t, j])
                 repaired[t, j] = True
     return x1, P1, repaired
 
@@ -205,9 +205,9 @@ def update(
             if trusted:
                 gain(PHt, L, K)
                 joseph(P_j, K, H_j, R_t, A, AP, KR, P1_j)
-                trusted = sound(P1_j, root)
+                trusted = is_psd(P1_j, root)
             if not trusted:
-                if not careful_update(P_j, H_j, R_t, L, K, P1_j):
+                if not square_root_update(P_j, H_j, R_t, L, K, P1_j):
                     for a in range(n):
                         for b in range(n):
                             P1_j[a, b] = P_j[a, b]

@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
-from .covariance import lift
+from .covariance import add_jitter
 
 MOST_EVENTS = 20_000
 """Joint events of a cluster beyond which its gate shrinks."""
@@ -84,7 +84,7 @@ def likelihoods(
     h (T, M, m): what the models expect; H (T or 1, M, m, n); P (T, M, n, n) and c (T, M),
     predicted.
     """
-    S, _ = lift((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
+    S, _ = add_jitter((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
     v = z[None, :, None] - h[:, None]
     nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
     m = h.shape[-1]

@@ -27,11 +27,11 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jipda import LEAST_GATE, MOST_EVENTS, OPENS_GATE, SMALLER
 from .jit import kernel
 from .small_matrices import (
+    add_jitter,
     cholesky_lifted,
     gain,
     innovation_covariance,
     joseph,
-    lift,
     whitened_square,
 )
 
@@ -314,7 +314,7 @@ def update(
                             )
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
-            if lift(P1[t, j], root):
+            if add_jitter(P1[t, j], root):
                 repairs += 1
         for j in range(M):
             mu[t, j] /= total

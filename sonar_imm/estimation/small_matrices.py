@@ -16,8 +16,8 @@
 
 For matrices of a few rows the call of a library costs more than the arithmetic. Every function
 writes into arrays the caller owns, so that nothing is allocated in a loop over models and targets;
-only the repairs, which are rare, allocate. `sound`, `lift` and the ``careful_`` functions are the
-rules of `covariance`, which explains them.
+only the repairs, which are rare, allocate. `is_psd`, `add_jitter` and the ``square_root_`` functions
+are the rules of `covariance`, which explains them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import math
 import numpy as np
 
 from .arrays import FloatArray
-from .covariance import LIFT, LIMIT
+from .covariance import JITTER, LIMIT
 from .jit import kernel
 
 
@@ -51,8 +51,8 @@ def cholesky(S: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
-def sound(P: FloatArray, L: FloatArray) -> bool:
-    """`covariance.sound` of one P (n, n); L (n, n) is scratch."""
+def is_psd(P: FloatArray, L: FloatArray) -> bool:
+    """`covariance.is_psd` of one P (n, n); L (n, n) is scratch."""
     # L D L' without square roots: L below the diagonal, L D above it, 1 / D on it.
     n = P.shape[0]
     for a in range(n):
@@ -76,19 +76,19 @@ def sound(P: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
-def lift(P: FloatArray, L: FloatArray) -> bool:
-    """`covariance.lift` of one P (n, n), in place; whether it was needed. L (n, n) is scratch."""
-    if sound(P, L):
+def add_jitter(P: FloatArray, L: FloatArray) -> bool:
+    """`covariance.add_jitter` of one P (n, n), in place; whether it was needed. L (n, n): scratch."""
+    if is_psd(P, L):
         return False
     n = P.shape[0]
     own = np.empty(n)
     for a in range(n):
         own[a] = P[a, a]
-    share = LIFT
+    share = JITTER
     while share < 2.0 * n:
         for a in range(n):
             P[a, a] = own[a] + share * own[a]
-        if sound(P, L):
+        if is_psd(P, L):
             return True
         share *= 10.0
     for a in range(n):
@@ -98,12 +98,12 @@ def lift(P: FloatArray, L: FloatArray) -> bool:
 
 @kernel
 def lift_all(P: FloatArray) -> int:
-    """`lift` each of P (M, n, n) in place that is finite: how many needed it."""
+    """`add_jitter` each of P (M, n, n) in place that is finite: how many needed it."""
     L = np.empty(P.shape[1:])
     repairs = 0
     for j in range(len(P)):
-        if not sound(P[j], L) and np.isfinite(P[j]).all():
-            lift(P[j], L)
+        if not is_psd(P[j], L) and np.isfinite(P[j]).all():
+            add_jitter(P[j], L)
             repairs += 1
     return repairs
 
@@ -111,7 +111,7 @@ def lift_all(P: FloatArray) -> int:
 @kernel
 def cholesky_lifted(S: FloatArray, L: FloatArray) -> bool:
     """`cholesky`, after lifting the diagonal of S in place until there is a factor."""
-    share = LIFT
+    share = JITTER
     while not cholesky(S, L):
         if not share < 2.0 * len(S):
             return False
@@ -173,7 +173,7 @@ def triangularise(A: FloatArray) -> None:
 
 
 @kernel
-def careful_predict(P: FloatArray, F: FloatArray, Q: FloatArray, out: FloatArray) -> None:
+def square_root_predict(P: FloatArray, F: FloatArray, Q: FloatArray, out: FloatArray) -> None:
     """F P F^T + Q into `out` by a root of P, sound (`covariance.propagate`)."""
     n = P.shape[0]
     L, FL = np.zeros((n, n)), np.empty((n, n))
@@ -191,11 +191,11 @@ def careful_predict(P: FloatArray, F: FloatArray, Q: FloatArray, out: FloatArray
                 value += FL[a, k] * FL[b, k]
             out[a, b] = value + 0.5 * (Q[a, b] + Q[b, a])
             out[b, a] = out[a, b]
-    lift(out, L)
+    add_jitter(out, L)
 
 
 @kernel
-def careful_update(
+def square_root_update(
     P: FloatArray,
     H: FloatArray,
     R: FloatArray,
@@ -240,7 +240,7 @@ def careful_update(
         A[m:, m : m + n] = root
         for r in range(m):
             if attempt == 1 or not R[r, r] > LIMIT * own[r]:
-                A[r, m + n + r] = math.sqrt(LIFT * own[r])
+                A[r, m + n + r] = math.sqrt(JITTER * own[r])
         triangularise(A)
         clear = True
         for r in range(m):
@@ -262,7 +262,7 @@ def careful_update(
                 value += A[m + a, m + k] * A[m + b, m + k]
             out[a, b] = value
             out[b, a] = value
-    lift(out, root)
+    add_jitter(out, root)
     return True
 
 

@@ -57,7 +57,7 @@ import numpy as np
 
 from . import imm
 from .arrays import BoolArray, FloatArray
-from .covariance import lift, symmetrise, transpose
+from .covariance import add_jitter, symmetrise, transpose
 from .kalman import apply
 from .unscented import sigma_offsets
 
@@ -99,7 +99,7 @@ def rts_smooth(
             smoothed_x[k + 1] - predicted,
             smoothed_P[k + 1],
         )
-        smoothed_P[k], _ = lift(drawn_P)
+        smoothed_P[k], _ = add_jitter(drawn_P)
     return smoothed_x, smoothed_P
 
 
@@ -163,7 +163,7 @@ def _imm_step(
     smoothed_P = np.einsum('ij,ijab->iab', weights, branch_P) + np.einsum(
         'ij,ija,ijb->iab', weights, spread, spread
     )
-    smoothed_P, repaired = lift(symmetrise(np.where(possible[:, None, None], smoothed_P, P)))
+    smoothed_P, repaired = add_jitter(symmetrise(np.where(possible[:, None, None], smoothed_P, P)))
     return IMMSmoothed(
         np.where(possible[:, None], smoothed_x, x),
         smoothed_P,

@@ -45,7 +45,7 @@ import numpy as np
 
 from .angles import wrap_angle
 from .arrays import BoolArray, FloatArray
-from .covariance import CovarianceError, lift, solve, symmetrise, transpose
+from .covariance import add_jitter, CovarianceError, solve, symmetrise, transpose
 from .kalman import apply, factorise, log_density, Predicted, Updated
 
 Function = Callable[[FloatArray], FloatArray]
@@ -113,7 +113,7 @@ def predict(
 ) -> Predicted:
     """Time update ``x <- f(x) + w``, ``w ~ N(0, Q)``; `angles` (n,) marks angles of the state."""
     moved = unscented_transform(f, x, P, angles=angles)
-    return Predicted(moved.mean, *lift(symmetrise(moved.covariance + Q)))
+    return Predicted(moved.mean, *add_jitter(symmetrise(moved.covariance + Q)))
 
 
 def update(
@@ -137,14 +137,14 @@ def update(
     """
     cloud = _transform(h, x, P, angles)
     weighted = cloud.after * cloud.weights[:, None]
-    S, singular = lift(symmetrise(transpose(weighted) @ cloud.after + R))
+    S, singular = add_jitter(symmetrise(transpose(weighted) @ cloud.after + R))
     factor = factorise(S, 'innovation covariance')
     cross = transpose(weighted) @ cloud.before
     gain = transpose(solve(transpose(factor), solve(factor, cross)))
     innovation = _wrap(z - cloud.mean, angles)
     rest = cloud.before - cloud.after @ transpose(gain)
     covariance = transpose(rest * cloud.weights[:, None]) @ rest + gain @ R @ transpose(gain)
-    covariance, repaired = lift(symmetrise(covariance))
+    covariance, repaired = add_jitter(symmetrise(covariance))
     nis, log_likelihood = log_density(innovation, factor)
     return Updated(
         _wrap(x + apply(gain, innovation), state_angles),

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation import imm, imm_kernels, kalman, small_matrices
-from sonar_imm.estimation.covariance import correct, LIFT, lift, LIMIT, propagate, sound
+from sonar_imm.estimation.covariance import add_jitter, correct, is_psd, JITTER, LIMIT, propagate
 from sonar_imm.trackers.obstacle import kernels as obstacle_kernels
 
 ROUNDING = 1e-14
@@ -56,7 +56,9 @@ def ill_conditioned(rng, count, n, m):
         root[thin, :, 0] *= 10.0 ** rng.uniform(-9, 0, (thin.sum(), 1))
         P = root @ np.swapaxes(root, -1, -2)
         scale = 10.0 ** rng.uniform(-3, 3, (count, size))
-        return lift(0.5 * (P + np.swapaxes(P, -1, -2)) * scale[:, :, None] * scale[:, None])[0]
+        return add_jitter(0.5 * (P + np.swapaxes(P, -1, -2)) * scale[:, :, None] * scale[:, None])[
+            0
+        ]
 
     P, Q = covariance(n, -12, 12), covariance(n, -20, 2)
     Q[rng.random(count) < 0.3] = 0.0
@@ -129,7 +131,7 @@ def test_a_measurement_much_better_than_the_state(engine):
         claimed = [Fraction(value) for value in P[0, 0].ravel()]
         h0, h1 = (Fraction(float(value)) for value in h)
         along = h0 * h0 * claimed[0] + 2 * h0 * h1 * claimed[1] + h1 * h1 * claimed[3]
-        assert Fraction(1, 10**6) / k <= along <= Fraction(20 * LIFT) * 10**12
+        assert Fraction(1, 10**6) / k <= along <= Fraction(20 * JITTER) * 10**12
         across = np.array([1.0, -1.0]) @ P[0, 0] @ np.array([1.0, -1.0])
         assert across == pytest.approx(2e12, rel=1e-6)
 
@@ -146,7 +148,7 @@ def test_an_update_is_as_good_as_the_limit_says(n, seed):
     assert got.usable
     scale = np.sqrt(np.diagonal(P))
     error = np.abs(got.P - exact) / np.outer(scale, scale)
-    assert error.max() <= 10.0 * LIFT + 1e-14 / max(float(least_eigenvalue(P)), LIMIT)
+    assert error.max() <= 10.0 * JITTER + 1e-14 / max(float(least_eigenvalue(P)), LIMIT)
 
 
 @pytest.mark.parametrize('engine', [imm, imm_kernels])
@@ -198,31 +200,31 @@ def test_ordinary_covariances_keep_their_bits():
     P = 0.5 * (P + np.swapaxes(P, -1, -2))
     P[0] = np.diag([1.0, 0.0, 2.0, 3.0])  # nothing to lift where there is no variance
     P[1] = 0.0
-    lifted, repaired = lift(P)
+    lifted, repaired = add_jitter(P)
     np.testing.assert_array_equal(lifted, P)
     assert not repaired.any()
     L = np.empty((4, 4))
-    assert not any(small_matrices.lift(one, L) for one in lifted)
+    assert not any(small_matrices.add_jitter(one, L) for one in lifted)
 
 
 def test_a_lift_adds_no_more_than_it_must():
     hurt = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])
-    lifted, repaired = lift(np.stack([np.eye(2), hurt, 1e9 * hurt]))
+    lifted, repaired = add_jitter(np.stack([np.eye(2), hurt, 1e9 * hurt]))
     np.testing.assert_array_equal(repaired, [False, True, True])
     np.testing.assert_array_equal(lifted[0], np.eye(2))
     assert (np.diagonal(lifted[1]) <= 1.0 + 1e-7).all() and is_covariance(lifted)
     compiled = hurt.copy()
-    assert small_matrices.lift(compiled, np.empty((2, 2)))
+    assert small_matrices.add_jitter(compiled, np.empty((2, 2)))
     np.testing.assert_allclose(compiled, lifted[1], rtol=1e-15)
 
 
 @pytest.mark.parametrize('bad', [np.diag([-0.1, 1.0]), np.full((2, 2), np.inf), -np.eye(2)])
 def test_what_is_no_covariance_is_left_for_the_caller_to_see(bad):
-    lifted, repaired = lift(bad)
-    assert repaired and not sound(lifted)
+    lifted, repaired = add_jitter(bad)
+    assert repaired and not is_psd(lifted)
     np.testing.assert_array_equal(lifted, bad)
     compiled = bad.copy()
-    assert small_matrices.lift(compiled, np.empty((2, 2)))
+    assert small_matrices.add_jitter(compiled, np.empty((2, 2)))
     np.testing.assert_array_equal(compiled, bad)
 
 
@@ -253,7 +255,7 @@ def test_a_diver_seen_far_better_than_known_keeps_a_covariance(ratio):
             np.zeros((1, 1, 4)), P, np.ones((1, 1)), np.ones((1, 1, 2)) * 1e-9, H, R
         )
         assert is_covariance(out[1])
-        floor = 3.0 * LIFT * P[0, 0, 0, 0]
+        floor = 3.0 * JITTER * P[0, 0, 0, 0]
         np.testing.assert_allclose(out[1][0, 0, :2, :2], R[0], rtol=1e-4, atol=floor)
 
 
@@ -265,7 +267,7 @@ def test_the_obstacle_update_stays_positive_definite():
     h, z = np.zeros((500, 4, 2)), np.zeros((500, 2))
     repairs = 0
     for _ in range(5):
-        x, P, mu, _, repaired = obstacle_kernels.soft_update(x, P, mu, h, z, R, 0.05, 1e-3)
+        x, P, mu, _, repaired = obstacle_kernels.jipda_update(x, P, mu, h, z, R, 0.05, 1e-3)
         assert is_covariance(P)
         assert np.isfinite(x).all() and (mu >= 0.0).all()
         np.testing.assert_allclose(mu.sum(axis=1), 1.0, rtol=1e-12)

@@ -56,7 +56,7 @@ def test_roots_and_soundness_are_those_of_single_matrices(n):
         close = np.abs(mine @ mine.T - one @ one.T) <= 1e-13 * np.outer(size, size)
         assert close.all() or not np.isfinite(P[k]).all(), k
     unsound(S, L, scratch, bad)
-    alone = [not small_matrices.sound(P[k], np.zeros((n, n))) for k in range(lanes)]
+    alone = [not small_matrices.is_psd(P[k], np.zeros((n, n))) for k in range(lanes)]
     assert bad.tolist() == [int(one) for one in alone]
     assert {0, 1} == set(bad.tolist())
 

@@ -31,7 +31,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.jit import kernel
 from ...estimation.lanes import lanes_for, roots, turn_of, unsound
-from ...estimation.small_matrices import lift
+from ...estimation.small_matrices import add_jitter
 from .kernels import KAPPA
 from .sigma_kernels import beside, echoes, fan, PLACES, places, product, turned, weighted
 
@@ -205,7 +205,7 @@ def advance(
                 for b in range(a + 1):
                     P1[t, j, a, b] = P1[t, j, b, a] = work.S[a, b, k]
             if bad[k]:
-                repaired[t, j] = lift(P1[t, j, :n, :n], scratch[:n, :n])
+                repaired[t, j] = add_jitter(P1[t, j, :n, :n], scratch[:n, :n])
     for t in range(T):
         best = np.argmax(mu[t])
         for j in range(C):

@@ -191,7 +191,7 @@ class DepthSlices:
         """After detections z (T, 2), R (T, 2, 2), of which `h` was expected; NIS (T,), and how
         many covariances had to be repaired."""
         outlier = self.config.outlier_probability
-        *after, nis, repaired = kernels.soft_update(
+        *after, nis, repaired = kernels.jipda_update(
             *mixture, h, z, R, outlier, self.outlier_density
         )
         return Mixture(*after), nis, int(np.count_nonzero(repaired))

@@ -33,7 +33,7 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.covariance import LIMIT
 from ...estimation.elementary import gaussians
 from ...estimation.jit import kernel
-from ...estimation.small_matrices import careful_update, lift, sound, whitened_square
+from ...estimation.small_matrices import add_jitter, is_psd, square_root_update, whitened_square
 
 KAPPA = 1.0
 NEGLIGIBLE = 1e-12
@@ -147,7 +147,7 @@ def matched(x: FloatArray, P: FloatArray, mu: FloatArray, n: int) -> tuple[Float
 
 
 @kernel
-def soft_update(
+def jipda_update(
     x: FloatArray,
     P: FloatArray,
     mu: FloatArray,
@@ -212,10 +212,10 @@ def soft_update(
                     P1[t, j, b, a] = value
             trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
             trusted = trusted and determinant > LIMIT * s00 * s11
-            if not (trusted and sound(P1[t, j], L)):
+            if not (trusted and is_psd(P1[t, j], L)):
                 repaired[t, j] = True
                 v[0], v[1] = r0, r1
-                likelihood = _careful_soft_update(
+                likelihood = _square_root_jipda_update(
                     x[t, j], P[t, j], v, R[t], outlier_probability, outlier, x1[t, j], P1[t, j]
                 )
             mu1[t, j] = mu[t, j] * likelihood
@@ -226,7 +226,7 @@ def soft_update(
 
 
 @kernel
-def _careful_soft_update(
+def _square_root_jipda_update(
     x: FloatArray,
     P: FloatArray,
     v: FloatArray,
@@ -236,13 +236,13 @@ def _careful_soft_update(
     x1: FloatArray,
     P1: FloatArray,
 ) -> float:
-    """`soft_update` of one component with innovation v (2,) in square-root form, into x1 and P1;
+    """`jipda_update` of one component with innovation v (2,) in square-root form, into x1 and P1;
     its likelihood. What cannot be used, because it is not finite, leaves x and P as they are."""
     n = len(x)
     L, K, H, w = np.zeros((2, 2)), np.empty((n, 2)), np.eye(2, n), np.empty(2)
     x1[:], P1[:] = x, P
     updated = np.empty((n, n))
-    if not careful_update(P, H, R, L, K, updated):
+    if not square_root_update(P, H, R, L, K, updated):
         return outlier
     own = (1.0 - outlier_probability) * math.exp(-0.5 * whitened_square(L, v, w))
     own /= 2.0 * math.pi * L[0, 0] * L[1, 1]
@@ -255,7 +255,7 @@ def _careful_soft_update(
             spread = beta * (1.0 - beta) * w[0] * w[1]
             P1[a, b] = (1.0 - beta) * P[a, b] + beta * updated[a, b] + spread
             P1[b, a] = P1[a, b]
-    lift(P1, updated)
+    add_jitter(P1, updated)
     return own + outlier
 
 

@@ -18,7 +18,7 @@ go on, and repairs are counted where people look."""
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.covariance import sound
+from sonar_imm.estimation.covariance import is_psd
 from sonar_imm.measurements import Arrivals, Fix
 from sonar_imm.simulation.diver.simulator import RECEIVERS
 from sonar_imm.trackers.diver.config import MODEL_SETS
@@ -69,7 +69,7 @@ def test_covariances_stay_positive_definite(model_set):
                 assert np.isfinite(estimate.state).all()
                 assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
                 np.testing.assert_allclose(estimate.probabilities.sum(axis=1), 1.0, rtol=1e-12)
-            assert sound(tracker._stream.state.P).all()
+            assert is_psd(tracker._stream.state.P).all()
         health = tracker.health()
         assert health['broken_tracks'] == 0
         repairs += health['covariance_repairs']
@@ -137,5 +137,5 @@ def test_covariances_stay_sound_after_sharp_pings(parameters, passive):
             for estimate in tracker.process(ping):
                 assert np.isfinite(estimate.state).all()
                 assert (least_eigenvalue(estimate.covariance) > -1e-14).all()
-            assert sound(tracker._stream.state.P).all()
+            assert is_psd(tracker._stream.state.P).all()
         assert tracker.health()['broken_tracks'] == 0

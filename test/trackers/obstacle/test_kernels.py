@@ -144,7 +144,7 @@ def test_soft_update_equals_two_cases_put_together():
     z = x[:, 0, :2] + rng.normal(size=(3, 2)) * [0.3, 0.005]
     R = np.tile(np.diag([0.025, 2.5e-5]), (3, 1, 1))
     h = np.ascontiguousarray(x[..., :2])
-    after, covariance, weight, *_ = kernels.soft_update(x, P, mu, h, z, R, 0.1, 0.5)
+    after, covariance, weight, *_ = kernels.jipda_update(x, P, mu, h, z, R, 0.1, 0.5)
     H = np.eye(2, 4)
     for t in range(3):
         likelihood = np.empty(4)
@@ -169,7 +169,7 @@ def test_soft_update_equals_two_cases_put_together():
 def test_an_update_that_no_component_explains_keeps_the_weights():
     x, P = np.zeros((1, 2, 4)), np.tile(np.eye(4) * 1e-6, (1, 2, 1, 1))
     mu, z = np.array([[0.3, 0.7]]), np.full((1, 2), 1e3)
-    *_, weight, nis, _ = kernels.soft_update(
+    *_, weight, nis, _ = kernels.jipda_update(
         x, P, mu, x[..., :2].copy(), z, np.eye(2)[None] * 1e-6, 0.0, 1.0
     )
     assert_allclose(weight, mu)
