@@ -16,8 +16,8 @@
 
 For matrices of a few rows the call of a library costs more than the arithmetic. Every function
 writes into arrays the caller owns, so that nothing is allocated in a loop over models and targets;
-only the repairs, which are rare, allocate. `is_psd`, `add_jitter` and the ``square_root_`` functions
-are the rules of `covariance`, which explains them.
+only the repairs, which are rare, allocate. `is_psd`, `add_jitter` and the ``square_root_``
+functions are the rules of `covariance`, which explains them.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def is_psd(P: FloatArray, L: FloatArray) -> bool:
 
 @kernel
 def add_jitter(P: FloatArray, L: FloatArray) -> bool:
-    """`covariance.add_jitter` of one P (n, n), in place; whether it was needed. L (n, n): scratch."""
+    """`covariance.add_jitter` of one P (n, n), in place; whether it was needed. L: scratch."""
     if is_psd(P, L):
         return False
     n = P.shape[0]
