@@ -25,12 +25,7 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import write_estimate
-from sonar_imm.cli.common import load_config
 from sonar_imm.measurements import Rejection
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.own_parameters import own_parameters
-from sonar_imm.recordings.reader import BagReader
 from sonar_imm.trackers import state_file, SYSTEMS
 from sonar_imm.trackers.state_file import (
     json_parameters,
@@ -40,6 +35,11 @@ from sonar_imm.trackers.state_file import (
     write_state,
 )
 from sonar_imm.trackers.state_values import freeze, frozen_state, put, restore, StateError
+from sonar_imm_tools.cli.common import load_config
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.reader import BagReader
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
 RUNS = {

@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers.fathometer import array_depths
 from sonar_imm.trackers.fathometer.array_depths import ToldDepths
 from sonar_imm.trackers.fathometer.array_response import array_response
 from sonar_imm.trackers.fathometer.response import lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SMALL = {**scenario('small').told(), 'particles': 2000}
 

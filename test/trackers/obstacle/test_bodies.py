@@ -23,11 +23,11 @@ import pytest
 from benchmarks.image_tracks import detected, tracked
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
 from sonar_imm.trackers.obstacle.bodies import Bodies, CENTRE, considered
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar, View
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 OWN = np.array([0.15, 0.004]) ** 2
 Z = np.array([[40.0, 0.1]])
