@@ -217,7 +217,7 @@ def _mark_patches(figure: go.Figure, profile: Profile) -> None:
 
 def _mark_silence(figure: go.Figure, profile: Profile) -> None:
     """Ticks at the bottom where there was no echo."""
-    silent = profile.range[~profile.heard]
+    silent = profile.range[~profile.valid]
     if len(silent):
         silent = silent[thin(len(silent), MOST_BINS)]
         figure.add_scattergl(

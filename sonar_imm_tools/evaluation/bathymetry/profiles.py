@@ -25,6 +25,12 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import BoolArray, FloatArray
 from sonar_imm.soundings import SIDES
 
+from ..columns import read_columns
+
+_BINS = (
+    'range', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
+)  # fmt: skip
+_TRUE = ('range', 'height?', 'angle?', 'patch?', 'valid?')
 FAR = 0.55
 """Share of a bin by which the range of the true floor may differ from that of the estimate: half a
 bin, and a margin for single precision."""
@@ -44,7 +50,7 @@ class TrueFloor:
 @frozen(eq=False)
 class Profile:
     """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
-    probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown;
+    probabilities (n, M) of the models; valid: bins with an echo; truth: None where unknown;
     side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
     the estimate itself says it, as those of a bank do."""
 
@@ -54,7 +60,7 @@ class Profile:
     height_std: FloatArray
     angle: FloatArray
     angle_std: FloatArray
-    heard: BoolArray
+    valid: BoolArray
     probabilities: FloatArray
     truth: TrueFloor | None
     side: str = ''
@@ -80,8 +86,9 @@ class Swath:
 
 def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None) -> Swath:
     """The estimates of a run, each with the truth of the same stamp and side."""
-    known = {(one.stamp_ns, one.source): one for one in truth or ()}
-    profiles, names = [], ()
+    known = {(table.stamp_ns, table.source): table for table in truth or ()}
+    profiles: list[Profile] = []
+    names: tuple[str, ...] = ()
     for estimate in estimates:
         names = estimate.model_names
         # A single side that is no namespace: its truth names no side.
@@ -104,7 +111,9 @@ def rough_models(names: tuple[str, ...]) -> BoolArray:
 def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
     """One ping; the state is a height or an angle, and the other one follows from it. With
     navigation the stated error is that of the soundings: pose and sound speed are in it."""
-    ranges, height, angle = (_column(estimate, name) for name in ('range', 'height', 'angle'))
+    bins = read_columns(
+        estimate, _BINS, "the estimates are not those of a floor: there is no column '{}'"
+    )
     std = np.sqrt(estimate.covariance[:, 0, 0])
     # A small angle moves the point along the circle around the sonar: dh = |y| d(angle).
     arm = np.abs(estimate.xyz[:, 1].astype(np.float64))
@@ -112,47 +121,41 @@ def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
     in_angle = estimate.state_names[0] == 'angle'
     height_std = std * arm if in_angle else std
     if 'vertical_uncertainty' in estimate.extras:
-        arm = np.abs(ranges * np.sin(_column(estimate, 'beam_angle')))
-        height_std = np.sqrt(_column(estimate, 'vertical_uncertainty'))
+        arm = np.abs(bins['range'] * np.sin(bins['beam_angle']))
+        height_std = np.sqrt(bins['vertical_uncertainty'])
     return Profile(
         stamp_ns=estimate.stamp_ns,
-        range=ranges,
-        height=height,
+        range=bins['range'],
+        height=bins['height'],
         height_std=height_std,
-        angle=angle,
+        angle=bins['angle'],
         angle_std=std if in_angle else std / arm,
-        heard=estimate.extras['valid'].astype(bool),
+        valid=bins['valid'] > 0,
         probabilities=estimate.probabilities,
-        truth=None if truth is None else true_floor(truth, ranges),
-        rough=_column(estimate, 'rough') if 'rough' in estimate.extras else None,
+        truth=None if truth is None else true_floor(truth, bins['range']),
+        rough=bins['rough'] if 'rough' in estimate.extras else None,
         side=SIDES[estimate.source] if 'side' in estimate.extras else '',
     )
 
 
 def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
     """The true floor at `ranges` (n,); unknown in bins that the truth does not have."""
-    where = _column(truth, 'range')
+    where, height, angle, patch, valid = read_columns(
+        truth, _TRUE, "the truth is not that of a floor: it has no column '{}'"
+    ).values()
     if not len(where):
         unknown, no = np.full(len(ranges), np.nan), np.zeros(len(ranges), bool)
         return TrueFloor(unknown, unknown, no, no)
     after = np.clip(np.searchsorted(where, ranges), 1, max(len(where) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(where) - 1)
-    nearest = np.where(ranges - where[before] <= where[after] - ranges, before, after)
+    is_before = ranges - where[before] <= where[after] - ranges
+    nearest = np.where(is_before, before, after)
     width = float(np.median(np.diff(ranges))) if len(ranges) > 1 else np.inf
     found = np.abs(where[nearest] - ranges) <= FAR * width
     return TrueFloor(
-        height=np.where(found, _column(truth, 'height')[nearest], np.nan),
-        angle=np.where(found, _column(truth, 'angle')[nearest], np.nan),
-        patch=found & (_column(truth, 'patch')[nearest] > 0),
-        echo=found & (_column(truth, 'valid')[nearest] > 0),
+        height=np.where(found, height[nearest], np.nan),
+        angle=np.where(found, angle[nearest], np.nan),
+        patch=found & (patch[nearest] > 0),
+        echo=found & (valid[nearest] > 0),
     )
-
-
-def _column(estimate: Estimate, name: str) -> FloatArray:
-    """A state or a further column as float64; NaN when the table has none."""
-    if name in estimate.state_names:
-        return estimate.state[:, estimate.state_names.index(name)]
-    if name not in estimate.extras:
-        return np.full(len(estimate), np.nan)
-    return np.asarray(estimate.extras[name], np.float64)

@@ -51,7 +51,7 @@ def score(swath: Swath) -> dict[str, Any]:
         'pings': len(profiles),
         'span_s': (max(stamps) - min(stamps)) / SECOND if stamps else 0.0,
         'bins': sum(len(profile.range) for profile in profiles),
-        'heard_share': _mean([profile.heard for profile in profiles]),
+        'heard_share': _mean([profile.valid for profile in profiles]),
         'rough_share': _mean([swath.roughness(profile) > 0.5 for profile in profiles]),
         'height_std_median_m': _median([profile.height_std for profile in profiles]),
     }
@@ -86,8 +86,8 @@ def _errors(known: list[Profile]) -> dict[str, Any]:
 
 def _gate(known: list[Profile]) -> dict[str, Any]:
     """How well the gate tells shadow from echo."""
-    shadow = [profile.heard[_PLACES['shadow'](profile.truth)] for profile in known]
-    echo = [profile.heard[profile.truth.echo] for profile in known]
+    shadow = [profile.valid[_PLACES['shadow'](profile.truth)] for profile in known]
+    echo = [profile.valid[profile.truth.echo] for profile in known]
     return {
         'shadow_bins': sum(map(len, shadow)),
         'shadow_passed_over': 1.0 - _mean(shadow),

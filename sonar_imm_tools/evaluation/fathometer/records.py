@@ -20,13 +20,19 @@ from collections.abc import Iterable, Sequence
 
 from attrs import frozen
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ... import SECOND
 from ...recordings.sources import BagError
+from ..columns import read_columns
+
+_FOUND = (
+    'depth', 'amplitude', 'relative_amplitude', 'cov_depth_depth', 'track_id', 'existence',
+    'sigma', 'preview',
+)  # fmt: skip
+_TRUE = ('depth', 'amplitude', 'track_id?')
 
 
 @frozen(eq=False)
@@ -35,7 +41,7 @@ class Reflections:
 
     depth: FloatArray
     strength: FloatArray
-    track_id: NDArray[np.integer]
+    track_id: IntArray
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -73,7 +79,7 @@ class Image:
 
     value: FloatArray
     depth: FloatArray
-    stamp_ns: np.ndarray
+    stamp_ns: IntArray
 
 
 def records_of(
@@ -85,11 +91,11 @@ def records_of(
 ) -> list[Record]:
     """Records in order of stamps, each with the truth nearest to `lag` seconds after it, if that
     is within `gap` seconds. Raises `BagError` when the columns are those of something else."""
-    known = sorted(truth or [], key=lambda one: one.stamp_ns)
-    stamps = np.array([one.stamp_ns for one in known], np.int64)
-    true = [_true(one) for one in known]
+    known = sorted(truth or [], key=lambda table: table.stamp_ns)
+    stamps = np.array([table.stamp_ns for table in known], np.int64)
+    true = [_true(table) for table in known]
     records = []
-    for estimate in sorted(estimates, key=lambda one: one.stamp_ns):
+    for estimate in sorted(estimates, key=lambda estimate: estimate.stamp_ns):
         nearest = None
         if len(stamps):
             away = np.abs(stamps - (estimate.stamp_ns + round(lag * SECOND)))
@@ -100,22 +106,15 @@ def records_of(
 
 
 def _record(estimate: Estimate, true: Reflections | None) -> Record:
-    columns = estimate.columns()
-    wanted = ('depth', 'relative_amplitude', 'track_id', 'existence', 'sigma', 'preview')
-    if missing := [name for name in wanted if name not in columns]:
-        raise BagError(f"not estimates of reflectors: there is no column '{missing[0]}'")
-    if not estimate.model_names or not all(n.startswith('order_') for n in estimate.model_names):
-        raise BagError("not estimates of reflectors: there is no column 'prob_order_<k>'")
+    columns = _read(estimate, _FOUND, "not estimates of reflectors: there is no column '{}'")
     there = np.isfinite(columns['depth'])
-    strength = np.where(
-        np.isfinite(columns['relative_amplitude']),
-        columns['relative_amplitude'],
-        columns['amplitude'],
-    )
+    relative = columns['relative_amplitude']
+    strength = np.where(np.isfinite(relative), relative, columns['amplitude'])
+    ids = columns['track_id'][there].astype(np.int64)
     return Record(
         stamp_ns=estimate.stamp_ns,
         preview=bool(columns['preview'][0]),
-        found=Reflections(columns['depth'][there], strength[there], columns['track_id'][there]),
+        found=Reflections(columns['depth'][there], strength[there], ids),
         depth_std=np.sqrt(columns['cov_depth_depth'][there]),
         existence=columns['existence'][there],
         pmf=estimate.probabilities[0],
@@ -126,9 +125,17 @@ def _record(estimate: Estimate, true: Reflections | None) -> Record:
 
 
 def _true(estimate: Estimate) -> Reflections:
-    columns = estimate.columns()
-    if missing := [name for name in ('depth', 'amplitude') if name not in columns]:
-        raise BagError(f"the truth is not that of reflectors: it has no column '{missing[0]}'")
-    ids = columns.get('track_id', np.arange(len(columns['depth'])))
+    columns = _read(estimate, _TRUE, "the truth is not that of reflectors: it has no column '{}'")
+    ids = columns['track_id']
+    ids = np.where(np.isfinite(ids), ids, np.arange(len(ids))).astype(np.int64)
     there = np.isfinite(columns['depth'])
     return Reflections(columns['depth'][there], columns['amplitude'][there], ids[there])
+
+
+def _read(table: Estimate, names: tuple[str, ...], missing: str) -> dict[str, FloatArray]:
+    if names is _FOUND and not all(name.startswith('order_') for name in table.model_names):
+        raise BagError(missing.format('prob_order_<k>'))
+    try:
+        return read_columns(table, names, missing)
+    except ValueError as error:
+        raise BagError(str(error)) from None

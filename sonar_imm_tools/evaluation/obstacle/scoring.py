@@ -44,7 +44,7 @@ def score(
     series: Series, truth: tuple[TruePath, ...] | None, *, cutoff: float, gap: float
 ) -> tuple[dict[str, Any], Matching | None]:
     """All metrics of a run, and the matching they rest on. Without truth only what needs none."""
-    pings = series.ping_ns
+    pings = series.scan_ns
     nis = series.nis[np.isfinite(series.nis)]
     metrics: dict[str, Any] = {
         'pings': len(pings),
@@ -95,8 +95,8 @@ def truth_consistency(found: Matching) -> dict[str, Any]:
 def followed_by(found: Matching, obstacles: int) -> NDArray[np.int64]:
     """(pings, obstacles) id of the track on each obstacle, -1 without."""
     series = found.series
-    followed = np.full((len(series.ping_ns), obstacles), -1, np.int64)
-    ping = np.searchsorted(series.ping_ns, series.stamp_ns[found.row])
+    followed = np.full((len(series.scan_ns), obstacles), -1, np.int64)
+    ping = np.searchsorted(series.scan_ns, series.stamp_ns[found.row])
     followed[ping, found.target] = series.track_id[found.row]
     return followed
 

@@ -180,7 +180,7 @@ def _sections(material: Material) -> list[Section]:
                 'uncertainty, squared. NIS says nothing about the height: with a wrong sign of '
                 'roll it is perfect too.',
                 nis_figure(
-                    seconds(hits.stamp_ns, series.ping_ns), hits.nis, np.full(len(hits), 2.0)
+                    seconds(hits.stamp_ns, series.scan_ns), hits.nis, np.full(len(hits), 2.0)
                 ),
             )
         )

@@ -33,6 +33,7 @@ from sonar_imm.estimation.consistency import gospa
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 
 from ... import SECOND
+from ..columns import column, covariance_of, read_rows, Rows
 
 STATES = ('range', 'bearing', 'vertical_offset')
 PINGS_TO_SEE = 6
@@ -40,35 +41,29 @@ PINGS_TO_SEE = 6
 PASSED = 0.2
 """Cosine to the axis of the sonar below which an obstacle counts as passed."""
 
+_VELOCITY = ('vx?', 'vy?')
+_DOES = tuple(f'prob_{name}?' for name in BEHAVIOURS)
+
 
 @frozen(eq=False, kw_only=True)
-class Series:
-    """Rows of confirmed tracks, sorted by stamp: stamp_ns, track_id (n,); state (n, 3) in the
-    order of `STATES`; covariance (n, 3, 3); low, high: the 90 % band of the offset (n,); above:
-    its probability (n,); nis (n,), NaN without a hit; velocity (n, 2) m/s with velocity_covariance
-    (n, 2, 2); does (n, 4): the probability of each of `BEHAVIOURS`; risk (n,): the probability of
-    a collision; these are NaN where a run does not tell them. ping_ns: all pings."""
+class Series(Rows):
+    """Rows of confirmed tracks; state: in the order of `STATES`; low, high: the 90 % band of the
+    offset; above: its probability; nis: NaN without a hit; velocity: m/s; does: the probability of
+    each of `BEHAVIOURS`; risk: the probability of a collision. The last four are NaN where a run
+    does not state them."""
 
-    ping_ns: IntArray
-    stamp_ns: IntArray
-    track_id: IntArray
-    state: FloatArray
-    covariance: FloatArray
-    low: FloatArray
-    high: FloatArray
-    above: FloatArray
-    nis: FloatArray
-    velocity: FloatArray
-    velocity_covariance: FloatArray
-    does: FloatArray
-    risk: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.stamp_ns)
-
-    def pick(self, rows: NDArray) -> Series:
-        """Some of the rows; `ping_ns` is kept."""
-        return Series(ping_ns=self.ping_ns, **{name: getattr(self, name)[rows] for name in _ROWS})
+    track_id: IntArray = column('track_id', dtype=np.int64)
+    track_state: IntArray = column('track_state', dtype=np.int64)
+    state: FloatArray = column(*STATES)
+    covariance: FloatArray = covariance_of(*STATES)
+    low: FloatArray = column('vertical_offset_lo')
+    high: FloatArray = column('vertical_offset_hi')
+    above: FloatArray = column('prob_above')
+    nis: FloatArray = column('nis')
+    velocity: FloatArray = column(*_VELOCITY)
+    velocity_covariance: FloatArray = covariance_of('x', 'y', prefix='vel_cov')
+    does: FloatArray = column(*_DOES)
+    risk: FloatArray = column('collision_probability?')
 
     def longest_track(self) -> int | None:
         """Id of the track with most hits, None without rows."""
@@ -76,17 +71,20 @@ class Series:
         return int(ids[np.argmax(counts)]) if len(ids) else None
 
 
-_ROWS = (
-    'stamp_ns', 'track_id', 'state', 'covariance', 'low', 'high', 'above', 'nis', 'velocity',
-    'velocity_covariance', 'does', 'risk',
-)  # fmt: skip
+@frozen(eq=False, kw_only=True)
+class _TrueRows(Rows):
+    track_id: IntArray = column('track_id', dtype=np.int64, default=1)
+    state: FloatArray = column(*STATES)
+    in_beam: FloatArray = column('in_beam', default=1)
+    velocity: FloatArray = column(*_VELOCITY)
+    does: FloatArray = column(*_DOES)
 
 
 @frozen(eq=False)
 class TruePath:
     """True states of one obstacle: stamp_ns (n,); seen (n, 3) in the order of `STATES`; in_beam
-    (n,); velocity (n, 2) m/s and does (n,), which of `BEHAVIOURS`, both None where it is not
-    told."""
+    (n,); velocity (n, 2) m/s and does (n,), which of `BEHAVIOURS`, both None where they are
+    not known."""
 
     track_id: int
     stamp_ns: IntArray
@@ -141,76 +139,31 @@ class Matching:
 
 
 def series_of(estimates: Iterable[Estimate]) -> Series:
-    """Concatenate the confirmed rows. Raises ValueError for estimates of another system."""
-    ordered = sorted(estimates, key=lambda one: one.stamp_ns)
-    filled = [one for one in ordered if len(one)]
-    if any(one.state_names != STATES for one in filled):
-        raise ValueError('the estimates are not those of obstacles')
-
-    def stack(parts: list[NDArray], tail: tuple[int, ...] = ()) -> NDArray:
-        return np.concatenate([np.empty((0, *tail)), *parts])
-
-    def extra(name: str) -> FloatArray:
-        return stack([np.asarray(one.extras[name], float) for one in filled])
-
-    columns = [one.columns() for one in filled]
-
-    def told(name: str) -> FloatArray:
-        if all(name in each for each in columns):
-            return stack([np.asarray(each[name], float) for each in columns])
-        return np.full(sum(map(len, filled)), np.nan)
-
-    spread = [told(f'vel_cov_{axes}') for axes in ('x_x', 'x_y', 'x_y', 'y_y')]
-    full = Series(
-        ping_ns=np.array([one.stamp_ns for one in ordered], np.int64),
-        stamp_ns=np.repeat(
-            np.array([one.stamp_ns for one in filled], np.int64), [len(one) for one in filled]
-        ),
-        track_id=extra('track_id').astype(np.int64),
-        state=stack([one.state for one in filled], (3,)),
-        covariance=stack([one.covariance for one in filled], (3, 3)),
-        low=extra('vertical_offset_lo'),
-        high=extra('vertical_offset_hi'),
-        above=stack([one.probabilities[:, one.model_names.index('above')] for one in filled]),
-        nis=extra('nis'),
-        velocity=np.stack([told('vx'), told('vy')], axis=-1),
-        velocity_covariance=np.stack(spread, axis=-1).reshape(-1, 2, 2),
-        does=np.stack([told(f'prob_{name}') for name in BEHAVIOURS], axis=-1),
-        risk=told('collision_probability'),
+    """The confirmed rows. Raises ValueError for estimates of another system."""
+    series = read_rows(
+        Series, estimates, "the estimates are not those of obstacles: there is no column '{}'"
     )
-    return full.pick(extra('track_state') > 0)
+    return series.pick(series.track_state > 0)
 
 
 def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ...]:
     """Truth by obstacle, shifted to `lag` seconds earlier. Raises ValueError for other tables."""
-    rows: dict[int, list[tuple[int, ...]]] = {}
-    for table in tables:
-        if missing := [name for name in STATES if name not in table.extras]:
-            raise ValueError(f"the truth has no column '{missing[0]}'")
-        columns = [np.asarray(table.extras[name], float) for name in STATES]
-        columns.append(np.asarray(table.extras.get('in_beam', np.ones(len(table.xyz))), float))
-        unknown, told = np.full(len(table.xyz), np.nan), table.columns()
-        for name in ('vx', 'vy', *(f'prob_{name}' for name in BEHAVIOURS)):
-            columns.append(np.asarray(told.get(name, unknown), float))
-        ids = np.asarray(table.extras.get('track_id', np.ones(len(table.xyz))), int)
-        for number, values in zip(ids, zip(*columns)):
-            rows.setdefault(int(number), []).append((table.stamp_ns, *map(float, values)))
+    rows = read_rows(_TrueRows, tables, "the truth has no column '{}'")
+    rows = rows.pick(np.isfinite(rows.state).all(axis=1))
     paths = []
-    for number, told in sorted(rows.items()):
-        by_stamp = {one[0]: one[1:] for one in told if np.isfinite(one[1:4]).all()}
-        if len(by_stamp) < 2:
+    for track_id in np.unique(rows.track_id).tolist():
+        own = rows.pick(rows.track_id == track_id)
+        own = own.pick(np.append(np.diff(own.stamp_ns) > 0, True))  # of one stamp the last
+        if len(own) < 2:
             continue
-        stamps = np.array(sorted(by_stamp), np.int64)
-        values = np.array([by_stamp[stamp] for stamp in stamps.tolist()])
-        velocity, does = values[:, 4:6], values[:, 6:]
         paths.append(
             TruePath(
-                number,
-                stamps - round(lag * SECOND),
-                values[:, :3],
-                values[:, 3] > 0,
-                velocity if np.isfinite(velocity).all() else None,
-                np.argmax(does, axis=1) if np.isfinite(does).all() else None,
+                track_id,
+                own.stamp_ns - round(lag * SECOND),
+                own.state,
+                own.in_beam > 0,
+                own.velocity if np.isfinite(own.velocity).all() else None,
+                np.argmax(own.does, axis=1) if np.isfinite(own.does).all() else None,
             )
         )
     return tuple(paths)
@@ -218,7 +171,7 @@ def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ..
 
 def match(series: Series, truth: tuple[TruePath, ...], *, cutoff: float, gap: float) -> Matching:
     """Match tracks to obstacles at every ping for which the truth is known."""
-    pings = series.ping_ns
+    pings = series.scan_ns
     seen = np.array([path.at(pings, gap) for path in truth]).reshape(len(truth), len(pings), 3)
     there = np.array([path.there(pings, gap) for path in truth], bool)
     there = there.reshape(len(truth), len(pings))

@@ -68,7 +68,7 @@ def test_the_standard_deviation_of_what_is_no_state_follows_from_the_arm():
     np.testing.assert_allclose(profile.angle_std, 0.2)
     np.testing.assert_allclose(profile.height_std, 0.2 * 8.0)
     np.testing.assert_allclose(profile.height, 0.5)
-    assert profile.heard.tolist() == [True, True, False, True]
+    assert profile.valid.tolist() == [True, True, False, True]
     assert profile.truth is None
 
 

@@ -26,7 +26,7 @@ PATCH = slice(8, 14)
 
 
 def profile(
-    *, height=0.1, rough=slice(9, 15), known=True, shadow=slice(0, 0), heard=None, stamp_ns=0
+    *, height=0.1, rough=slice(9, 15), known=True, shadow=slice(0, 0), valid=None, stamp_ns=0
 ):
     """Twenty bins of a floor at 0 with a patch in 8..13; estimates are off by `height`."""
     probabilities = np.tile([0.9, 0.1], (N, 1))
@@ -43,7 +43,7 @@ def profile(
         height_std=np.full(N, 0.06),
         angle=np.full(N, 0.1 + np.radians(2.0)),
         angle_std=np.full(N, 0.01),
-        heard=np.ones(N, bool) if heard is None else heard,
+        valid=np.ones(N, bool) if valid is None else valid,
         probabilities=probabilities,
         truth=truth if known else None,
     )
@@ -80,9 +80,9 @@ def test_overlap_and_delay_of_the_segmentation():
 
 
 def test_shadow_is_scored_apart():
-    heard = np.ones(N, bool)
-    heard[:3] = False
-    metrics = score(swath(profile(shadow=slice(0, 4), heard=heard)))
+    valid = np.ones(N, bool)
+    valid[:3] = False
+    metrics = score(swath(profile(shadow=slice(0, 4), valid=valid)))
     assert metrics['height']['all']['n'] == N - 4
     assert metrics['height']['shadow']['n'] == 4
     assert metrics['gate'] == {'shadow_bins': 4, 'shadow_passed_over': 0.75, 'echo_heard': 1.0}
