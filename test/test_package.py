@@ -38,6 +38,7 @@ PYPI_OF_KEY = {
     'python3-click': 'click',
     'python3-filterpy-pip': 'filterpy',
     'python3-hypothesis': 'hypothesis',
+    'python3-jinja2': 'jinja2',
     'python3-numba': 'numba',
     'python3-numpy': 'numpy',
     'python3-pymap3d': 'pymap3d',

@@ -24,7 +24,7 @@ for all columns that begin like it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
 from attrs import evolve, field, fields, frozen
@@ -34,8 +34,14 @@ from numpy.typing import NDArray
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
+from ..recordings.sources import BagError
+
 _COLUMNS = 'columns'
 R = TypeVar('R', bound='Rows')
+
+
+class MissingColumn(BagError, ValueError):
+    """A table without a column that is needed."""
 
 
 @frozen
@@ -51,7 +57,7 @@ class _Columns:
         def values(name: str) -> NDArray[Any]:
             plain = name.rstrip('?')
             if rows and name == plain and plain not in table and np.isnan(self.default):
-                raise ValueError(missing.format(name))
+                raise MissingColumn(missing.format(name))
             return np.asarray(table.get(plain, np.full(rows, self.default)), self.dtype)
 
         if self.prefix:
@@ -94,16 +100,23 @@ class Rows:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def pick(self: R, rows: NDArray[Any]) -> R:
-        """The same run with some of its rows (a mask or indices); `scan_ns` is kept."""
+    def pick(self: R, rows: Any) -> R:
+        """The same run with some of its rows (a mask, indices or a slice); `scan_ns` is kept."""
         names = ('stamp_ns', *_declared(type(self)))
         return evolve(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def by_track(self: R) -> Iterator[tuple[int, R]]:
+        """The rows of each ``track_id``; of several with one stamp the last counts."""
+        track_id = getattr(self, 'track_id')  # noqa: B009
+        for number in np.unique(track_id).tolist():
+            own = self.pick(track_id == number)
+            yield number, own.pick(np.append(np.diff(own.stamp_ns) > 0, True))
 
 
 def read_rows(kind: type[R], estimates: Iterable[Estimate], missing: str, **further: Any) -> R:
     """The rows of `estimates` as an object of class `kind`; further: its fields that are no
-    columns. Raises ValueError with the sentence `missing`, in which ``{}`` stands for the name of
-    a column that is needed and not there."""
+    columns. Raises `MissingColumn` with the sentence `missing`, in which ``{}`` stands for the
+    name of a column that is needed and not there."""
     ordered = sorted(estimates, key=lambda estimate: estimate.stamp_ns)
     filled = [estimate for estimate in ordered if len(estimate)]
     tables = [(estimate.columns(), len(estimate)) for estimate in filled] or [({}, 0)]
@@ -121,7 +134,7 @@ def read_rows(kind: type[R], estimates: Iterable[Estimate], missing: str, **furt
 
 
 def read_columns(table: Estimate, names: Iterable[str], missing: str) -> dict[str, FloatArray]:
-    """The columns `names` of one table, each (n,). Raises ValueError as `read_rows` does."""
+    """The columns `names` of one table, each (n,). Raises `MissingColumn` as `read_rows` does."""
     columns = table.columns()
     return {
         name.rstrip('?'): _Columns((name,)).read(columns, len(table), missing) for name in names

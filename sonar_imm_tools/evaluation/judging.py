@@ -25,7 +25,8 @@ Everything else is the same for all of them: the folder of a run, the page, the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import contextlib
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, TYPE_CHECKING
@@ -35,9 +36,11 @@ from attrs import frozen
 from sonar_imm.trackers import SYSTEMS
 
 from ..offline.run_folder import RunFolder
+from ..recordings.sources import BagError
+from .numbers import cards, fill, lines, Metric, Text
 
 if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
-    from .page import Part
+    from .report import Part, Section
 
 TRUTH_GAP = 60.0
 
@@ -93,17 +96,41 @@ class JudgeOptions:
 class Judgement:
     """Scores and summary of one run.
 
-    metrics: the content of ``metrics.json``. summary: the result in a few sentences. lines: title
-    and value of the most important numbers. part: makes the part of the report for the run, with
-    further checks. accuracy: compares the error with a limit (None for `LIMIT` of the system);
-    None without truth.
+    run: the content of ``run.json``; metrics: that of ``metrics.json``. words: the result in a few
+    sentences. shown: which metrics people see, and how. sections: makes the sections of the
+    report. accuracy: compares the error with a limit (None for `LIMIT` of the system); None
+    without truth.
     """
 
+    run: Mapping[str, Any]
     metrics: dict[str, Any]
-    summary: str
-    lines: tuple[tuple[str, str], ...]
-    part: Callable[[Sequence[Check]], Part]
+    words: Text
+    shown: Sequence[Metric]
+    sections: Callable[[], Iterable[Section]]
     accuracy: Callable[[float | None], Check | None]
+
+    @property
+    def summary(self) -> str:
+        """The result in a few sentences."""
+        return fill(self.words, self.metrics)
+
+    @property
+    def lines(self) -> tuple[tuple[str, str], ...]:
+        """Label and value of the most important numbers."""
+        return lines(self.shown, self.metrics)
+
+    def part(self, checks: Sequence[Check] = ()) -> Part:
+        """The part of the report for this run, with further `checks`."""
+        from .report import Part
+
+        return Part(
+            run=self.run,
+            metrics=self.metrics,
+            summary=self.summary,
+            checks=tuple(checks),
+            cards=cards(self.shown, self.metrics),
+            sections=tuple(self.sections()),
+        )
 
 
 class Judge(Protocol):
@@ -118,5 +145,14 @@ class Judge(Protocol):
 
 def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
     """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
-    one: Judge = import_module(SYSTEMS[folder.read_run()['system']].judge)
-    return one.judge(folder, options or JudgeOptions())
+    system: Judge = import_module(SYSTEMS[folder.read_run()['system']].judge)
+    return system.judge(folder, options or JudgeOptions())
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Raises ValueError, by which a table is refused, as `BagError` that names the recording."""
+    try:
+        yield
+    except ValueError as error:
+        raise BagError(f'{path}: {error}') from None

@@ -22,9 +22,11 @@ mean slightly outside its bounds proves nothing; one far outside does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+import string
 from typing import Any
 
+from attrs import frozen
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray
@@ -62,7 +64,8 @@ def usable_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     A filter that is certain of one heading states a velocity along that heading only. Then its
     covariance is singular, and NEES is not defined.
     """
-    good = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    finite = np.isfinite(error).all(axis=1), np.isfinite(covariance).all(axis=(1, 2))
+    good = np.logical_and(*finite)
     values = np.linalg.eigvalsh(covariance[good])
     good[good] = values[:, 0] > SINGULAR * values[:, -1]
     return nees(error[good], covariance[good]) if good.any() else np.empty(0)
@@ -123,20 +126,120 @@ def bounds_remark(summary: Mapping[str, Any]) -> str:
     return f'{summary["dof"]} expected, {summary["low"]:.2f} to {summary["high"]:.2f} believable'
 
 
-def error_line(
-    title: str, summary: Mapping[str, Any], unit: str, shown: str = ''
-) -> list[tuple[str, str]]:
-    """Title and value of an `error_summary` in `unit` (printed as `shown`), if it has errors."""
-    if not summary.get('n'):
-        return []
-    values = (f'{summary[f"{name}_{unit}"]:.3f}' for name in ('rmse', 'median', 'p95'))
-    return [(f'{title}, RMSE / median / 95 %', ' / '.join(values) + f' {shown or unit}')]
+# -- in words ------------------------------------------------------------------------------------
+
+NO_TRUTH = (
+    'There is no truth to compare with, so only the estimates and their stated uncertainty are '
+    'shown.'
+)
+UNMATCHED = 'None of them was matched with the truth.'
+Text = str | Callable[[Mapping[str, Any]], str]
+"""A format with dotted names of metrics, ``'{position.rmse_m:.2f} m'``, or a function of them."""
 
 
-def chi2_line(title: str, summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of a `chi2_summary` or `nis_summary`, if it has values."""
-    if not summary.get('n'):
-        return []
-    return [
-        (title, f'{summary["mean"]:.2f}, believable {summary["low"]:.2f} to {summary["high"]:.2f}')
-    ]
+@frozen(kw_only=True)
+class Metric:
+    """A metric of ``metrics.json`` as people read it, on the terminal, in the report, or in both.
+
+    label, line: title and text of the line on the terminal. card, value, remark: title, value and
+    explanation of the key number in the report. when: whether to show it. Without a label it is
+    not on the terminal, without a card not in the report, and without the first number that is
+    named in neither.
+    """
+
+    label: str = ''
+    line: str = ''
+    card: str = ''
+    value: str = ''
+    remark: Text = ''
+    when: Callable[[Mapping[str, Any]], object] = lambda metrics: True
+
+
+@frozen
+class Card:
+    """One key number: the value, what it is, and a line to compare it with."""
+
+    value: str
+    title: str
+    remark: str = ''
+
+
+def error(key: str, label: str, unit: str = 'm', **card: Text) -> Metric:
+    """The `error_summary` at `key`: all of it in a line, RMSE and the rest on a card."""
+    names = [f'{{{key}.{name}_{unit}' for name in ('rmse', 'median', 'p95')]
+    shown = {'mps': 'm/s'}.get(unit, unit)
+    values: dict[str, Any] = {
+        'value': f'{names[0]}:.2f}} {shown}',
+        'remark': f'median {names[1]}:.2f}} {shown}, 95 % {names[2]}:.2f}} {shown}',
+    }
+    line = ' / '.join(f'{name}:.3f}}' for name in names) + f' {shown}'
+    return Metric(label=f'{label}, RMSE / median / 95 %', line=line, **values | card)
+
+
+def chi2(key: str, label: str, card: str = '') -> Metric:
+    """The `chi2_summary` or `nis_summary` at `key`: the mean, and what is believable."""
+    return Metric(
+        label=label,
+        line=f'{{{key}.mean:.2f}}, believable {{{key}.low:.2f}} to {{{key}.high:.2f}}',
+        card=card,
+        value=f'{{{key}.mean:.2f}}',
+        remark=lambda metrics: bounds_remark(look_up(metrics, key)),
+    )
+
+
+def each(key: str, names: Iterable[str]) -> list[Metric]:
+    """A line for each of the numbers `names` at `key`."""
+    return [Metric(label=name.replace('_', ' '), line=f'{{{key}.{name}:.3g}}') for name in names]
+
+
+def lines(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Label and text of every metric that is known and belongs on the terminal."""
+    return tuple(
+        (metric.label, fill(metric.line, metrics))
+        for metric in shown
+        if metric.label and metric.when(metrics) and _known(metric.line, metrics)
+    )
+
+
+def cards(shown: Iterable[Metric], metrics: Mapping[str, Any]) -> tuple[Card, ...]:
+    """The key number of every metric that is known and belongs in the report."""
+    return tuple(
+        Card(fill(metric.value, metrics), metric.card, fill(metric.remark, metrics))
+        for metric in shown
+        if metric.card and metric.when(metrics) and _known(metric.value, metrics)
+    )
+
+
+def fill(text: Text, metrics: Mapping[str, Any]) -> str:
+    """`text` with its metrics; ``-`` stands for a number that is not known. The format ``.0%``
+    leaves a space before the sign."""
+    return text(metrics) if callable(text) else _WORDS.vformat(text, (), metrics)
+
+
+def look_up(metrics: Mapping[str, Any], name: str) -> Any:
+    """What is at a dotted name; None when it is not there."""
+    found: Any = metrics
+    for key in name.split('.'):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found
+
+
+def _known(text: str, metrics: Mapping[str, Any]) -> bool:
+    """Whether the first number of a format is there."""
+    value = next(look_up(metrics, name) for _, name, _, _ in _WORDS.parse(text) if name)
+    return value is not None and value == value
+
+
+class _Words(string.Formatter):
+    def get_field(self, name: str, args: Any, metrics: Any) -> tuple[Any, str]:
+        return look_up(metrics, name), name
+
+    def format_field(self, value: Any, form: str) -> str:
+        if value is None or value != value:
+            return '-'
+        if form.endswith('%'):
+            return f'{100.0 * value:{form[:-1]}f} %'
+        return super().format_field(value, form)
+
+
+_WORDS = _Words()

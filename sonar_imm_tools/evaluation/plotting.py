@@ -12,19 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the figures of all systems share: colours, style, time axes, and the NIS figure.
+"""What the figures of all systems share: colours, style, kinds of traces, and the NIS figure.
 
 Colours are those of Okabe and Ito, which people with any colour vision can tell apart.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 import plotly.graph_objects as go
 from scipy.stats import chi2
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from .. import SECOND
 
@@ -32,6 +34,11 @@ INK, GRID, GREY, AMBER = '#1b2733', '#e4e9ee', '#8593a1', '#E69F00'
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9')
 MOST_POINTS = 20_000
 FONT = 'Inter, "Segoe UI", Roboto, Helvetica, Arial, sans-serif'
+TRUTH = {'color': INK, 'width': 1.5, 'dash': 'dot'}
+"""How the truth is drawn."""
+TIME = {'title': 'time [s]', 'zeroline': False}
+BARE = {'showgrid': False, 'zeroline': False}
+"""An axis of an image."""
 
 
 def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
@@ -45,23 +52,11 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
     nis = nis if same else nis / dof
     figure = go.Figure()
     shown = thin(len(nis), MOST_POINTS)
-    figure.add_scattergl(
-        x=time[shown],
-        y=nis[shown],
-        mode='markers',
-        name='NIS of a hit',
-        marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6},
-    )
+    add_points(figure, time[shown], nis[shown], 'NIS of a hit', COLOURS[0], opacity=0.6)
     width = max(5, min(50, len(nis) // 8))
     if len(nis) > width:
         mean = np.convolve(nis, np.full(width, 1.0 / width), mode='valid')
-        figure.add_scattergl(
-            x=time[width - 1 :],
-            y=mean,
-            mode='lines',
-            name=f'mean of {width}',
-            line={'color': INK, 'width': 2},
-        )
+        add_line(figure, time[width - 1 :], mean, f'mean of {width}', INK, 2, gl=True)
         if shared:
             low, high = chi2.ppf([0.025, 0.975], width * shared) / width
             figure.add_hrect(y0=low, y1=high, fillcolor=AMBER, opacity=0.25, line_width=0)
@@ -71,32 +66,88 @@ def nis_figure(time: FloatArray, nis: FloatArray, dof: FloatArray) -> go.Figure:
             line={'color': COLOURS[1], 'dash': 'dash'},
             annotation_text='95 % of the hits should lie below',
         )
-    figure.update_xaxes(title='time [s]', zeroline=False)
-    figure.update_yaxes(title='NIS' if same else 'NIS / degrees of freedom', rangemode='tozero')
-    return styled(figure, height=340)
+    title = 'NIS' if same else 'NIS / degrees of freedom'
+    return styled(figure, 340, TIME, {'title': title, 'rangemode': 'tozero'})
+
+
+def add_line(
+    figure: go.Figure,
+    x: ArrayLike,
+    y: ArrayLike,
+    name: str | None,
+    colour: str,
+    width: float = 2,
+    *,
+    gl: bool = False,
+    **further: Any,
+) -> None:
+    """Add a line; gl: it may be drawn by WebGL; further: of the trace."""
+    add = figure.add_scattergl if gl else figure.add_scatter
+    line = {'color': colour, 'width': width}
+    add(x=x, y=y, **{'mode': 'lines', 'name': name, 'line': line} | further)
+
+
+def add_points(
+    figure: go.Figure,
+    x: ArrayLike,
+    y: ArrayLike,
+    name: str,
+    colour: str,
+    size: float = 4,
+    **marker: Any,
+) -> None:
+    """Add points; marker: more of how they look."""
+    look = {'size': size, 'color': colour} | marker
+    figure.add_scattergl(x=x, y=y, mode='markers', name=name, marker=look)
 
 
 def add_band(
-    figure: go.Figure, time: FloatArray, half: FloatArray, *, first: bool, row: int
+    figure: go.Figure,
+    x: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    colour: str,
+    opacity: tuple[float, float],
+    **further: Any,
 ) -> None:
-    """Add the band from -half to half to subplot `row`; `first`: with an entry in the legend."""
+    """Add the band between `low` and `high`; opacity: of the area and of its outline."""
     figure.add_scatter(
-        x=np.concatenate([time, time[::-1]]),
-        y=np.concatenate([half, -half[::-1]]),
+        x=np.concatenate([x, x[::-1]]),
+        y=np.concatenate([low, high[::-1]]),
         fill='toself',
-        fillcolor=transparent(AMBER, 0.28),
+        fillcolor=transparent(colour, opacity[0]),
         mode='lines',
-        line={'color': transparent(AMBER, 0.6), 'width': 0.5},
+        line={'color': transparent(colour, opacity[1]), 'width': 0.5},
         hoverinfo='skip',
-        name='predicted 95 % band',
-        legendgroup='band',
-        showlegend=first,
-        row=row,
-        col=1,
+        **further,
     )
 
 
-def seconds(stamp_ns: NDArray[np.int64], scan_ns: NDArray[np.int64]) -> FloatArray:
+def add_image(
+    figure: go.Figure,
+    x: ArrayLike,
+    y: ArrayLike,
+    z: ArrayLike,
+    title: str = 'probability',
+    *,
+    limits: tuple[float, float] = (0.0, 1.0),
+    colours: str = 'Blues',
+    **further: Any,
+) -> None:
+    """Add an image of `z` (y, x); title: of its colours."""
+    figure.add_heatmap(
+        x=x,
+        y=y,
+        z=z,
+        zmin=limits[0],
+        zmax=limits[1],
+        colorscale=colours,
+        colorbar={'title': {'text': title, 'side': 'right'}, 'thickness': 12},
+        **further,
+    )
+
+
+def seconds(stamp_ns: IntArray, scan_ns: IntArray) -> FloatArray:
     """Seconds since the first scan of the run."""
     return (stamp_ns - scan_ns[0]) / SECOND if len(scan_ns) else np.empty(0)
 
@@ -112,8 +163,8 @@ def transparent(colour: str, opacity: float) -> str:
     return f'rgba({red},{green},{blue},{opacity})'
 
 
-def styled(figure: go.Figure, *, height: int) -> go.Figure:
-    """Give `figure` the style of the page; `height` in pixels."""
+def styled(figure: go.Figure, height: int, x: dict[str, Any], y: dict[str, Any]) -> go.Figure:
+    """Give `figure` the style of the page; height: in pixels; x, y: what its axes have."""
     figure.update_layout(
         height=height,
         margin={'l': 64, 'r': 24, 't': 44, 'b': 52},
@@ -124,6 +175,6 @@ def styled(figure: go.Figure, *, height: int) -> go.Figure:
         legend={'orientation': 'h', 'y': 1.02, 'yanchor': 'bottom', 'x': 0},
     )
     axis = {'gridcolor': GRID, 'zerolinecolor': '#c3ccd5', 'linecolor': '#c3ccd5', 'ticks': ''}
-    figure.update_xaxes(**axis)
-    figure.update_yaxes(**axis)
+    figure.update_xaxes(x | axis)
+    figure.update_yaxes(y | axis)
     return figure

@@ -14,22 +14,80 @@
 
 """The report: one HTML file for readers who need not know filters.
 
-A system provides the key numbers and the figures of a run. `run_part` adds what is the same for
-all: the comparison with a live node, all numbers, what happened to the input, and its provenance.
+A system provides the key numbers and sections of a run. ``templates/report.html`` adds what is the
+same for all: the comparison with a live node, all numbers, what happened to the input, and its
+provenance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+from attrs import frozen
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+import plotly.graph_objects as go
+import plotly.offline
 
 from sonar_imm import __version__
 from sonar_imm.files import whole
 
 from .judging import Check
-from .numbers import flatten
-from .page import Card, folded, mapping_table, Part, render, Section, table
+from .numbers import Card, flatten
+
+LEAST_GL_POINTS = 2000
+MOST_GL_FIGURES = 4
+"""A browser keeps 16 WebGL contexts and blanks the oldest beyond. A figure takes up to three, so
+only the largest figures of a page are drawn by WebGL."""
+
+
+@frozen
+class Section:
+    """A section of the page: heading, one paragraph, then a figure or a table."""
+
+    title: str
+    text: str
+    figure: go.Figure | None = None
+    header: Sequence[str] = ()
+    rows: Sequence[Sequence[object]] = ()
+
+
+@frozen(kw_only=True)
+class Part:
+    """One run on the page. run: the content of ``run.json``; metrics: that of ``metrics.json``."""
+
+    run: Mapping[str, Any]
+    metrics: Mapping[str, Any]
+    summary: str
+    checks: Sequence[Check] = ()
+    cards: Sequence[Card] = ()
+    sections: Sequence[Section] = ()
+
+    @property
+    def title(self) -> str:
+        """The name of the recording."""
+        return Path(self.run['bag']).name
+
+    @property
+    def check_rows(self) -> list[tuple[str, str, str, str]]:
+        """The checks as a table."""
+        return [(c.name, c.result, c.wanted, 'yes' if c.good else 'NO') for c in self.checks]
+
+    @property
+    def refused(self) -> list[tuple[str, int, str]]:
+        """Why messages could not be used, how many, and the first of each kind."""
+        reasons = self.run.get('refused', {}).items()
+        return [(reason, entry['count'], entry['example']) for reason, entry in reasons]
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What is needed to repeat the run."""
+        names = ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed')
+        about = {name: self.run[name] for name in names if name in self.run}
+        topics = [f'{topic} as {name}' for topic, name in self.run['topics'].items()]
+        return about | {'topics': topics} | dict(self.run.get('versions', {}))
 
 
 def write_report(path: Path, parts: Sequence[Part]) -> None:
@@ -40,95 +98,42 @@ def write_report(path: Path, parts: Sequence[Part]) -> None:
 
 def report_html(parts: Sequence[Part]) -> str:
     """The report as text; the same parts give the same bytes."""
-    return render(
-        ', '.join(part.title for part in parts),
-        parts,
-        footer=f'Made by sonar_imm {__version__}. Times are seconds since the first '
-        'estimate of a run.',
+    pages = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name('templates')),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    pages.filters['flat'] = flatten
+    # A number and its percent sign stay on one line.
+    pages.filters['unbroken'] = lambda text: text.replace(' %', '\u00a0%')
+    return pages.get_template('report.html').render(
+        parts=parts,
+        draw=partial(_draw, _accelerated(parts)),
+        plotlyjs=plotly.offline.get_plotlyjs(),
+        version=__version__,
     )
 
 
-def run_part(
-    run: Mapping[str, Any],
-    metrics: Mapping[str, Any],
-    checks: Sequence[Check],
-    *,
-    summary: str,
-    cards: Iterable[Card],
-    sections: Iterable[Section],
-) -> Part:
-    """One run on the page: `checks` first, then the sections of its system, then the rest.
-
-    run: the content of ``run.json``; metrics: that of ``metrics.json``.
-    """
-    return Part(
-        f'sonar_imm · {run["system"]} tracker',
-        Path(run['bag']).name,
-        summary,
-        tuple(cards),
-        (*_comparison(checks), *sections, _numbers(metrics), *_about(run)),
-    )
+def _accelerated(parts: Sequence[Part]) -> list[go.Figure]:
+    """The figures that are drawn by WebGL: the few that have most points."""
+    figures = [section.figure for part in parts for section in part.sections]
+    heavy = [figure for figure in figures if figure and _gl_points(figure) >= LEAST_GL_POINTS]
+    return sorted(heavy, key=_gl_points, reverse=True)[:MOST_GL_FIGURES]
 
 
-def _comparison(checks: Sequence[Check]) -> list[Section]:
-    if not checks:
-        return []
-    rows = [
-        (check.name, check.result, check.wanted, 'yes' if check.good else 'NO') for check in checks
-    ]
-    return [
-        Section(
-            'Live node against offline tracker',
-            'The recording was played to a real ROS 2 node, '
-            'message by message, and what the node published was compared with the offline run.',
-            html=table(('check', 'result', 'wanted', 'good'), rows),
-        )
-    ]
+def _gl_points(figure: go.Figure) -> int:
+    return sum(len(trace.x) for trace in figure.data if trace.type == 'scattergl')
 
 
-def _numbers(metrics: Mapping[str, Any]) -> Section:
-    return Section(
-        'All numbers',
-        'The content of metrics.json. The bounds suppose that successive errors are '
-        'independent, which those of one track are not quite.',
-        html=folded('Show them', mapping_table(('metric', 'value'), flatten(metrics))),
-    )
-
-
-def _about(run: Mapping[str, Any]) -> list[Section]:
-    counts = run.get('counts', {})
-    refused = run.get('refused', {})
-    sections = [
-        Section(
-            'What happened to the input',
-            'Every message is accounted for.',
-            html=table(('outcome', 'messages'), counts.items()),
-        )
-    ]
-    if refused:
-        rows = [(reason, entry['count'], entry['example']) for reason, entry in refused.items()]
-        sections.append(
-            Section(
-                'Refused input',
-                'Messages that could not be used, with the first of each kind.',
-                html=table(('reason', 'messages', 'why'), rows),
-            )
-        )
-    parameters = folded(
-        'Show them', mapping_table(('parameter', 'value'), run.get('parameters', {}))
-    )
-    about = {
-        key: run[key]
-        for key in ('bag', 'bag_sha256', 'bag_bytes', 'order', 'smoothed', 'topics')
-        if key in run
-    } | dict(run.get('versions', {}))
-    about['topics'] = [f'{topic} as {name}' for topic, name in run['topics'].items()]
-    return [
-        *sections,
-        Section('Parameters', 'The parameters of the tracker.', html=parameters),
-        Section(
-            'Provenance',
-            'Input and versions, to repeat the run.',
-            html=mapping_table(('what', 'value'), about),
-        ),
-    ]
+def _draw(accelerated: Sequence[go.Figure], figure: go.Figure, name: str) -> str:
+    if not any(figure is fast for fast in accelerated):
+        content = figure.to_dict()
+        for trace in content['data']:
+            if trace['type'] == 'scattergl':
+                trace['type'] = 'scatter'
+        figure = go.Figure(content)
+    buttons = ['lasso2d', 'select2d', 'autoScale2d']
+    config = {'displaylogo': False, 'responsive': True, 'modeBarButtonsToRemove': buttons}
+    return figure.to_html(full_html=False, include_plotlyjs=False, div_id=name, config=config)

@@ -19,11 +19,14 @@ import pytest
 
 from sonar_imm_tools.evaluation.numbers import (
     bounds_remark,
-    chi2_line,
+    cards,
+    chi2,
     chi2_summary,
     coverage_sentence,
-    error_line,
+    error,
     error_summary,
+    lines,
+    Metric,
     nis_summary,
     usable_nees,
 )
@@ -37,12 +40,26 @@ def test_coverage_is_put_in_words(coverage, words):
 
 
 def test_lines_name_the_unit_and_are_left_out_without_errors():
-    summary = error_summary(np.radians([3.0, 4.0]), unit='rad')
-    ((title, value),) = error_line('angle error', summary, 'rad')
+    shown = [error('angle', 'angle error', 'rad'), chi2('nees', 'NEES')]
+    angle = error_summary(np.radians([3.0, 4.0]), unit='rad')
+    ((title, value),) = lines(shown, {'angle': angle, 'nees': chi2_summary(np.empty(0), 2)})
     assert title == 'angle error, RMSE / median / 95 %'
     assert value == '0.062 / 0.061 / 0.069 rad'
-    assert error_line('angle error', error_summary(np.empty(0)), 'm') == []
-    assert chi2_line('NEES', chi2_summary(np.empty(0), 2)) == []
+    assert lines(shown, {'angle': error_summary(np.empty(0), unit='rad')}) == ()
+
+
+def test_a_metric_is_shown_where_its_first_number_is_known():
+    shown = [
+        Metric(label='kept / lost', line='{a.kept:.0%} / {a.lost:.0%}'),
+        Metric(card='Kept', value='{a.kept:.1%}', remark='of {n}', when=lambda m: m['n'] > 1),
+    ]
+    assert lines(shown, {'a': {'kept': 0.5, 'lost': float('nan')}}) == (
+        ('kept / lost', '50 % / -'),
+    )
+    assert lines(shown, {'a': {'lost': 0.5}}) == lines(shown, {}) == ()
+    (card,) = cards(shown, {'n': 2, 'a': {'kept': 0.25}})
+    assert (card.title, card.value, card.remark) == ('Kept', '25.0 %', 'of 2')
+    assert cards(shown, {'n': 1, 'a': {'kept': 0.25}}) == ()
 
 
 def test_nees_leaves_out_what_says_nothing():

@@ -18,7 +18,13 @@ import re
 
 import plotly.graph_objects as go
 
-from sonar_imm_tools.evaluation.page import LEAST_GL_POINTS, MOST_GL_FIGURES, Part, render, Section
+from sonar_imm_tools.evaluation.report import (
+    LEAST_GL_POINTS,
+    MOST_GL_FIGURES,
+    Part,
+    report_html,
+    Section,
+)
 
 
 def kinds(sizes):
@@ -26,8 +32,10 @@ def kinds(sizes):
     parts = []
     for size in sizes:
         figure = go.Figure(go.Scattergl(x=list(range(size)), y=list(range(size)), name=f'n{size}'))
-        parts.append(Part('', 'run', '', (), (Section('figure', 'text', figure),)))
-    html = render('title', parts, footer='')
+        run = {'system': 'diver', 'bag': 'run', 'topics': {}}
+        sections = [Section('figure', 'text', figure)]
+        parts.append(Part(run=run, metrics={}, summary='', sections=sections))
+    html = report_html(parts)
     # Templates of figures name every kind of trace: look at the ones with a name.
     return re.findall(r'"name":"n\d+"[^{]*?"type":"(\w+)"', html[html.index('<body>') :])
 

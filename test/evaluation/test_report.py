@@ -22,13 +22,14 @@ import numpy as np
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
 from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.diver import figures
 from sonar_imm_tools.evaluation.diver.scoring import score
-from sonar_imm_tools.evaluation.diver.sections import diver_part, Material
 from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.summary import METRICS, summary_sentence
 from sonar_imm_tools.evaluation.diver.truth import Truth
-from sonar_imm_tools.evaluation.judging import Check
-from sonar_imm_tools.evaluation.page import Card, Section
-from sonar_imm_tools.evaluation.report import report_html, run_part
+from sonar_imm_tools.evaluation.judging import Check, Judgement
+from sonar_imm_tools.evaluation.numbers import Card
+from sonar_imm_tools.evaluation.report import Part, report_html, Section
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 RUN = {
@@ -42,17 +43,26 @@ RUN = {
 }
 
 
-def material(truth=True, count=60, **changes):
-    estimates, true_rows, _ = single_run(count=count)
-    series = series_of(estimates)
-    known = Truth.from_series(series_of(true_rows)) if truth else None
-    return Material(
-        run={**RUN, **changes}, metrics=score(series, known), series=series, truth=known
+def judged(series, truth=None, **changes):
+    run, metrics = {**RUN, **changes}, score(series, truth)
+    return Judgement(
+        run=run,
+        metrics=metrics,
+        words=summary_sentence,
+        shown=METRICS,
+        sections=lambda: figures.sections(run, metrics, series, truth),
+        accuracy=lambda limit: None,
     )
 
 
-def html(*materials):
-    return report_html([diver_part(one) for one in materials])
+def part(truth=True, count=60, checks=(), **changes):
+    estimates, true_rows, _ = single_run(count=count)
+    known = Truth.from_series(series_of(true_rows)) if truth else None
+    return judged(series_of(estimates), known, **changes).part(checks)
+
+
+def html(*parts):
+    return report_html(parts)
 
 
 class Page(HTMLParser):
@@ -76,7 +86,7 @@ class Page(HTMLParser):
 
 
 def test_the_page_is_whole_and_loads_nothing():
-    text = html(material())
+    text = html(part())
     page = Page(text)
     assert page.loads == []
     assert page.headings[:5] == [
@@ -91,44 +101,43 @@ def test_the_page_is_whole_and_loads_nothing():
 
 
 def test_the_same_material_makes_the_same_bytes():
-    assert html(material()) == html(material())
+    assert html(part()) == html(part())
 
 
 def test_without_truth_the_stated_uncertainty_is_shown():
-    page = Page(html(material(truth=False)))
+    page = Page(html(part(truth=False)))
     assert 'Stated uncertainty' in page.headings
     assert 'Error, and the predicted error' not in page.headings
 
 
 def test_several_runs_share_a_page_without_sharing_ids():
-    page = Page(html(material(), material(bag='other.bag')))
+    page = Page(html(part(), part(bag='other.bag')))
     assert 'other.bag' in page.headings
-    figure_ids = [one for one in page.ids if one.startswith('figure-')]
+    figure_ids = [name for name in page.ids if name.startswith('figure-')]
     assert len(figure_ids) == len(set(figure_ids)) == 8
 
 
 def test_a_run_without_tracks_still_makes_a_page():
     series = series_of([])
-    page = Page(html(Material(run=RUN, metrics=score(series), series=series)))
+    page = Page(html(judged(series).part()))
     assert 'Map' in page.headings
 
 
 def test_checks_against_the_live_node_come_first():
     checks = [Check('bytes', 'equal', 'equal', True)]
-    page = Page(report_html([diver_part(material(), checks)]))
+    page = Page(html(part(checks=checks)))
     assert page.headings[1] == 'Live node against offline tracker'
 
 
 def test_runs_of_several_systems_share_a_page():
-    other = run_part(
-        {**RUN, 'system': 'whale', 'bag': 'whale.bag'},
-        {'size': {'rmse_m': 2.0}},
-        [],
+    other = Part(
+        run={**RUN, 'system': 'whale', 'bag': 'whale.bag'},
+        metrics={'size': {'rmse_m': 2.0}},
         summary='A whale.',
         cards=[Card('30 m', 'Length')],
         sections=[Section('Whale', 'Seen from the side.')],
     )
-    text = report_html([diver_part(material()), other])
+    text = html(part(), other)
     page = Page(text)
     assert page.headings.index('whale.bag') < page.headings.index('Whale')
     assert 'sonar_imm · diver tracker' in text and 'sonar_imm · whale tracker' in text

@@ -14,16 +14,15 @@
 
 """How runs of the bathymetry tracker are judged: the floor along each ping against the true floor.
 
-`profiles` pairs estimate and truth of each ping, `scoring` compares them. `summary`, `sections`
-and `figures` present the result; `bench` measures the speed beside other filters (`peers`).
+`profiles` pairs estimate and truth of each ping, `scoring` compares them. `summary` and `figures`
+present the result; `bench` measures the speed beside other filters (`peers`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import functools
 import math
-from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from attrs import evolve
@@ -33,18 +32,17 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.soundings import SIDES
 
 from ...offline.run_folder import read_truth, RunFolder
-from ..judging import Check, Judgement, JudgeOptions, Limit
-from .profiles import profiles_of, Swath
+from ..judging import Check, Judgement, JudgeOptions, Limit, naming
+from .profiles import profiles_of
 from .scoring import score
-from .summary import lines, summary_sentence
+from .summary import METRICS, summary_sentence
 
 if TYPE_CHECKING:
-    from ..page import Part
+    from ..report import Section
 
 LIMIT = Limit(0.25, 'm', 'height RMSE', 'height.all.rmse_m')
 """Limit for recordings without one of their own, over all bins with an echo. On the scene of the
-paper the
-default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""
+paper the default reaches 0.15 m, and MUSIC, which has no terrain model, 0.27 m."""
 
 
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
@@ -52,16 +50,25 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     run = folder.read_run()
     truth: list[Estimate] = []
     for topic, side in truth_topics(run).items():
-        for one in read_truth(run, options.truth_bag, topic) or []:
-            sided = {} if side is None else {'side': np.full(len(one), side, np.uint8)}
-            truth.append(evolve(one, extras={**one.extras, **sided}))
-    swath = profiles_of(folder.read_estimates(), truth)
+        for table in read_truth(run, options.truth_bag, topic) or []:
+            sided = {} if side is None else {'side': np.full(len(table), side, np.uint8)}
+            truth.append(evolve(table, extras={**table.extras, **sided}))
+    with naming(folder.path):
+        swath = profiles_of(folder.read_estimates(), truth)
     metrics = score(swath)
+
+    def sections() -> Iterable[Section]:
+        # plotly, which only a report needs, takes a second to load.
+        from .figures import sections
+
+        return sections(run, folder.path, swath)
+
     return Judgement(
+        run=run,
         metrics=metrics,
-        summary=summary_sentence(metrics),
-        lines=tuple(lines(metrics)),
-        part=functools.partial(_part, folder.path, run, metrics, swath),
+        words=summary_sentence,
+        shown=METRICS,
+        sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
 
@@ -75,19 +82,6 @@ def truth_topics(run: Mapping[str, Any]) -> dict[str, int | None]:
         for topic, name in run['topics'].items()
         if name.endswith('snapshot')
     }
-
-
-def _part(
-    folder: Path,
-    run: Mapping[str, Any],
-    metrics: Mapping[str, Any],
-    swath: Swath,
-    checks: Sequence[Check],
-) -> Part:
-    # plotly, which only a report needs, takes a second to load.
-    from .sections import bathymetry_part
-
-    return bathymetry_part(folder, run, metrics, swath, checks)
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:

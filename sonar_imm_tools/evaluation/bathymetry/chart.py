@@ -30,7 +30,7 @@ from sonar_imm.measurements import Navigation
 from ...offline.run_folder import read_measurements, SOUNDINGS
 from ...recordings.export.grid import EMPTY_LABEL, Grid, grid_of
 from ...recordings.export.points import Points, read_points
-from ..plotting import INK, styled, thin
+from ..plotting import add_line, INK, styled, thin
 
 MOST_CELLS = 160
 """Cells along the longer side of the chart."""
@@ -48,8 +48,8 @@ def points_of(folder: Path) -> Points | None:
 
 def track_of(run: Mapping[str, Any]) -> FloatArray:
     """Where the ship went (n, 2), east and north; empty when the recording is gone."""
-    places = [one.position[:2] for one in read_measurements(run) if isinstance(one, Navigation)]
-    track = np.array(places).reshape(-1, 2)
+    navigation = [pose for pose in read_measurements(run) if isinstance(pose, Navigation)]
+    track = np.array([pose.position[:2] for pose in navigation]).reshape(-1, 2)
     return track[thin(len(track), MOST_POSES)]
 
 
@@ -83,13 +83,6 @@ def chart_figure(grid: Grid, track: FloatArray) -> go.Figure:
         ),
     )
     if len(track):
-        figure.add_scatter(
-            x=track[:, 0],
-            y=track[:, 1],
-            mode='lines',
-            name='track of the ship',
-            line={'color': INK, 'width': 1.5},
-        )
-    figure.update_xaxes(title='east [m]', zeroline=False, constrain='domain')
-    figure.update_yaxes(title='north [m]', zeroline=False, scaleanchor='x')
-    return styled(figure, height=520)
+        add_line(figure, track[:, 0], track[:, 1], 'track of the ship', INK, 1.5)
+    x = {'title': 'east [m]', 'zeroline': False, 'constrain': 'domain'}
+    return styled(figure, 520, x, {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'})

@@ -12,11 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The figures of sea floors. Each function takes arrays and gives one plotly figure."""
+"""What the report shows of sea floors: sections with a figure each."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -24,15 +26,87 @@ import plotly.graph_objects as go
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.config import BathymetryConfig
+from sonar_imm.trackers.bathymetry.likelihood import spacing_of
 
 from ... import SECOND
-from ..plotting import AMBER, COLOURS, INK, styled, thin, transparent
+from ...offline.run_folder import read_measurements
+from ..plotting import (
+    add_band,
+    add_image,
+    add_line,
+    add_points,
+    AMBER,
+    BARE,
+    COLOURS,
+    INK,
+    styled,
+    thin,
+)
+from ..report import Section
+from . import chart
 from .profiles import Profile, Swath
 from .scoring import BAND, runs
 
 MOST_BINS = 1200
 DIRECTIONS = 161
 FLOOR_DB = -20
+SLANT = {'title': 'slant range [m]'}
+
+
+def sections(run: Mapping[str, Any], folder: Path, swath: Swath) -> Iterator[Section]:
+    """The sections of one run in `folder`. run: content of ``run.json``."""
+    if swath.profiles:
+        yield from _of_pings(run, swath)
+    if (points := chart.points_of(folder)) is not None:
+        grid = chart.chart_of(points)
+        yield Section(
+            'Chart',
+            f'{len(points)} soundings in cells of {grid.cell:g} m, as `sonar-imm export` writes '
+            'them; north is up. Dark line: the ship.',
+            chart.chart_figure(grid, chart.track_of(run)),
+        )
+
+
+def _of_pings(run: Mapping[str, Any], swath: Swath) -> Iterator[Section]:
+    number = len(swath.profiles) // 2
+    profile = swath.profiles[number]
+    which = f' Ping {number + 1} of {len(swath.profiles)}.'
+    yield Section(
+        'Profile of the floor',
+        'Height along one ping. Dotted: truth. Shaded: two standard deviations, which should hold '
+        f'95 % of the truth. Blue: the true rough patch.{which}',
+        profile_figure(profile),
+    )
+    if (snapshot := _snapshot(run, profile)) is not None:
+        spacing = spacing_of(snapshot, BathymetryConfig.from_mapping(run['parameters']))
+        yield Section(
+            'Pseudo-spectrum and estimated angle',
+            'Light: directions with much sound (Capon spectrum of the samples, 11 bins at a time, '
+            f'no terrain model). Line: the estimated angle.{which}',
+            spectrum_figure(profile, snapshot, spacing),
+        )
+    yield Section(
+        'Which terrain model held',
+        f'Dark: the model is probable. Lines: ends of the true patch.{which}',
+        models_figure(profile, swath.model_names),
+    )
+    if swath.rough.any():
+        yield Section(
+            'Rough floor over the whole run',
+            'One row per ping. Dark: probably rough.',
+            segmentation_figure(swath),
+        )
+
+
+def _snapshot(run: Mapping[str, Any], profile: Profile) -> Snapshot | None:
+    """The samples of one ping, None when the recording is gone."""
+    for ping in read_measurements(run):
+        if not isinstance(ping, Snapshot) or ping.stamp_ns != profile.stamp_ns:
+            continue
+        if len(ping) == len(profile.range) and profile.side in ('', ping.side):
+            return ping
+    return None
 
 
 def profile_figure(profile: Profile) -> go.Figure:
@@ -41,36 +115,24 @@ def profile_figure(profile: Profile) -> go.Figure:
     shown = thin(len(profile.range), MOST_BINS)
     ranges, height, std = profile.range[shown], profile.height[shown], profile.height_std[shown]
     known = np.isfinite(std)
-    figure.add_scatter(
-        x=np.concatenate([ranges[known], ranges[known][::-1]]),
-        y=np.concatenate([(height + BAND * std)[known], (height - BAND * std)[known][::-1]]),
-        fill='toself',
-        fillcolor=transparent(AMBER, 0.3),
-        mode='lines',
-        line={'color': transparent(AMBER, 0.6), 'width': 0.5},
-        name='two standard deviations',
-        hoverinfo='skip',
-    )
+    high, low = (height + BAND * std)[known], (height - BAND * std)[known]
+    name = 'two standard deviations'
+    add_band(figure, ranges[known], high, low, AMBER, (0.3, 0.6), name=name)
     if profile.truth is not None:
-        _mark_patches(figure, profile)
-        figure.add_scatter(
-            x=ranges,
-            y=np.where(profile.truth.echo, profile.truth.height, np.nan)[shown],
-            mode='lines',
-            name='truth',
-            line={'color': INK, 'width': 1.0, 'dash': 'dot'},
-        )
-    figure.add_scatter(
-        x=ranges,
-        y=height,
-        mode='lines',
-        name='estimate',
-        line={'color': COLOURS[0], 'width': 1.4},
-    )
-    _mark_silence(figure, profile)
-    figure.update_xaxes(title='slant range [m]', zeroline=False)
-    figure.update_yaxes(title='height above the reference [m]')
-    return styled(figure, height=400)
+        for begin, end in runs(profile.truth.patch):
+            ends = {'x0': profile.range[begin], 'x1': profile.range[end - 1]}
+            figure.add_vrect(**ends, fillcolor=COLOURS[5], opacity=0.12, line_width=0)
+        true = np.where(profile.truth.echo, profile.truth.height, np.nan)[shown]
+        dotted = {'color': INK, 'width': 1.0, 'dash': 'dot'}
+        add_line(figure, ranges, true, 'truth', INK, line=dotted)
+    add_line(figure, ranges, height, 'estimate', COLOURS[0], 1.4)
+    silent = profile.range[~profile.valid]
+    if len(silent):
+        silent = silent[thin(len(silent), MOST_BINS)]
+        bottom = np.full(len(silent), float(np.nanmin(profile.height)) - 0.3)
+        add_points(figure, silent, bottom, 'no echo', COLOURS[3], symbol='line-ns-open')
+    y = {'title': 'height above the reference [m]'}
+    return styled(figure, 400, SLANT | {'zeroline': False}, y)
 
 
 def spectrum_figure(
@@ -89,110 +151,23 @@ def spectrum_figure(
     decibels = 10.0 * np.log10(power / power.max(axis=1, keepdims=True))
     angles = np.degrees(np.arcsin(sines))
     figure = go.Figure()
-    figure.add_heatmap(
-        x=np.round(profile.range[bins], 3),
-        y=np.round(angles, 2),
-        z=np.maximum(np.round(decibels), FLOOR_DB).T.astype(np.int8),
-        zmin=FLOOR_DB,
-        zmax=0,
-        colorscale='Greys_r',
-        colorbar={'title': {'text': 'dB below the peak', 'side': 'right'}, 'thickness': 12},
+    add_image(
+        figure,
+        np.round(profile.range[bins], 3),
+        np.round(angles, 2),
+        np.maximum(np.round(decibels), FLOOR_DB).T.astype(np.int8),
+        'dB below the peak',
+        limits=(FLOOR_DB, 0),
+        colours='Greys_r',
         hovertemplate='%{x:.2f} m, %{y:.1f}°: %{z} dB<extra></extra>',
     )
     if profile.truth is not None:
         true = np.degrees(np.where(profile.truth.echo, profile.truth.angle, np.nan))
-        figure.add_scatter(
-            x=profile.range[bins],
-            y=true[bins],
-            mode='lines',
-            name='truth',
-            line={'color': AMBER, 'width': 1.2},
-        )
-    figure.add_scatter(
-        x=profile.range[bins],
-        y=np.degrees(profile.angle[bins]),
-        mode='lines',
-        name='estimate',
-        line={'color': COLOURS[1], 'width': 1.6},
-    )
-    figure.update_xaxes(title='slant range [m]', showgrid=False, zeroline=False)
-    figure.update_yaxes(
-        title='angle from broadside [°]',
-        showgrid=False,
-        zeroline=False,
-        range=_view(np.degrees(profile.angle), angles),
-    )
-    return styled(figure, height=420)
-
-
-def models_figure(profile: Profile, names: Iterable[str]) -> go.Figure:
-    """Probability of each terrain model along one ping, as a heat strip."""
-    names = tuple(names)
-    bins = thin(len(profile.range), MOST_BINS)
-    figure = go.Figure()
-    figure.add_heatmap(
-        x=np.round(profile.range[bins], 3),
-        y=list(names),
-        z=np.round(profile.probabilities[bins].T, 3),
-        zmin=0.0,
-        zmax=1.0,
-        colorscale='Blues',
-        colorbar={'title': {'text': 'probability', 'side': 'right'}, 'thickness': 12},
-        hovertemplate='%{x:.2f} m, %{y}: %{z:.3f}<extra></extra>',
-    )
-    if profile.truth is not None:
-        for begin, end in runs(profile.truth.patch):
-            for bin_number in (begin, end - 1):
-                figure.add_vline(x=profile.range[bin_number], line={'color': COLOURS[1]})
-    figure.update_xaxes(title='slant range [m]', showgrid=False, zeroline=False)
-    figure.update_yaxes(showgrid=False, zeroline=False)
-    return styled(figure, height=180 + 24 * len(names))
-
-
-def segmentation_figure(swath: Swath) -> go.Figure:
-    """Probability of rough floor over pings and range, with the ends of the true patches."""
-    one_side = [one for one in swath.profiles if one.side == swath.profiles[0].side]
-    profiles = one_side[thin(len(one_side), 400)]
-    longest = max(profiles, key=lambda profile: len(profile.range))
-    bins = thin(len(longest.range), 600)
-    ranges = longest.range[bins]
-    seconds = [(one.stamp_ns - swath.profiles[0].stamp_ns) / SECOND for one in profiles]
-    rough = np.stack(
-        [
-            np.interp(ranges, one.range, swath.roughness(one), left=np.nan, right=np.nan)
-            for one in profiles
-        ]
-    )
-    figure = go.Figure()
-    figure.add_heatmap(
-        x=np.round(ranges, 3),
-        y=seconds,
-        z=np.round(rough, 2),
-        zmin=0.0,
-        zmax=1.0,
-        colorscale='Blues',
-        colorbar={'title': {'text': 'probability of rough', 'side': 'right'}, 'thickness': 12},
-        hovertemplate='%{x:.2f} m, %{y:.2f} s: %{z:.2f}<extra></extra>',
-    )
-    ends = [
-        (one.range[place], when)
-        for one, when in zip(profiles, seconds)
-        if one.truth is not None
-        for begin, end in runs(one.truth.patch)
-        for place in (begin, end - 1)
-    ]
-    if ends:
-        x, y = np.array(ends).T
-        figure.add_scattergl(
-            x=x,
-            y=y,
-            mode='markers',
-            name='ends of the true patch',
-            marker={'color': COLOURS[1], 'size': 6, 'symbol': 'line-ns-open'},
-        )
-    figure.update_xaxes(title='slant range [m]', showgrid=False, zeroline=False)
-    figure.update_yaxes(title='time [s]', showgrid=False, zeroline=False, autorange='reversed')
-    return styled(figure, height=340)
+        add_line(figure, profile.range[bins], true[bins], 'truth', AMBER, 1.2)
+    estimated = np.degrees(profile.angle)
+    add_line(figure, profile.range[bins], estimated[bins], 'estimate', COLOURS[1], 1.6)
+    y = {'title': 'angle from broadside [°]', 'range': _view(estimated, angles)}
+    return styled(figure, 420, SLANT | BARE, y | BARE)
 
 
 def _view(shown: FloatArray, angles: FloatArray) -> list[float]:
@@ -204,26 +179,56 @@ def _view(shown: FloatArray, angles: FloatArray) -> list[float]:
     return [max(low, float(angles[0])), min(high, float(angles[-1]))]
 
 
-def _mark_patches(figure: go.Figure, profile: Profile) -> None:
-    for begin, end in runs(profile.truth.patch):
-        figure.add_vrect(
-            x0=profile.range[begin],
-            x1=profile.range[end - 1],
-            fillcolor=COLOURS[5],
-            opacity=0.12,
-            line_width=0,
-        )
+def models_figure(profile: Profile, names: Sequence[str]) -> go.Figure:
+    """Probability of each terrain model along one ping, as a heat strip."""
+    bins = thin(len(profile.range), MOST_BINS)
+    figure = go.Figure()
+    add_image(
+        figure,
+        np.round(profile.range[bins], 3),
+        list(names),
+        np.round(profile.probabilities[bins].T, 3),
+        hovertemplate='%{x:.2f} m, %{y}: %{z:.3f}<extra></extra>',
+    )
+    if profile.truth is not None:
+        for begin, end in runs(profile.truth.patch):
+            for bin_number in (begin, end - 1):
+                figure.add_vline(x=profile.range[bin_number], line={'color': COLOURS[1]})
+    return styled(figure, 180 + 24 * len(names), SLANT | BARE, BARE)
 
 
-def _mark_silence(figure: go.Figure, profile: Profile) -> None:
-    """Ticks at the bottom where there was no echo."""
-    silent = profile.range[~profile.valid]
-    if len(silent):
-        silent = silent[thin(len(silent), MOST_BINS)]
-        figure.add_scattergl(
-            x=silent,
-            y=np.full(len(silent), float(np.nanmin(profile.height)) - 0.3),
-            mode='markers',
-            name='no echo',
-            marker={'color': COLOURS[3], 'size': 4, 'symbol': 'line-ns-open'},
-        )
+def segmentation_figure(swath: Swath) -> go.Figure:
+    """Probability of rough floor over pings and range, with the ends of the true patches."""
+    first = swath.profiles[0]
+    same_side = [profile for profile in swath.profiles if profile.side == first.side]
+    profiles = same_side[thin(len(same_side), 400)]
+    longest = max(profiles, key=lambda profile: len(profile.range))
+    ranges = longest.range[thin(len(longest.range), 600)]
+    seconds = [(profile.stamp_ns - first.stamp_ns) / SECOND for profile in profiles]
+    rough = np.stack(
+        [
+            np.interp(ranges, profile.range, swath.roughness(profile), left=np.nan, right=np.nan)
+            for profile in profiles
+        ]
+    )
+    figure = go.Figure()
+    add_image(
+        figure,
+        np.round(ranges, 3),
+        seconds,
+        np.round(rough, 2),
+        'probability of rough',
+        hovertemplate='%{x:.2f} m, %{y:.2f} s: %{z:.2f}<extra></extra>',
+    )
+    ends = [
+        (profile.range[place], when)
+        for profile, when in zip(profiles, seconds)
+        if profile.truth is not None
+        for begin, end in runs(profile.truth.patch)
+        for place in (begin, end - 1)
+    ]
+    if ends:
+        x, y = np.array(ends).T
+        name = 'ends of the true patch'
+        add_points(figure, x, y, name, COLOURS[1], 6, symbol='line-ns-open')
+    return styled(figure, 340, SLANT | BARE, {'title': 'time [s]', 'autorange': 'reversed'} | BARE)

@@ -28,9 +28,9 @@ from sonar_imm.soundings import SIDES
 from ..columns import read_columns
 
 _BINS = (
-    'range', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
+    'range?', 'valid', 'height?', 'angle?', 'beam_angle?', 'vertical_uncertainty?', 'rough?',
 )  # fmt: skip
-_TRUE = ('range', 'height?', 'angle?', 'patch?', 'valid?')
+_TRUE = ('range?', 'height?', 'angle?', 'patch?', 'valid?')
 FAR = 0.55
 """Share of a bin by which the range of the true floor may differ from that of the estimate: half a
 bin, and a margin for single precision."""
@@ -149,8 +149,7 @@ def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
     after = np.clip(np.searchsorted(where, ranges), 1, max(len(where) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(where) - 1)
-    is_before = ranges - where[before] <= where[after] - ranges
-    nearest = np.where(is_before, before, after)
+    nearest = np.where(ranges - where[before] <= where[after] - ranges, before, after)
     width = float(np.median(np.diff(ranges))) if len(ranges) > 1 else np.inf
     found = np.abs(where[nearest] - ranges) <= FAR * width
     return TrueFloor(

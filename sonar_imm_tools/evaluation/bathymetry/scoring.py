@@ -35,6 +35,9 @@ from .profiles import BoolArray, Profile, Swath, TrueFloor
 BAND = 2.0
 """Half width of the band in figures and scores, in standard deviations."""
 
+Known = list[tuple[Profile, TrueFloor]]
+"""The pings whose true floor is known."""
+
 _PLACES: dict[str, Callable[[TrueFloor], BoolArray]] = {
     'all': lambda truth: truth.echo,
     'smooth': lambda truth: truth.echo & ~truth.patch,
@@ -55,7 +58,7 @@ def score(swath: Swath) -> dict[str, Any]:
         'rough_share': _mean([swath.roughness(profile) > 0.5 for profile in profiles]),
         'height_std_median_m': _median([profile.height_std for profile in profiles]),
     }
-    known = [profile for profile in profiles if profile.truth is not None]
+    known = [(profile, profile.truth) for profile in profiles if profile.truth is not None]
     if known:
         metrics |= {'scored_pings': len(known), **_errors(known), 'gate': _gate(known)}
         if swath.rough.any():
@@ -63,16 +66,14 @@ def score(swath: Swath) -> dict[str, Any]:
     return metrics
 
 
-def _errors(known: list[Profile]) -> dict[str, Any]:
+def _errors(known: Known) -> dict[str, Any]:
     """Errors of height and angle, and the share inside the band, by place."""
     height: dict[str, Any] = {}
     angle: dict[str, Any] = {}
     inside: dict[str, float] = {}
     for place, choose in _PLACES.items():
         high, turn, held = [], [], []
-        for profile in known:
-            truth = profile.truth
-            assert truth is not None
+        for profile, truth in known:
             bins = choose(truth)
             error = np.abs(profile.height - truth.height)[bins]
             high.append(error)
@@ -84,10 +85,10 @@ def _errors(known: list[Profile]) -> dict[str, Any]:
     return {'height': height, 'angle': angle, 'inside_band': inside}
 
 
-def _gate(known: list[Profile]) -> dict[str, Any]:
+def _gate(known: Known) -> dict[str, Any]:
     """How well the gate tells shadow from echo."""
-    shadow = [profile.valid[_PLACES['shadow'](profile.truth)] for profile in known]
-    echo = [profile.valid[profile.truth.echo] for profile in known]
+    shadow = [profile.valid[_PLACES['shadow'](truth)] for profile, truth in known]
+    echo = [profile.valid[truth.echo] for profile, truth in known]
     return {
         'shadow_bins': sum(map(len, shadow)),
         'shadow_passed_over': 1.0 - _mean(shadow),
@@ -95,13 +96,12 @@ def _gate(known: list[Profile]) -> dict[str, Any]:
     }
 
 
-def segmentation(swath: Swath, known: list[Profile]) -> dict[str, Any]:
+def segmentation(swath: Swath, known: Known) -> dict[str, Any]:
     """Overlap of the labels with the true patches, and by how many bins their ends are late."""
     both = either = rough = true = 0
     late_in, late_out, missed = [], [], 0
-    for profile in known:
-        label, patch = swath.roughness(profile) > 0.5, profile.truth.patch
-        echo = profile.truth.echo
+    for profile, truth in known:
+        label, patch, echo = swath.roughness(profile) > 0.5, truth.patch, truth.echo
         both += int((label & patch & echo).sum())
         either += int(((label | patch) & echo).sum())
         rough += int((label & echo).sum())

@@ -12,80 +12,89 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The scores of a bathymetry run as sentences and lines of text."""
+"""How the scores of a bathymetry run are put into words."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-import math
 from typing import Any
 
-from ..numbers import error_line
+from ..numbers import error, fill, look_up, Metric, NO_TRUTH
+
+
+def _unscored(metrics: Mapping[str, Any]) -> bool:
+    return not look_up(metrics, 'height.all.n')
+
+
+def _patches(metrics: Mapping[str, Any]) -> object:
+    """Whether there are both smooth floor and rough patches."""
+    return look_up(metrics, 'height.patch.n') and look_up(metrics, 'height.smooth.n')
+
+
+METRICS = (
+    Metric(label='pings, range bins', line='{pings}, {bins}'),
+    Metric(label='bins with an echo', line='{heard_share:.0%}'),
+    Metric(card='Pings', value='{pings}', remark='{bins} range bins', when=_unscored),
+    Metric(card='Bins with an echo', value='{heard_share:.0%}', when=_unscored),
+    Metric(card='Stated uncertainty, median', value='{height_std_median_m:.2f} m', when=_unscored),
+    Metric(card='Bins labelled rough', value='{rough_share:.0%}', when=_unscored),
+    error('height.all', 'height error, all', card='Height error, RMS'),
+    error('height.smooth', 'height error, smooth'),
+    Metric(card='On smooth floor, RMS', value='{height.smooth.rmse_m:.2f} m', when=_patches),
+    error('height.patch', 'height error, patch'),
+    Metric(card='In rough patches, RMS', value='{height.patch.rmse_m:.2f} m', when=_patches),
+    error('height.shadow', 'height error, shadow'),
+    error(
+        'angle.all',
+        'angle error, all',
+        'deg',
+        card='Angle error, RMS',
+        value='{angle.all.rmse_deg:.2f}°',
+        remark='',
+    ),
+    Metric(
+        label='inside two sd, smooth / patch',
+        line='{inside_band.smooth:.0%} / {inside_band.patch:.0%}',
+        card='Truth inside two standard deviations',
+        value='{inside_band.all:.0%}',
+        remark='95 % would be perfect',
+    ),
+    Metric(
+        label='overlap of the rough patches',
+        line='{segmentation.iou:.2f}',
+        card='Overlap of the rough patches',
+        value='{segmentation.iou:.2f}',
+        remark='noticed {segmentation.bins_late_in:.0f} bins late, left '
+        '{segmentation.bins_late_out:.0f} bins late',
+        when=lambda metrics: look_up(metrics, 'segmentation.patches'),
+    ),
+    Metric(
+        label='bins late, into / out of a patch',
+        line='{segmentation.bins_late_in:.0f} / {segmentation.bins_late_out:.0f}',
+    ),
+    Metric(
+        label='shadow passed over',
+        line='{gate.shadow_passed_over:.0%}',
+        when=lambda metrics: look_up(metrics, 'gate.shadow_bins'),
+    ),
+)
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
-    height = metrics.get('height', {}).get('all', {})
-    if not height.get('n'):
-        return (
-            f'{metrics["pings"]} pings with {metrics["bins"]} range bins, of which '
-            f'{percent(metrics["heard_share"])} have an echo. There is no truth to compare with, '
-            'so only the estimates and their stated uncertainty are shown.'
+    if _unscored(metrics):
+        echo = '{pings} pings with {bins} range bins, of which {heard_share:.0%} have an echo. '
+        return fill(echo, metrics) + NO_TRUTH
+    words = 'On average the floor lies {height.all.rmse_m:.2f} m from the truth (RMS)'
+    if _patches(metrics):
+        words += (
+            ': {height.smooth.rmse_m:.2f} m where it is smooth, {height.patch.rmse_m:.2f} m in '
+            'rough patches'
         )
-    sentences = [f'On average the floor lies {height["rmse_m"]:.2f} m from the truth (RMS)']
-    patch, smooth = metrics['height']['patch'], metrics['height']['smooth']
-    if patch['n'] and smooth['n']:
-        sentences[0] += (
-            f': {smooth["rmse_m"]:.2f} m where it is smooth, {patch["rmse_m"]:.2f} m in rough '
-            'patches'
-        )
-    sentences[0] += '.'
-    sentences.append(
-        f'{percent(metrics["inside_band"]["all"])} of the bins lie inside the band of two '
-        'standard deviations; 95 % would be perfect.'
+    words += (
+        '. {inside_band.all:.0%} of the bins lie inside the band of two standard deviations; '
+        '95 % would be perfect.'
     )
-    found = metrics.get('segmentation', {})
-    if found.get('patches'):
-        sentences.append(
-            f'What is labelled rough and what is rough overlap by {percent(found["iou"])}.'
-        )
-    return ' '.join(sentences)
-
-
-def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the most important numbers."""
-    result = [
-        ('pings, range bins', f'{metrics["pings"]}, {metrics["bins"]}'),
-        ('bins with an echo', percent(metrics['heard_share'])),
-    ]
-    for place in ('all', 'smooth', 'patch', 'shadow'):
-        result += error_line(
-            f'height error, {place}', metrics.get('height', {}).get(place, {}), 'm'
-        )
-    result += error_line('angle error, all', metrics.get('angle', {}).get('all', {}), 'deg')
-    inside = metrics.get('inside_band', {})
-    if inside and not math.isnan(inside['all']):
-        result.append(
-            (
-                'inside two sd, smooth / patch',
-                f'{percent(inside["smooth"])} / {percent(inside["patch"])}',
-            )
-        )
-    found = metrics.get('segmentation', {})
-    if found.get('patches'):
-        result.append(('overlap of the rough patches', f'{found["iou"]:.2f}'))
-        result.append(
-            (
-                'bins late, into / out of a patch',
-                f'{found["bins_late_in"]:.0f} / {found["bins_late_out"]:.0f}',
-            )
-        )
-    gate = metrics.get('gate', {})
-    if gate.get('shadow_bins'):
-        result.append(('shadow passed over', percent(gate['shadow_passed_over'])))
-    return result
-
-
-def percent(share: float) -> str:
-    """A share in percent, '-' when it is unknown."""
-    return '-' if math.isnan(share) else f'{100.0 * share:.0f} %'
+    if look_up(metrics, 'segmentation.patches'):
+        words += ' What is labelled rough and what is rough overlap by {segmentation.iou:.0%}.'
+    return fill(words, metrics)

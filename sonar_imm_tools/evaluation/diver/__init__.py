@@ -15,38 +15,35 @@
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
 `series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
-belongs to which diver, `scoring` compares them. `summary`, `sections` and `figures` present the
-result; `bench` measures the speed.
+belongs to which diver, `scoring` compares them. `summary` and `figures` present the result;
+`bench` measures the speed.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import functools
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.placing import Placer
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
-from ...recordings.sources import BagError
-from ..judging import Check, Judgement, JudgeOptions, Limit
+from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .scoring import fix_series, score
-from .series import Series, series_of
-from .summary import lines, summary_sentence
+from .series import series_of
+from .summary import METRICS, summary_sentence
 from .truth import Truth
 
 if TYPE_CHECKING:
-    from ..page import Part
+    from ..report import Section
 
 LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
 """Limit for recordings without one of their own. The raw fixes of Table 1 have 1.71 m and its best
-tracker
-0.85 m on average; one recording can be worse than the average."""
+tracker 0.85 m on average; one recording can be worse than the average."""
 
 CUTOFF = 10.0
 """Metres from which an estimate is on no diver, where there are several."""
@@ -55,53 +52,39 @@ CUTOFF = 10.0
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
     run = folder.read_run()
-    series = _series(folder.read_estimates(), folder.path)
+    with naming(folder.path):
+        series = series_of(folder.read_estimates())
     truth = _truth(run, options)
     placer = Placer(DiverConfig.from_mapping(run['parameters'], ignore_unknown=True), Counter())
-    placed = (one for measurement in read_measurements(run) for one in placer.place(measurement))
-    fixes = [one for one in placed if isinstance(one, (Fix, Fixes))]
+    placed = (fix for measurement in read_measurements(run) for fix in placer.place(measurement))
+    fixes = [fix for fix in placed if isinstance(fix, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics = score(series, truth, fixes=raw, cutoff=cutoff)
     metrics['truth_lag_s'] = options.lag
+
+    def sections() -> Iterable[Section]:
+        # plotly, which only a report needs, takes a second to load.
+        from .figures import sections
+
+        return sections(run, metrics, series, truth, raw)
+
     return Judgement(
+        run=run,
         metrics=metrics,
-        summary=summary_sentence(metrics),
-        lines=tuple(lines(metrics)),
-        part=functools.partial(_part, run, metrics, series, truth, raw),
+        words=summary_sentence,
+        shown=METRICS,
+        sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
-
-
-def _series(estimates: Iterable[Estimate], where: Path) -> Series:
-    try:
-        return series_of(estimates)
-    except ValueError as error:
-        raise BagError(f'{where}: {error}') from None
 
 
 def _truth(run: Mapping[str, Any], options: JudgeOptions) -> Truth | None:
     rows = read_truth(run, options.truth_bag)
     if rows is None:
         return None
-    series = _series(rows, options.truth_bag or Path(run['bag']))
-    return Truth.from_series(series, max_gap=options.gap).shifted(options.lag)
-
-
-def _part(
-    run: Mapping[str, Any],
-    metrics: Mapping[str, Any],
-    series: Series,
-    truth: Truth | None,
-    fixes: Series | None,
-    checks: Sequence[Check],
-) -> Part:
-    # plotly, which only a report needs, takes a second to load.
-    from .sections import diver_part, Material
-
-    return diver_part(
-        Material(run=run, metrics=metrics, series=series, truth=truth, fixes=fixes), checks
-    )
+    with naming(options.truth_bag or Path(run['bag'])):
+        return Truth.from_series(series_of(rows), max_gap=options.gap).shifted(options.lag)
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:

@@ -12,34 +12,110 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The figures of divers. Each function takes arrays and gives one plotly figure."""
+"""What the report shows of divers: sections with a figure each."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from typing import Any
+
 import numpy as np
-from numpy.typing import NDArray
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ..plotting import (
     add_band,
+    add_image,
+    add_line,
+    add_points,
+    AMBER,
+    BARE,
     COLOURS,
     GREY,
-    INK,
     MOST_POINTS,
+    nis_figure,
     seconds,
     styled,
     thin,
+    TIME,
     transparent,
+    TRUTH,
 )
-from .matching import Matching
-from .series import IntArray, Series
+from ..report import Section
+from .matching import match, Matching
+from .series import Series
 from .truth import Truth
 
 MOST_ELLIPSES = 60
 MOST_TRACKS_NAMED = 12
+
+
+def sections(
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    series: Series,
+    truth: Truth | None = None,
+    fixes: Series | None = None,
+) -> Iterator[Section]:
+    """The sections of one run. run: content of ``run.json``; metrics: of ``metrics.json``."""
+    series = series.confirmed()
+    yield Section(
+        'Map',
+        'Seen from above. Dotted: truth. Crosses: raw fixes. Shaded: ellipses that should hold '
+        'the target 95 % of the time.',
+        map_figure(series, truth, fixes),
+    )
+    track_id = series.longest_track()
+    if track_id is None:
+        return
+    count = len(np.unique(series.track_id))
+    which = '' if count == 1 else f' Track {track_id}, the longest of {count}.'
+    matching = None
+    if truth is not None and 'position' in metrics:
+        matching = match(series, truth, cutoff=metrics['cutoff_m'])
+    if matching is not None and len(matching.row):
+        yield Section(
+            'Error, and the predicted error',
+            f'The error of a consistent tracker lies inside the band 95 % of the time.{which}',
+            error_figure(matching, track_id),
+        )
+    else:
+        yield Section(
+            'Stated uncertainty',
+            f'One sigma on each axis.{which}',
+            sigma_figure(series, track_id),
+        )
+    if series.model_names:
+        relative = run.get('parameters', {}).get('model_set') == 'relative_headings'
+        yield Section(
+            'Which motion model held',
+            f'Dark: the model is probable. Headings are counter-clockwise from +x.{which}',
+            models_figure(series, track_id, None if relative else true_course(matching, track_id)),
+        )
+    hits = series.hits()
+    if len(hits):
+        yield Section(
+            'Normalised innovations (NIS)',
+            'Distance of each measurement from its prediction, in units of the stated '
+            'uncertainty, squared. Amber: where the mean should stay.',
+            nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, hits.nis_dof),
+        )
+
+
+def true_course(matching: Matching | None, track_id: int) -> tuple[FloatArray, FloatArray] | None:
+    """Seconds and degrees of the true course of the target of a track; None when unknown."""
+    if matching is None:
+        return None
+    rows = matching.series.track_id[matching.row] == track_id
+    velocity = matching.truth[rows, 2:]
+    moving = np.hypot(*velocity.T) > 0.05
+    stamps = matching.series.stamp_ns[matching.row[rows]][moving]
+    if not len(stamps):
+        return None
+    course = np.degrees(np.arctan2(velocity[moving, 1], velocity[moving, 0]))
+    return seconds(stamps, matching.series.scan_ns), course
 
 
 def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.Figure:
@@ -55,7 +131,8 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
             hoverinfo='skip',
             marker={'symbol': 'x-thin', 'size': 5, 'line': {'color': GREY, 'width': 1}},
         )
-    for path in truth.paths if truth else ():
+    paths = truth.paths if truth else ()
+    for path in paths:
         shown = thin(len(path.stamp_ns), MOST_POINTS)
         figure.add_scatter(
             x=path.state[shown, 0],
@@ -63,20 +140,18 @@ def map_figure(series: Series, truth: Truth | None, fixes: Series | None) -> go.
             mode='lines',
             name='truth',
             legendgroup='truth',
-            showlegend=path is truth.paths[0],
+            showlegend=path is paths[0],
             hovertemplate=f'target {path.track_id}: x %{{x:.2f}}, y %{{y:.2f}}',
-            line={'color': INK, 'width': 1.5, 'dash': 'dot'},
+            line=TRUTH,
         )
     for order, track_id in enumerate(_tracks_by_length(series)):
         _add_track(figure, series.pick(series.track_id == track_id), order)
     # Clutter can lie anywhere: the first view shows tracks and truth, the rest by zooming out.
-    paths = truth.paths if truth else ()
     x_range, y_range = view_of(
         np.concatenate([series.state[:, :2], *(path.state[:, :2] for path in paths)])
     )
-    figure.update_xaxes(title='x [m]', range=x_range)
-    figure.update_yaxes(title='y [m]', range=y_range, scaleanchor='x', scaleratio=1)
-    return styled(figure, height=640)
+    y = {'title': 'y [m]', 'range': y_range, 'scaleanchor': 'x', 'scaleratio': 1}
+    return styled(figure, 640, {'title': 'x [m]', 'range': x_range}, y)
 
 
 def view_of(points: FloatArray) -> tuple[list[float] | None, list[float] | None]:
@@ -84,8 +159,9 @@ def view_of(points: FloatArray) -> tuple[list[float] | None, list[float] | None]
     if not len(points):
         return None, None
     low, high = points.min(axis=0), points.max(axis=0)
-    room = 0.08 * max(float((high - low).max()), 1.0)
-    return tuple([float(a - room), float(b + room)] for a, b in zip(low, high))
+    margin = 0.08 * max(float((high - low).max()), 1.0)
+    x, y = ([float(a - margin), float(b + margin)] for a, b in zip(low, high))
+    return x, y
 
 
 def _add_track(figure: go.Figure, track: Series, order: int) -> None:
@@ -120,48 +196,36 @@ def _add_track(figure: go.Figure, track: Series, order: int) -> None:
 
 def error_figure(matching: Matching, track_id: int) -> go.Figure:
     """Error in x and y of one track, over the 95 % band that the tracker predicted."""
-    rows = matching.series.track_id[matching.row] == track_id
+    series = matching.series
+    rows = series.track_id[matching.row] == track_id
     row = matching.row[rows]
-    order = np.argsort(matching.series.stamp_ns[row], kind='stable')
+    order = np.argsort(series.stamp_ns[row], kind='stable')
     row, error = row[order], matching.error[rows][order]
-    time = seconds(matching.series.stamp_ns[row], matching.series.scan_ns)
+    time = seconds(series.stamp_ns[row], series.scan_ns)
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06)
     for axis, name in enumerate('xy'):
-        sigma = np.sqrt(matching.series.covariance[row, axis, axis])
-        add_band(figure, time, 1.96 * sigma, first=axis == 0, row=axis + 1)
-        figure.add_scattergl(
-            x=time,
-            y=error[:, axis],
-            mode='lines+markers',
-            name='error of the track',
-            legendgroup='error',
-            showlegend=axis == 0,
-            row=axis + 1,
-            col=1,
-            line={'color': COLOURS[0], 'width': 1.2},
-            marker={'size': 3},
-        )
-        figure.update_yaxes(title=f'{name} error [m]', row=axis + 1, col=1)
-    figure.update_xaxes(zeroline=False)
+        place = {'row': axis + 1, 'col': 1}
+        shared = {'showlegend': axis == 0, **place}
+        half = 1.96 * np.sqrt(series.covariance[row, axis, axis])
+        band = {'name': 'predicted 95 % band', 'legendgroup': 'band', **shared}
+        add_band(figure, time, half, -half, AMBER, (0.28, 0.6), **band)
+        line = {'mode': 'lines+markers', 'marker': {'size': 3}, 'legendgroup': 'error', **shared}
+        name_of_all = 'error of the track'
+        add_line(figure, time, error[:, axis], name_of_all, COLOURS[0], 1.2, gl=True, **line)
+        figure.update_yaxes(title=f'{name} error [m]', **place)
     figure.update_xaxes(title='time [s]', row=2, col=1)
-    return styled(figure, height=460)
+    return styled(figure, 460, {'zeroline': False}, {})
 
 
 def sigma_figure(series: Series, track_id: int) -> go.Figure:
     """Stated standard deviations over time, for runs without truth."""
     track = series.pick(series.track_id == track_id)
+    time = seconds(track.stamp_ns, track.scan_ns)
     figure = go.Figure()
     for axis, name in enumerate('xy'):
-        figure.add_scattergl(
-            x=seconds(track.stamp_ns, track.scan_ns),
-            mode='lines',
-            name=name,
-            y=np.sqrt(track.covariance[:, axis, axis]),
-            line={'color': COLOURS[axis], 'width': 1.5},
-        )
-    figure.update_xaxes(title='time [s]', zeroline=False)
-    figure.update_yaxes(title='stated sigma [m]', rangemode='tozero')
-    return styled(figure, height=320)
+        sigma = np.sqrt(track.covariance[:, axis, axis])
+        add_line(figure, time, sigma, name, COLOURS[axis], 1.5, gl=True)
+    return styled(figure, 320, TIME, {'title': 'stated sigma [m]', 'rangemode': 'tozero'})
 
 
 def models_figure(
@@ -174,44 +238,31 @@ def models_figure(
     track = series.pick(series.track_id == track_id)
     track = track.pick(thin(len(track), 4000))
     order = np.array(model_order(track.model_names), int)
+    names = np.array(track.model_names)[order]
     headings = sum(name.startswith('heading_') for name in track.model_names)
-    others = len(order) - headings
     figure = go.Figure()
-    figure.add_heatmap(
-        x=seconds(track.stamp_ns, track.scan_ns),
-        y=np.arange(len(order)),
-        z=track.probabilities[:, order].T,
-        zmin=0.0,
-        zmax=1.0,
-        colorscale='Blues',
-        colorbar={'title': {'text': 'probability', 'side': 'right'}, 'thickness': 12},
-        customdata=np.tile(np.array(track.model_names)[order][:, None], (1, len(track))),
+    add_image(
+        figure,
+        seconds(track.stamp_ns, track.scan_ns),
+        np.arange(len(order)),
+        track.probabilities[:, order].T,
+        customdata=np.tile(names[:, None], (1, len(track))),
         hovertemplate='%{x:.1f} s, %{customdata}: %{z:.3f}<extra></extra>',
     )
     if truth_course is not None and headings:
         time, degrees = truth_course
-        figure.add_scattergl(
-            x=time,
-            y=others + np.mod(degrees, 360.0) * headings / 360.0,
-            mode='markers',
-            name='true course',
-            showlegend=True,
-            marker={'color': COLOURS[1], 'size': 4},
-        )
-    figure.update_yaxes(
-        tickvals=np.arange(len(order)),
-        showgrid=False,
-        zeroline=False,
-        ticktext=[model_label(track.model_names[index]) for index in order],
-        range=[-0.5, len(order) - 0.5],
-    )
-    figure.update_xaxes(title='time [s]', showgrid=False, zeroline=False)
-    return styled(figure, height=180 + 18 * len(order))
+        row = len(order) - headings + np.mod(degrees, 360.0) * headings / 360.0
+        add_points(figure, time, row, 'true course', COLOURS[1])
+        figure.data[-1].showlegend = True
+    rows = {'tickvals': np.arange(len(order)), 'range': [-0.5, len(order) - 0.5]}
+    labels = [model_label(name) for name in names]
+    height = 180 + 18 * len(order)
+    return styled(figure, height, TIME | BARE, {'ticktext': labels} | rows | BARE)
 
 
 def outlines(
     mean: FloatArray, covariance: FloatArray, *, probability: float = 0.95, points: int = 40
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """(m, 2) outlines of Gaussian ellipses that hold `probability`, NaN rows between them."""
     shown = thin(len(mean), MOST_ELLIPSES)
     values, vectors = np.linalg.eigh(covariance[shown])

@@ -79,18 +79,18 @@ def match(series: Series, truth: Truth, *, cutoff: float) -> Matching:
     for scan in np.flatnonzero(known & (ends > starts)):
         there = np.flatnonzero(present[:, scan])
         offset = series.state[starts[scan] : ends[scan], None, :2] - states[None, there, scan, :2]
-        for row, column in assign(np.hypot(offset[..., 0], offset[..., 1]), limit):
-            rows.append(starts[scan] + row)
-            targets.append(there[column])
-            scans.append(scan)
-            followed_by[there[column], scan] = series.track_id[starts[scan] + row]
-    row, target, at = (np.array(values, np.int64) for values in (rows, targets, scans))
+        for at, column in assign(np.hypot(offset[..., 0], offset[..., 1]), limit):
+            rows.append(int(starts[scan]) + at)
+            targets.append(int(there[column]))
+            scans.append(int(scan))
+            followed_by[there[column], scan] = series.track_id[starts[scan] + at]
+    row, target, ping = (np.array(values, np.int64) for values in (rows, targets, scans))
     scan_ns = series.scan_ns[known]
     return Matching(
         series=series,
         row=row,
         target=target,
-        truth=states[target, at],
+        truth=states[target, ping],
         scan_ns=scan_ns,
         present=present[:, known],
         followed_by=followed_by[:, known],

@@ -12,74 +12,102 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The scores of a diver run as sentences and lines of text."""
+"""How the scores of a diver run are put into words."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from ..numbers import chi2_line, coverage_sentence, error_line
+from ..numbers import (
+    chi2,
+    coverage_sentence,
+    each,
+    error,
+    fill,
+    look_up,
+    Metric,
+    NO_TRUTH,
+    UNMATCHED,
+)
+
+
+def _unscored(metrics: Mapping[str, Any]) -> bool:
+    return not look_up(metrics, 'position.n')
+
+
+def _several(metrics: Mapping[str, Any]) -> bool:
+    """Whether there are several tracks or several divers."""
+    counts = [look_up(metrics, f'tracks.{name}') or 0 for name in ('tracks', 'true_targets')]
+    return max(counts) > 1 and not _unscored(metrics)
+
+
+METRICS = (
+    Metric(
+        card='Confirmed tracks',
+        value='{tracks_confirmed}',
+        remark='{stamps} stamps in {span_s:.0f} s',
+        when=_unscored,
+    ),
+    error('position', 'position error', card='Position error, RMS'),
+    error('raw_fix', 'raw fixes', card='Raw fixes, RMS', remark='{raw_fix.n} fixes'),
+    error('velocity', 'velocity error', 'mps', card='Velocity error, RMS', remark=''),
+    chi2('consistency.nees_position', 'NEES, position', card='NEES of the position'),
+    chi2('consistency.nees_state', 'NEES, whole state'),
+    chi2('consistency.nis', 'NIS', card='NIS of the hits'),
+    Metric(
+        label='truth inside 50 / 90 / 95 % ellipse',
+        line=' / '.join(f'{{consistency.coverage.{level}:.0%}}' for level in (50, 90, 95)),
+        card='Truth inside the 95 % ellipse',
+        value='{consistency.coverage.95:.0%}',
+        remark='95 % would be perfect',
+    ),
+    Metric(
+        label='best lag of the estimates',
+        line='{lag.best_s:.2f} s, then RMSE {lag.rmse_at_best_m:.3f} m',
+    ),
+    Metric(
+        card='Tracks / true targets',
+        value='{tracks.tracks} / {tracks.true_targets}',
+        remark='{tracks.identity_switches} identity switches, {tracks.false_tracks} false, '
+        '{tracks.completeness:.0%} complete',
+        when=_several,
+    ),
+    *each(
+        'tracks',
+        (
+            'true_targets',
+            'tracks',
+            'false_tracks',
+            'identity_switches',
+            'fragmentations',
+            'completeness',
+            'false_rows_per_scan',
+        ),
+    ),
+)
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
-    position = metrics.get('position', {})
-    if not position.get('n'):
-        known = 'scored_stamps' in metrics
-        return f'{metrics["tracks_confirmed"]} confirmed tracks in {metrics["span_s"]:.0f} s. ' + (
-            'None of them was matched with the truth.'
-            if known
-            else 'There is no truth to compare with, so only the estimates and their stated '
-            'uncertainty are shown.'
+    if _unscored(metrics):
+        return fill('{tracks_confirmed} confirmed tracks in {span_s:.0f} s. ', metrics) + (
+            UNMATCHED if 'scored_stamps' in metrics else NO_TRUTH
         )
-    sentences = [f'On average the track lies {position["rmse_m"]:.2f} m from the truth (RMS).']
-    raw = metrics.get('raw_fix', {})
-    if raw.get('n'):
-        sentences.append(_against_fixes(position['rmse_m'], raw['rmse_m']))
+    sentences = ['On average the track lies {position.rmse_m:.2f} m from the truth (RMS).']
+    if look_up(metrics, 'raw_fix.n'):
+        sentences.append(_against_fixes(metrics))
     sentences.append(coverage_sentence(metrics['consistency']['coverage']['95']))
-    return ' '.join(sentences)
+    return fill(' '.join(sentences), metrics)
 
 
-def _against_fixes(tracked: float, raw: float) -> str:
+def _against_fixes(metrics: Mapping[str, Any]) -> str:
+    raw = metrics['raw_fix']['rmse_m']
     if not raw > 0.0:
         return 'The raw fixes are the truth itself: no tracker can be better than they are.'
-    change = 1.0 - tracked / raw
+    change = 1.0 - metrics['position']['rmse_m'] / raw
     return f'The raw fixes lie {raw:.2f} m away: tracking ' + (
         f'removes {100 * change:.0f} % of the error.'
         if change >= 0.0
         else f'adds {-100 * change:.0f} % to it.'
     )
-
-
-def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the most important numbers."""
-    consistency = metrics['consistency']
-    result = [
-        *error_line('position error', metrics.get('position', {}), 'm'),
-        *error_line('raw fixes', metrics.get('raw_fix', {}), 'm'),
-        *error_line('velocity error', metrics.get('velocity', {}), 'mps', 'm/s'),
-        *chi2_line('NEES, position', consistency.get('nees_position', {})),
-        *chi2_line('NEES, whole state', consistency.get('nees_state', {})),
-        *chi2_line('NIS', consistency['nis']),
-    ]
-    if metrics.get('position', {}).get('n'):
-        result.append(
-            (
-                'truth inside 50 / 90 / 95 % ellipse',
-                ' / '.join(f'{100 * share:.0f} %' for share in consistency['coverage'].values()),
-            )
-        )
-    if metrics.get('lag'):
-        result.append(
-            (
-                'best lag of the estimates',
-                f'{metrics["lag"]["best_s"]:.2f} s, then RMSE '
-                f'{metrics["lag"]["rmse_at_best_m"]:.3f} m',
-            )
-        )
-    result += [
-        (name.replace('_', ' '), f'{value:.3g}')
-        for name, value in metrics.get('tracks', {}).items()
-    ]
-    return result

@@ -21,14 +21,13 @@ truth is unknown and nothing is scored.
 
 from __future__ import annotations
 
-from attrs import frozen
+from attrs import evolve, frozen
 import numpy as np
-from numpy.typing import NDArray
 
-from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ... import SECOND
-from .series import IntArray, Series
+from .series import Series
 
 
 @frozen(eq=False)
@@ -72,11 +71,7 @@ class Truth:
         not finite are left out.
         """
         good = series.pick(np.isfinite(series.state[:, :2]).all(axis=1))
-        paths = []
-        for track_id in np.unique(good.track_id):
-            rows = good.pick(good.track_id == track_id)
-            last = np.append(np.diff(rows.stamp_ns) > 0, True)
-            paths.append(TruthPath(int(track_id), rows.stamp_ns[last], rows.state[last]))
+        paths = (TruthPath(target, rows.stamp_ns, rows.state) for target, rows in good.by_track())
         return cls(tuple(paths), max_gap)
 
     def __len__(self) -> int:
@@ -86,14 +81,10 @@ class Truth:
         """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
         lag."""
         shift = round(lag * SECOND)
-        return Truth(
-            tuple(
-                TruthPath(path.track_id, path.stamp_ns - shift, path.state) for path in self.paths
-            ),
-            self.max_gap,
-        )
+        paths = (evolve(path, stamp_ns=path.stamp_ns - shift) for path in self.paths)
+        return evolve(self, paths=tuple(paths))
 
-    def at(self, stamp_ns: IntArray) -> NDArray[np.float64]:
+    def at(self, stamp_ns: IntArray) -> FloatArray:
         """(paths, m, 4) states at `stamp_ns`, NaN where unknown."""
         empty = np.empty((0, len(stamp_ns), 4))
         return np.concatenate(

@@ -15,29 +15,27 @@
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
 `records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
-reflectors. `summary`, `sections` and `figures` present the result; `fixed_order` shows filters of
-a fixed number for comparison; `bench` measures the speed.
+reflectors. `summary` and `figures` present the result; `bench` measures the speed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 import functools
 from typing import Any, TYPE_CHECKING
 
 from ...offline.run_folder import read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit
-from .records import Record, records_of
+from .records import records_of
 from .scoring import CUTOFF, score
-from .summary import lines, summary_sentence
+from .summary import METRICS, summary_sentence
 
 if TYPE_CHECKING:
-    from ..page import Part
+    from ..report import Section
 
 LIMIT = Limit(0.08, 'm', 'OSPA', 'ospa_m')
 """Limit for recordings without one of their own. The best configuration has 0.05 m on average over
-long drifts;
-one recording can be worse than the average."""
+long drifts; one recording can be worse than the average."""
 
 
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
@@ -51,25 +49,21 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     )
     metrics = score(records, CUTOFF if options.cutoff is None else options.cutoff)
     metrics['truth_lag_s'] = options.lag
+
+    def sections() -> Iterable[Section]:
+        # plotly, which only a report needs, takes a second to load.
+        from .figures import sections
+
+        return sections(run, metrics, records)
+
     return Judgement(
+        run=run,
         metrics=metrics,
-        summary=summary_sentence(metrics),
-        lines=tuple(lines(metrics)),
-        part=functools.partial(_part, run, metrics, records),
+        words=summary_sentence,
+        shown=METRICS,
+        sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
-
-
-def _part(
-    run: Mapping[str, Any],
-    metrics: Mapping[str, Any],
-    records: Sequence[Record],
-    checks: Sequence[Check],
-) -> Part:
-    # plotly, which only a report needs, takes a second to load.
-    from .sections import fathometer_part
-
-    return fathometer_part(run, metrics, records, checks)
 
 
 def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:

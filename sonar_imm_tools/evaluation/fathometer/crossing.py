@@ -104,7 +104,7 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
                 'longitude': _between(lines[0].longitude, i, s),
                 'latitude': _between(lines[0].latitude, i, s),
                 'angle_deg': angle,
-                **_compared(*found, limit, directions, position_std),
+                **_compared(found[0], found[1], limit, directions, position_std),
             }
         )
     matched = [one for crossing in crossings for one in crossing['horizons']]

@@ -12,24 +12,93 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figures of a run of reflectors: response and tracks, number of reflectors, amplitudes, OSPA."""
+"""What the report shows of reflectors: sections with a figure each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
+from attrs import evolve
 import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 from ... import SECOND
-from ..plotting import COLOURS, INK, styled
-from .fixed_order import FixedOrder
-from .records import Image, Record
+from ...offline.run_folder import read_measurements
+from ..plotting import add_image, add_line, add_points, BARE, COLOURS, INK, styled, TIME
+from ..report import Section
+from .records import Image, Record, Reflections
+from .scoring import pair
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
+OVER_TIME = {'title': 'time [s]', 'showgrid': False}
+
+
+def sections(
+    run: Mapping[str, Any], metrics: Mapping[str, Any], records: Sequence[Record]
+) -> Iterator[Section]:
+    """The sections of one run. run: content of ``run.json``; metrics: of ``metrics.json``."""
+    if not records:
+        return
+    committed = [record for record in records if not record.preview]
+    start = records[0].stamp_ns
+    yield Section(
+        'Depth response and reflectors',
+        'Grey: the response. Lines: the reflectors that were found, one colour per identity. '
+        'Yellow: the true depths, where they are known.',
+        response_figure(response_image(run), committed, start),
+    )
+    if not committed:
+        return
+    yield Section(
+        'How many there are',
+        'Dark: this number of reflectors is probable. Line: the true number, when known.',
+        order_figure(committed, start),
+    )
+    yield Section(
+        'Amplitudes',
+        'Corrected for spherical spreading where the depth of the array is known. A passive array '
+        'measures ratios only, so the truth is scaled to match.',
+        amplitude_figure(committed, start, metrics.get('amplitude', {}).get('factor')),
+    )
+    if _known(committed):
+        yield Section(
+            'Distance from the truth',
+            'OSPA: RMS depth error, where a false or missed reflector counts as an error of the '
+            'cutoff.',
+            distance_figure(committed, metrics['cutoff_m'], start),
+        )
+
+
+def response_image(run: Mapping[str, Any]) -> Image | None:
+    """The depth responses of a run as its tracker saw them; None when its recording is gone.
+
+    They are computed again by a tracker with two particles, whose estimates are not used.
+    """
+    config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
+    columns, depths, last = [], None, None
+    for measurement in read_measurements(run):
+        tracker.process(measurement)
+        response = tracker.response
+        if response is None or response is last:
+            continue
+        last = response
+        if depths is None:
+            depths = response.depth
+        if len(response.depth) == len(depths):
+            columns.append((response.stamp_ns, response.amplitude / response.sigma))
+    if depths is None:
+        return None
+    columns.sort(key=lambda column: column[0])
+    return Image(
+        np.array([value for _, value in columns]).T,
+        depths,
+        np.array([stamp for stamp, _ in columns], np.int64),
+    )
 
 
 def response_figure(image: Image | None, records: Sequence[Record], start_ns: int) -> go.Figure:
@@ -37,62 +106,46 @@ def response_figure(image: Image | None, records: Sequence[Record], start_ns: in
     figure = go.Figure()
     if image is not None:
         image = _thinned(image)
-        figure.add_heatmap(
-            x=(image.stamp_ns - start_ns) / SECOND,
-            y=image.depth,
-            z=np.round(image.value, 2),
-            zmin=0.0,
-            zmax=float(max(6.0, np.nanpercentile(image.value, 99.7))),
-            colorscale='Greys',
+        most = float(max(6.0, np.nanpercentile(image.value, 99.7)))
+        add_image(
+            figure,
+            (image.stamp_ns - start_ns) / SECOND,
+            image.depth,
+            np.round(image.value, 2),
+            'response / noise',
+            limits=(0.0, most),
+            colours='Greys',
             showscale=True,
-            colorbar={'title': {'text': 'response / noise', 'side': 'right'}, 'thickness': 12},
             hoverinfo='skip',
         )
-    true = [record for record in records if record.true is not None]
-    if true:
-        figure.add_trace(_dots(true, lambda r: r.true.depth, start_ns, 'truth'))
-    for index, (track_id, rows) in enumerate(_tracks(records)):
-        figure.add_scattergl(
-            x=[_seconds(records[k], start_ns) for k, _ in rows],
-            y=[records[k].found.depth[row] for k, row in rows],
-            mode='lines+markers',
-            name=f'reflector {track_id}',
-            line={'color': COLOURS[index % 4], 'width': 1.5},
-            marker={'size': 4},
-            showlegend=False,
-        )
-    figure.update_xaxes(title='time [s]', showgrid=False)
-    figure.update_yaxes(title='depth [m]', autorange='reversed', showgrid=False)
-    return styled(figure, height=520)
+    _add_truth(figure, records, lambda true: true.depth, start_ns, 'truth')
+    _add_tracks(figure, records, 'depth', start_ns, mode='lines+markers', marker={'size': 4})
+    y = {'title': 'depth [m]', 'autorange': 'reversed', 'showgrid': False}
+    return styled(figure, 520, OVER_TIME, y)
 
 
 def order_figure(records: Sequence[Record], start_ns: int) -> go.Figure:
     """The PMF of the number of reflectors over time, and the true number."""
     pmf = np.array([record.pmf for record in records]).T
     figure = go.Figure()
-    figure.add_heatmap(
-        x=[_seconds(record, start_ns) for record in records],
-        y=records[0].order_min + np.arange(len(pmf)),
-        z=np.round(pmf, 4),
-        zmin=0.0,
-        zmax=1.0,
-        colorscale='Blues',
-        colorbar={'title': {'text': 'probability', 'side': 'right'}, 'thickness': 12},
+    add_image(
+        figure,
+        _seconds(records, start_ns),
+        records[0].order_min + np.arange(len(pmf)),
+        np.round(pmf, 4),
         hovertemplate='%{x:.0f} s, %{y} reflectors: %{z:.3f}<extra></extra>',
     )
-    true = [record for record in records if record.true is not None]
-    if true:
+    if known := _known(records):
         figure.add_scattergl(
-            x=[_seconds(record, start_ns) for record in true],
-            y=[len(record.true) for record in true],
+            x=_seconds([record for record, _ in known], start_ns),
+            y=[len(true) for _, true in known],
             mode='lines',
             name='truth',
             line={'color': COLOURS[1], 'width': 2, 'shape': 'hv'},
             showlegend=True,
         )
-    figure.update_xaxes(title='time [s]', showgrid=False)
-    figure.update_yaxes(title='number of reflectors', dtick=1, showgrid=False, zeroline=False)
-    return styled(figure, height=360)
+    y = {'title': 'number of reflectors', 'dtick': 1} | BARE
+    return styled(figure, 360, OVER_TIME, y)
 
 
 def amplitude_figure(
@@ -101,88 +154,59 @@ def amplitude_figure(
     """Amplitude of every track over time, and the true amplitudes times `factor`."""
     figure = go.Figure()
     if factor:
-        true = [record for record in records if record.true is not None]
         name = 'truth, at the same scale'
-        figure.add_trace(_dots(true, lambda r: factor * r.true.strength, start_ns, name))
-    for index, (track_id, rows) in enumerate(_tracks(records)):
-        figure.add_scattergl(
-            x=[_seconds(records[k], start_ns) for k, _ in rows],
-            y=[records[k].found.strength[row] for k, row in rows],
-            mode='lines',
-            name=f'reflector {track_id}',
-            line={'color': COLOURS[index % 4], 'width': 1.5},
-            showlegend=False,
-        )
-    figure.update_xaxes(title='time [s]', zeroline=False)
-    figure.update_yaxes(title='amplitude, freed of spreading', rangemode='tozero')
-    return styled(figure, height=360)
+        _add_truth(figure, records, lambda true: factor * true.strength, start_ns, name)
+    _add_tracks(figure, records, 'strength', start_ns)
+    y = {'title': 'amplitude, freed of spreading', 'rangemode': 'tozero'}
+    return styled(figure, 360, TIME, y)
 
 
-def distance_figure(records: Sequence[Record], ospa: FloatArray, start_ns: int) -> go.Figure:
+def distance_figure(records: Sequence[Record], cutoff: float, start_ns: int) -> go.Figure:
     """OSPA of every record with truth."""
+    known = _known(records)
+    ospa = np.array([pair(record.found.depth, t.depth, cutoff).ospa for record, t in known])
     figure = go.Figure()
-    figure.add_scattergl(
-        x=[_seconds(record, start_ns) for record in records],
-        y=ospa,
-        mode='lines',
-        line={'color': INK, 'width': 1.2},
-    )
-    figure.update_xaxes(title='time [s]', zeroline=False)
-    figure.update_yaxes(title='OSPA [m]', rangemode='tozero')
-    return styled(figure, height=280)
+    time = _seconds([record for record, _ in known], start_ns)
+    add_line(figure, time, ospa, None, INK, 1.2, gl=True)
+    return styled(figure, 280, TIME, {'title': 'OSPA [m]', 'rangemode': 'tozero'})
 
 
-def fixed_order_figure(
-    fixed: Sequence[FixedOrder], records: Sequence[Record], start_ns: int
-) -> go.Figure:
-    """What filters of a fixed number of reflectors find, and the truth, side by side."""
-    titles = [f'{one.order} reflectors' for one in fixed]
-    figure = make_subplots(
-        cols=len(fixed), shared_yaxes=True, subplot_titles=titles, horizontal_spacing=0.02
-    )
-    true = [record for record in records if record.true is not None]
-    for column, one in enumerate(fixed, start=1):
-        if true:
-            dots = _dots(true, lambda r: r.true.depth, start_ns, 'truth')
-            figure.add_trace(dots, row=1, col=column)
-        dots = _dots(one.records, lambda r: r.found.depth, start_ns, 'found', COLOURS[0])
-        figure.add_trace(dots, row=1, col=column)
-    figure.update_traces(showlegend=False)
-    figure.update_xaxes(title='time [s]', showgrid=False)
-    figure.update_yaxes(autorange='reversed', showgrid=False)
-    figure.update_yaxes(title='depth [m]', col=1)
-    return styled(figure, height=380)
+def _known(records: Sequence[Record]) -> list[tuple[Record, Reflections]]:
+    """The records with their truth, where that is known."""
+    return [(record, record.true) for record in records if record.true is not None]
 
 
-def _dots(
+def _add_truth(
+    figure: go.Figure,
     records: Sequence[Record],
-    values: Callable[[Record], FloatArray],
+    values: Callable[[Reflections], FloatArray],
     start_ns: int,
     name: str,
-    colour: str = COLOURS[4],
-) -> go.Scattergl:
-    """All `values` of each record at its time."""
-    each = [(values(record), _seconds(record, start_ns)) for record in records]
-    return go.Scattergl(
-        x=np.concatenate([np.full(len(value), seconds) for value, seconds in each]),
-        y=np.concatenate([value for value, _ in each]),
-        mode='markers',
-        name=name,
-        marker={'size': 3, 'color': colour},
-    )
+) -> None:
+    """All true `values` of each record at its time."""
+    if known := _known(records):
+        each = [values(true) for _, true in known]
+        time = np.repeat(_seconds([record for record, _ in known], start_ns), list(map(len, each)))
+        add_points(figure, time, np.concatenate(each), name, COLOURS[4], 3)
 
 
-def _tracks(records: Sequence[Record]) -> list[tuple[int, list[tuple[int, int]]]]:
-    """(record, row) of every reflector, by id."""
-    places: dict[int, list[tuple[int, int]]] = {}
-    for k, record in enumerate(records):
-        for row, track_id in enumerate(record.found.track_id):
-            places.setdefault(int(track_id), []).append((k, row))
-    return sorted(places.items())
+def _add_tracks(
+    figure: go.Figure, records: Sequence[Record], what: str, start_ns: int, **look: Any
+) -> None:
+    """A line for every reflector: `what` of it over time."""
+    places: dict[int, list[tuple[float, float]]] = {}
+    for record, time in zip(records, _seconds(records, start_ns)):
+        for track_id, value in zip(record.found.track_id, getattr(record.found, what)):
+            places.setdefault(int(track_id), []).append((time, value))
+    for index, (track_id, rows) in enumerate(sorted(places.items())):
+        times, values = zip(*rows)
+        name = f'reflector {track_id}'
+        further = {'showlegend': False} | look
+        add_line(figure, times, values, name, COLOURS[index % 4], 1.5, gl=True, **further)
 
 
-def _seconds(record: Record, start_ns: int) -> float:
-    return (record.stamp_ns - start_ns) / SECOND
+def _seconds(records: Sequence[Record], start_ns: int) -> list[float]:
+    return [(record.stamp_ns - start_ns) / SECOND for record in records]
 
 
 def _thinned(image: Image) -> Image:

@@ -25,8 +25,7 @@ from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 
 from ... import SECOND
-from ...recordings.sources import BagError
-from ..columns import read_columns
+from ..columns import MissingColumn, read_columns
 
 _FOUND = (
     'depth', 'amplitude', 'relative_amplitude', 'cov_depth_depth', 'track_id', 'existence',
@@ -106,7 +105,10 @@ def records_of(
 
 
 def _record(estimate: Estimate, true: Reflections | None) -> Record:
-    columns = _read(estimate, _FOUND, "not estimates of reflectors: there is no column '{}'")
+    missing = "not estimates of reflectors: there is no column '{}'"
+    columns = read_columns(estimate, _FOUND, missing)
+    if not estimate.model_names or not all(n.startswith('order_') for n in estimate.model_names):
+        raise MissingColumn(missing.format('prob_order_<k>'))
     there = np.isfinite(columns['depth'])
     relative = columns['relative_amplitude']
     strength = np.where(np.isfinite(relative), relative, columns['amplitude'])
@@ -125,17 +127,12 @@ def _record(estimate: Estimate, true: Reflections | None) -> Record:
 
 
 def _true(estimate: Estimate) -> Reflections:
-    columns = _read(estimate, _TRUE, "the truth is not that of reflectors: it has no column '{}'")
+    columns = read_columns(
+        estimate, _TRUE, "the truth is not that of reflectors: it has no column '{}'"
+    )
     ids = columns['track_id']
-    ids = np.where(np.isfinite(ids), ids, np.arange(len(ids))).astype(np.int64)
+    ids = np.where(np.isfinite(ids), ids, np.arange(len(ids)))
     there = np.isfinite(columns['depth'])
-    return Reflections(columns['depth'][there], columns['amplitude'][there], ids[there])
-
-
-def _read(table: Estimate, names: tuple[str, ...], missing: str) -> dict[str, FloatArray]:
-    if names is _FOUND and not all(name.startswith('order_') for name in table.model_names):
-        raise BagError(missing.format('prob_order_<k>'))
-    try:
-        return read_columns(table, names, missing)
-    except ValueError as error:
-        raise BagError(str(error)) from None
+    return Reflections(
+        columns['depth'][there], columns['amplitude'][there], ids[there].astype(np.int64)
+    )

@@ -12,64 +12,75 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The scores of a fathometer run as sentences and lines of text."""
+"""How the scores of a fathometer run are put into words."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from ..numbers import error_line
+from ..numbers import error, fill, Metric, NO_TRUTH
+
+
+def _unscored(metrics: Mapping[str, Any]) -> bool:
+    return 'scored_records' not in metrics
+
+
+METRICS = (
+    Metric(label='records', line='{records}'),
+    Metric(label='reflectors per record', line='{reflectors_mean:.2f}'),
+    Metric(card='Reflectors per record', value='{reflectors_mean:.1f}', when=_unscored),
+    Metric(card='Reflectors in all', value='{ids}', remark='{records} records', when=_unscored),
+    Metric(
+        label='number of reflectors right',
+        line='{order_right:.1%}',
+        card='Number of reflectors right',
+        value='{order_right:.0%}',
+    ),
+    Metric(
+        label='OSPA',
+        line='{ospa_m:.3f} m',
+        card='OSPA',
+        value='{ospa_m:.3f} m',
+        remark='cutoff {cutoff_m:g} m',
+    ),
+    Metric(
+        label='false / missed per record',
+        line='{false_per_record:.3f} / {missed_per_record:.3f}',
+        card='False / missed per record',
+        value='{false_per_record:.2f} / {missed_per_record:.2f}',
+    ),
+    error(
+        'depth',
+        'depth error',
+        card='Depth error, RMS',
+        value='{depth.rmse_m:.3f} m',
+        remark='{depth.inside_2_sigma:.0%} within two stated sigma',
+    ),
+    Metric(
+        label='amplitude error, median / 95 %',
+        line='{amplitude.median_relative_error:.1%} / {amplitude.p95_relative_error:.1%}',
+        card='Amplitude error, median',
+        value='{amplitude.median_relative_error:.0%}',
+    ),
+    Metric(label='identity switches', line='{identity_switches}'),
+)
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
     if not metrics['records']:
         return 'There is no record in this run.'
-    if 'scored_records' not in metrics:
-        return (
-            f'{metrics["reflectors_mean"]:.1f} reflectors per record in {metrics["records"]} '
-            'records. There is no truth to compare with, so only the estimates and their stated '
-            'uncertainty are shown.'
-        )
-    sentences = [
-        f'The number of reflectors is right in {100 * metrics["order_right"]:.0f} % of the '
-        f'records; a record lies {metrics["ospa_m"]:.3f} m from the true set (OSPA).'
-    ]
+    if _unscored(metrics):
+        found = '{reflectors_mean:.1f} reflectors per record in {records} records. '
+        return fill(found, metrics) + NO_TRUTH
+    words = (
+        'The number of reflectors is right in {order_right:.0%} of the records; a record lies '
+        '{ospa_m:.3f} m from the true set (OSPA).'
+    )
     if metrics['depth']['n']:
-        sentences.append(
-            f'Depths are off by {metrics["depth"]["rmse_m"]:.3f} m (RMS); '
-            f'{metrics["false_per_record"]:.2f} reflectors per record are false and '
-            f'{metrics["missed_per_record"]:.2f} are missed.'
+        words += (
+            ' Depths are off by {depth.rmse_m:.3f} m (RMS); {false_per_record:.2f} reflectors per '
+            'record are false and {missed_per_record:.2f} are missed.'
         )
-    return ' '.join(sentences)
-
-
-def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the most important numbers."""
-    result = [
-        ('records', f'{metrics["records"]}'),
-        ('reflectors per record', f'{metrics["reflectors_mean"]:.2f}'),
-    ]
-    if 'scored_records' not in metrics:
-        return result
-    result += [
-        ('number of reflectors right', f'{100 * metrics["order_right"]:.1f} %'),
-        ('OSPA', f'{metrics["ospa_m"]:.3f} m'),
-        (
-            'false / missed per record',
-            f'{metrics["false_per_record"]:.3f} / {metrics["missed_per_record"]:.3f}',
-        ),
-        *error_line('depth error', metrics['depth'], 'm'),
-    ]
-    if metrics['amplitude']['n']:
-        error = metrics['amplitude']
-        result.append(
-            (
-                'amplitude error, median / 95 %',
-                f'{100 * error["median_relative_error"]:.1f} / '
-                f'{100 * error["p95_relative_error"]:.1f} %',
-            )
-        )
-    result.append(('identity switches', f'{metrics["identity_switches"]}'))
-    return result
+    return fill(words, metrics)

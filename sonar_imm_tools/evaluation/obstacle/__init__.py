@@ -17,36 +17,32 @@
 `series` lays estimates end to end and says which track is which obstacle. `scoring` says how
 large the errors are and whether the stated uncertainty holds, `motion` the same of velocities,
 behaviours and collisions, `deferred` what the paper's deferred estimate would have been.
-`summary`, `sections` and `figures` present it; `bench` measures the tracker.
+`summary` and `figures` present it; `bench` measures the tracker.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import functools
 from pathlib import Path
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import Any, TYPE_CHECKING
 
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
-from ...recordings.sources import BagError
-from ..judging import Check, Judgement, JudgeOptions, Limit
+from ..judging import Check, Judgement, JudgeOptions, Limit, naming
 from .deferred import deferred_estimates
 from .motion import motion_metrics
 from .scoring import score
-from .series import Matching, series_of, truth_of
-from .summary import lines, summary_sentence
+from .series import Matching, series_of, TruePath, truth_of
+from .summary import METRICS, summary_sentence
 
 if TYPE_CHECKING:
-    from ..page import Part
-
-T = TypeVar('T')
+    from ..report import Section
 
 LIMIT = Limit(2.5, 'm', 'vertical offset RMSE within 50 m', 'vertical_offset_near.rmse_m')
 """Limit for recordings without one of their own. 300 runs have 1.6 m at 50 m and 0.9 m at 20 m on
-average; one
-recording can be worse than the average."""
+average; one recording can be worse than the average."""
 
 CUTOFF = 5.0
 """Metres in range and bearing from which a track is on no obstacle."""
@@ -55,63 +51,41 @@ CUTOFF = 5.0
 def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
     run = folder.read_run()
-    series = _understood(lambda: series_of(folder.read_estimates()), folder.path)
+    with naming(folder.path):
+        series = series_of(folder.read_estimates())
     tables = read_truth(run, options.truth_bag)
-    truth = (
-        None
-        if tables is None
-        else _understood(
-            lambda: truth_of(tables, options.lag), options.truth_bag or Path(run['bag'])
-        )
-    )
+    with naming(options.truth_bag or Path(run['bag'])):
+        truth = truth_of(tables or (), options.lag)
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics, found = score(series, truth, cutoff=cutoff, gap=options.gap)
     metrics['truth_lag_s'] = options.lag
     config = ObstacleConfig.from_mapping(run['parameters'], ignore_unknown=True)
-    if found is not None and truth is not None:
+    if found is not None:
         metrics |= motion_metrics(found, truth, config)
     received = list(read_measurements(run))
     deferred = deferred_estimates(series, received, config, _met_first(found, truth), options.gap)
     if deferred is not None:
         metrics['deferred'] = deferred.as_dict()
 
-    def part(checks: Sequence[Check]) -> Part:
+    def sections() -> Iterable[Section]:
         # plotly, which only a report needs, takes a second to load.
-        from .sections import Material, obstacle_part
+        from .figures import sections
 
-        return obstacle_part(
-            Material(
-                run=run,
-                metrics=metrics,
-                series=series,
-                truth=truth,
-                found=found,
-                deferred=deferred,
-                received=received,
-                gap=options.gap,
-            ),
-            checks,
-        )
+        return sections(metrics, series, truth, found, deferred, received, options.gap)
 
     return Judgement(
+        run=run,
         metrics=metrics,
-        summary=summary_sentence(metrics),
-        lines=tuple(lines(metrics)),
-        part=part,
+        words=summary_sentence,
+        shown=METRICS,
+        sections=sections,
         accuracy=functools.partial(_accuracy, metrics),
     )
 
 
-def _understood(read: Callable[[], T], where: Path) -> T:
-    try:
-        return read()
-    except (ValueError, KeyError) as error:
-        raise BagError(f'{where}: {error}') from None
-
-
-def _met_first(found: Matching | None, truth: Sequence[Any] | None) -> dict[int, Any]:
+def _met_first(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, TruePath]:
     """The obstacle that each track was matched with first, by track id."""
-    if found is None or not truth:
+    if found is None:
         return {}
     pairs = zip(found.series.track_id[found.row].tolist(), found.target.tolist())
     return {track_id: truth[target] for track_id, target in reversed(list(pairs))}

@@ -12,63 +12,153 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The figures of obstacles. Each function takes arrays and gives one plotly figure."""
+"""What the report shows of obstacles: sections with a figure or a table each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
-from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS
 from sonar_imm.trackers.obstacle.deferred import Deferred
 
-from ..plotting import AMBER, COLOURS, GREY, INK, MOST_POINTS, styled, thin, transparent
+from ..plotting import (
+    add_band,
+    add_line,
+    add_points,
+    AMBER,
+    COLOURS,
+    GREY,
+    INK,
+    MOST_POINTS,
+    nis_figure,
+    seconds,
+    styled,
+    thin,
+    TRUTH,
+)
+from ..report import Section
 from .deferred import DeferredEstimates
 from .series import level, Matching, Series, TruePath
+
+NEARING = {'title': 'range [m]', 'autorange': 'reversed', 'zeroline': False}
+"""The axis of ranges: obstacles come nearer from left to right."""
+
+
+def sections(
+    metrics: Mapping[str, Any],
+    series: Series,
+    truth: Sequence[TruePath],
+    found: Matching | None,
+    deferred: DeferredEstimates | None,
+    received: Sequence[Any],
+    gap: float,
+) -> Iterator[Section]:
+    """The sections of one run. metrics: content of ``metrics.json``; received: the measurements;
+    gap: seconds without truth across which it is not interpolated."""
+    yield Section(
+        'Height over range',
+        'How far each obstacle lies below the sonar, as it comes nearer from left to right. '
+        'Shaded: the 90 % band. Dotted: truth.',
+        offset_figure(series, _truths(found, truth), gap),
+    )
+    yield Section(
+        'Above or below',
+        'On a level path above and below look the same, and the probability has to stay at one '
+        'half. Rolling decides it.',
+        above_figure(series),
+    )
+    pings = [ping for ping in received if isinstance(ping, Detections) and len(ping)]
+    yield Section(
+        'Image of the sonar',
+        'Tracks among the detections of all pings. Dotted: truth, while the beam holds it.',
+        image_figure(series, pings, truth),
+    )
+    if deferred is not None:
+        yield Section(
+            f'Deferred estimate: RMSD of track {deferred.track_id}',
+            'The paper estimates the offset afterwards, from all echoes of the track. The curve '
+            'shows how badly each assumed offset explains them. Diamonds: least RMSD. The paper '
+            'looks below the sonar alone; a single such number is worth some 4 m.',
+            rmsd_figure(deferred),
+        )
+    if found is not None and len(found.row):
+        yield Section(
+            'Error, and the predicted error',
+            'Errors of the vertical offset in units of the stated standard deviation.',
+            error_figure(found),
+        )
+        yield Section(
+            'Calibration of the probability of being above',
+            'How often an obstacle was above, by the stated probability. Pings of one approach '
+            'are not independent.',
+            header=('P(above)', 'pings', 'stated', 'was above'),
+            rows=[
+                (name, group['n'], group['stated'], group['came_true'])
+                for name, group in metrics['above']['bins'].items()
+            ],
+        )
+    if behaviours := metrics.get('behaviours'):
+        yield Section(
+            'What the obstacles do',
+            'Mean stated probability of each behaviour, by what the obstacle really does.',
+            header=('does', 'rows', *(f'P({name})' for name in BEHAVIOURS)),
+            rows=[
+                (true, values['n'], *(values[name] for name in BEHAVIOURS))
+                for true, values in behaviours['confusion'].items()
+            ],
+        )
+    if collisions := metrics.get('collisions'):
+        yield Section(
+            'Calibration of the probability of a collision',
+            'How often a collision followed, by the stated probability. Forecasts of one approach '
+            f'are not independent. Brier score {collisions["brier"]:.3f}; of always stating how '
+            f'often it happened, {collisions["brier_of_a_guess"]:.3f}.',
+            calibration_figure(collisions['bins']),
+        )
+    hits = series.pick(np.isfinite(series.nis))
+    if len(hits):
+        yield Section(
+            'Normalised innovations (NIS)',
+            'Distance of each detection from its prediction, in units of the stated uncertainty, '
+            'squared. NIS says nothing about the height: with a wrong sign of roll it is perfect '
+            'too.',
+            nis_figure(seconds(hits.stamp_ns, hits.scan_ns), hits.nis, np.full(len(hits), 2.0)),
+        )
+
+
+def _truths(found: Matching | None, truth: Sequence[TruePath]) -> dict[int, TruePath]:
+    """The obstacle that each track was matched with last."""
+    if found is None:
+        return {}
+    tracks = found.series.track_id[found.row].tolist()
+    return {track: truth[target] for track, target in zip(tracks, found.target.tolist())}
+
+
+def _by_track(series: Series) -> Iterator[tuple[str, str, Series]]:
+    """Name, colour and rows of each track."""
+    for order, track_id in enumerate(np.unique(series.track_id).tolist()):
+        rows = series.pick(series.track_id == track_id)
+        yield f'track {track_id}', COLOURS[order % len(COLOURS)], rows
 
 
 def offset_figure(series: Series, truths: dict[int, TruePath], gap: float) -> go.Figure:
     """Vertical offset of each track with its 90 % band over the range, far to near."""
     figure = go.Figure()
-    for order, track_id in enumerate(np.unique(series.track_id).tolist()):
-        track = series.pick(series.track_id == track_id)
-        colour, name = COLOURS[order % len(COLOURS)], f'track {track_id}'
+    for name, colour, track in _by_track(series):
         near = track.state[:, 0]
-        figure.add_scatter(
-            x=np.concatenate([near, near[::-1]]),
-            y=np.concatenate([track.low, track.high[::-1]]),
-            fill='toself',
-            fillcolor=transparent(colour, 0.15),
-            mode='lines',
-            hoverinfo='skip',
-            line={'color': transparent(colour, 0.4), 'width': 0.5},
-            legendgroup=name,
-            showlegend=False,
-        )
-        figure.add_scatter(
-            x=near,
-            y=track.state[:, 2],
-            mode='lines',
-            name=name,
-            legendgroup=name,
-            line={'color': colour, 'width': 2},
-        )
-        if track_id in truths:
-            seen = truths[track_id].at(track.stamp_ns, gap)
-            figure.add_scatter(
-                x=seen[:, 0],
-                y=seen[:, 2],
-                mode='lines',
-                legendgroup=name,
-                showlegend=False,
-                line={'color': INK, 'width': 1.5, 'dash': 'dot'},
-            )
-    figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
-    figure.update_yaxes(title='below the sonar [m]', autorange='reversed')
-    return styled(figure, height=440)
+        hidden: dict[str, Any] = {'legendgroup': name, 'showlegend': False}
+        add_band(figure, near, track.low, track.high, colour, (0.15, 0.4), **hidden)
+        add_line(figure, near, track.state[:, 2], name, colour, legendgroup=name)
+        if (path := truths.get(int(track.track_id[0]))) is not None:
+            seen = path.at(track.stamp_ns, gap)
+            figure.add_scatter(x=seen[:, 0], y=seen[:, 2], mode='lines', line=TRUTH, **hidden)
+    y = {'title': 'below the sonar [m]', 'autorange': 'reversed'}
+    return styled(figure, 440, NEARING, y)
 
 
 def image_figure(
@@ -79,37 +169,17 @@ def image_figure(
     if pings:
         echoes = np.concatenate([np.column_stack([ping.range, ping.bearing]) for ping in pings])
         shown = level(echoes[thin(len(echoes), MOST_POINTS)])
-        figure.add_scattergl(
-            x=-shown[:, 1],
-            y=shown[:, 0],
-            mode='markers',
-            name='detections',
-            hoverinfo='skip',
-            marker={'size': 3, 'color': GREY},
-        )
+        add_points(figure, -shown[:, 1], shown[:, 0], 'detections', GREY, 3)
+        figure.data[-1].hoverinfo = 'skip'
     for path in truths:
         flat = level(path.seen[path.in_beam])
-        figure.add_scatter(
-            x=-flat[:, 1],
-            y=flat[:, 0],
-            mode='lines',
-            name='truth',
-            legendgroup='truth',
-            showlegend=path is truths[0],
-            line={'color': INK, 'width': 1.5, 'dash': 'dot'},
-        )
-    for order, track_id in enumerate(np.unique(series.track_id).tolist()):
-        flat = level(series.state[series.track_id == track_id])
-        figure.add_scatter(
-            x=-flat[:, 1],
-            y=flat[:, 0],
-            mode='lines',
-            name=f'track {track_id}',
-            line={'color': COLOURS[order % len(COLOURS)], 'width': 2},
-        )
-    figure.update_xaxes(title='to starboard [m]')
-    figure.update_yaxes(title='ahead [m]', scaleanchor='x', scaleratio=1, rangemode='tozero')
-    return styled(figure, height=620)
+        legend: dict[str, Any] = {'legendgroup': 'truth', 'showlegend': path is truths[0]}
+        add_line(figure, -flat[:, 1], flat[:, 0], 'truth', INK, line=TRUTH, **legend)
+    for name, colour, track in _by_track(series):
+        flat = level(track.state)
+        add_line(figure, -flat[:, 1], flat[:, 0], name, colour)
+    y = {'title': 'ahead [m]', 'scaleanchor': 'x', 'scaleratio': 1, 'rangemode': 'tozero'}
+    return styled(figure, 620, {'title': 'to starboard [m]'}, y)
 
 
 def rmsd_figure(deferred: DeferredEstimates) -> go.Figure:
@@ -121,14 +191,10 @@ def rmsd_figure(deferred: DeferredEstimates) -> go.Figure:
         (deferred.refit, 'first echo and scale refitted', COLOURS[2]),
     ):
         _add_curve(figure, curve, name, colour, deferred.altitude)
-    figure.add_vrect(
-        x0=deferred.band[0],
-        x1=deferred.band[1],
-        fillcolor=AMBER,
-        opacity=0.25,
-        line_width=0,
-        annotation_text='90 % band, online',
-    )
+    low, high = deferred.band
+    name = '90 % band, online'
+    look = {'fillcolor': AMBER, 'opacity': 0.25, 'line_width': 0}
+    figure.add_vrect(x0=low, x1=high, annotation_text=name, **look)
     for value, name, dash, side in (
         (deferred.online, 'online', 'dash', 'right'),
         (deferred.truth, 'truth', 'dot', 'left'),
@@ -141,23 +207,18 @@ def rmsd_figure(deferred: DeferredEstimates) -> go.Figure:
                 annotation_text=name,
                 annotation_position=f'bottom {side}',
             )
-    figure.update_xaxes(title='vertical offset at the first echo, below the sonar [m]')
-    figure.update_yaxes(title='RMSD [pixels of range and bearing]', type='log')
-    return styled(figure, height=440)
+    x = {'title': 'vertical offset at the first echo, below the sonar [m]'}
+    return styled(figure, 440, x, {'title': 'RMSD [pixels of range and bearing]', 'type': 'log'})
 
 
 def _add_curve(
     figure: go.Figure, curve: Deferred, name: str, colour: str, altitude: float
 ) -> None:
-    figure.add_scatter(
-        x=curve.offset,
-        y=curve.rmsd,
-        mode='lines',
-        name=name,
-        line={'color': colour, 'width': 2},
-        customdata=altitude - curve.offset,
-        hovertemplate='%{x:.2f} m below, %{customdata:.2f} m above the floor: %{y:.2f}',
-    )
+    hover: dict[str, Any] = {
+        'customdata': altitude - curve.offset,
+        'hovertemplate': '%{x:.2f} m below, %{customdata:.2f} m above the floor: %{y:.2f}',
+    }
+    add_line(figure, curve.offset, curve.rmsd, name, colour, **hover)
     if np.isfinite(curve.best):
         figure.add_scatter(
             x=[curve.best],
@@ -172,58 +233,28 @@ def _add_curve(
 def above_figure(series: Series) -> go.Figure:
     """Probability that the obstacle is above the sonar, over the range."""
     figure = go.Figure()
-    for order, track_id in enumerate(np.unique(series.track_id).tolist()):
-        rows = series.track_id == track_id
-        figure.add_scatter(
-            x=series.state[rows, 0],
-            y=series.above[rows],
-            mode='lines',
-            name=f'track {track_id}',
-            line={'color': COLOURS[order % len(COLOURS)], 'width': 2},
-        )
-    figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
-    figure.update_yaxes(title='P(above)', range=[-0.02, 1.02])
-    return styled(figure, height=280)
+    for name, colour, track in _by_track(series):
+        add_line(figure, track.state[:, 0], track.above, name, colour)
+    return styled(figure, 280, NEARING, {'title': 'P(above)', 'range': [-0.02, 1.02]})
 
 
 def error_figure(found: Matching) -> go.Figure:
     """Error of the offset over its stated standard deviation, against the range."""
-    error = found.error[:, 2]
-    sigma: FloatArray = np.sqrt(found.series.covariance[found.row, 2, 2])
+    sigmas = found.error[:, 2] / np.sqrt(found.series.covariance[found.row, 2, 2])
     figure = go.Figure()
-    figure.add_hrect(
-        y0=-1.645,
-        y1=1.645,
-        fillcolor=AMBER,
-        opacity=0.2,
-        line_width=0,
-        annotation_text='9 in 10 should lie here',
-    )
-    figure.add_scattergl(
-        x=found.truth[:, 0],
-        y=error / sigma,
-        mode='markers',
-        name='error / stated sigma',
-        marker={'size': 4, 'color': COLOURS[0], 'opacity': 0.6},
-    )
-    figure.update_xaxes(title='range [m]', autorange='reversed', zeroline=False)
-    figure.update_yaxes(title='offset error / sigma')
-    return styled(figure, height=320)
+    look = {'fillcolor': AMBER, 'opacity': 0.2, 'line_width': 0}
+    figure.add_hrect(y0=-1.645, y1=1.645, annotation_text='9 in 10 should lie here', **look)
+    name = 'error / stated sigma'
+    add_points(figure, found.truth[:, 0], sigmas, name, COLOURS[0], opacity=0.6)
+    return styled(figure, 320, NEARING, {'title': 'offset error / sigma'})
 
 
 def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> go.Figure:
     """How often what was stated with a probability came true, by bins of it; the area of a point
     is the number of forecasts."""
-    stated = [one['stated'] for one in bins.values()]
-    came, n = [one['came_true'] for one in bins.values()], [one['n'] for one in bins.values()]
+    stated, came, n = ([b[name] for b in bins.values()] for name in ('stated', 'came_true', 'n'))
     figure = go.Figure()
-    figure.add_scatter(
-        x=[0, 1],
-        y=[0, 1],
-        mode='lines',
-        name='as stated',
-        line={'color': INK, 'width': 1.5, 'dash': 'dot'},
-    )
+    add_line(figure, [0, 1], [0, 1], 'as stated', INK, line=TRUTH)
     figure.add_scatter(
         x=stated,
         y=came,
@@ -233,6 +264,5 @@ def calibration_figure(bins: Mapping[str, Mapping[str, float]]) -> go.Figure:
         line={'color': COLOURS[0]},
         marker={'size': [6.0 + 18.0 * (count / max(n)) ** 0.5 for count in n]},
     )
-    figure.update_xaxes(title='stated probability', range=[-0.03, 1.03])
-    figure.update_yaxes(title='share that happened', range=[-0.03, 1.03])
-    return styled(figure, height=360)
+    x = {'title': 'stated probability', 'range': [-0.03, 1.03]}
+    return styled(figure, 360, x, {'title': 'share that happened', 'range': [-0.03, 1.03]})

@@ -62,7 +62,7 @@ def velocity_scores(found: Matching, truth: Sequence[TruePath]) -> dict[str, Any
     rows = np.flatnonzero(known)
     if not len(rows):
         return {}
-    true = np.array([truth[found.target[k]].velocity[at[k]] for k in rows])  # type: ignore[index]
+    true = np.array([truth[found.target[k]].velocity[at[k]] for k in rows])
     error = series.velocity[found.row[rows]] - true
     moves = np.linalg.norm(true, axis=1) > 0.0
     scores: dict[str, Any] = {
@@ -84,7 +84,7 @@ def behaviour_scores(found: Matching, truth: Sequence[TruePath]) -> dict[str, An
     rows = np.flatnonzero(known & (stated.sum(axis=1) > 0.0))
     if not len(rows):
         return {}
-    true = np.array([truth[found.target[k]].does[at[k]] for k in rows])  # type: ignore[index]
+    true = np.array([truth[found.target[k]].does[at[k]] for k in rows])
     confusion = {
         BEHAVIOURS[kind]: {
             'n': int((true == kind).sum()),

@@ -151,9 +151,7 @@ def truth_of(tables: Iterable[Estimate], lag: float = 0.0) -> tuple[TruePath, ..
     rows = read_rows(_TrueRows, tables, "the truth has no column '{}'")
     rows = rows.pick(np.isfinite(rows.state).all(axis=1))
     paths = []
-    for track_id in np.unique(rows.track_id).tolist():
-        own = rows.pick(rows.track_id == track_id)
-        own = own.pick(np.append(np.diff(own.stamp_ns) > 0, True))  # of one stamp the last
+    for track_id, own in rows.by_track():
         if len(own) < 2:
             continue
         paths.append(

@@ -12,98 +12,102 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The scores of an obstacle run as sentences and lines of text."""
+"""How the scores of an obstacle run are put into words."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from ..numbers import chi2_line, error_line
+from sonar_imm.trackers.obstacle.config import BEHAVIOURS
+
+from ..numbers import chi2, each, error, fill, look_up, Metric, NO_TRUTH, UNMATCHED
 from .scoring import NEAR
 
-_DEFERRED = ('online', 'rmsd', 'rmsd_both_sides', 'refit')
+METRICS = (
+    Metric(
+        card='Confirmed obstacles',
+        value='{tracks_confirmed}',
+        remark='{pings} pings in {span_s:.0f} s',
+        when=lambda metrics: not look_up(metrics, 'range.n'),
+    ),
+    error('range', 'range error'),
+    error('bearing', 'bearing error', 'deg'),
+    error('vertical_offset', 'vertical offset error'),
+    error(
+        'vertical_offset_near',
+        f'the same within {NEAR:.0f} m',
+        card=f'Height error within {NEAR:.0f} m, RMS',
+    ),
+    chi2('consistency.nees_offset', 'NEES, vertical offset', card='NEES of the offset'),
+    chi2('consistency.nees_state', 'NEES, whole state'),
+    chi2('consistency.nis', 'NIS', card='NIS of the hits'),
+    Metric(
+        label='truth inside the 90 % band',
+        line='{consistency.band_coverage:.0%}',
+        card='Truth inside the 90 % band',
+        value='{consistency.band_coverage:.0%}',
+        remark='90 % would be perfect',
+    ),
+    Metric(label='Brier score of P(above)', line='{above.brier:.3f}'),
+    *(
+        metric
+        for name in ('moving', 'still')
+        for metric in (
+            Metric(
+                label=f'velocity error, {name}, RMSE per axis',
+                line=f'{{velocity.{name}.rmse_m_s:.3f}} m/s',
+            ),
+            chi2(f'velocity.{name}.nees', 'NEES, velocity'),
+        )
+    ),
+    *(
+        Metric(
+            label=f'P({name}) of what is',
+            line=f'{{behaviours.confusion.{name}.{name}:.3f}} '
+            f'({{behaviours.confusion.{name}.n}} rows)',
+        )
+        for name in BEHAVIOURS
+    ),
+    Metric(
+        label='Brier score of collisions',
+        line='{collisions.brier:.3f}, of a guess {collisions.brier_of_a_guess:.3f} '
+        '({collisions.n} forecasts, {collisions.happened:.0%} happened)',
+    ),
+    Metric(
+        label='GOSPA',
+        line='{gospa.mean_m:.2f} m',
+        card='GOSPA',
+        value='{gospa.mean_m:.2f} m',
+        remark='{gospa.missed_per_ping:.2f} missed, {gospa.false_per_ping:.2f} false per ping',
+    ),
+    Metric(
+        label='vertical offset: online / RMSD / of both sides / refitted',
+        line='{deferred.online_m:+.2f} / {deferred.rmsd_m:+.2f} / '
+        '{deferred.rmsd_both_sides_m:+.2f} / {deferred.refit_m:+.2f} m',
+    ),
+    Metric(label='vertical offset, truth', line='{deferred.truth_m:+.2f} m'),
+    *each(
+        'tracks',
+        ('true_obstacles', 'found_obstacles', 'tracks', 'false_tracks', 'identity_switches'),
+    ),
+)
 
 
 def summary_sentence(metrics: Mapping[str, Any]) -> str:
     """The result in a few sentences."""
-    offset = metrics.get('vertical_offset', {})
-    if not offset.get('n'):
-        known = 'scored_rows' in metrics
-        return (
-            f'{metrics["tracks_confirmed"]} confirmed obstacles in {metrics["span_s"]:.0f} s. '
-            + (
-                'None of them was matched with the truth.'
-                if known
-                else 'There is no truth to compare with, so only the estimates and their stated '
-                'uncertainty are shown.'
-            )
+    if not look_up(metrics, 'vertical_offset.n'):
+        return fill('{tracks_confirmed} confirmed obstacles in {span_s:.0f} s. ', metrics) + (
+            UNMATCHED if 'scored_rows' in metrics else NO_TRUTH
         )
-    near = metrics['vertical_offset_near']
-    sentences = []
-    if near['n']:
-        sentences.append(
-            f'Within {NEAR:.0f} m the height of an obstacle is right to '
-            f'{near["rmse_m"]:.2f} m (RMS).'
-        )
-    held = metrics['consistency']['band_coverage']
-    sentences.append(f'Its 90 % band holds the truth {100 * held:.0f} % of the time.')
-    tracks = metrics['tracks']
-    sentences.append(
-        f'{tracks["found_obstacles"]} of {tracks["true_obstacles"]} obstacles were '
-        f'found, {tracks["false_tracks"]} tracks were false.'
+    near = (
+        f'Within {NEAR:.0f} m the height of an obstacle is right to '
+        '{vertical_offset_near.rmse_m:.2f} m (RMS). '
     )
-    return ' '.join(sentences)
-
-
-def motion_lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Velocity, behaviours and forecasts of collisions, as far as they were scored."""
-    result = []
-    for name, values in metrics.get('velocity', {}).items():
-        result.append((f'velocity error, {name}, RMSE an axis', f'{values["rmse_m_s"]:.3f} m/s'))
-        result += chi2_line('NEES, velocity', values.get('nees', {}))
-    for name, values in metrics.get('behaviours', {}).get('confusion', {}).items():
-        result.append((f'P({name}) of what is', f'{values[name]:.3f} ({values["n"]} rows)'))
-    if collisions := metrics.get('collisions'):
-        result.append(
-            (
-                'Brier score of collisions',
-                f'{collisions["brier"]:.3f}, of a guess {collisions["brier_of_a_guess"]:.3f} '
-                f'({collisions["n"]} forecasts, {100 * collisions["happened"]:.0f} % happened)',
-            )
-        )
-    return result
-
-
-def lines(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and value of the most important numbers."""
-    consistency = metrics['consistency']
-    result = [
-        *error_line('range error', metrics.get('range', {}), 'm'),
-        *error_line('bearing error', metrics.get('bearing', {}), 'deg'),
-        *error_line('vertical offset error', metrics.get('vertical_offset', {}), 'm'),
-        *error_line(f'the same within {NEAR:.0f} m', metrics.get('vertical_offset_near', {}), 'm'),
-        *chi2_line('NEES, vertical offset', consistency.get('nees_offset', {})),
-        *chi2_line('NEES, whole state', consistency.get('nees_state', {})),
-        *chi2_line('NIS', consistency['nis']),
-    ]
-    if metrics.get('vertical_offset', {}).get('n'):
-        held = consistency['band_coverage']
-        result.append(('truth inside the 90 % band', f'{100 * held:.0f} %'))
-        result.append(('Brier score of P(above)', f'{metrics["above"]["brier"]:.3f}'))
-        result += motion_lines(metrics)
-        result.append(('GOSPA', f'{metrics["gospa"]["mean_m"]:.2f} m'))
-    if deferred := metrics.get('deferred'):
-        result.append(
-            (
-                'vertical offset: online / RMSD / of both sides / refitted',
-                ' / '.join(f'{deferred[f"{name}_m"]:+.2f}' for name in _DEFERRED)
-                + ' m'
-                + (f', truth {deferred["truth_m"]:+.2f} m' if 'truth_m' in deferred else ''),
-            )
-        )
-    result += [
-        (name.replace('_', ' '), f'{value:.3g}')
-        for name, value in metrics.get('tracks', {}).items()
-    ]
-    return result
+    return fill(
+        (near if metrics['vertical_offset_near']['n'] else '')
+        + 'Its 90 % band holds the truth {consistency.band_coverage:.0%} of the time. '
+        '{tracks.found_obstacles} of {tracks.true_obstacles} obstacles were found, '
+        '{tracks.false_tracks} tracks were false.',
+        metrics,
+    )

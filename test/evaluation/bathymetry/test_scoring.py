@@ -19,7 +19,8 @@ import pytest
 
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
 from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
-from sonar_imm_tools.evaluation.bathymetry.summary import lines, summary_sentence
+from sonar_imm_tools.evaluation.bathymetry.summary import METRICS, summary_sentence
+from sonar_imm_tools.evaluation.numbers import lines
 
 N = 20
 PATCH = slice(8, 14)
@@ -86,7 +87,7 @@ def test_shadow_is_scored_apart():
     assert metrics['height']['all']['n'] == N - 4
     assert metrics['height']['shadow']['n'] == 4
     assert metrics['gate'] == {'shadow_bins': 4, 'shadow_passed_over': 0.75, 'echo_heard': 1.0}
-    assert any('shadow passed over' in name for name, _ in lines(metrics))
+    assert any('shadow passed over' in name for name, _ in lines(METRICS, metrics))
 
 
 def test_without_truth_the_tracker_speaks_for_itself():
@@ -95,13 +96,13 @@ def test_without_truth_the_tracker_speaks_for_itself():
     assert metrics['rough_share'] == pytest.approx(0.3)
     assert 'height' not in metrics
     assert 'no truth' in summary_sentence(metrics)
-    assert dict(lines(metrics))['bins with an echo'] == '100 %'
+    assert dict(lines(METRICS, metrics))['bins with an echo'] == '100 %'
 
 
 def test_a_run_without_a_ping_has_words_too():
     metrics = score(Swath((), (), np.zeros(0, bool)))
     assert summary_sentence(metrics).startswith('0 pings with 0 range bins')
-    assert lines(metrics)
+    assert lines(METRICS, metrics)
 
 
 def test_runs():
