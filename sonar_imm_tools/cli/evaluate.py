@@ -116,7 +116,7 @@ def command(
 
         write_report(page, [judgement.part([]) for judgement in judgements.values()])
     if as_json:
-        metrics = {_name(folder, out_dir): one.metrics for folder, one in judgements.items()}
+        metrics = {_name(folder, out_dir): run.metrics for folder, run in judgements.items()}
         print_json(metrics.get('.', metrics))
         return
     for folder, judgement in judgements.items():

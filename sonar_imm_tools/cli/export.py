@@ -106,9 +106,9 @@ def command(
         raise click.UsageError(f"'{out.name}' ends in none of {known}")
     if out.exists() and not overwrite:
         raise BagError(f'{out} is there already; choose another name or say --overwrite')
-    told = RunFolder(run).read_run()
+    record = RunFolder(run).read_run()
     if kind in HORIZON_FORMATS:
-        _export_horizons(run, told, out, kind, epsg, origin, original, as_json)
+        _export_horizons(run, record, out, kind, epsg, origin, original, as_json)
         return
     if not (run / SOUNDINGS).is_file():
         raise BagError(
@@ -135,7 +135,7 @@ def command(
 
 def _export_horizons(
     run: Path,
-    told: dict[str, Any],
+    record: dict[str, Any],
     out: Path,
     kind: str,
     epsg: int | None,
@@ -143,7 +143,7 @@ def _export_horizons(
     original: Path | None,
     as_json: bool,
 ) -> None:
-    """Picks of a run of the fathometer; told: its run.json."""
+    """Picks of a run of the fathometer; record: its run.json."""
     import numpy as np
 
     from ..offline.run_folder import RunFolder
@@ -154,8 +154,8 @@ def _export_horizons(
     from ..recordings.reader import BagReader
     from ..recordings.sources import BagError
 
-    if told['system'] != 'fathometer':
-        raise BagError(f'{run} is of {told["system"]}: only the fathometer has horizons')
+    if record['system'] != 'fathometer':
+        raise BagError(f'{run} is of {record["system"]}: only the fathometer has horizons')
     segy = kind in ('sgy', 'segy', 'seg')
     if segy and original is None:
         raise click.UsageError(
@@ -164,8 +164,8 @@ def _export_horizons(
     if segy and original is not None and out.exists() and out.samefile(original):
         raise click.UsageError('OUT is the file given by --segy, which stays as it is')
     positions, notes = None, {}
-    if Path(told['bag']).exists():
-        with BagReader(told['bag']) as bag:
+    if Path(record['bag']).exists():
+        with BagReader(record['bag']) as bag:
             positions, notes = read_positions(bag), bag.custom_data
             if positions is None and epsg is not None:
                 positions = read_navigated(
@@ -177,8 +177,8 @@ def _export_horizons(
                     'its origin lies'
                 )
     elif segy or kind == 'geojson':
-        raise BagError(f'{told["bag"]}, the recording of {run}, is gone')
-    speed = float(told['parameters'].get('sound_speed', 1500.0))
+        raise BagError(f'{record["bag"]}, the recording of {run}, is gone')
+    speed = float(record['parameters'].get('sound_speed', 1500.0))
     picks = picks_of(RunFolder(run).read_estimates(), speed, positions)
     result: dict[str, Any] = {'out': str(out), 'picks': len(picks), 'left_out': 0}
     result['horizons'] = len(set(picks.horizon.tolist()))

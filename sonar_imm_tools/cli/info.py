@@ -72,15 +72,16 @@ def _print(found: dict[str, Any]) -> None:
     for problem in found['problems']:
         say(f'problem: {problem}')
     for number, (system, named) in enumerate(found['topic_options'].items()):
-        told = 'or as something else' if number else 'to track it'
-        say(f'{told}: {track_line(found["bag"], system, named)}')
+        purpose = 'or as something else' if number else 'to track it'
+        say(f'{purpose}: {track_line(found["bag"], system, named)}')
     if not found['systems']:
         say('no tracker can use it')
 
 
 def _scans(scans: dict[str, int] | None) -> str:
-    several = scans is not None and scans['most'] > 1
-    return f', {scans["count"]} scans, up to {scans["most"]} per scan' if several else ''
+    if scans is None or scans['most'] <= 1:
+        return ''
+    return f', {scans["count"]} scans, up to {scans["most"]} per scan'
 
 
 def track_line(bag: str, system: str, named: dict[str, str]) -> str:

@@ -95,7 +95,7 @@ def run_seed(sweep: Sweep, seed: int, within: str | None = None) -> Outcome:
         try:
             return _run(sweep, seed, Path(place))
         except Exception as error:
-            # The place differs from run to run; what is told has to be the same each time.
+            # The place differs from run to run; the sentence has to be the same each time.
             return Outcome(seed, failure=sentence_of(error).replace(f'{place}{os.sep}', ''))
 
 
@@ -180,17 +180,17 @@ def _distributed(
         yield outcome or Outcome(seeds[number], failure=failure)
 
 
-# -- what is told of them ------------------------------------------------------------------------
+# -- what comes out ------------------------------------------------------------------------------
 
 
 def summarise(outcomes: Iterable[Outcome]) -> dict[str, dict[str, float]]:
     """Of each metric, over the runs that gave it: how many did (`runs`), mean, std (of one run),
     stderr (of the mean), p05 and p95. With one run std and stderr are NaN."""
     values: dict[str, list[float]] = {}
-    for outcome in sorted(outcomes, key=lambda one: one.seed):
+    for outcome in sorted(outcomes, key=lambda outcome: outcome.seed):
         for name, value in outcome.metrics.items():
             values.setdefault(name, []).append(value)
-    return {name: _spread(np.array(told, np.float64)) for name, told in values.items()}
+    return {name: _spread(np.array(numbers, np.float64)) for name, numbers in values.items()}
 
 
 def _spread(values: np.ndarray) -> dict[str, float]:
@@ -209,7 +209,7 @@ def _spread(values: np.ndarray) -> dict[str, float]:
 
 def record(sweep: Sweep, outcomes: Iterable[Outcome]) -> dict[str, Any]:
     """The content of sweep.json: what was run, with which versions, and what came out."""
-    ordered = sorted(outcomes, key=lambda one: one.seed)
+    ordered = sorted(outcomes, key=lambda outcome: outcome.seed)
     versions: dict[str, set[str]] = {}
     for outcome in ordered:
         for name, version in outcome.versions.items():
@@ -220,8 +220,8 @@ def record(sweep: Sweep, outcomes: Iterable[Outcome]) -> dict[str, Any]:
         'scene': sweep.scene.as_dict(),
         'parameters': sweep.config.as_dict(),
         'seeds': [outcome.seed for outcome in ordered],
-        'failures': {str(one.seed): one.failure for one in ordered if one.failure},
-        'versions': {name: ' and '.join(sorted(told)) for name, told in versions.items()},
+        'failures': {str(run.seed): run.failure for run in ordered if run.failure},
+        'versions': {name: ' and '.join(sorted(found)) for name, found in versions.items()},
         'summary': summarise(ordered),
     }
 
@@ -250,6 +250,6 @@ def write(out: Path, content: Mapping[str, Any], outcomes: Iterable[Outcome]) ->
     with whole(out / CSV) as path, path.open('w', encoding='utf-8', newline='') as file:
         table = csv.writer(file, lineterminator='\n')
         table.writerow(['seed', 'failure', *names])
-        for one in sorted(outcomes, key=lambda outcome: outcome.seed):
-            table.writerow([one.seed, one.failure, *(one.metrics.get(name) for name in names)])
+        for run in sorted(outcomes, key=lambda outcome: outcome.seed):
+            table.writerow([run.seed, run.failure, *(run.metrics.get(name) for name in names)])
     RunFolder(out).write_json(JSON, content)

@@ -131,7 +131,7 @@ def track_summary(matching: Matching) -> dict[str, float]:
         'false_tracks': int(np.count_nonzero(2 * hits < lifetimes)),
         'identity_switches': identity_switches(matching.followed_by.T),
         'fragmentations': sum(
-            _interruptions(one[there]) for one, there in zip(found, matching.present)
+            _interruptions(is_found[there]) for is_found, there in zip(found, matching.present)
         ),
         'completeness': float(found.sum() / present) if present else float('nan'),
         'false_rows_per_scan': float(

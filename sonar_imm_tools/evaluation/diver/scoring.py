@@ -88,7 +88,7 @@ def score(
 
 def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
     """Fixes as a series without tracks: every row has track id 0, no velocity, no models."""
-    ordered = [scan_of(one) for one in sorted(fixes, key=lambda fix: fix.stamp_ns)]
+    ordered = [scan_of(fix) for fix in sorted(fixes, key=lambda fix: fix.stamp_ns)]
     counts = [len(scan) for scan in ordered]
     stamps = np.array([scan.stamp_ns for scan in ordered], np.int64)
     n = sum(counts)

@@ -107,22 +107,24 @@ def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[st
                 **_compared(found[0], found[1], limit, directions, position_std),
             }
         )
-    matched = [one for crossing in crossings for one in crossing['horizons']]
+    matched = [pair for crossing in crossings for pair in crossing['horizons']]
     return {
         'line_a': lines[0].name,
         'line_b': lines[1].name,
         'position_std_m': position_std,
         'crossings': crossings,
         'matched': len(matched),
-        **summary([one for one in matched if one['judged']]),
+        **summary([pair for pair in matched if pair['judged']]),
     }
 
 
 def summary(judged: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Numbers of horizons that are judged. between_lines_m: standard deviation that, added to what
     is stated, makes their mean square 1 (Paule and Mandel); 0 where none is missing."""
-    sigmas = np.array([one['sigmas'] for one in judged])
-    difference, std = (np.array([one[key] for one in judged]) for key in ('difference_m', 'std_m'))
+    sigmas = np.array([pair['sigmas'] for pair in judged])
+    difference, std = (
+        np.array([pair[key] for pair in judged]) for key in ('difference_m', 'std_m')
+    )
     return {
         'judged': len(judged),
         'rms_difference_m': _rms(difference),
@@ -147,29 +149,30 @@ def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
     if not metrics['crossings']:
         return [f'{metrics["line_a"]} and {metrics["line_b"]} do not cross']
     lines = []
-    for one in metrics['crossings']:
+    for crossing in metrics['crossings']:
         lines.append(
-            f'crossing at {one["latitude"]:.6f}, {one["longitude"]:.6f} under '
-            f'{one["angle_deg"]:.0f} deg: {len(one["horizons"])} horizons matched, '
-            f'{one["only_a"]} and {one["only_b"]} seen by one line only'
+            f'crossing at {crossing["latitude"]:.6f}, {crossing["longitude"]:.6f} under '
+            f'{crossing["angle_deg"]:.0f} deg: {len(crossing["horizons"])} horizons matched, '
+            f'{crossing["only_a"]} and {crossing["only_b"]} seen by one line only'
         )
-        for h in one['horizons']:
+        for h in crossing['horizons']:
             depths = f'{h["depth_a_m"]:8.2f} m and {h["depth_b_m"]:8.2f} m'
             marks = {'bottom': h['bottom'], 'multiple': h['multiple'], 'cut': h['cut']}
             lines.append(
                 f'  {depths}: {h["difference_m"]:+.2f} m = {h["sigmas"]:+.1f} stated sigma of '
                 f'{h["std_m"]:.2f} m' + ''.join(f', {name}' for name, has in marks.items() if has)
             )
-        if one['floor_cut']:
+        if crossing['floor_cut']:
             lines.append(
                 '  not judged: the floor lies at the first depth that is tracked, or above it, so '
                 'that what is below may be multiples of it'
             )
-        if 'shift_m' in one:
+        if 'shift_m' in crossing:
             lines.append(
-                f'  common shift {one["shift_m"]:+.2f} m +- {one["shift_std_m"]:.2f} m; after it '
-                f'{one["residual_rms_m"]:.2f} m rms, {one["residual_rms_sigmas"]:.1f} stated '
-                'sigmas rms'
+                '  common shift {shift_m:+.2f} m +- {shift_std_m:.2f} m; after it '
+                '{residual_rms_m:.2f} m rms, {residual_rms_sigmas:.1f} stated sigmas rms'.format(
+                    **crossing
+                )
             )
     if metrics['judged']:
         lines.append(
@@ -192,13 +195,13 @@ def _line(folder: RunFolder) -> Line:
         positions = read_positions(bag)
     if positions is None:
         raise BagError(f'{run["bag"]} has no positions (sensor_msgs/NavSatFix)')
-    records = [one for one in folder.read_estimates() if not one.columns()['preview'][0]]
-    stamps = np.array([one.stamp_ns for one in records], np.int64)
+    records = [record for record in folder.read_estimates() if not record.columns()['preview'][0]]
+    stamps = np.array([record.stamp_ns for record in records], np.int64)
     east, north = positions.at(stamps)
     there = np.isfinite(east)
     if there.sum() < 2:
         raise BagError(f'{folder.path}: fewer than two records have a place')
-    kept = tuple(one for one, good in zip(records, there) if good)
+    kept = tuple(record for record, good in zip(records, there) if good)
     config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
     depth = tracked_depths(run, config)
     return Line(
@@ -294,7 +297,7 @@ def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> 
                 bool(within <= line.step),
             )
         )
-    return sorted(horizons, key=lambda one: one.depth)
+    return sorted(horizons, key=lambda horizon: horizon.depth)
 
 
 def _compared(
@@ -307,30 +310,30 @@ def _compared(
     """directions (2, 2): unit vectors along both lines."""
     from scipy.optimize import linear_sum_assignment
 
-    depth_a, depth_b = np.array([one.depth for one in a]), np.array([one.depth for one in b])
+    depth_a, depth_b = np.array([h.depth for h in a]), np.array([h.depth for h in b])
     distance = np.abs(depth_a.reshape(-1, 1) - depth_b.reshape(1, -1))
     rows, columns = linear_sum_assignment(np.minimum(distance, limit))
     pairs = [(a[i], b[j]) for i, j in zip(rows, columns) if distance[i, j] < limit]
-    floor_cut = any(one.cut and one.is_bottom > 0.5 for one in (*a, *b))
+    floor_cut = any(h.cut and h.is_bottom > 0.5 for h in (*a, *b))
     horizons = []
-    for one, other in pairs:
+    for first, second in pairs:
         # Lines that are nearly parallel say nothing of the slope across them.
-        slopes = np.array([one.slope, other.slope])
+        slopes = np.array([first.slope, second.slope])
         gradient = np.linalg.lstsq(directions, slopes, rcond=0.3)[0]
         place = np.sqrt(2.0) * position_std * np.hypot(*gradient)
-        std = float(np.sqrt(one.std**2 + other.std**2 + place**2))
-        cut = one.cut or other.cut
+        std = float(np.sqrt(first.std**2 + second.std**2 + place**2))
+        cut = first.cut or second.cut
         horizons.append(
             {
-                'track_id_a': one.track_id,
-                'track_id_b': other.track_id,
-                'depth_a_m': one.depth,
-                'depth_b_m': other.depth,
-                'difference_m': one.depth - other.depth,
+                'track_id_a': first.track_id,
+                'track_id_b': second.track_id,
+                'depth_a_m': first.depth,
+                'depth_b_m': second.depth,
+                'difference_m': first.depth - second.depth,
                 'std_m': std,
-                'sigmas': (one.depth - other.depth) / std,
-                'bottom': one.is_bottom > 0.5 and other.is_bottom > 0.5,
-                'multiple': max(one.multiple, other.multiple) > 0.5,
+                'sigmas': (first.depth - second.depth) / std,
+                'bottom': first.is_bottom > 0.5 and second.is_bottom > 0.5,
+                'multiple': max(first.multiple, second.multiple) > 0.5,
                 'cut': cut,
                 'judged': not (cut or floor_cut),
             }
@@ -340,7 +343,7 @@ def _compared(
         'only_a': len(a) - len(pairs),
         'only_b': len(b) - len(pairs),
         'floor_cut': floor_cut,
-        **common_shift([one for one in horizons if one['judged']]),
+        **common_shift([pair for pair in horizons if pair['judged']]),
     }
 
 
@@ -349,7 +352,9 @@ def common_shift(judged: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     state, its standard deviation, and what it leaves; nothing for fewer than two."""
     if len(judged) < 2:
         return {}
-    difference, std = (np.array([one[key] for one in judged]) for key in ('difference_m', 'std_m'))
+    difference, std = (
+        np.array([pair[key] for pair in judged]) for key in ('difference_m', 'std_m')
+    )
     weight = std**-2
     shift = float(weight @ difference / weight.sum())
     left = difference - shift
@@ -365,6 +370,10 @@ def common_shift(judged: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 def _between(values: FloatArray, row: int, share: float) -> float:
     return float(values[row] + share * (values[row + 1] - values[row]))
+
+
+def _columns(pairs: Sequence[Mapping[str, Any]], *keys: str) -> tuple[FloatArray, ...]:
+    return tuple(np.array([pair[key] for pair in pairs], np.float64) for key in keys)
 
 
 def _rms(values: FloatArray) -> float:

@@ -97,9 +97,9 @@ def deferred_estimates(
         return None
     track = series.pick((series.track_id == track_id) & np.isfinite(series.nis))
     received = list(measurements)
-    pings = {one.stamp_ns: one for one in received if isinstance(one, Detections) and len(one)}
+    pings = {p.stamp_ns: p for p in received if isinstance(p, Detections) and len(p)}
     track = track.pick(np.array([stamp in pings for stamp in track.stamp_ns.tolist()], bool))
-    navigation = [one for one in received if isinstance(one, Navigation)]
+    navigation = [pose for pose in received if isinstance(pose, Navigation)]
     poses, known = sonar_poses(navigation, track.stamp_ns, config)
     rows = np.flatnonzero(known)
     rows = rows[:: max(1, -(-len(rows) // MOST_ECHOES))]
@@ -112,7 +112,7 @@ def deferred_estimates(
     sunk = float(at.position[-1, 2] - at.position[0, 2])
     first, last = track.stamp_ns[rows[:1]], rows[-1]
     path = truth.get(track_id)
-    heights = [one for one in received if isinstance(one, Altitude)]
+    heights = [height for height in received if isinstance(height, Altitude)]
     return DeferredEstimates(
         track_id=track_id,
         echoes=len(rows),
@@ -121,7 +121,7 @@ def deferred_estimates(
         refit=deferred(z, at, config, both_sides=True, refit=True),
         online=float(track.state[last, 2]) + sunk,
         band=(float(track.low[last]) + sunk, float(track.high[last]) + sunk),
-        altitude=min(heights, key=lambda one: abs(one.stamp_ns - int(first[0]))).altitude
+        altitude=min(heights, key=lambda height: abs(height.stamp_ns - int(first[0]))).altitude
         if heights
         else float('nan'),
         truth=float(path.at(first, gap)[0, 2]) if path else float('nan'),

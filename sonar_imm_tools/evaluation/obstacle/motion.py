@@ -20,9 +20,9 @@ behaviours  mean stated probability of each behaviour, by what the obstacle does
 collisions  Brier score of the stated probability, beside that of a guess by how often it happens,
             and by bins how often what was stated happened
 
-A collision is what the tracker was told it is: `safety_radius` and `safety_height` at once, within
-`cpa_horizon`. A forecast counts where the truth goes on until its outcome is known: it happened,
-the horizon is over, or the obstacle has been passed.
+A collision is what the parameters of the run define: `safety_radius` and `safety_height` at once,
+within `cpa_horizon`. A forecast counts where the truth goes on until its outcome is known: it
+happened, the horizon is over, or the obstacle has been passed.
 """
 
 from __future__ import annotations

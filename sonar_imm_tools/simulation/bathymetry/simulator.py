@@ -141,10 +141,10 @@ class BathymetryScenario(ShipScenario):
             problems.append('shadows needs increasing ranges in pairs, begin and end of each')
         return problems
 
-    def told(self) -> dict[str, Any]:
+    def instruments(self) -> dict[str, Any]:
         ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
         mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
-        return {**super().told(), **mounted}
+        return {**super().instruments(), **mounted}
 
 
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
@@ -244,8 +244,8 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
     if ship is not None:
         seconds = (config.pings - 1) / config.ping_rate
         stated = navigation_of(config, ship, FIRST_STAMP_NS, seconds, rng, 'map')
-        received = [*(Received(one.stamp_ns, one) for one in stated), *received]
-        received.sort(key=lambda one: one.received_ns)
+        received = [*(Received(item.stamp_ns, item) for item in stated), *received]
+        received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), tuple(truth), frame_id=truth[0].frame_id)
 
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a diver scene can be told, and the scenes that have a name."""
+"""The parameters of a diver scene, and the scenes that have a name."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ import numpy as np
 from sonar_imm.parameters import parameter
 
 from ..scenario import Scenario
-from .afloat import GEODETIC, told_of_places, USBL
-from .crossing import CROSSING, told_of_scans
+from .afloat import GEODETIC, instruments_of_places, USBL
+from .crossing import CROSSING, instruments_of_scans
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
 SENSORS = (
@@ -148,10 +148,10 @@ class DiverScenario(Scenario):
             problems.append('leg_min cannot exceed leg_max')
         return problems
 
-    def told(self) -> dict[str, Any]:
+    def instruments(self) -> dict[str, Any]:
         if self.sensor in ('geodetic', 'usbl'):
-            return told_of_places(self)
-        return told_of_scans(self) if self.sensor == 'scans' else super().told()
+            return instruments_of_places(self)
+        return instruments_of_scans(self) if self.sensor == 'scans' else super().instruments()
 
 
 MULTISTATIC = {

@@ -113,7 +113,7 @@ def _sense_arrivals(
     ]
     if not pairs:
         return []
-    receiver = np.array([one for one, _ in pairs])
+    receiver = np.array([number for number, _ in pairs])
     toa = np.array([path for _, path in pairs]) / (config.sound_speed + errors.sound_speed)
     toa = toa + errors.clock[receiver]
     n = len(pairs)

@@ -70,7 +70,7 @@ def simulate(config: DiverScenario, seed: int) -> Scene:
         for measurement in SENSE[config.sensor](config, errors.at(k), int(stamp), present, rng):
             when = int(stamp) + round(delay * 1e9)
             received.append(Received(when, measurement, namespace_of(measurement)))
-    received.sort(key=lambda one: one.received_ns)
+    received.sort(key=lambda item: item.received_ns)
     return Scene(tuple(received), truth)
 
 

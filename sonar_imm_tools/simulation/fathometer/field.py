@@ -64,9 +64,9 @@ def pressure_field(
     length = round(config.record_seconds * config.sample_rate)
     frequency = np.fft.rfftfreq(length, 1.0 / config.sample_rate)
     low, high = 0.5 * config.frequency_min, 1.2 * config.frequency_max
-    heard = np.flatnonzero((frequency >= low) & (frequency <= high))
+    inside = np.flatnonzero((frequency >= low) & (frequency <= high))
     spectra = np.zeros((len(frequency), config.phones), np.complex64)
-    for rows in np.split(heard, range(_AT_ONCE, len(heard), _AT_ONCE)):
+    for rows in np.split(inside, range(_AT_ONCE, len(inside), _AT_ONCE)):
         root = np.linalg.cholesky(expected_csdm(config, drift, record, frequency[rows]))
         noise = rng.standard_normal((len(rows), config.phones, 2)) @ np.array([1.0, 1j])
         spectra[rows] = np.sqrt(0.5) * (root @ noise[..., None])[..., 0]

@@ -176,21 +176,21 @@ class FathometerScenario(Scenario):
             problems.append('fading would leave no layer')
         return problems
 
-    def told(self) -> dict[str, Any]:
-        """See `Scenario.told`."""
-        told = Scenario.told(self)
+    def instruments(self) -> dict[str, Any]:
+        """See `Scenario.instruments`."""
+        values = Scenario.instruments(self)
         if self.level == 'csdm':
             # They are drawn frequency by frequency: no window makes their noise fade with depth.
-            told |= {'window': 'rectangular', 'overlap': 0.0}
+            values |= {'window': 'rectangular', 'overlap': 0.0}
         if self.level == 'pressure':
             # Snapshots are the tracker's own; they are as long as the depths to be tracked need.
-            del told['snapshot_seconds']
-            told |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
+            del values['snapshot_seconds']
+            values |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
         if self.level == 'envelope':
             # A profiler has no array: of the instrument only its pulse and its noise matter.
-            told = {'sound_speed': self.sound_speed}
-            told |= envelope_parameters(self.pulse_width, self.noise_sigma)
-        return told
+            values = {'sound_speed': self.sound_speed}
+            values |= envelope_parameters(self.pulse_width, self.noise_sigma)
+        return values
 
     def spectra_bytes(self) -> float:
         """Size of all cross-spectra of the scene."""
@@ -295,13 +295,13 @@ def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Fathomete
 class Drift:
     """The floor and the array over time: depth and amplitude (records, K) of all layers that ever
     exist, present (records, K), array_depth (records,) and the depth that is stated,
-    array_depth_told (records,)."""
+    array_depth_stated (records,)."""
 
     depth: FloatArray
     amplitude: FloatArray
     present: NDArray[np.bool_]
     array_depth: FloatArray
-    array_depth_told: FloatArray
+    array_depth_stated: FloatArray
 
 
 def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:
@@ -328,7 +328,7 @@ def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:
     swing = np.exp(config.amplitude_swing * np.sin(2.0 * np.pi * turns))
     turns = record / config.heave_records + rng.uniform()
     array_depth = config.array_depth + config.heave * np.sin(2.0 * np.pi * turns)
-    told = array_depth + config.array_depth_std * rng.standard_normal(T)
+    stated = array_depth + config.array_depth_std * rng.standard_normal(T)
     return Drift(
-        depth, np.clip(level * share * swing, 0.0, 1.0), share > PRESENT, array_depth, told
+        depth, np.clip(level * share * swing, 0.0, 1.0), share > PRESENT, array_depth, stated
     )

@@ -63,7 +63,7 @@ def simulate(config: FathometerScenario, seed: int) -> Scene:
     have the stamp of their record and come before it.
     """
     records = list(stream(config, seed))
-    received = tuple(one for measurements, _ in records for one in measurements)
+    received = tuple(item for measurements, _ in records for item in measurements)
     return Scene(received, tuple(truth for _, truth in records), frame_id=FRAME_ID)
 
 
@@ -75,9 +75,9 @@ def stream(
     drift = drift_of(config, rng)
     for record, measurements in enumerate(_measurements(config, drift, rng)):
         stamp_ns = measurements[-1].stamp_ns
-        received = [Received(one.stamp_ns, one) for one in measurements]
+        received = [Received(item.stamp_ns, item) for item in measurements]
         if config.depth_companion:
-            depth = float(drift.array_depth_told[record])
+            depth = float(drift.array_depth_stated[record])
             companion = ArrayDepth(stamp_ns=stamp_ns, depth=depth, frame_id=FRAME_ID)
             received.insert(0, Received(stamp_ns, companion))
         here = np.flatnonzero(drift.present[record])
@@ -101,11 +101,11 @@ def _measurements(
 ) -> Iterator[list[Any]]:
     """The measurements of each record."""
     for record in range(config.records):
-        told = None if config.depth_companion else float(drift.array_depth_told[record])
+        stated = None if config.depth_companion else float(drift.array_depth_stated[record])
         if config.level == 'pressure':
-            yield pressure_blocks(config, drift, record, told, rng)
+            yield pressure_blocks(config, drift, record, stated, rng)
         elif config.level == 'csdm':
-            yield [cross_spectra(config, drift, record, told, rng)]
+            yield [cross_spectra(config, drift, record, stated, rng)]
         else:
             amplitude, sigma = _TRACES[config.level](config, drift, record, rng)
             yield [
@@ -115,7 +115,7 @@ def _measurements(
                     depth=_depths(config),
                     amplitude=amplitude,
                     sigma=None if sigma is None else np.full(len(amplitude), sigma),
-                    reference_depth=told,
+                    reference_depth=stated,
                 )
             ]
 
@@ -124,11 +124,11 @@ def cross_spectra(
     config: FathometerScenario,
     drift: Drift,
     record: int,
-    told: float | None,
+    stated: float | None,
     rng: np.random.Generator,
 ) -> CrossSpectra:
-    """A sample of the cross-spectra of one record around their expectation. told: the depth of the
-    array that the record states."""
+    """A sample of the cross-spectra of one record around their expectation. stated: the depth of
+    the array that the record states."""
     spacing = 1.0 / config.snapshot_seconds
     first = int(np.ceil(config.frequency_min / spacing - 1e-9))
     last = int(np.floor(config.frequency_max / spacing + 1e-9))
@@ -140,7 +140,7 @@ def cross_spectra(
         frequency=frequency,
         csdm=sample_csdm(R, config.snapshots, rng),
         snapshots=config.snapshots,
-        reference_depth=told,
+        reference_depth=stated,
     )
 
 
@@ -158,7 +158,7 @@ def _response(
     w = fathometer.steering(spectra.frequency, heights, config.sound_speed)
     gamma = fathometer.coherence(spectra.csdm, w, config.processor)
     comb = float(spectra.frequency[0]), 1.0 / config.snapshot_seconds
-    where = float(drift.array_depth_told[record])
+    where = float(drift.array_depth_stated[record])
 
     def at(first: float, count: int) -> FloatArray:
         lattice = first, config.depth_step, count
@@ -180,7 +180,7 @@ def _pulses(
     spectrum = band * (rng.standard_normal((len(band), 2)) @ np.array([1.0, 1j]))
     noise = np.fft.irfft(spectrum, size)[: len(depth)]
     noise *= config.noise_sigma * size / np.sqrt(4.0 * np.count_nonzero(band))
-    shift = drift.array_depth_told[record] - drift.array_depth[record]
+    shift = drift.array_depth_stated[record] - drift.array_depth[record]
     # The level of an MVDR response falls with the two-way path plus the length of the array.
     height = drift.depth[record] - drift.array_depth[record]
     level = (
@@ -205,7 +205,7 @@ def pressure_blocks(
     config: FathometerScenario,
     drift: Drift,
     record: int,
-    told: float | None,
+    stated: float | None,
     rng: np.random.Generator,
 ) -> list[Pressure]:
     """The pressure of one record in blocks of `block_seconds`, the last ends with the record."""
@@ -224,7 +224,7 @@ def pressure_blocks(
             frame_id=FRAME_ID,
             pressure=pressure[first : first + block],
             sample_rate=config.sample_rate,
-            reference_depth=told,
+            reference_depth=stated,
             scale=scale,
         )
         for first in range(0, len(pressure) - 1, block)

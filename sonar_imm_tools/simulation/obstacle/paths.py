@@ -74,7 +74,7 @@ class Path:
             for axis in range(2):
                 where[:, axis] += np.interp(t, clock, self.sway[:, axis])
         if self.swing is not None:
-            where[:, :2] += np.column_stack([one(t) for one in self.swing])
+            where[:, :2] += np.column_stack([swing(t) for swing in self.swing])
         return where
 
     def velocity(self, t: FloatArray) -> FloatArray:

@@ -110,7 +110,7 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     else:
         echoes = [_echoes(config, vehicle, times, path, sound) for path in obstacles]
         received += _pings(config, stamps, echoes, rng)
-    received.sort(key=lambda one: one.received_ns)
+    received.sort(key=lambda item: item.received_ns)
     truth = tuple(
         _truth(config, number, path, vehicle, stamps, times)
         for number, path in enumerate(obstacles, start=1)
