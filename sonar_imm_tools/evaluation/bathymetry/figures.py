@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+import math
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,14 @@ import plotly.graph_objects as go
 
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.measurements import Snapshot
+from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.bathymetry.likelihood import spacing_of
 
 from ... import SECOND
-from ...offline.run_folder import read_measurements
+from ...offline.run_folder import read_measurements, SOUNDINGS
+from ...recordings.export.grid import EMPTY_LABEL, Grid, grid_of
+from ...recordings.export.points import Points, read_points
 from ..plotting import (
     add_band,
     add_image,
@@ -44,13 +47,16 @@ from ..plotting import (
     thin,
 )
 from ..report import Section
-from . import chart
 from .profiles import Profile, Swath
 from .scoring import BAND, runs
 
 MOST_BINS = 1200
 DIRECTIONS = 161
 FLOOR_DB = -20
+MOST_CELLS = 160
+"""Cells along the longer side of the chart."""
+CELLS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
+MOST_POSES = 1000
 SLANT = {'title': 'slant range [m]'}
 
 
@@ -58,13 +64,13 @@ def sections(run: Mapping[str, Any], folder: Path, swath: Swath) -> Iterator[Sec
     """The sections of one run in `folder`. run: content of ``run.json``."""
     if swath.profiles:
         yield from _of_pings(run, swath)
-    if (points := chart.points_of(folder)) is not None:
-        grid = chart.chart_of(points)
+    if (points := points_of(folder)) is not None:
+        grid = chart_of(points)
         yield Section(
             'Chart',
             f'{len(points)} soundings in cells of {grid.cell:g} m, as `sonar-imm export` writes '
             'them; north is up. Dark line: the ship.',
-            chart.chart_figure(grid, chart.track_of(run)),
+            chart_figure(grid, track_of(run)),
         )
 
 
@@ -232,3 +238,53 @@ def segmentation_figure(swath: Swath) -> go.Figure:
         name = 'ends of the true patch'
         add_points(figure, x, y, name, COLOURS[1], 6, symbol='line-ns-open')
     return styled(figure, 340, SLANT | BARE, {'title': 'time [s]', 'autorange': 'reversed'} | BARE)
+
+
+def points_of(folder: Path) -> Points | None:
+    """The soundings of a run; None without any."""
+    if not (folder / SOUNDINGS).is_file():
+        return None
+    points = read_points(folder / SOUNDINGS)
+    return points if len(points) else None
+
+
+def track_of(run: Mapping[str, Any]) -> FloatArray:
+    """Where the ship went (n, 2), east and north; empty when the recording is gone."""
+    navigation = [pose for pose in read_measurements(run) if isinstance(pose, Navigation)]
+    track = np.array([pose.position[:2] for pose in navigation]).reshape(-1, 2)
+    return track[thin(len(track), MOST_POSES)]
+
+
+def chart_of(points: Points) -> Grid:
+    """The grid of the chart, with cells as small as fit."""
+    extent = max(np.ptp(points['x']), np.ptp(points['y']))
+    cell = next((c for c in CELLS if extent / c <= MOST_CELLS), math.ceil(extent / MOST_CELLS))
+    return grid_of(points, float(cell))
+
+
+def chart_figure(grid: Grid, track: FloatArray) -> go.Figure:
+    """Height of the floor in the grid, north up, and the track of the ship."""
+    rows, columns = grid.height.shape
+    figure = go.Figure()
+    figure.add_heatmap(
+        x=grid.west + grid.cell * (np.arange(columns) + 0.5),
+        y=grid.north - grid.cell * (np.arange(rows) + 0.5),
+        z=grid.height.astype(np.float32),
+        customdata=np.dstack(
+            [
+                grid.uncertainty.astype(np.float32),
+                np.where(grid.label == EMPTY_LABEL, np.nan, grid.label).astype(np.float32),
+                grid.count,
+            ]
+        ),
+        colorscale='Viridis',
+        colorbar={'title': 'z [m]'},
+        hovertemplate=(
+            'east %{x:.1f} m, north %{y:.1f} m<br>z %{z:.2f} m, sd %{customdata[0]:.2f} m<br>'
+            'model %{customdata[1]}, %{customdata[2]} soundings<extra></extra>'
+        ),
+    )
+    if len(track):
+        add_line(figure, track[:, 0], track[:, 1], 'track of the ship', INK, 1.5)
+    x = {'title': 'east [m]', 'zeroline': False, 'constrain': 'domain'}
+    return styled(figure, 520, x, {'title': 'north [m]', 'zeroline': False, 'scaleanchor': 'x'})

@@ -224,7 +224,7 @@ def simulate(config: BathymetryScenario, seed: int) -> Scene:
     rng = np.random.default_rng(seed)
     sides = ('port', 'starboard') if config.side == 'both' else (config.side,)
     ranges = config.first_range + config.bin_width * np.arange(
-        round((config.last_range - config.first_range) / config.bin_width)
+        round((config.last_range - config.first_range) / config.bin_width), dtype=np.float64
     )
     listening_ns = round(2e9 * ranges[-1] / config.sound_speed)
     ship = ship_of(config, config.sonar_depth, rng) if config.moving else None

@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from typing import Any
+
 from attrs import evolve, frozen
 import numpy as np
 
@@ -48,7 +51,8 @@ class Errors:
 
 def draw_errors(config: DiverScenario, times: FloatArray, rng: np.random.Generator) -> Errors:
     """What is drawn once for a scene, and the errors that last, at `times` (n,) s."""
-    depth = rng.uniform(*config.depth, size=config.divers)
+    shallow, deep = config.depth
+    depth = rng.uniform(shallow, deep, size=config.divers)
     phase = rng.uniform(0.0, 2.0 * np.pi, size=config.divers)
     swell = np.sin(2.0 * np.pi * times[:, None] / config.swell_period + phase)
     misplaced = config.receiver_position_std * rng.normal(size=(len(RECEIVERS), 2))
@@ -211,7 +215,7 @@ def _sense_multistatic_fixes(
     return fixes
 
 
-SENSE = {
+SENSE: dict[str, Callable[..., Iterable[Any]]] = {
     'polar': _sense_polar,
     'positions': _sense_positions,
     'arrivals': _sense_arrivals,

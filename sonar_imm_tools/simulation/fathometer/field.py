@@ -62,7 +62,7 @@ def pressure_field(
 ) -> NDArray[np.float32]:
     """Pressure (n, M) of one record; a two-sided spectrum of R."""
     length = round(config.record_seconds * config.sample_rate)
-    frequency = np.fft.rfftfreq(length, 1.0 / config.sample_rate)
+    frequency = np.asarray(np.fft.rfftfreq(length, 1.0 / config.sample_rate), np.float64)
     low, high = 0.5 * config.frequency_min, 1.2 * config.frequency_max
     inside = np.flatnonzero((frequency >= low) & (frequency <= high))
     spectra = np.zeros((len(frequency), config.phones), np.complex64)

@@ -33,12 +33,11 @@ import numpy as np
 
 from sonar_imm.acoustics import fathometer
 from sonar_imm.acoustics.ambient import sample_csdm
-from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.acoustics.pulse import band_pulse, gaussian_pulse
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.truth import Received, Scene, TrueReflectors
 
-from .envelope import envelope
 from .field import expected_csdm, pressure_field
 from .scenario import Drift, drift_of, FathometerScenario, scenario, SCENARIOS
 
@@ -53,6 +52,8 @@ __all__ = [
 ]
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
+_THRESHOLD = 3.0
+"""Standard deviations of the noise below which a profiler writes zero."""
 FRAME_ID = 'array'
 
 
@@ -132,7 +133,7 @@ def cross_spectra(
     spacing = 1.0 / config.snapshot_seconds
     first = int(np.ceil(config.frequency_min / spacing - 1e-9))
     last = int(np.floor(config.frequency_max / spacing + 1e-9))
-    frequency = spacing * np.arange(first, last + 1)
+    frequency = spacing * np.arange(first, last + 1, dtype=np.float64)
     R = expected_csdm(config, drift, record, frequency)
     return CrossSpectra(
         stamp_ns=stamp_of(config, record),
@@ -146,7 +147,7 @@ def cross_spectra(
 
 def _depths(config: FathometerScenario) -> FloatArray:
     count = int((config.depth_max - config.depth_min) / config.depth_step + 1e-6) + 1
-    return config.depth_min + config.depth_step * np.arange(count)
+    return config.depth_min + config.depth_step * np.arange(count, dtype=np.float64)
 
 
 def _response(
@@ -194,7 +195,7 @@ def _scattered(
     config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
 ) -> tuple[FloatArray, None]:
     """The envelope of a profiler, which says nothing of its noise."""
-    return envelope(config, drift, record, _depths(config), rng), None
+    return _envelope(config, drift, record, _depths(config), rng), None
 
 
 _TRACES = {'response': _response, 'trace': _pulses, 'envelope': _scattered}
@@ -229,3 +230,48 @@ def pressure_blocks(
         )
         for first in range(0, len(pressure) - 1, block)
     ]
+
+
+def _envelope(
+    config: FathometerScenario,
+    drift: Drift,
+    record: int,
+    depth: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """The stacked envelope (n,) of one record at `depth` (n,) m, evenly spaced, as a sub-bottom
+    profiler records it over a floor that scatters in its volume.
+
+    The pressure behind an envelope is complex. Each layer answers with the pulse, in a phase that
+    is drawn anew for each ping, because the layers are rough. Below the first layer everything
+    scatters: a complex Gaussian field, seen through the same pulse, whose rms value falls as
+    ``exp(-depth below / scatter_decay)``. Where both overlap they interfere, so that an echo comes
+    and goes with the speckle around it. The magnitude is averaged over `stack` pings, and what
+    lies below three standard deviations of the receiver's noise is written as zero, as instruments
+    do.
+    """
+    pulse = gaussian_pulse(config.pulse_width)
+    n, step = len(depth), config.depth_step
+    there = drift.amplitude[record] > 0.0
+    place, strength = drift.depth[record, there], drift.amplitude[record, there]
+    echo = pulse(depth[:, None] - place) * strength
+    below = depth - place.min() if len(place) else np.full(n, -1.0)
+    level = config.scatter * np.exp(-np.maximum(below, 0.0) / config.scatter_decay)
+    level = np.where(below >= 0.0, level, 0.0)
+    reach = int(5.0 * config.pulse_width / step)
+    kernel = pulse(step * np.arange(-reach, reach + 1, dtype=np.float64))
+    kernel /= np.sqrt(np.sum(np.square(kernel)))
+    total = np.zeros(n)
+    for _ in range(config.stack):
+        phase = np.exp(2j * np.pi * rng.uniform(size=len(place)))
+        field = echo @ phase
+        field = field + np.convolve(level * _complex_noise(n, rng), kernel, 'same')
+        wide = _complex_noise(n + 2 * reach, rng)
+        field = field + config.noise_sigma * np.convolve(wide, kernel, 'valid')
+        total += np.abs(field)
+    return np.asarray(np.maximum(total / config.stack - _THRESHOLD * config.noise_sigma, 0.0))
+
+
+def _complex_noise(count: int, rng: np.random.Generator) -> FloatArray:
+    """Of unit power, (count,) complex."""
+    return rng.standard_normal((count, 2)) @ np.array([1.0, 1j]) * np.sqrt(0.5)

@@ -66,7 +66,7 @@ class ImageSonar:
         reach = int(np.ceil(_FAR_SIDELOBES * np.radians(config.beam_width_deg) / beam_step))
         self._across = _unit(self._beam(beam_step * np.arange(-reach, reach + 1)))
         reach = int(np.ceil(2.0 * config.pulse_length / step))
-        self._along = _unit(self._pulse(step * np.arange(-reach, reach + 1)))
+        self._along = _unit(self._pulse(step * np.arange(-reach, reach + 1, dtype=np.float64)))
         shape = config.seabed_shape
         self._texture = rng.gamma(shape, 1.0 / shape, (_TEXTURE, _TEXTURE))
         self._chain = rng.uniform(-0.5, 0.5, 60) * config.target_size

@@ -105,8 +105,13 @@ def _path(
     if config.obstacle_motion == 'moving':
         ahead = np.array([np.cos(course), np.sin(course)])
         meets = float(place[:2] @ ahead) / config.speed
-        times = {'starts': config.obstacle_starts, 'stops': config.obstacle_stops}
-        return Path(place, meets=meets, speed=_speed(config, course, rng), **times)
+        return Path(
+            place,
+            meets=meets,
+            speed=_speed(config, course, rng),
+            starts=config.obstacle_starts,
+            stops=config.obstacle_stops,
+        )
     return Path(place)
 
 

@@ -100,7 +100,7 @@ def simulate(config: ObstacleScenario, seed: int) -> Scene:
     rng = np.random.default_rng(seed)
     vehicle = _Vehicle(config, rng)
     stamps = FIRST_STAMP_NS + np.round(_ping_times(config, rng) * 1e9).astype(np.int64)
-    times = (stamps - FIRST_STAMP_NS) * 1e-9
+    times: FloatArray = (stamps - FIRST_STAMP_NS).astype(np.float64) * 1e-9
     obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
     sound = 1.0 + config.sound_speed_error * rng.normal()
     received = _navigate(config, vehicle, rng)
