@@ -142,7 +142,7 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     config = scenario(scene_name, {'pings': pings, **changes})
     scene = simulate(config, seed)
     heard = frozenset({'snapshot', 'nav'} if config.moving else {'snapshot'})
-    told = BathymetryConfig.from_mapping({**config.instruments(), **values}).for_inputs(heard)
+    told = BathymetryConfig.from_mapping({**config.told(), **values}).for_inputs(heard)
     if told.navigation == 'ignored' and told.sound_speed_profile:
         raise ValueError('a profile needs navigation')
     tracker = BathymetryTracker(told)

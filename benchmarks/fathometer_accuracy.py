@@ -124,7 +124,7 @@ def drift(seed: int, records: int, cache: Path | None) -> tuple[dict[str, list[T
         rng = np.random.default_rng(seed)
         floor = drift_of(config, rng)
         for record in range(records):
-            spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
+            spectra = cross_spectra(config, floor, record, floor.array_depth_told[record], rng)
             for name, trace in responses(spectra).items():
                 traces.setdefault(name, []).append(trace)
             here = floor.present[record]

@@ -108,7 +108,7 @@ def drawn(config: FathometerScenario, seed: int, length: int) -> list[CrossSpect
     )
     rng = np.random.default_rng([seed, 1])
     return [
-        cross_spectra(as_spectra, floor, k, float(floor.array_depth_stated[k]), rng)
+        cross_spectra(as_spectra, floor, k, float(floor.array_depth_told[k]), rng)
         for k in range(config.records)
     ]
 
@@ -125,7 +125,7 @@ def responses(measurements: list[Any], config: FathometerConfig) -> list[np.ndar
 
 def run(seed: int, folder: Path) -> dict[str, dict[str, float]]:
     config = scenario('pressure')
-    told = {**config.instruments(), 'pulse': 'band'}
+    told = {**config.told(), 'pulse': 'band'}
     scene = simulate(config, seed)
     bags = [folder / kind.replace(' ', '_') for kind in KINDS]
     settings = FathometerConfig.from_mapping(told)

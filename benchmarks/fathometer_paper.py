@@ -145,7 +145,7 @@ def of_array(runs: int, records: int, particles: int) -> dict[str, dict[str, flo
             for label, options in OF_ARRAY.items()
         }
         for record in range(records):
-            depth = float(floor.array_depth_stated[record])
+            depth = float(floor.array_depth_told[record])
             spectra = cross_spectra(config, floor, record, depth, rng)
             true = floor.depth[record, floor.present[record]]
             for label, tracker in trackers.items():

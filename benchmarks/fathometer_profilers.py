@@ -196,7 +196,7 @@ def scene_rows(runs: int) -> dict[str, Any]:
         config = scenario('diffuse', {'records': 100})
         scene = simulate(config, seed)
         for row, values in rows.items():
-            told = {**config.instruments(), 'particles': PARTICLES}
+            told = {**config.told(), 'particles': PARTICLES}
             if row == 'without':
                 told['scatter_decay'] = ()
             tracker = FathometerTracker(FathometerConfig.from_mapping(told))

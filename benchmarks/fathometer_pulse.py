@@ -67,7 +67,7 @@ def records_of(
 ) -> Iterator[tuple[CrossSpectra, np.ndarray, np.ndarray]]:
     """Cross-spectra, true depths and true amplitudes of each record."""
     for record in range(config.records):
-        told = float(floor.array_depth_stated[record])
+        told = float(floor.array_depth_told[record])
         here = floor.present[record]
         spectra = cross_spectra(config, floor, record, told, rng)
         yield spectra, floor.depth[record, here], floor.amplitude[record, here]
@@ -104,7 +104,7 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
         config, floor, rng = drift(seed, records)
     else:
         config, floor, rng = layers(seed, records, SIGNS[name])
-    told = dict(config.instruments())
+    told = dict(config.told())
     told |= {'window': 'rectangular', 'overlap': 0.0, 'particles': particles, 'seed': seed}
     told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     if name != 'drift':
@@ -145,7 +145,7 @@ def ghosts() -> dict[str, list[dict[str, float]]]:
     exact = CrossSpectra(
         stamp_ns=1, frequency=frequency, csdm=expected_csdm(config, floor, 0, frequency)
     )
-    told = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
+    told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
     tracked = FathometerConfig(
         **{**told, 'depth_min': config.depth_min, 'depth_max': config.depth_max},
         pulse='processor',

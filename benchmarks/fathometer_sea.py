@@ -95,7 +95,7 @@ def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -
     kind = level.split()[0]
     config = scenario('pressure', {'level': kind, 'steps_per_sigma': 0.0, **scene})
     floor, rng = floor_of(config, seed), np.random.default_rng([seed, 1])
-    told = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
+    told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
     told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     told.pop('snapshot_seconds', None)
     settings = FathometerConfig(**{**told, **options}, seed=seed)
@@ -113,7 +113,7 @@ def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -
     tracker = FathometerTracker(settings)
     right, distance, snr = [], [], []
     for record in range(config.records):
-        depth = float(floor.array_depth_stated[record])
+        depth = float(floor.array_depth_told[record])
         if kind == 'csdm':
             measured: list[Any] = [cross_spectra(config, floor, record, depth, rng)]
         else:

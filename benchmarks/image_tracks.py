@@ -63,7 +63,7 @@ NUMBERS = ('range', 'bearing', 'offset')
 
 def detected(setting: ObstacleScenario, given: list[Measurement]) -> list[Measurement]:
     """The measurements of a scene with detections in place of its images."""
-    feeder = setting.feeder_instruments()
+    feeder = setting.told_feeder()
     detector = ImageDetector(
         DetectorConfig(
             beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']

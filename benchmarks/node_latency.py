@@ -86,7 +86,7 @@ def case_of(system: str, count: int) -> Case:
         for one in simulated.measurements
         for entry in [entries[type(one.measurement)]]
     ]
-    return Case(system, scene.instruments(), timed, messages)
+    return Case(system, scene.told(), timed, messages)
 
 
 class Echo(Node):

@@ -79,9 +79,9 @@ def command(
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
-    values = unusual(config.instruments(), SYSTEMS[system].config_type())
-    sections = {system: values}
-    if fed := config.feeder_instruments():
+    told = unusual(config.told(), SYSTEMS[system].config_type())
+    sections = {system: told}
+    if fed := config.told_feeder():
         # A scene writes its images as the only type that needs no further package.
         sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
     report = write_scene(
@@ -104,7 +104,7 @@ def command(
         'seed': seed,
         'messages': report.messages,
         'targets': targets,
-        'parameters': values,
+        'parameters': told,
     }
     if as_json:
         print_json(result)

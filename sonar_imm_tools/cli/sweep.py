@@ -158,7 +158,7 @@ def planned(
     scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     config, node = load_config(SYSTEMS[system], params, {})
     if params is None:
-        config = evolve(config, **unusual(scene.instruments(), type(config)))
+        config = evolve(config, **unusual(scene.told(), type(config)))
     return Sweep(
         system=system,
         scenario=name,
@@ -169,9 +169,7 @@ def planned(
             frame_id=node.frame_id,
             use_tf_static=hears_transforms(node),
             world_frame=node.world_frame_convention,
-            detector=load_detector(SYSTEMS[system], params, {})
-            if params
-            else scene.feeder_instruments(),
+            detector=load_detector(SYSTEMS[system], params, {}) if params else scene.told_feeder(),
         ),
     )
 

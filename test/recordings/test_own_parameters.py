@@ -28,17 +28,17 @@ from sonar_imm_tools.simulation.obstacle.simulator import scenario as obstacle_s
 
 def test_only_what_differs_from_the_defaults_is_told():
     config = SYSTEMS['obstacle'].config_type()
-    assert unusual(obstacle_scenario('approach').instruments(), config) == {}
+    assert unusual(obstacle_scenario('approach').told(), config) == {}
     moved = obstacle_scenario('approach', {'sonar_lever': (2.0, 0.0, -0.3), 'roll_rms_deg': 4.0})
-    assert unusual(moved.instruments(), config) == {'sonar_lever': (2.0, 0.0, -0.3)}
+    assert unusual(moved.told(), config) == {'sonar_lever': (2.0, 0.0, -0.3)}
 
 
 def test_drawn_cross_spectra_have_no_window():
     config = SYSTEMS['fathometer'].config_type()
     # The length of a snapshot, which the tracker would choose by itself, is part of the scene.
     common = {'snapshot_seconds': 1.4}
-    assert unusual(fathometer_scenario('drift_traces').instruments(), config) == common
-    told = unusual(fathometer_scenario('drift_spectra').instruments(), config)
+    assert unusual(fathometer_scenario('drift_traces').told(), config) == common
+    told = unusual(fathometer_scenario('drift_spectra').told(), config)
     assert told == common | {'window': 'rectangular', 'overlap': 0.0}
 
 

@@ -57,7 +57,7 @@ def scene_of(system):
 def run(system, said=None, **told):
     """The last estimate, the reasons of refusals, and the tracker."""
     scene, received = scene_of(system)
-    config = SYSTEMS[system].config_type()(**{**scene.instruments(), **told})
+    config = SYSTEMS[system].config_type()(**{**scene.told(), **told})
     tracker = SYSTEMS[system].build(config)
     door, made, refused = FrameDoor(tracker, FrameGuard()), [], []
     for one in [*([said] if said else []), *(item.measurement for item in received)]:
@@ -151,7 +151,7 @@ def test_a_late_altitude_does_not_shut_out_the_later_ones():
 def test_an_array_keeps_to_its_first_frame():
     scene, received = scene_of('bathymetry')
     snapshot = next(one.measurement for one in received if isinstance(one.measurement, Snapshot))
-    config = SYSTEMS['bathymetry'].config_type()(**scene.instruments())
+    config = SYSTEMS['bathymetry'].config_type()(**scene.told())
     door = FrameDoor(SYSTEMS['bathymetry'].build(config), FrameGuard())
     first = evolve(snapshot, frame_id='array')
     assert door.admit(first) is first

@@ -112,7 +112,7 @@ def bench_sea(rounds: int = 7) -> dict[str, Any]:
     ping = next(one for one in heard if isinstance(one, Snapshot))
     methods: dict[str, Timed] = {}
     for engine in ('particles', 'grid'):
-        told = BathymetryConfig.from_mapping({**config.instruments(), 'engine': engine})
+        told = BathymetryConfig.from_mapping({**config.told(), 'engine': engine})
         tracker = BathymetryTracker(told.for_inputs(frozenset({'snapshot', 'nav'})))
         for one in heard:
             if one is not ping:

@@ -222,7 +222,7 @@ def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
     told = scenario('crossing', {'duration': scans - 1.0, 'clutter': 3.0})
     scene = [one.measurement for one in simulate(told, 0).measurements]
     configs = [
-        DiverConfig(**{**told.instruments(), 'association': association})
+        DiverConfig(**{**told.told(), 'association': association})
         for association in ('gnn', 'jipda')
     ]
     DiverTracker(configs[1]).warm()

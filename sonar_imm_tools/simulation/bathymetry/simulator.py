@@ -141,10 +141,10 @@ class BathymetryScenario(ShipScenario):
             problems.append('shadows needs increasing ranges in pairs, begin and end of each')
         return problems
 
-    def instruments(self) -> dict[str, Any]:
+    def told(self) -> dict[str, Any]:
         ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
         mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
-        return {**super().instruments(), **mounted}
+        return {**super().told(), **mounted}
 
 
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)

@@ -25,8 +25,8 @@ import numpy as np
 from sonar_imm.parameters import parameter
 
 from ..scenario import Scenario
-from .afloat import GEODETIC, instruments_of_places, USBL
-from .crossing import CROSSING, instruments_of_scans
+from .afloat import GEODETIC, told_of_places, USBL
+from .crossing import CROSSING, told_of_scans
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
 SENSORS = (
@@ -148,10 +148,10 @@ class DiverScenario(Scenario):
             problems.append('leg_min cannot exceed leg_max')
         return problems
 
-    def instruments(self) -> dict[str, Any]:
+    def told(self) -> dict[str, Any]:
         if self.sensor in ('geodetic', 'usbl'):
-            return instruments_of_places(self)
-        return instruments_of_scans(self) if self.sensor == 'scans' else super().instruments()
+            return told_of_places(self)
+        return told_of_scans(self) if self.sensor == 'scans' else super().told()
 
 
 MULTISTATIC = {

@@ -176,9 +176,9 @@ class FathometerScenario(Scenario):
             problems.append('fading would leave no layer')
         return problems
 
-    def instruments(self) -> dict[str, Any]:
-        """See `Scenario.instruments`."""
-        values = Scenario.instruments(self)
+    def told(self) -> dict[str, Any]:
+        """See `Scenario.told`."""
+        values = Scenario.told(self)
         if self.level == 'csdm':
             # They are drawn frequency by frequency: no window makes their noise fade with depth.
             values |= {'window': 'rectangular', 'overlap': 0.0}
@@ -295,13 +295,13 @@ def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Fathomete
 class Drift:
     """The floor and the array over time: depth and amplitude (records, K) of all layers that ever
     exist, present (records, K), array_depth (records,) and the depth that is stated,
-    array_depth_stated (records,)."""
+    array_depth_told (records,)."""
 
     depth: FloatArray
     amplitude: FloatArray
     present: NDArray[np.bool_]
     array_depth: FloatArray
-    array_depth_stated: FloatArray
+    array_depth_told: FloatArray
 
 
 def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:

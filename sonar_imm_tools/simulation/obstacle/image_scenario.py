@@ -92,7 +92,7 @@ class ImageScenario(Scenario):
         1.0, 'side of a patch of the sea floor', unit='m', low=0.01, high=1000.0
     )
 
-    def feeder_instruments(self) -> dict[str, Any]:
+    def told_feeder(self) -> dict[str, Any]:
         """What `fls_detector_node` has to know of the images. The scene that is built on this
         class has the range and the sector."""
         if not self.images:

@@ -168,7 +168,7 @@ def test_what_a_vessel_sees_is_consistent_where_it_is_placed():
         truth = {
             one.track_id: dict(zip(one.stamp_ns.tolist(), one.position)) for one in scene.truth
         }
-        placer = Placer(DiverConfig(**config.instruments()), Counter())
+        placer = Placer(DiverConfig(**config.told()), Counter())
         for item in scene.measurements:
             for fix in placer.place(item.measurement):
                 error = (fix.position - truth[fix.target_id][fix.stamp_ns])[:2]

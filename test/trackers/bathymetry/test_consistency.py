@@ -61,7 +61,7 @@ def test_the_median_ping_decides_and_a_few_are_not_enough():
 @pytest.mark.parametrize('factor, said', [(1.0, False), (4.0, True), (0.25, True)])
 def test_a_noise_variance_that_is_wrong_by_four_is_said(factor, said):
     scene = swath.scenario('paper', {'pings': 6})
-    tracker = BathymetryTracker(BathymetryConfig(**scene.instruments()))
+    tracker = BathymetryTracker(BathymetryConfig(**scene.told()))
     for one in swath.simulate(scene, 4).measurements:
         found = one.measurement
         if isinstance(found, Snapshot):
@@ -73,7 +73,7 @@ def test_a_noise_variance_that_is_wrong_by_four_is_said(factor, said):
 
 def test_without_a_stated_noise_there_is_nothing_to_test():
     scene = swath.scenario('paper', {'pings': 6})
-    tracker = BathymetryTracker(BathymetryConfig(**scene.instruments()))
+    tracker = BathymetryTracker(BathymetryConfig(**scene.told()))
     for one in swath.simulate(scene, 4).measurements:
         if isinstance(one.measurement, Snapshot):
             tracker.process(evolve(one.measurement, noise_variance=None))

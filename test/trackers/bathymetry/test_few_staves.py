@@ -31,7 +31,7 @@ def run(scene, **values):
     and the tracker."""
     config = scenario('paper', {**WIDE, **scene})
     simulated = simulate(config, 1)
-    told = BathymetryConfig.from_mapping({**config.instruments(), **values})
+    told = BathymetryConfig.from_mapping({**config.told(), **values})
     tracker = BathymetryTracker(told)
     error, inside, heard, echo = [], [], [], []
     for one, truth in zip(simulated.measurements, simulated.truth):

@@ -31,7 +31,7 @@ WATER = 5.0 + 0.05 * np.arange(900)
 def run(name, values, **config):
     made = scenario(name, values)
     scene = simulate(made, 1)
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping({**made.instruments(), **config}))
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping({**made.told(), **config}))
     pings = [tracker.process(one.measurement) for one in scene.measurements]
     return [one for ping in pings for one in ping], scene.truth
 
@@ -86,12 +86,7 @@ def test_a_wrong_height_of_the_sonar_is_survived(model_set, height):
     values = {'pings': 2, 'ping_rate': 0.3, 'patch_along': [], 'moving': True}
     made = scenario('moving', {**values, 'sonar_height': height, 'first_range': 5.0})
     scene = simulate(made, 2)
-    told = {
-        **made.instruments(),
-        'sonar_height': 15.0,
-        'sonar_height_std': 5.0,
-        'model_set': model_set,
-    }
+    told = {**made.told(), 'sonar_height': 15.0, 'sonar_height_std': 5.0, 'model_set': model_set}
     tracker = BathymetryTracker(BathymetryConfig.from_mapping(told))
     made = [one for item in scene.measurements for one in tracker.process(item.measurement)]
     assert len(made) == 2

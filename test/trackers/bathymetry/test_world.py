@@ -68,7 +68,7 @@ def test_a_heading_that_passes_through_180_degrees_is_no_jump():
 def in_summer(**changes):
     scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT, **changes})
     made = simulate(scene, 3)
-    config = BathymetryConfig.from_mapping({**scene.instruments(), 'engine': 'grid'})
+    config = BathymetryConfig.from_mapping({**scene.told(), 'engine': 'grid'})
     config = config.for_inputs(frozenset({'snapshot', 'nav'}))
     return made, config, [one.measurement for one in made.measurements]
 

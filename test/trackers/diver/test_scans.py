@@ -149,9 +149,7 @@ def test_two_confirmed_tracks_on_one_diver_become_the_older_one():
 def test_late_scans_give_the_same_bits(association):
     scene = simulate(scenario('crossing', {'duration': 25.0, 'clutter': 3.0}), seed=4)
     items = [one.measurement for one in scene.measurements]
-    config = DiverConfig(
-        association=association, **scenario('crossing', {'clutter': 3.0}).instruments()
-    )
+    config = DiverConfig(association=association, **scenario('crossing', {'clutter': 3.0}).told())
     order = np.argsort(np.arange(len(items)) + np.random.default_rng(1).uniform(0, 8, len(items)))
     one = run(DiverTracker(config), items)
     other = run(DiverTracker(config), [items[k] for k in order])
@@ -169,7 +167,7 @@ def test_crossing_in_clutter_is_better_softly():
 
 def test_a_smoother_takes_scans_and_hides_what_does_not_exist():
     scene = simulate(scenario('crossing', {'duration': 30.0}), seed=1)
-    config = DiverConfig(association='jipda', **scenario('crossing').instruments())
+    config = DiverConfig(association='jipda', **scenario('crossing').told())
     tracker = SmoothingDiverTracker(config)
     forward = run(tracker, [one.measurement for one in scene.measurements])
     smooth = tracker.smoothed()

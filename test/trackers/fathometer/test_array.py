@@ -27,7 +27,7 @@ from sonar_imm.trackers.fathometer.response import lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
-SMALL = {**scenario('small').instruments(), 'particles': 2000}
+SMALL = {**scenario('small').told(), 'particles': 2000}
 
 
 @pytest.fixture(scope='module')

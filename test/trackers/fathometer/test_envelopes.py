@@ -36,8 +36,7 @@ def scene():
 
 def told(**overrides):
     return FathometerConfig.from_mapping(
-        {**scenario('diffuse').instruments(), 'particles': 1000, **overrides},
-        ignore_unknown=True,
+        {**scenario('diffuse').told(), 'particles': 1000, **overrides}, ignore_unknown=True
     )
 
 

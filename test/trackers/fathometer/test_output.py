@@ -39,7 +39,7 @@ def spectra():
 
 def heard(spectra, low, high, **options):
     """Depth, response and noise between `low` and `high`."""
-    told = scenario('small').instruments()
+    told = scenario('small').told()
     config = FathometerConfig(**told, noise_depth_min=0.0, noise_depth_max=0.0, **options)
     lattice = Lattice(low, 0.03, int((high - low) / 0.03))
     found = array_response(spectra, lattice, config, ARRAY)
