@@ -12,8 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The file of a state: what it holds, and what is refused. That a tracker goes on from it bit for bit
-is in test/conformance."""
+"""The file of a state: what it holds, and what is refused. That a tracker goes on from it bit for
+bit is in test/conformance."""
 
 from collections import Counter
 import hashlib
