@@ -37,22 +37,12 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..offline.run_folder import RunFolder
 from ..recordings.sources import BagError
-from .numbers import cards, fill, lines, Metric, Text
+from .numbers import cards, Check, fill, lines, Metric, Text
 
 if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
     from .report import Part, Section
 
 TRUTH_GAP = 60.0
-
-
-@frozen
-class Check:
-    """One check: its result, and what was wanted."""
-
-    name: str
-    result: str
-    wanted: str
-    good: bool
 
 
 @frozen

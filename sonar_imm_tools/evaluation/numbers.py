@@ -126,6 +126,16 @@ def bounds_remark(summary: Mapping[str, Any]) -> str:
     return f'{summary["dof"]} expected, {summary["low"]:.2f} to {summary["high"]:.2f} believable'
 
 
+@frozen
+class Check:
+    """One check: its result, and what was wanted."""
+
+    name: str
+    result: str
+    wanted: str
+    good: bool
+
+
 # -- in words ------------------------------------------------------------------------------------
 
 NO_TRUTH = (

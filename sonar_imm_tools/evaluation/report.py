@@ -34,8 +34,7 @@ import plotly.offline
 from sonar_imm import __version__
 from sonar_imm.files import whole
 
-from .judging import Check
-from .numbers import Card, flatten
+from .numbers import Card, Check, flatten
 
 LEAST_GL_POINTS = 2000
 MOST_GL_FIGURES = 4

@@ -27,8 +27,8 @@ from sonar_imm_tools.evaluation.diver.scoring import score
 from sonar_imm_tools.evaluation.diver.series import series_of
 from sonar_imm_tools.evaluation.diver.summary import METRICS, summary_sentence
 from sonar_imm_tools.evaluation.diver.truth import Truth
-from sonar_imm_tools.evaluation.judging import Check, Judgement
-from sonar_imm_tools.evaluation.numbers import Card
+from sonar_imm_tools.evaluation.judging import Judgement
+from sonar_imm_tools.evaluation.numbers import Card, Check
 from sonar_imm_tools.evaluation.report import Part, report_html, Section
 from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
