@@ -90,11 +90,6 @@ def flip_quaternion(q: ArrayLike) -> FloatArray:
     return np.sqrt(0.5) * np.stack([x + y, x - y, w - z, w + z], axis=-1)
 
 
-def flip_pose(pose: Pose) -> Pose:
-    """Oracle for tests: a pose in NED and FRD given in ENU and FLU, and the other way round."""
-    return Pose(flip_world(pose.position), flip_rotation(pose.R))
-
-
 def rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> FloatArray:
     """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians.
 
@@ -258,37 +253,3 @@ def apply(R: FloatArray, vector: FloatArray) -> FloatArray:
 
 def _arcsin(argument: FloatArray) -> FloatArray:
     return np.arcsin(np.where(np.abs(argument) <= 1.0, argument, np.nan))
-
-
-# -- the paper's differential form -------------------------------------------------------------
-
-
-class Rates(NamedTuple):
-    """Time derivatives (...,): range m/s, azimuth rad/s, vertical offset m/s."""
-
-    d: FloatArray
-    delta: FloatArray
-    d_st: FloatArray
-
-
-def rates(
-    m: FloatArray, velocity: FloatArray, turn_rate: FloatArray, R: FloatArray, model: str = 'plane'
-) -> Rates:
-    """Oracle for tests of `predict`: how the echo of a fixed point m (..., 3) changes while the
-    sonar moves, eq. (3), (4).
-
-    velocity (..., 3) and turn_rate (..., 3) are the sonar's own, in its frame: ``dm/dt = -V -
-    omega x m``. `predict` agrees with it to first order:
-    the Euler step the paper takes with it is off by 0.003, 0.011, 0.07 and 0.27 degrees rms of
-    azimuth at 0.1, 0.2, 0.5 and 1 s, which is more than an obstacle's vertical offset shows.
-    """
-    moving = -velocity - np.cross(turn_rate, m)
-    d = np.linalg.norm(m, axis=-1)
-    d_rate = -np.einsum('...i,...i->...', m, velocity) / d
-    if model == 'plane':
-        delta_rate = (m[..., 0] * moving[..., 1] - m[..., 1] * moving[..., 0]) / (
-            m[..., 0] ** 2 + m[..., 1] ** 2
-        )
-    else:
-        delta_rate = (moving[..., 1] - m[..., 1] * d_rate / d) / np.sqrt(d**2 - m[..., 1] ** 2)
-    return Rates(d_rate, delta_rate, -np.einsum('...i,...i->...', R[..., 2, :], velocity))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A position from one ping: maximum likelihood, with every doubt said out loud.
+"""A position from one ping by maximum likelihood, or the reason why there is none.
 
 `localise` takes the arrivals of one ping (range sums from known transmitters, bearings, or one-way
 arrivals from a tag whose time of emission is unknown) and gives a `Localisation` or a `Refusal`
@@ -30,8 +30,7 @@ with a short reason. What guards it:
 * **Plausibility.** A fix further than `max_range` from the instruments is refused.
 
 The covariance is the inverse of the Fisher information at the solution. An error of the sound
-speed is common to all arrivals and is not in it: `multistatic.crlb` with `sound_speed_std` tells
-how much it adds.
+speed is common to all arrivals and is not in it.
 """
 
 from __future__ import annotations
@@ -271,10 +270,10 @@ def _usable(rows: FloatArray) -> BoolArray:
 
 
 def _spread(kept: BoolArray, usable: BoolArray) -> BoolArray:
-    """What was kept of the usable rows, told for all rows (n,)."""
-    told = usable.copy()
-    told[usable] = kept
-    return told
+    """What was kept of the usable rows, for all rows (n,)."""
+    out = usable.copy()
+    out[usable] = kept
+    return out
 
 
 def _dof(fit: ArrivalFit, kept: BoolArray) -> int:

@@ -60,20 +60,6 @@ def unbiased_polar_to_cartesian(
     return _along_bearing(r * np.exp(-0.5 * v_bearing), bearing, along, across)
 
 
-def linearised_polar_to_cartesian(
-    range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike, var_bearing: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: the conventional conversion, biased at long range, to position (..., 2)
-    and first-order covariance (..., 2, 2)."""
-    r = np.asarray(range_, np.float64)
-    return _along_bearing(
-        r,
-        bearing,
-        np.asarray(var_range, np.float64),
-        np.square(r) * np.asarray(var_bearing, np.float64),
-    )
-
-
 def _along_bearing(
     distance: FloatArray, bearing: ArrayLike, along: FloatArray, across: FloatArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -79,30 +79,6 @@ class IMMSmoothed(NamedTuple):
         return imm.combine(self.x, self.P, self.mu, E)
 
 
-def rts_smooth(
-    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: smooth a forward pass of one model: x (K, ..., n) and P (K, ..., n, n)
-    filtered; F, Q (K, ..., n, n) and B (K, ..., n) of the move into each step. Returns the
-    smoothed x and P."""
-    smoothed_x, smoothed_P = x.copy(), P.copy()
-    for k in range(len(x) - 2, -1, -1):
-        predicted = apply(F[k + 1], x[k]) + (0.0 if B is None else B[k + 1])
-        S = F[k + 1] @ P[k] @ transpose(F[k + 1]) + Q[k + 1]
-        precision, _ = _precision(S, np.diagonal(S, axis1=-2, axis2=-1))
-        smoothed_x[k], drawn_P = _draw_back(
-            x[k],
-            P[k],
-            F[k + 1],
-            Q[k + 1],
-            precision,
-            smoothed_x[k + 1] - predicted,
-            smoothed_P[k + 1],
-        )
-        smoothed_P[k], _ = add_jitter(drawn_P)
-    return smoothed_x, smoothed_P
-
-
 def imm_smooth(
     x: FloatArray,
     P: FloatArray,
@@ -234,3 +210,30 @@ def _precision(S: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray
         (scaled / values[..., None, :]) @ transpose(scaled),
         np.log(values).sum(axis=-1) + 2.0 * np.log(root).sum(axis=-1),
     )
+
+
+def smooth_modes(
+    mu: FloatArray, transition: FloatArray, moved: BoolArray | None = None
+) -> FloatArray:
+    """Smoothed probabilities (T, M) from filtered ones mu (T, M).
+
+    moved (T,): False where the chain rested on the step into k, True everywhere if not given.
+
+    >>> import numpy as np
+    >>> mu = np.array([[0.5, 0.5], [0.99, 0.01]])  # undecided, then sure
+    >>> smooth_modes(mu, np.array([[0.9, 0.1], [0.1, 0.9]])).round(3).tolist()
+    [[0.892, 0.108], [0.99, 0.01]]
+    """
+    smoothed = mu.copy()
+    predicted = mu[:-1] @ transition
+    for k in range(len(mu) - 2, -1, -1):
+        if moved is not None and not moved[k + 1]:
+            smoothed[k] = smoothed[k + 1]
+            continue
+        c = predicted[k]
+        ratio = np.divide(smoothed[k + 1], c, out=np.zeros_like(c), where=c > 0.0)
+        weight = mu[k] * (transition @ ratio)
+        total = weight.sum()
+        if total > 0.0:
+            smoothed[k] = weight / total
+    return smoothed

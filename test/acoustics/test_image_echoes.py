@@ -20,8 +20,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.image_echo_kernels import joined_parts
-from sonar_imm.acoustics.image_echoes import EchoRules, find_echoes
+from sonar_imm.acoustics.image_echoes import EchoRules, find_echoes, joined_parts
 
 RANGE = 10.0 + 0.1 * np.arange(300)
 BEARING = np.radians(np.linspace(-20.0, 20.0, 161))

@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.estimation import small_matrices
-from sonar_imm.estimation.lanes import lanes_for, MOST_LANES, roots, turn_of, unsound
+from sonar_imm.estimation.small_matrices import lanes_for, MOST_LANES, roots, turn_of, unsound
 
 
 def covariances(rng, n, lanes):

@@ -19,10 +19,11 @@ import itertools
 from pathlib import Path
 
 import numpy as np
+from oracles.smoothing import rts_smooth
 import pytest
 
 from sonar_imm.estimation import imm, kalman
-from sonar_imm.estimation.smoothing import imm_smooth, rts_smooth
+from sonar_imm.estimation.smoothing import imm_smooth
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
 

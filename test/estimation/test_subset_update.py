@@ -18,9 +18,8 @@ from itertools import product
 
 from helpers.sea_vectors import vectors
 import numpy as np
+from oracles.subset_update import subset_update
 import pytest
-
-from sonar_imm.estimation.subset_update import subset_update
 
 
 def linear(h, value, variance):

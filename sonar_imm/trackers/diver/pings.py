@@ -33,14 +33,13 @@ import numpy as np
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, EMISSION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.small_matrices import lift_all
-from ...estimation.student_t import DEGREES
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .expectation_kernels import expect_numbers, expect_residuals, fit_numbers
 from .instruments import Layout
 from .model_set import heights_of, ModelSet
 from .ping_kernels import MOST_EXPLANATIONS, Numbers, subset_ping
-from .robust_kernels import student_t_maxima, student_t_ping
+from .robust_kernels import DEGREES, student_t_maxima, student_t_ping
 from .sensing import bearing_variance, MOST_NUMBERS, spread, toa_variance
 
 MOST_SUBSETS = 6

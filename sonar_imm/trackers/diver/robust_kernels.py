@@ -30,8 +30,12 @@ from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.consider import consider_scalar
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import cholesky, cholesky_lifted, whitened_square
-from ...estimation.student_t import MOST_ITERATIONS
 from .ping_kernels import Numbers
+
+DEGREES = 4.0
+"""Degrees of freedom of the Student-t density of a residual."""
+
+MOST_ITERATIONS = 60
 
 SMALLEST_GAIN = 1e-7
 """Gain in log-density that ends a search: far below what a model probability could show."""

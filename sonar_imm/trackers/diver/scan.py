@@ -25,8 +25,13 @@ from ...acoustics.multistatic import difference_projection
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import assign, assign_fits, association_cost, gate_threshold
-from ...estimation.association_kernels import TENTATIVE
+from ...estimation.association import (
+    assign,
+    assign_fits,
+    association_cost,
+    gate_threshold,
+    TENTATIVE,
+)
 from ...estimation.consider import consider_models
 from ...estimation.small_matrices import lift_all
 from ...measurements import Arrivals, NOBODY
@@ -44,7 +49,7 @@ FIXES, ARRIVALS = 0, 1
 
 NEAR = 28.0
 """NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`estimation.subset_update`."""
+`ping_kernels`."""
 
 TAKEN = 0.5
 """Probability of being good from which a number counts as a track's."""

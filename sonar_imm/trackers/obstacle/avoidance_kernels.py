@@ -28,7 +28,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.elementary import gaussians
 from ...estimation.jit import kernel
-from ...estimation.lanes import lanes_for, roots, turn_of
+from ...estimation.small_matrices import lanes_for, roots, turn_of
 from .behaviour_kernels import COMMON
 from .kernels import KAPPA, NEGLIGIBLE
 from .sigma_kernels import beside, fan, PLACED, PLACES, places, product, turned, weighted

@@ -30,8 +30,7 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.jit import kernel
-from ...estimation.lanes import lanes_for, roots, turn_of, unsound
-from ...estimation.small_matrices import add_jitter
+from ...estimation.small_matrices import add_jitter, lanes_for, roots, turn_of, unsound
 from .kernels import KAPPA
 from .sigma_kernels import beside, echoes, fan, PLACES, places, product, turned, weighted
 
