@@ -65,8 +65,8 @@ def surface_noise_csdm(
             pair = noise_integral(-(x + apart)) + noise_integral(-(x - apart))
             down += a[m] * a[n] * pair
     both = np.zeros((len(k), 2 * hydrophones - 1))
-    for one, strength in zip(H, a):
-        y = k * (spacing * np.arange(2 * hydrophones - 1) + 2.0 * one)
+    for height, strength in zip(H, a):
+        y = k * (spacing * np.arange(2 * hydrophones - 1) + 2.0 * height)
         both += 2.0 * strength * noise_integral(y).real
     i = np.arange(hydrophones)
     lag = i[:, None] - i[None, :]

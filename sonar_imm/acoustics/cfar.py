@@ -140,19 +140,19 @@ def quiet_level(
     # Of the first rows no level is known; theirs is about that of the first for which one is.
     first = level[np.argmax(known.any(axis=1))]
     about = np.where(known, level, np.where(np.isfinite(first) & (first > 0.0), first, 1.0))
-    heard = np.log(power + _TINY)
-    logarithm = np.maximum(heard, np.log(_SILENT * about))
+    logarithm_of_power = np.log(power + _TINY)
+    logarithm = np.maximum(logarithm_of_power, np.log(_SILENT * about))
     around, _ = noise_level(logarithm, **window)
     off = np.where(known, logarithm - around, np.nan)
     half = max(beams // 2, 0)
     # The mean of a Rayleigh law lies above its mean logarithm.
     above = np.log(CENSORED) + np.euler_gamma
-    quiet = ~known | (heard <= around + above)
+    quiet = ~known | (logarithm_of_power <= around + above)
     # Again, by the mean logarithm of what was kept: something long has lifted the first one.
     kept, few = _kept(quiet, logarithm, half)
     kept[few] = around[few]
     around, _ = greatest_of_level(kept, 0, training, guard)
-    quiet = ~known | (heard <= around + above)
+    quiet = ~known | (logarithm_of_power <= around + above)
     kept, few = _kept(quiet, power, half)
     kept[few] = np.exp(np.where(known, around, 0.0)[few] + np.euler_gamma)
     censored, _ = greatest_of_level(kept, 0, training, guard)

@@ -146,7 +146,7 @@ def slerp(q0: FloatArray, q1: FloatArray, fraction: ArrayLike) -> FloatArray:
     """The quaternion (..., 4) `fraction` (...) of the way from q0 to q1 (..., 4) at constant rate,
     the short way round. Fractions outside [0, 1] go on at the same rate."""
     if np.ndim(q0) == np.ndim(q1) == 1 and np.ndim(fraction) == 0:
-        return _slerp_one(q0.tolist(), q1.tolist(), float(fraction))  # type: ignore[arg-type]
+        return _slerp_pair(q0.tolist(), q1.tolist(), float(fraction))  # type: ignore[arg-type]
     q0, q1 = q0 / np.sqrt(_dot(q0, q0)), q1 / np.sqrt(_dot(q1, q1))
     fraction = np.asarray(fraction, np.float64)[..., None]
     cosine = _dot(q0, q1)
@@ -158,7 +158,7 @@ def slerp(q0: FloatArray, q1: FloatArray, fraction: ArrayLike) -> FloatArray:
     return np.asarray(np.where(sine < 1e-12, q0, np.cos(fraction * angle) * q0 + turned))
 
 
-def _slerp_one(q0: list[float], q1: list[float], fraction: float) -> FloatArray:
+def _slerp_pair(q0: list[float], q1: list[float], fraction: float) -> FloatArray:
     """`slerp` of one pair, in plain floats: a fifth of the time."""
     size0, size1 = math.sqrt(sum(a * a for a in q0)), math.sqrt(sum(a * a for a in q1))
     q0, q1 = [a / size0 for a in q0], [a / size1 for a in q1]

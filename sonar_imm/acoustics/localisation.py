@@ -295,9 +295,9 @@ def _search(fit: ArrivalFit, limits: Limits) -> tuple[BoolArray, Minima]:
             break
         seeds = minima.position[:SEEDS]
         suspects = _suspects(fit, seeds, kept)
-        all_but_one = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
+        weights = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
         trials = minimise(
-            fit, np.tile(seeds, (len(suspects), 1)), np.repeat(all_but_one, len(seeds), axis=0)
+            fit, np.tile(seeds, (len(suspects), 1)), np.repeat(weights, len(seeds), axis=0)
         )
         kept[suspects[int(np.argmin(trials.cost)) // len(seeds)]] = False
         weight = fit.weight * kept

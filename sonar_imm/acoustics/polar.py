@@ -54,9 +54,9 @@ def unbiased_polar_to_cartesian(
         np.asarray(value, np.float64) for value in (range_, var_range, var_bearing)
     )
     # expm1 because 1 - lambda^2 is about 1e-3 and is squared: the printed equations lose it.
-    one_less_lambda2, one_less_lambda4 = -np.expm1(-v_bearing), -np.expm1(-2.0 * v_bearing)
-    along = v_range * (1.0 - 0.5 * one_less_lambda4) + 0.5 * np.square(r * one_less_lambda2)
-    across = 0.5 * (np.square(r) + v_range) * one_less_lambda4
+    loss2, loss4 = -np.expm1(-v_bearing), -np.expm1(-2.0 * v_bearing)
+    along = v_range * (1.0 - 0.5 * loss4) + 0.5 * np.square(r * loss2)
+    across = 0.5 * (np.square(r) + v_range) * loss4
     return _along_bearing(r * np.exp(-0.5 * v_bearing), bearing, along, across)
 
 

@@ -208,8 +208,8 @@ class SlidingAverage:
     def push(self, spectra: ComplexArray) -> list[Average]:
         """The averages due after `spectra` (k, F, M)."""
         done = []
-        for one in spectra:
-            self._spectra.append(one)
+        for snapshot in spectra:
+            self._spectra.append(snapshot)
             self._since += 1
             if len(self._spectra) == self.count and self._since >= self.step:
                 total = outer_sum(np.stack(self._spectra))

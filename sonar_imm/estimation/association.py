@@ -367,11 +367,11 @@ def count(
         there = looked[t] or hit[t]
         hits = 0
         for k in range(window):
-            one = seen[t, k]
+            was_hit = seen[t, k]
             if there:
-                one = seen[t, k + 1] if k + 1 < window else hit[t]
-            seen_1[out, k] = one
-            hits += one
+                was_hit = seen[t, k + 1] if k + 1 < window else hit[t]
+            seen_1[out, k] = was_hit
+            hits += was_hit
         age_1[out] = age[t] + there
         misses_1[out] = 0 if hit[t] else misses[t] + there
         last_1[out] = stamp_ns if hit[t] else last_hit_ns[t]
@@ -388,6 +388,6 @@ def count(
 
 def warm() -> None:
     """Run the kernels once on tiny input: compiled or loaded from the cache."""
-    one, no = np.ones(1, np.int64), np.zeros(1, np.bool_)
+    yes, no = np.ones(1, np.int64), np.zeros(1, np.bool_)
     choose(np.zeros((1, 1)), no, 0.0, 0.0)
-    count(one, no[:, None], one, one, one.astype(np.uint8), no, no, 1, 1, 1, 1)
+    count(yes, no[:, None], yes, yes, yes.astype(np.uint8), no, no, 1, 1, 1, 1)

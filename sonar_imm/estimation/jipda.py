@@ -46,7 +46,7 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .small_matrices import (
     add_jitter,
-    cholesky_lifted,
+    cholesky_with_jitter,
     gain,
     innovation_covariance,
     joseph,
@@ -105,7 +105,7 @@ def likelihoods(
                     v[r] = z[d, r] - h[t, j, r]
                     for s in range(m):
                         S[r, s] = S0[j, r, s] + R[d, r, s]
-                if not cholesky_lifted(S, L):
+                if not cholesky_with_jitter(S, L):
                     continue
                 nis = whitened_square(L, v, w)
                 value = -0.5 * (nis + m * LOG_2PI)
@@ -294,7 +294,7 @@ def update(
                         S[r, s] = S0[r, s] + R[d, r, s]
                 for a in range(n):
                     shift[d, j, a] = 0.0
-                if not cholesky_lifted(S, L):
+                if not cholesky_with_jitter(S, L):
                     continue
                 log[d, j] = -0.5 * whitened_square(L, v, w)
                 for r in range(m):

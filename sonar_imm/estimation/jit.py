@@ -93,7 +93,9 @@ def _attach_cache(compiled: Any, function: Callable[..., Any]) -> None:
     from numba.core.caching import FunctionCache
 
     numbas_own: Any = FunctionCache(function)
-    _check_verbs(type(numbas_own._cache_file), type(compiled._cache))
+    files: Any = type(numbas_own._cache_file)
+    replaced: Any = type(compiled._cache)
+    _check_verbs(files, replaced)
     numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
     compiled._cache = numbas_own
 

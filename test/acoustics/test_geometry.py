@@ -78,8 +78,8 @@ def test_rotations_of_both_worlds():
     ned, enu = (
         columns(rows, *(f'q{world}_{part}' for part in 'xyzw')) for world in ('ned', 'enu')
     )
-    for one, other in ((ned, enu), (enu, ned)):
-        same = geometry.flip_quaternion(one)  # q and -q are the same rotation
+    for first, other in ((ned, enu), (enu, ned)):
+        same = geometry.flip_quaternion(first)  # q and -q are the same rotation
         same *= np.sign(np.sum(same * other, axis=1, keepdims=True))
         assert_allclose(same, other, **EXACT)
     enu_angles = geometry.euler_angles(expected['enu'])

@@ -85,8 +85,8 @@ def test_an_interferer_no_longer_draws_the_likelihood():
         s = 10.0 * np.exp(2j * np.pi * rng.uniform(size=2)) * [1.0, 3.0]
         y = s[0] * array.steering(0.2, 8, 0.5) + s[1] * array.steering(-0.6, 8, 0.5)
         y += (rng.normal(size=8) + 1j * rng.normal(size=8)) / np.sqrt(2.0)
-        told = interfered_log_likelihood(grid, y, 100.0, covariance, STEP)
-        found.append(grid[told.argmax()])
+        likelihood = interfered_log_likelihood(grid, y, 100.0, covariance, STEP)
+        found.append(grid[likelihood.argmax()])
         drawn.append(grid[log_likelihood(grid, y, 100.0, 1.0, STEP).argmax()])
     assert np.abs(np.array(found) - 0.2).max() < 0.06
     assert np.abs(np.median(drawn) + 0.6) < 0.06

@@ -105,10 +105,10 @@ def test_a_cluster_with_too_many_events_gets_a_smaller_gate():
     rng = np.random.default_rng(3)
     ratio, nis = rng.gamma(2.0, 3.0, (8, 8)), rng.uniform(0.0, 13.0, (8, 8))
     existence, pd = np.full(8, 0.9), np.full(8, 0.9)
-    one, two = (form(ratio, nis, existence, pd, 13.8) for form in FORMS)
-    for ours, theirs in zip(one, two):
+    first, second = (form(ratio, nis, existence, pd, 13.8) for form in FORMS)
+    for ours, theirs in zip(first, second):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-14)
-    kept = nis[one[0] > 0.0].max()
+    kept = nis[first[0] > 0.0].max()
     gates = 13.8 * 0.7 ** np.arange(30)
     assert 0.0 < kept < 13.8
     gate = gates[gates >= kept].min()
@@ -146,7 +146,7 @@ def test_the_update_is_that_of_the_prototype():
     )
     arrays = (X, P, mu, h, np.tile(H, (3, 1, 1)))
     kernel = jipda.update(
-        *(np.ascontiguousarray(one[None]) for one in arrays),
+        *(np.ascontiguousarray(each[None]) for each in arrays),
         Z,
         big_R,
         beta[None],
@@ -181,8 +181,8 @@ def test_both_forms_of_likelihoods_and_update_are_equal(seed):
             missed[t] / after[t],
             considered,
         )
-        for one, other in zip(found, single):
-            np.testing.assert_allclose(one[t], other, rtol=1e-9, atol=1e-12)
+        for ours, other in zip(found, single):
+            np.testing.assert_allclose(ours[t], other, rtol=1e-9, atol=1e-12)
 
 
 def test_a_single_certain_detection_is_the_update_of_the_imm_filter():

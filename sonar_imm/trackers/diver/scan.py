@@ -33,7 +33,7 @@ from ...estimation.association import (
     TENTATIVE,
 )
 from ...estimation.consider import consider_models
-from ...estimation.small_matrices import lift_all
+from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
 from . import fix_kernels
 from .config import DiverConfig
@@ -196,7 +196,7 @@ class Scan:
                 R[detection],
                 mask,
             )
-            self.repairs += sum(lift_all(one) for one in P)
+            self.repairs += sum(add_jitter_all(one) for one in P)
             self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
             self.nis[tracks] += np.where(ok, nis, 0.0)
             self.nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
