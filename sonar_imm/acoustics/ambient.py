@@ -23,7 +23,7 @@ of the cross-spectral density is then a sum of one integral,
     R_ij = I(k (h_i - h_j)) + sum_lm a_l a_m I(-k (h_i - h_j + 2 (H_l - H_m)))
            + 2 sum_l a_l Re I(k (h_i + h_j + 2 H_l)),
 
-the last of which is what a fathometer hears.
+the last of which is what a fathometer measures.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def quiet_level(
     # The mean of a Rayleigh law lies above its mean logarithm.
     above = np.log(CENSORED) + np.euler_gamma
     quiet = ~known | (logarithm_of_power <= around + above)
-    # Again, by the mean logarithm of what was kept: something long has lifted the first one.
+    # Again, by the mean logarithm of what was kept: something long has raised the first.
     kept, few = _kept(quiet, logarithm, half)
     kept[few] = around[few]
     around, _ = greatest_of_level(kept, 0, training, guard)
@@ -161,7 +161,7 @@ def quiet_level(
 
 def _kept(quiet: BoolArray, value: FloatArray, half: int) -> tuple[FloatArray, BoolArray]:
     """Mean (R, B) of the quiet cells of the beams within `half` of each, and where these are fewer
-    than one in ten and tell nothing."""
+    than one in ten and are unknown."""
     share = across_beams(quiet.astype(np.float64), half)
     kept = across_beams(np.where(quiet, value, 0.0), half) / np.maximum(share, 0.1)
     return kept, share < 0.1
@@ -246,6 +246,7 @@ def greatest_of_level(
     power: FloatArray, half: int, training: int, guard: int
 ) -> tuple[FloatArray, FloatArray]:
     """See `noise_level`; `half` beams on either side are averaged."""
+    # Sums are taken afresh for each cell: one huge value would spoil the rest of a running sum.
     R, B = power.shape
     smooth = across_beams(power, half)
     window = np.empty((R, B))  # mean of the rows r to r + training - 1 that there are

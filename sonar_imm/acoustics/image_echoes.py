@@ -52,7 +52,7 @@ _LARGEST = 1e38
 
 @frozen(kw_only=True)
 class EchoRules:
-    """How echoes are told from noise.
+    """How echoes are separated from noise.
 
     beam_width rad and range_resolution m: -3 dB widths of the echo of a point; false_alarm: of a
     cell of Rayleigh noise; margin: that threshold is so much higher (power), for noise with longer

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What an array hears in one range bin: heavy-tailed echoes from one direction, and noise.
+"""The likelihood of one range bin of an array: heavy-tailed echoes from one direction, and noise.
 
 A patch of floor answers with a few strong facets, so the echo of a bin is not Gaussian: its power
 varies. Taking the power as exponentially distributed gives the complex multivariate symmetric

@@ -24,7 +24,7 @@ with a short reason. What guards it:
 * **Singular baseline.** Between transmitter and receiver the gradient of the range sum vanishes. A
   fix is refused when its largest standard deviation or the condition number of its covariance
   passes the limit, or when two standard deviations away the likelihood is not what the covariance
-  says: the covariance would be a fiction.
+  says.
 * **Late reflections.** When the chi-square test fails, the row whose removal helps most is left
   out, one at a time, while a degree of freedom remains to test the rest with.
 * **Plausibility.** A fix further than `max_range` from the instruments is refused.
@@ -354,7 +354,7 @@ def _covariance(fit: ArrivalFit, information: FloatArray) -> FloatArray:
 def _doubt(
     fit: ArrivalFit, weight: FloatArray, best: Candidate, dof: int, limits: Limits
 ) -> Refusal | None:
-    """Why the best candidate must not be believed, or None."""
+    """Why the best candidate is refused, or None."""
     variances, axes = np.linalg.eigh(best.covariance)
     if variances[1] > limits.max_std**2 or variances[1] > limits.max_condition * variances[0]:
         return Refusal(

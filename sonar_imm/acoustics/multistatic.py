@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Multistatic ranging: what sound that passes a target tells about where the target is.
+"""Multistatic ranging: the position of a target from sound that passes by it.
 
 A ping leaves a transmitter at a known time, meets the target and arrives at several receivers.
 Arrival time times sound speed is a **range sum**, transmitter - target - receiver: the target lies
 on an ellipse with the two as foci (in three dimensions an ellipsoid; here cut at the known height
 `target_z` of the target). Between the foci the two unit vectors cancel, the gradient vanishes and
 the range sum says nothing to first order: the singular baseline. A receiver with an array also
-hears the **bearing**.
+measures the **bearing**.
 
 An acoustic tag emits by itself at an unknown time. Its one-way arrivals are **pseudo-ranges**:
 slant ranges plus an offset common to all receivers. `difference_projection` takes the offset out

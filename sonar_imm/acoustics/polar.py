@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From range and bearing to a position with a covariance that a Kalman filter may believe.
+"""From range and bearing to an unbiased position with a consistent covariance.
 
 The textbook conversion x = r cos b, y = r sin b with a linearised covariance is biased: noise on
 the bearing v = var_b bends the line of equal range into an arc, whose centre of mass lies r v / 2

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Late, shuffled, repeated and outlying stamps, and how to get the right answer in spite of them.
+"""Late, shuffled, repeated and outlying stamps.
 
 Sonar data carry the instant of transmission and may arrive seconds later, in any order. Two
 objects deal with that.
