@@ -15,7 +15,7 @@
 """Cross-spectral density matrices from the pressure at many hydrophones, as it streams in.
 
 Pressure arrives in blocks of any length. It is cut into snapshots of `length` samples that overlap
-by half or another share, each is weighted by a window and Fourier transformed with exp(-i w t), and
+by half or another share; each is weighted by a window and Fourier transformed, exp(-i w t), and
 the outer products of the snapshots at each frequency are averaged::
 
     snapshots = SnapshotStream(...)      # pressure -> spectra (k, F, M)
