@@ -54,15 +54,12 @@ PYPI_OF_KEY = {
 }
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
-# Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
-# those that some commands need, each with an extra of its own.
+# Libraries that some commands need, each with an extra of its own.
 PEERS = {
     'sonar_imm.evaluation.jobs': {'distributed'},
     'sonar_imm.evaluation.tables': {'pyarrow'},
     'sonar_imm.viewing.rerun_file': {'rerun'},
     'sonar_imm.viewing.server': {'foxglove'},
-    'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
-    'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'},
     'sonar_imm.evaluation.sweep': {'distributed'},
     'sonar_imm.recordings.convert.segy': {'segyio'},
     'sonar_imm.recordings.export.grid': {'rasterio'},
@@ -238,7 +235,6 @@ def test_every_system_is_found_by_its_name() -> None:
         scenes = importlib.import_module(system.scenes)
         assert scenes.SCENARIOS and callable(scenes.scenario) and callable(scenes.simulate)
         assert callable(importlib.import_module(system.judge).judge)
-        assert importlib.import_module(system.benches).BENCHES
         node = ROOT.joinpath(*system.node.split('.')).with_suffix('.py')  # importing needs rclpy
         assert '\ndef main(' in node.read_text(encoding='utf-8')
         assert list((ROOT / 'bags').glob(f'{name}_*')), f'no recording of {name} is shipped'

@@ -16,7 +16,7 @@
 
 `records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
 reflectors. `summary`, `sections` and `figures` present the result; `fixed_order` shows filters of
-a fixed number for comparison; `bench` measures the speed.
+a fixed number for comparison.
 """
 
 from __future__ import annotations

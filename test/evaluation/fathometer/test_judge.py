@@ -21,7 +21,6 @@ import pytest
 
 from sonar_imm.cli import main
 from sonar_imm.evaluation.fathometer import LIMIT
-from sonar_imm.evaluation.fathometer.bench import bench_likelihood, bench_record
 from sonar_imm.evaluation.fathometer.fixed_order import fixed_orders
 from sonar_imm.evaluation.fathometer.records import Record, records_of, Reflections
 from sonar_imm.evaluation.fathometer.scoring import pair, score
@@ -207,12 +206,3 @@ def test_truth_further_away_than_the_gap_is_none(run):
     some = run.read_estimates()
     early, late = records_of(some[:1], some[1:], gap=60.0), records_of(some[:1], some[1:], gap=100)
     assert early[0].true is None and late[0].true is not None
-
-
-def test_both_ways_to_the_likelihood_agree():
-    result = bench_likelihood(rounds=1, sets=10)
-    assert result['good'] and result['largest_relative_difference'] < 1e-6
-    record = bench_record(2)
-    assert set(record['reflectors'].values()) == {8} and set(record['median_ms']) == set(
-        record['reflectors']
-    )

@@ -28,13 +28,13 @@ from typing import Any
 
 import numpy as np
 
-from ...acoustics.fathometer import coherence, steering
-from ...acoustics.pulse import band_pulse
-from ...acoustics.spectra import outer_sum, SnapshotStream
-from ...estimation.arrays import FloatArray
-from ...measurements import CrossSpectra, Trace
-from ...trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from ..benches import Bench
+from benchmarks.speed import Bench
+from sonar_imm.acoustics.fathometer import coherence, steering
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.acoustics.spectra import outer_sum, SnapshotStream
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import CrossSpectra, Trace
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 REFLECTORS, PARTICLES = 8, 20_000
 RECORD_WANTED_MS = 30.0
@@ -74,9 +74,9 @@ def bench_record(records: int = 12) -> dict[str, Any]:
     orders: dict[str, int] = {}
     for record in range(records + 3):
         for name, tracker in trackers.items():
-            one = trace(record, rngs[name])
+            record_trace = trace(record, rngs[name])
             begin = time.process_time()
-            estimates = tracker.process(one)
+            estimates = tracker.process(record_trace)
             times[name].append(1e3 * (time.process_time() - begin))
             likely = int(np.argmax(estimates[-1].probabilities[0]))
             orders[name] = likely + tracker.config.order_min
@@ -95,20 +95,20 @@ def bench_record(records: int = 12) -> dict[str, Any]:
 
 def bench_threads(threads: int = 4, records: int = 9) -> dict[str, Any]:
     """Milliseconds of a record on one core and on `threads`, which must give the same bytes."""
-    median, said = {}, []
+    median, results = {}, []
     for count in (1, threads):
         rng = np.random.default_rng(0)
         tracker = FathometerTracker(FathometerConfig(particles=PARTICLES, threads=count))
         times, states = [], b''
         for record in range(records):
-            one = trace(record, rng)
+            record_trace = trace(record, rng)
             begin = time.perf_counter()
-            estimates = tracker.process(one)
+            estimates = tracker.process(record_trace)
             times.append(1e3 * (time.perf_counter() - begin))
             states += b''.join(e.state.tobytes() + e.probabilities.tobytes() for e in estimates)
         median[str(count)] = float(np.median(times[3:]))
-        said.append(states)
-    return {'median_ms': median, 'same_bytes': said[0] == said[1], 'good': said[0] == said[1]}
+        results.append(states)
+    return {'median_ms': median, 'same_bytes': (same := results[0] == results[1]), 'good': same}
 
 
 def bench_array(

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from ...measurements import Altitude, Detections, Navigation
-from ...trackers.obstacle.config import ObstacleConfig
-from ...trackers.obstacle.tracker import ObstacleTracker
-from ..benches import Bench
+from benchmarks.speed import Bench
+from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
 
 OBSTACLES = 20
 WANTED_MS = 2.0
