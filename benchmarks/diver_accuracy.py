@@ -24,12 +24,9 @@ their own (other seeds). RMSE is over all stamps from the first fix on.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import final_estimates, Parts, study
 from sonar_imm.estimation import imm_kernels
 from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.consistency import average_bounds, nees
@@ -78,8 +75,8 @@ def load(names: list[str], seeds: range) -> tuple[np.ndarray, np.ndarray, np.nda
         scene = simulate(scenario(names[seed % len(names)]), seed)
         track = scene.truth[0]
         truth.append(np.column_stack([track.position[:, :2], track.velocity]))
-        z.append([one.measurement.position[:2] for one in scene.measurements])
-        R.append([one.measurement.covariance for one in scene.measurements])
+        z.append([item.measurement.position[:2] for item in scene.measurements])
+        R.append([item.measurement.covariance for item in scene.measurements])
     return np.array(truth), np.array(z), np.array(R)
 
 
@@ -239,10 +236,8 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
         squared, absent, names, total = [], 0, [], 0
         for seed in range(runs):
             scene = simulate(scenario(name), seed)
-            tracker = DiverTracker(DiverConfig(max_tracks=1))
-            final = {}
-            for one in scene.measurements:
-                final.update((each.stamp_ns, each) for each in tracker.process(one.measurement))
+            measurements = [item.measurement for item in scene.measurements]
+            final = final_estimates(DiverTracker(DiverConfig(max_tracks=1)), measurements)
             at = {int(stamp): k for k, stamp in enumerate(scene.truth[0].stamp_ns)}
             ids = set()
             for stamp, estimate in final.items():
@@ -262,24 +257,14 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
     return table
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=500)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    tables = {
-        'RMSE of position, m': main_table(options.runs),
-        'where it loses': losses(min(options.runs, 200)),
-        'consistency of the default': consistency(min(options.runs, 200)),
-        'smoothing, Table 1 legs, RMSE m': smoothing(min(options.runs, 60)),
-        'the whole tracker': whole_tracker(min(options.runs, 60)),
-    }
-    for title, table in tables.items():
-        print(f'\n{title} ({options.runs} runs at most)\n\n{markdown(table)}', flush=True)
-    write_json(options.out, {'runs': options.runs, **tables})
+def main(runs: int = 500) -> Parts:
+    yield {'runs': runs}
+    yield {'RMSE of position, m': main_table(runs)}
+    yield {'where it loses': losses(min(runs, 200))}
+    yield {'consistency of the default': consistency(min(runs, 200))}
+    yield {'smoothing, Table 1 legs, RMSE m': smoothing(min(runs, 60))}
+    yield {'the whole tracker': whole_tracker(min(runs, 60))}
 
 
 if __name__ == '__main__':
-    main()
+    study(main)

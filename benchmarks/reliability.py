@@ -38,7 +38,7 @@ import subprocess
 import sys
 from typing import Any
 
-from benchmarks.tables import write_json
+from benchmarks.study import write_json
 from sonar_imm.trackers import SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[1]
