@@ -30,10 +30,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.study import cell, Parts, Row, study
+from benchmarks.study import cell, Parts, Row, study, truths
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.simulation.bathymetry.simulator import BathymetryScenario, scenario, simulate
-from sonar_imm.simulation.scene import Scene
+from sonar_imm.simulation.scene import Scene, TrueProfile
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 PAPER_CHAIN = (0.98, 0.02, 0.02, 0.98)
@@ -136,7 +136,7 @@ def tracked(values: Mapping[str, Any], scene: Scene) -> Answer:
     tables = [tracker.process(item.measurement)[0].columns() for item in scene.measurements]
     height = np.array([table['height'] for table in tables])
     angle = np.array([table['angle'] for table in tables])
-    truth = np.array([profile.height for profile in scene.truth])
+    truth = np.array([profile.height for profile in truths(scene, TrueProfile)])
     inside = rough = None
     if 'cov_height_height' in tables[0]:
         sd = np.sqrt([table['cov_height_height'] for table in tables])
@@ -149,9 +149,10 @@ def tracked(values: Mapping[str, Any], scene: Scene) -> Answer:
 
 
 def score(answer: Answer, scene: Scene, prototype: tuple[float | None, ...]) -> dict[str, Any]:
-    patch = np.array([profile.patch for profile in scene.truth])
-    square = np.square(answer.height - [profile.height for profile in scene.truth])
-    angular = np.square(answer.angle - [profile.angle for profile in scene.truth])
+    truth = truths(scene, TrueProfile)
+    patch = np.array([profile.patch for profile in truth])
+    square = np.square(answer.height - np.array([profile.height for profile in truth]))
+    angular = np.square(answer.angle - np.array([profile.angle for profile in truth]))
     rough, inside = answer.rough, answer.inside
     return {
         'smooth': math.sqrt(square[~patch].mean()),

@@ -152,6 +152,7 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     if config.moving and settings.navigation == 'ignored':
         level = config.water_level - config.sonar_depth - config.sonar_height
         for profile in swath.profiles:
+            assert profile.truth is not None
             profile.truth.height[:] -= level  # a sonar at rest counts from its reference floor
     metrics = score(swath)
     return {

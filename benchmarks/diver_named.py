@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.diver_crossing import true_paths
-from benchmarks.study import mean_of, Parts, rms, study
+from benchmarks.study import mean_of, Parts, rms, study, truths
 from sonar_imm.evaluation.diver.scoring import score
 from sonar_imm.evaluation.diver.series import series_of
 from sonar_imm.measurements import Fix, Fixes
@@ -55,7 +55,7 @@ def truth_of(scene: str, seed: int) -> tuple[TrueTrack, ...]:
         'turn_deg': 60.0,
     }
     values |= {'divers': 2, 'spacing': 30.0} if scene == 'apart' else {}
-    made = simulate(scenario('table1', values), seed).truth
+    made = truths(simulate(scenario('table1', values), seed), TrueTrack)
     first = made[0]
     if scene == 'apart':
         return made

@@ -28,23 +28,25 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.study import final_estimates, Parts, study
+from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.simulation.diver.simulator import scenario, simulate
-from sonar_imm.simulation.scene import Scene
+from sonar_imm.simulation.scene import Scene, TrueTrack
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 
 SETTLED = 10.0
 """Seconds from the start that are not scored."""
 
 Values = Mapping[str, Any]
+Cells = list[tuple[str, str, str, Values, Values]]
+"""Row, column, scenario, what it changes, parameters."""
 
 
 def score(scene: Scene, config: DiverConfig) -> np.ndarray:
     """Rows (k, 4) of squared horizontal error, horizontal NEES, squared depth error, whole NEES;
     the last two NaN where depth is no state. A stamp without a track gives NaN."""
     final = final_estimates(DiverTracker(config), (i.measurement for i in scene.measurements))
-    track = scene.truth[0]
-    rows = []
+    track = truths(scene, TrueTrack)[0]
+    rows: list[list[Any]] = []
     for k, stamp in enumerate(track.stamp_ns.tolist()):
         if (stamp - track.stamp_ns[0]) * 1e-9 < SETTLED or stamp not in final:
             continue
@@ -102,11 +104,10 @@ def text_of(found: Mapping[str, Any]) -> str:
 
 
 def middle_depth(scene: Scene) -> float:
-    return float(scene.truth[0].position[:, 2].mean())
+    return float(truths(scene, TrueTrack)[0].position[:, 2].mean())
 
 
-def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
-    """(row, column, scenario, scene, config)."""
+def depth_cells() -> Cells:
     rows = {
         '2, 5, 8, 12 m': (2.0, 5.0, 8.0, 12.0),
         '5 m': (5.0,) * 4,
@@ -122,7 +123,7 @@ def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
         'pressure, .2 m': ({'depth_std': 0.2}, {'dimensions': 3}),
         'depth bank': ({}, {'dimensions': 3}),
     }
-    cells = [
+    cells: Cells = [
         (f'{row}, diver {diver}', column, 'multistatic', {'receiver_depths': at, **swims, **more},
          config)
         for row, at in rows.items()
@@ -144,14 +145,14 @@ def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
     return cells
 
 
-def systematic_cells() -> list[tuple[str, str, str, Values, Values]]:
+def systematic_cells() -> Cells:
     off: dict[str, Values] = {
         'receivers': {'receiver_position_std': 1.0},
         'clocks': {'receiver_clock_std': 5e-4},
         'sound': {'sound_speed_std': 5.0},
     }
     every: Values = {key: value for error in off.values() for key, value in error.items()}
-    cells: list[tuple[str, str, str, Values, Values]] = []
+    cells: Cells = []
     for row, scene in {'nothing, told all three': {}, **off, 'all': every}.items():
         stated = scene or every
         for column, config in {
@@ -164,8 +165,8 @@ def systematic_cells() -> list[tuple[str, str, str, Values, Values]]:
     return cells
 
 
-def lasting_cells() -> list[tuple[str, str, str, Values, Values]]:
-    cells = []
+def lasting_cells() -> Cells:
+    cells: Cells = []
     for std, tau, white in ((1.0, 60.0, 0.5), (2.0, 60.0, 0.05), (2.0, 600.0, 0.05),
                             (1.0, 10.0, 0.5)):  # fmt: skip
         scene = {'fix_bias_std': std, 'fix_bias_time': tau, 'fix_std': white}

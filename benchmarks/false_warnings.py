@@ -105,10 +105,11 @@ def runs(bag: Path, factor: float, seeds: range) -> Iterator[tuple[float, int]]:
         if any(isinstance(item, SonarImage) for item in measurements):
             measurements = detected(setting, measurements)
         tracker.reset()
-        hysteresis, raised, active = Hysteresis(), 0, set()
+        hysteresis, raised = Hysteresis(), 0
+        active: set[str] = set()
         for measurement in measurements:
             tracker.process(misstated(measurement, factor))
-            texts = getattr(tracker, 'warnings', list)()
+            texts: list[str] = getattr(tracker, 'warnings', list)()
             found = hysteresis.settle([Finding(text[:20], WARN, text) for text in texts])
             raised += len({finding.key for finding in found} - active)
             active = {finding.key for finding in found}

@@ -136,15 +136,26 @@ def drift(seed: int, records: int, cache: Path | None) -> Drift:
 
 
 def _save(file: Path, traces: dict[str, list[Trace]], truth: Truth) -> None:
+    amplitudes: dict[str, Any] = {
+        name: np.array([trace.amplitude for trace in each]) for name, each in traces.items()
+    }
+    sigmas: dict[str, Any] = {
+        f'{name}_sigma': [_noise(trace) for trace in each] for name, each in traces.items()
+    }
     np.savez_compressed(
         file,
         count=np.array([len(ids) for ids, _ in truth]),
         ids=np.concatenate([ids for ids, _ in truth]),
         true_depth=np.concatenate([depth for _, depth in truth]),
         reference=np.array([trace.reference_depth for trace in traces['mvdr']]),
-        **{name: np.array([trace.amplitude for trace in each]) for name, each in traces.items()},
-        **{f'{name}_sigma': [trace.sigma[0] for trace in each] for name, each in traces.items()},
+        **amplitudes,
+        **sigmas,
     )
+
+
+def _noise(trace: Trace) -> float:
+    assert trace.sigma is not None
+    return float(trace.sigma[0])
 
 
 def _load(file: Path) -> Drift:

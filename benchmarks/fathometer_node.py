@@ -52,7 +52,7 @@ from sonar_imm.simulation.scene import Received, Scene
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 KINDS = ('pressure', 'its cross-spectra', 'cross-spectra drawn')
-MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+MIRROR: dict[str, Any] = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
 """Automatic snapshots of pressure use this noise window by themselves."""
 
 

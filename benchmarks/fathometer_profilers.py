@@ -90,9 +90,9 @@ def real_lines(folder: Path) -> Parts:
         call('track', folder / f'{line}_uncut.bag', folder / f'{line}_uncut', *FEW)
     crossings = {}
     for a, b, cut in (('L1', 'L9', ''), ('L2', 'L9', ''), ('L3', 'L9', ''), ('L3', 'L9', 'uncut')):
-        runs = (RunFolder(folder / '_'.join(filter(None, (line, cut)))) for line in (a, b))
-        name = ', '.join(filter(None, (f'{a} x {b}', cut)))
-        crossings[name] = crossing_metrics(*runs, 3.0)
+        first, other = (RunFolder(folder / (f'{c}_{cut}' if cut else c)) for c in (a, b))
+        name = f'{a} x {b}, {cut}' if cut else f'{a} x {b}'
+        crossings[name] = crossing_metrics(first, other, 3.0)
         print(name, crossings[name], flush=True)
     horizons = [h for c in crossings.values() for at in c['crossings'] for h in at['horizons']]
     between = summary([h for h in horizons if h['judged']])

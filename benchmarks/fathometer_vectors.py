@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -144,12 +144,13 @@ def pressure(folder: Path) -> dict[str, float]:
     with np.load(folder / 'fathometer_sea' / 'pressure.npz') as file:
         v = {name: file[name] for name in file}
     names = ('snapshot_seconds', 'record_seconds', 'frequency_min', 'frequency_max')
+    settings: dict[str, Any] = {name: float(v[name]) for name in names}
     config = FathometerConfig(
         phones=16,
         element_spacing=float(v['element_spacing']),
         noise_depth_min=0.0,
         noise_depth_max=0.0,
-        **{name: float(v[name]) for name in names},
+        **settings,
     )
     depth = v['depth']
     lattice = Lattice(float(depth[0]), float(depth[1] - depth[0]), len(depth))
@@ -169,7 +170,7 @@ def pressure(folder: Path) -> dict[str, float]:
             'W': (levelled(coherent.weight), levelled(v['weight'][k])),
             'b': (found.amplitude, v['response'][k]),
             'mirror sigma': (found.sigma[:1], v['sigma_mirror'][k : k + 1]),
-            'pulse': (pulse(lattice.step * np.arange(320)), v['pulse_processor'][k]),
+            'pulse': (pulse(np.asarray(lattice.step * np.arange(320))), v['pulse_processor'][k]),
         }
         for name, (ours, theirs) in pairs.items():
             error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())

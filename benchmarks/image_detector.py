@@ -173,6 +173,7 @@ def centroids(runs: int) -> list[dict[str, float]]:
             for i in np.flatnonzero(near(ping, r, b))[:1]:
                 error = np.array([ping.range[i] - r, ping.bearing[i] - b])
                 errors.append(error)
+                assert ping.var_range is not None and ping.var_bearing is not None
                 nees.append(np.square(error) / [ping.var_range[i], ping.var_bearing[i]])
         rms = np.sqrt(np.mean(np.square(errors), axis=0))
         rows.append(

@@ -34,12 +34,17 @@ from attrs import evolve
 import numpy as np
 
 from benchmarks.obstacle_sea import truth_tables
-from benchmarks.study import final_estimates, Parts, study
+from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.evaluation.obstacle.motion import motion_metrics
 from sonar_imm.evaluation.obstacle.scoring import score
 from sonar_imm.evaluation.obstacle.series import series_of, truth_of
 from sonar_imm.measurements import Measurement, SonarImage
-from sonar_imm.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
+from sonar_imm.simulation.obstacle.simulator import (
+    ObstacleScenario,
+    scenario,
+    simulate,
+    TrueObstacle,
+)
 from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.obstacle import bodies
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
@@ -78,7 +83,9 @@ def tracked(
     """The scores of one run."""
     config = evolve(ObstacleConfig(), max_range=setting.max_range)
     final = final_estimates(ObstacleTracker(config), measurements)
-    truth = truth_of([table for true in scene.truth for table in truth_tables(true)])
+    truth = truth_of(
+        [table for true in truths(scene, TrueObstacle) for table in truth_tables(true)]
+    )
     metrics, found = score(series_of(final.values()), truth, cutoff=5.0, gap=60.0)
     tracks, near = metrics['tracks'], metrics['vertical_offset_near']
     row = {

@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
+from functools import partial
 import os
 import signal
 import subprocess
@@ -171,7 +172,7 @@ def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
             node.out[key].publish(message)
             continue
         due = max(due + 1.0 / rate, time.perf_counter()) if rate else 0.0
-        node.link.wait_for(lambda due=due: time.perf_counter() >= due, LIMIT)
+        node.link.wait_for(partial(_passed, due), LIMIT)
         frame_id = message.header.frame_id
         pair = [0.0, 0.0]
         for which in (0, 1) if len(spent) % 2 else (1, 0):
@@ -180,6 +181,10 @@ def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
         size = len(deserialize_message(node.last, PointCloud2).data)
         spent.append((pair[0], pair[1]))
     return np.array(spent[SETTLED:])
+
+
+def _passed(due: float) -> bool:
+    return time.perf_counter() >= due
 
 
 def _assigned(name: str, value: Any) -> str:

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.study import final_estimates, Parts, rms, study
+from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Detections, Navigation
@@ -124,7 +124,7 @@ def deferred_at(
     scene: Scene, config: ObstacleConfig, at: float, refit: bool
 ) -> list[float] | None:
     """The same of the deferred estimate from the echoes so far, known for certain to be its."""
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     received = [item.measurement for item in scene.measurements]
     navigation = [item for item in received if isinstance(item, Navigation)]
     last = np.flatnonzero(truth.range <= at)[0]
@@ -160,7 +160,8 @@ def case(
                 rows.append([deferred_at(scene, config, at, method == 'refit') for at in RANGES])
             else:
                 final = track(scene, config_of(setting, method=method, **tracker_values))
-                rows.append([offset_at(scene.truth[0], final, at) for at in RANGES])
+                truth = truths(scene, TrueObstacle)[0]
+                rows.append([offset_at(truth, final, at) for at in RANGES])
     return {f'{name}, {method}': summary(rows) for method, rows in results.items()}
 
 
@@ -188,7 +189,8 @@ def several(runs: int) -> dict[str, dict[str, float]]:
             setting = scenario('six', LEVER)
             scene = simulate(setting, seed)
             final = track(scene, config_of(setting, **values))
-            parts += [score(scene, ping, final) for ping in range(len(scene.truth[0].stamp_ns))]
+            stamps = truths(scene, TrueObstacle)[0].stamp_ns
+            parts += [score(scene, ping, final) for ping in range(len(stamps))]
         mean = np.nanmean([part for part in parts if part is not None], axis=0)
         names = ('GOSPA', 'localisation', 'missed', 'false', 'NEES', 'cover')
         table[label] = dict(zip(names, map(float, mean)))
@@ -198,12 +200,12 @@ def several(runs: int) -> dict[str, dict[str, float]]:
 def score(scene: Scene, ping: int, final: dict[int, Estimate]) -> tuple[float, ...] | None:
     """GOSPA of one ping and its parts, NEES and coverage of the matched. An obstacle is there from
     when the beam has held it for six pings until it has been passed."""
-    stamp = int(scene.truth[0].stamp_ns[ping])
+    stamp = int(truths(scene, TrueObstacle)[0].stamp_ns[ping])
     if stamp not in final:
         return None
     there = [
         truth
-        for truth in scene.truth
+        for truth in truths(scene, TrueObstacle)
         if truth.in_beam[: ping + 1].sum() >= 6 and ahead(truth, ping)
     ]
     points, confirmed = level(final[stamp])

@@ -29,11 +29,12 @@ from attrs import evolve
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.study import Parts, study
+from benchmarks.study import Parts, study, truths
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.simulation.obstacle import scenario, simulate
 from sonar_imm.simulation.obstacle.images import vertical_pattern
+from sonar_imm.simulation.obstacle.simulator import TrueObstacle
 from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
@@ -58,7 +59,7 @@ AT = (50.0, 30.0, 20.0)
 def with_intensities(scene: Scene, seed: int, width: float) -> Iterator[Any]:
     """The measurements of a scene, detections with intensities."""
     rng = np.random.default_rng([seed, 9])
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     index = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}
     strength = rng.normal(scale=10.0)
     slow = 3.0 * rng.normal()
@@ -91,7 +92,7 @@ def run(values: dict[str, Any], seed: int, factor: float, config: ObstacleConfig
     """Error of the offset, its variance, and whether the band holds, at `AT`: (3, 3)."""
     draw = {'vertical_offset': float(np.random.default_rng(seed).uniform(-4.0, 4.0))}
     scene = simulate(scenario('approach', {**draw, 'altitude': 30.0, **values}), seed)
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     tracker = ObstacleTracker(config)
     found = np.full((3, 3), np.nan)
     index = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}

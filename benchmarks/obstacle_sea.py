@@ -48,7 +48,7 @@ from benchmarks.obstacle_accuracy import (
     summary,
     track,
 )
-from benchmarks.study import Parts, rms, study
+from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.evaluation.obstacle.scoring import score
 from sonar_imm.evaluation.obstacle.series import series_of, truth_of
@@ -136,7 +136,7 @@ def velocity(runs: int) -> dict[str, dict[str, float]]:
         errors: dict[float, list[float]] = {seconds: [] for seconds in after}
         for seed in range(runs):
             scene = simulate(setting, seed)
-            truth = scene.truth[0]
+            truth = truths(scene, TrueObstacle)[0]
             final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             t = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
             seen = when or t[np.argmax(truth.in_beam)]
@@ -158,18 +158,15 @@ def case(name: str, runs: int, first: int = 0) -> dict[str, dict[str, float]]:
     does, tracks = [], dict.fromkeys(METHODS, 0)
     for seed in range(first, first + runs):
         scene = simulate(setting, seed)
+        truth = truths(scene, TrueObstacle)[0]
         for method, values in METHODS.items():
             final = track(scene, config_of(setting, **values))
-            offsets[method].append([offset_at(scene.truth[0], final, at) for at in RANGES])
-            tracks[method] += len(
-                {
-                    int(number)
-                    for estimate in final.values()
-                    for number in estimate.extras['track_id'][estimate.extras['track_state'] > 0]
-                }
-            )
+            offsets[method].append([offset_at(truth, final, at) for at in RANGES])
+            extras = [estimate.extras for estimate in final.values()]
+            confirmed = [e['track_id'][e['track_state'] > 0] for e in extras]
+            tracks[method] += len(np.unique(np.concatenate(confirmed)))
             if method == 'all':
-                does.append(behaviour_at(scene.truth[0], final))
+                does.append(behaviour_at(truth, final))
     table = {}
     for method, rows in offsets.items():
         table[f'{name}, {method}'] = {
@@ -191,7 +188,7 @@ def movers(runs: int) -> dict[str, dict[str, float]]:
     for seed in range(1, runs + 1):
         scene = simulate(setting, seed)
         final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
-        tables = [table for truth in scene.truth for table in truth_tables(truth)]
+        tables = [table for truth in truths(scene, TrueObstacle) for table in truth_tables(truth)]
         metrics, _ = score(series_of(final.values()), truth_of(tables), cutoff=NEAR, gap=60.0)
         tracks = metrics['tracks']
         found.append(
@@ -236,13 +233,13 @@ def calibration(runs: int, reach: float) -> dict[str, dict[str, float]]:
         )
         for seed in range(runs):
             scene = simulate(setting, 1000 + seed)
-            truth = scene.truth[0]
+            truth = truths(scene, TrueObstacle)[0]
             final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             for at in (60.0, 40.0, 25.0):
                 seen = first_at(truth, final, at)
                 if seen is not None and np.isfinite(seen[1]['collision_probability']):
-                    hit = happened(truth, seen[0], config.safety_radius, config.safety_height)
-                    forecasts.append((kind, at, seen[1]['collision_probability'], float(hit)))
+                    ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
+                    forecasts.append((kind, at, seen[1]['collision_probability'], float(ends)))
     table: dict[str, dict[str, float]] = {}
     kinds, ranges, p, hit = (np.array(column) for column in zip(*forecasts))
     for low, high in zip(BINS, BINS[1:]):
@@ -270,7 +267,7 @@ def guarded(rows: list[list[list[float] | None]]) -> dict[str, float]:
         return summary(rows)
     table = {}
     for k, at in enumerate(RANGES):
-        error = [row[k][0] for row in rows if row[k]]
+        error = [found[0] for row in rows if (found := row[k])]
         table[f'RMSE {at:.0f} m'] = rms(error) if error else np.nan
         table[f'lost {at:.0f} m'] = 1.0 - len(error) / len(rows)
     return table

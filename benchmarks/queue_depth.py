@@ -24,6 +24,7 @@ lost.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 import os
 from pathlib import Path
 import time
@@ -74,9 +75,8 @@ def row(depth: int, rate: float, seconds: float) -> dict[str, int]:
             ('diagnostic_msgs/msg/DiagnosticArray', '/diagnostics', output_qos()),
             ('sensor_msgs/msg/PointCloud2', '/diver/processed', latched_qos()),
         ):
-            link.node.create_subscription(
-                message_class(kind), topic, lambda m, topic=topic: latest.update({topic: m}), qos
-            )
+            take = partial(latest.__setitem__, topic)
+            link.node.create_subscription(message_class(kind), topic, take, qos)
         fix = link.node.create_publisher(
             message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), 'fix', output_qos(1000)
         )

@@ -26,6 +26,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import tempfile
+from typing import Any
 
 from attrs import evolve
 import numpy as np
@@ -45,7 +46,7 @@ from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
 LAG = 3.4
 
-TAG = {
+TAG: dict[str, Any] = {
     'max_tracks': 1,
     'confirm_hits': 1,
     'max_coast': 600.0,
@@ -56,17 +57,23 @@ TAG = {
 """What a user knows: one tag, silent for half a minute at a time, a metre deep, in water of this
 sound speed, with receivers of this accuracy. Everything else is at its default."""
 
-BOATS = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
-PACE = {'speed_noise': 0.07}
+BOATS: dict[str, Any] = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
+PACE: dict[str, Any] = {'speed_noise': 0.07}
 """A swimmer whose speed, spread by `speed_std` = .4 m/s, is another one after a minute: a random
 walk of sqrt(2 / 60 s) .4 m/s over a second, as that of a process that forgets within a minute."""
 COLUMNS = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
-SETS = {
+SETS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
     'heading_speed': {},
     'heading_speed, pace kept a minute': PACE,
     'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
+}
+OF_BOATS: dict[str, dict[str, Any]] = {
+    'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
+    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
+    'heading_speed': BOATS,
+    'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
 }
 
 
@@ -96,8 +103,9 @@ def follow(config: DiverConfig, items: list) -> tuple[list, list]:
 
 def against_gps(
     stamps: np.ndarray, places: np.ndarray, truth: np.ndarray, lag: float
-) -> np.ndarray:
-    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps, and
+    which stamps those are."""
     t = stamps + lag
     after = np.clip(np.searchsorted(truth[:, 0], t), 1, len(truth) - 1)
     good = (
@@ -146,7 +154,7 @@ def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[floa
                 xyz=np.zeros((1, 3), np.float32),
                 state_names=('px', 'py'),
                 state=place[None, :2],
-                covariance=covariance[None],
+                covariance=np.asarray(covariance)[None],
             )
             for stamp, place, covariance in rows
         ],
@@ -165,7 +173,7 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
     return out
 
 
-def tag_table(title: str, items: list, truth: np.ndarray, **extra) -> None:
+def tag_table(title: str, items: list, truth: np.ndarray, **extra: Any) -> None:
     print(f'\n### {title} ({len(items)} messages)\n')
     header('RMSE m', 'RMSE, GPS 3.4 s later', 'median', 'NEES (2)', 'compared')
     config = DiverConfig(**{**TAG, **extra})
@@ -232,12 +240,7 @@ def boats(folder: Path) -> None:
                 f'{sum(map(len, items))} fixes\n'
             )
             header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
-            for name, values in {
-                'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
-                'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
-                'heading_speed': BOATS,
-                'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
-            }.items():
+            for name, values in OF_BOATS.items():
                 config = DiverConfig(
                     fix_std=4.0 if sensor == 'radar' else 2.0,
                     clutter_density=1e-5,

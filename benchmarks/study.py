@@ -44,9 +44,9 @@ import sys
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from sonar_imm.estimates import Estimate
+from sonar_imm.simulation.scene import Scene
 
 Parts = Iterator[Mapping[str, Any]]
 Row = Mapping[str, Any]
@@ -190,12 +190,12 @@ def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def standard_error(values: ArrayLike) -> float:
+def standard_error(values: Sequence[float] | np.ndarray) -> float:
     """Of the mean of `values` (n,); 0 of a single one."""
     return float(np.std(values) / max(1, np.size(values) - 1) ** 0.5)
 
 
-def rms(values: ArrayLike) -> float:
+def rms(values: Sequence[float] | np.ndarray) -> float:
     """Root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -206,6 +206,11 @@ def final_estimates(tracker: Any, measurements: Iterable[Any]) -> dict[int, Esti
     for measurement in measurements:
         final.update((each.stamp_ns, each) for each in tracker.process(measurement))
     return final
+
+
+def truths(scene: Scene, kind: type[T]) -> tuple[T, ...]:
+    """What is true of a scene, by its type."""
+    return tuple(truth for truth in scene.truth if isinstance(truth, kind))
 
 
 def in_fresh_process(function: Callable[..., T], *arguments: Any) -> T:

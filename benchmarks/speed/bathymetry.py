@@ -130,16 +130,16 @@ def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
         likelihood: NumpyLikelihood = Property()
         ndim_meas = 1
 
-        def function(self, state, noise=False, **kwargs):
+        def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
             raise NotImplementedError
 
-        def rvs(self, num_samples=1, **kwargs):
+        def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
             raise NotImplementedError
 
-        def pdf(self, state1, state2, **kwargs):
+        def pdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
             return np.exp(self.logpdf(state1, state2))
 
-        def logpdf(self, state1, state2, **kwargs):
+        def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> FloatArray:
             heights = np.asarray(state2.state_vector[0, :], np.float64)
             return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
 

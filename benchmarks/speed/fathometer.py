@@ -50,7 +50,8 @@ def trace(record: int, rng: np.random.Generator) -> Trace:
     depth = 122.0 + STEP * np.arange(SAMPLES)
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     places = 130.0 + 4.0 * np.arange(REFLECTORS) + 0.02 * rng.standard_normal(REFLECTORS)
-    noise = np.convolve(rng.standard_normal(2 * SAMPLES), pulse(STEP * np.arange(-32, 33)), 'same')
+    white, lags = rng.standard_normal(2 * SAMPLES), np.asarray(STEP * np.arange(-32, 33))
+    noise = np.convolve(white, np.asarray(pulse(lags)), mode='same')
     noise = noise[:SAMPLES] / noise.std()
     amplitude = pulse(depth[:, None] - places) @ np.linspace(25.0, 8.0, REFLECTORS) + noise
     return Trace(
@@ -147,7 +148,7 @@ def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
     from G and b at their depths, and by least squares over the trace. Also those of a whole
     particle of the tracker."""
     rng = np.random.default_rng(1)
-    lattice = STEP * np.arange(SAMPLES)
+    lattice = np.asarray(STEP * np.arange(SAMPLES))
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     shapes = whitened_pulses(pulse, lattice)
     x = rng.standard_normal(len(shapes))
