@@ -28,7 +28,6 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from attrs import evolve
 import numpy as np
 
 from benchmarks.study import final_estimates
@@ -169,7 +168,8 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
     for ping in items:
         rows = np.sort(rng.permutation(len(ping))[:receivers])
         if rng.uniform() < keep and len(rows) > 1:
-            out.append(evolve(ping, **{name: getattr(ping, name)[rows] for name in COLUMNS}))
+            columns = {name: getattr(ping, name)[rows] for name in COLUMNS}
+            out.append(Arrivals(stamp_ns=ping.stamp_ns, frame_id=ping.frame_id, **columns))
     return out
 
 
