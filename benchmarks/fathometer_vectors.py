@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -109,21 +109,21 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
         sets = Sets.empty(model, 1)
         sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
         sets.sign[0] = v['sign'][k, :order]
-        told = float(v['log_likelihood'][k]), v['amplitude_mean'][k, :order]
-        yield SignedSet(model, sets, v['response'][k], *told)
+        log_likelihood, amplitude = float(v['log_likelihood'][k]), v['amplitude_mean'][k, :order]
+        yield SignedSet(model, sets, v['response'][k], log_likelihood, amplitude)
 
 
 def signed_likelihood(folder: Path) -> dict[str, float]:
     """Largest error of the finite ones; how many of all are rejected as they should not be, or not
     as they should."""
     worst, wrong = 0.0, 0
-    for one in signed_sets(folder):
-        single, found = SetFilter(one.model, 1), np.zeros(1)
+    for row in signed_sets(folder):
+        single, found = SetFilter(row.model, 1), np.zeros(1)
         # The kernel that weighs sets, without moving them.
-        single._weigh(one.sets, one.response, found, single._amplitudes)
-        wrong += np.isfinite(one.log_likelihood) != np.isfinite(found[0])
-        if np.isfinite(one.log_likelihood):
-            worst = max(worst, abs(found[0] - one.log_likelihood))
+        single._weigh(row.sets, row.response, found, single._amplitudes)
+        wrong += np.isfinite(row.log_likelihood) != np.isfinite(found[0])
+        if np.isfinite(row.log_likelihood):
+            worst = max(worst, abs(found[0] - row.log_likelihood))
     return {
         'signed_likelihood: error': float(worst),
         'signed_likelihood: wrongly rejected or not': float(wrong),
@@ -144,12 +144,13 @@ def pressure(folder: Path) -> dict[str, float]:
     with np.load(folder / 'fathometer_sea' / 'pressure.npz') as file:
         v = {name: file[name] for name in file}
     names = ('snapshot_seconds', 'record_seconds', 'frequency_min', 'frequency_max')
+    settings: dict[str, Any] = {name: float(v[name]) for name in names}
     config = FathometerConfig(
         phones=16,
         element_spacing=float(v['element_spacing']),
         noise_depth_min=0.0,
         noise_depth_max=0.0,
-        **{name: float(v[name]) for name in names},
+        **settings,
     )
     depth = v['depth']
     lattice = Lattice(float(depth[0]), float(depth[1] - depth[0]), len(depth))
@@ -159,17 +160,17 @@ def pressure(folder: Path) -> dict[str, float]:
             stamp_ns=1, pressure=v['p'][k] * v['scale'][k], sample_rate=float(v['sample_rate'])
         )
         (collected,), _ = PressureStream(config, Counter()).push(block, 40.0)
-        heard = array_coherence(collected.spectra, config)
+        coherent = array_coherence(collected.spectra, config)
         found = array_response(collected.spectra, lattice, config, float(v['array_depth'][k]))
-        pulse = processor_pulse(heard, Lattice(40.0, lattice.step, 320), config.sound_speed)
+        pulse = processor_pulse(coherent, Lattice(40.0, lattice.step, 320), config.sound_speed)
         rows = np.searchsorted(collected.spectra.frequency, v['csdm_frequency'] - 0.1)
         pairs: Mapping[str, tuple[np.ndarray, np.ndarray]] = {
             'R': (levelled(collected.spectra.csdm[rows]), levelled(v['csdm'][k])),
-            'gamma': (heard.gamma, v['gamma_mvdr'][k]),
-            'W': (levelled(heard.weight), levelled(v['weight'][k])),
+            'gamma': (coherent.gamma, v['gamma_mvdr'][k]),
+            'W': (levelled(coherent.weight), levelled(v['weight'][k])),
             'b': (found.amplitude, v['response'][k]),
             'mirror sigma': (found.sigma[:1], v['sigma_mirror'][k : k + 1]),
-            'pulse': (pulse(lattice.step * np.arange(320)), v['pulse_processor'][k]),
+            'pulse': (pulse(np.asarray(lattice.step * np.arange(320))), v['pulse_processor'][k]),
         }
         for name, (ours, theirs) in pairs.items():
             error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
@@ -195,8 +196,8 @@ LIMITS = {
 def rows(folder: Path, seeds: int) -> dict[str, list[float]]:
     """Errors by name, of each seed where there are some."""
     found: dict[str, list[float]] = {}
-    for one in [exact_hmm(folder, seed) for seed in range(seeds)]:
-        for name, value in one.items():
+    for seed in range(seeds):
+        for name, value in exact_hmm(folder, seed).items():
             found.setdefault(name, []).append(value)
     for name, value in (signed_likelihood(folder) | sediment(folder) | pressure(folder)).items():
         found[name] = [value]

@@ -126,11 +126,6 @@ class System:
         return f'sonar_imm_tools.evaluation.{self.name}'
 
     @property
-    def benches(self) -> str:
-        """The module with `BENCHES`, see `evaluation.benches`."""
-        return f'{self.judge}.bench'
-
-    @property
     def node(self) -> str:
         """The module with `main` of the ROS 2 node."""
         return f'sonar_imm.nodes.{self.name}'

@@ -16,7 +16,7 @@
 
 `series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
 belongs to which diver, `scoring` compares them. `summary`, `sections` and `figures` present the
-result; `bench` measures the speed.
+result.
 """
 
 from __future__ import annotations

@@ -20,13 +20,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
-from plotly.subplots import make_subplots
 
 from sonar_imm.estimation.arrays import FloatArray
 
 from ... import SECOND
 from ..plotting import COLOURS, INK, styled
-from .fixed_order import FixedOrder
 from .records import Image, Record
 
 MOST_DEPTHS, MOST_RECORDS = 500, 1500
@@ -130,28 +128,6 @@ def distance_figure(records: Sequence[Record], ospa: FloatArray, start_ns: int) 
     figure.update_xaxes(title='time [s]', zeroline=False)
     figure.update_yaxes(title='OSPA [m]', rangemode='tozero')
     return styled(figure, height=280)
-
-
-def fixed_order_figure(
-    fixed: Sequence[FixedOrder], records: Sequence[Record], start_ns: int
-) -> go.Figure:
-    """What filters of a fixed number of reflectors find, and the truth, side by side."""
-    titles = [f'{one.order} reflectors' for one in fixed]
-    figure = make_subplots(
-        cols=len(fixed), shared_yaxes=True, subplot_titles=titles, horizontal_spacing=0.02
-    )
-    true = [record for record in records if record.true is not None]
-    for column, one in enumerate(fixed, start=1):
-        if true:
-            dots = _dots(true, lambda r: r.true.depth, start_ns, 'truth')
-            figure.add_trace(dots, row=1, col=column)
-        dots = _dots(one.records, lambda r: r.found.depth, start_ns, 'found', COLOURS[0])
-        figure.add_trace(dots, row=1, col=column)
-    figure.update_traces(showlegend=False)
-    figure.update_xaxes(title='time [s]', showgrid=False)
-    figure.update_yaxes(autorange='reversed', showgrid=False)
-    figure.update_yaxes(title='depth [m]', col=1)
-    return styled(figure, height=380)
 
 
 def _dots(

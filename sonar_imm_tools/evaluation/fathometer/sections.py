@@ -29,7 +29,6 @@ from ..judging import Check
 from ..page import Card, Part, Section
 from ..report import run_part
 from . import figures
-from .fixed_order import fixed_orders
 from .records import Image, Record
 from .scoring import pair
 from .summary import summary_sentence
@@ -150,26 +149,4 @@ def _sections(
                 figures.distance_figure(true, np.array(ospa), start),
             )
         )
-    if image is not None and committed:
-        sections.append(_fixed_section(run, image, committed, metrics['cutoff_m'], start))
     return sections
-
-
-def _fixed_section(
-    run: Mapping[str, Any],
-    image: Image,
-    records: Sequence[Record],
-    cutoff: float,
-    start_ns: int,
-) -> Section:
-    fixed = fixed_orders(run, image, records, cutoff)
-    text = 'Bootstrap filters with a fixed number of reflectors, on the same responses. '
-    text += 'Blue: what they find. Yellow: the true depths, where they are known.'
-    if np.isfinite([one.ospa for one in fixed]).all():
-        apart = ', '.join(f'{one.ospa:.2f} m with {one.order}' for one in fixed)
-        text += f' OSPA: {apart}.'
-    return Section(
-        'With a fixed number of reflectors',
-        text,
-        figures.fixed_order_figure(fixed, records, start_ns),
-    )

@@ -28,14 +28,13 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.speed import Bench
 from sonar_imm.acoustics.fathometer import coherence, steering
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.acoustics.spectra import outer_sum, SnapshotStream
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-
-from ..benches import Bench
 
 REFLECTORS, PARTICLES = 8, 20_000
 RECORD_WANTED_MS = 30.0
@@ -51,7 +50,8 @@ def trace(record: int, rng: np.random.Generator) -> Trace:
     depth = 122.0 + STEP * np.arange(SAMPLES)
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     places = 130.0 + 4.0 * np.arange(REFLECTORS) + 0.02 * rng.standard_normal(REFLECTORS)
-    noise = np.convolve(rng.standard_normal(2 * SAMPLES), pulse(STEP * np.arange(-32, 33)), 'same')
+    white, lags = rng.standard_normal(2 * SAMPLES), np.asarray(STEP * np.arange(-32, 33))
+    noise = np.convolve(white, np.asarray(pulse(lags)), mode='same')
     noise = noise[:SAMPLES] / noise.std()
     amplitude = pulse(depth[:, None] - places) @ np.linspace(25.0, 8.0, REFLECTORS) + noise
     return Trace(
@@ -75,9 +75,9 @@ def bench_record(records: int = 12) -> dict[str, Any]:
     orders: dict[str, int] = {}
     for record in range(records + 3):
         for name, tracker in trackers.items():
-            one = trace(record, rngs[name])
+            record_trace = trace(record, rngs[name])
             begin = time.process_time()
-            estimates = tracker.process(one)
+            estimates = tracker.process(record_trace)
             times[name].append(1e3 * (time.process_time() - begin))
             likely = int(np.argmax(estimates[-1].probabilities[0]))
             orders[name] = likely + tracker.config.order_min
@@ -96,20 +96,20 @@ def bench_record(records: int = 12) -> dict[str, Any]:
 
 def bench_threads(threads: int = 4, records: int = 9) -> dict[str, Any]:
     """Milliseconds of a record on one core and on `threads`, which must give the same bytes."""
-    median, said = {}, []
+    median, results = {}, []
     for count in (1, threads):
         rng = np.random.default_rng(0)
         tracker = FathometerTracker(FathometerConfig(particles=PARTICLES, threads=count))
         times, states = [], b''
         for record in range(records):
-            one = trace(record, rng)
+            record_trace = trace(record, rng)
             begin = time.perf_counter()
-            estimates = tracker.process(one)
+            estimates = tracker.process(record_trace)
             times.append(1e3 * (time.perf_counter() - begin))
             states += b''.join(e.state.tobytes() + e.probabilities.tobytes() for e in estimates)
         median[str(count)] = float(np.median(times[3:]))
-        said.append(states)
-    return {'median_ms': median, 'same_bytes': said[0] == said[1], 'good': said[0] == said[1]}
+        results.append(states)
+    return {'median_ms': median, 'same_bytes': (same := results[0] == results[1]), 'good': same}
 
 
 def bench_array(
@@ -148,7 +148,7 @@ def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
     from G and b at their depths, and by least squares over the trace. Also those of a whole
     particle of the tracker."""
     rng = np.random.default_rng(1)
-    lattice = STEP * np.arange(SAMPLES)
+    lattice = np.asarray(STEP * np.arange(SAMPLES))
     pulse = band_pulse(50.0, 4000.0, 1500.0)
     shapes = whitened_pulses(pulse, lattice)
     x = rng.standard_normal(len(shapes))

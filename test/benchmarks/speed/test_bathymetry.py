@@ -16,8 +16,7 @@
 
 import pytest
 
-from sonar_imm_tools.evaluation.bathymetry import bench
-from sonar_imm_tools.evaluation.bathymetry.peers import cut, stone_soup_filter
+from benchmarks.speed import bathymetry as bench
 
 
 @pytest.fixture
@@ -60,20 +59,20 @@ def test_the_goal_is_met_by_speed_and_by_ratio(short, monkeypatch, particles, nu
 
 @pytest.mark.parametrize('grid, good', [(26e3, True), (24e3, False)])
 def test_the_goal_at_sea_is_met_by_both_engines(monkeypatch, grid, good):
-    heard = {}
+    ran = {}
 
     def rates(methods, rounds, clock):
-        heard.update({name: (len(run()[0]), bins) for name, (run, bins) in methods.items()})
+        ran.update({name: (len(run()[0]), bins) for name, (run, bins) in methods.items()})
         return {'particles': 121e3, 'grid': grid}
 
     monkeypatch.setattr(bench, 'rates', rates)
     assert bench.bench_sea(rounds=1)['good'] is good
-    assert heard == {'particles': (2000, 2000), 'grid': (2000, 2000)}
+    assert ran == {'particles': (2000, 2000), 'grid': (2000, 2000)}
 
 
 def test_stone_soup_follows_the_same_floor(short):
     pytest.importorskip('stonesoup')
-    height = stone_soup_filter(cut(short, 60))
+    height = bench.stone_soup_filter(bench.cut(short, 60))
     assert abs(height[20:]).max() < 0.5
     assert set(bench.bench_stone_soup(rounds=1)['bins_per_second']) == {'particles', 'stone_soup'}
 

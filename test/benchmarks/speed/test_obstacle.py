@@ -16,7 +16,7 @@
 
 import pytest
 
-from sonar_imm_tools.evaluation.obstacle import bench
+from benchmarks.speed import obstacle as bench
 
 
 def test_all_obstacles_are_tracked_and_every_ping_is_timed():
@@ -34,5 +34,5 @@ def test_each_variant_tracks_the_obstacles_too(name):
 
 def test_the_sentence_names_every_variant():
     result = bench.bench_variants(rounds=1, pings=12)
-    told = bench.BENCHES[1].sentence(result)
-    assert all(name in told for name in bench.VARIANTS)
+    sentence = bench.BENCHES[1].sentence(result)
+    assert all(name in sentence for name in bench.VARIANTS)

@@ -16,7 +16,7 @@
 
 import pytest
 
-from sonar_imm_tools.evaluation.fathometer import bench
+from benchmarks.speed import fathometer as bench
 
 
 @pytest.fixture(autouse=True)
@@ -45,3 +45,10 @@ def test_every_step_from_pressure_to_response_is_timed():
         'white_noise',
     }
     assert min(result['ms'].values()) > 0.0 and 'mvdr' in bench.BENCHES[-1].sentence(result)
+
+
+def test_a_record_is_timed_with_all_its_reflectors(monkeypatch):
+    monkeypatch.setattr(bench, 'PARTICLES', 20_000)
+    record = bench.bench_record(2)
+    assert set(record['reflectors'].values()) == {8}
+    assert set(record['median_ms']) == set(record['reflectors'])

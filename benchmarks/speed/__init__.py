@@ -12,9 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Benches: what ``sonar-imm bench`` measures, each system its own.
+"""Speed: what ``sonar-imm bench`` measures, beside FilterPy and Stone Soup in the same run.
 
-The module `System.benches` provides ``BENCHES``, a tuple of `Bench`. How long a live node takes is
+    python -m benchmarks.speed diver --rounds 5
+
+Each system has a module here with ``BENCHES``, a tuple of `Bench`. Times depend on the machine and
+its load; the ratio of two programs measured in turn hardly does. How long a live node takes is
 measured for every system alike, by the command.
 """
 
@@ -26,7 +29,8 @@ from typing import Any
 
 from attrs import frozen
 
-from sonar_imm.trackers import SYSTEMS
+PEERS = ('filterpy', 'stonesoup')
+"""Libraries that a bench may need to compare with."""
 
 
 @frozen
@@ -45,5 +49,5 @@ class Bench:
 
 def benches_of(system: str) -> tuple[Bench, ...]:
     """What is measured of one system."""
-    found: tuple[Bench, ...] = import_module(SYSTEMS[system].benches).BENCHES
+    found: tuple[Bench, ...] = import_module(f'{__name__}.{system}').BENCHES
     return found

@@ -17,12 +17,18 @@
 All filters take the complex64 snapshots of the paper's scene and are timed in turn, round after
 round. The best round counts, because it is the least disturbed one. Of the tracker the whole of
 `process` is timed: variances, filter and estimate.
+
+`numpy_filter` is the IMM particle filter in plain numpy: all particles of a model at once, one bin
+after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup, another
+algorithm (one set of particles that carry their model) with the same likelihood and as many
+particles in all. Both suppose the scene of the paper, two random walks and noise of unit variance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta
 from functools import partial
 import math
 import os
@@ -30,19 +36,145 @@ import time
 from typing import Any
 
 import numpy as np
+from scipy.special import kve
 
+from benchmarks.speed import Bench
+from sonar_imm.acoustics.laplace import autocorrelation
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-
-from ...simulation.bathymetry.simulator import scenario, simulate
-from ..benches import Bench
-from .peers import config, cut, numpy_filter, SIGMAS, stone_soup_filter
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 PEER_BINS = 400
 GOAL, GOAL_RATIO = 80_000, 30
 SEA_GOALS = {'particles': 120_000, 'grid': 25_000}
 
 Timed = tuple[Callable[[], Any], int]
+
+CHAIN = np.array([[0.98, 0.02], [0.02, 0.98]])
+SIGMAS = (0.01, 1.0)
+HEIGHT, TILT, SPACING = 15.0, math.radians(30.0), 0.5
+
+
+def config(**values: Any) -> BathymetryConfig:
+    """Parameters with which the tracker computes what the peers compute."""
+    defaults = {'sigmas': SIGMAS, 'initial_std': 1.0, 'transition_matrix': tuple(CHAIN.ravel())}
+    return BathymetryConfig(**{**defaults, **values})
+
+
+class NumpyLikelihood:
+    """Log likelihood of heights for every bin of a ping, complex Laplace, without constants."""
+
+    def __init__(self, ping: Snapshot):
+        self.range, self.P = ping.range, ping.staves
+        power = (np.abs(ping.iq) ** 2).mean(axis=1)
+        window = np.ones(21)
+        level = np.convolve(power, window, 'same') / np.convolve(power**0, window, 'same')
+        rho = np.maximum(level - 1.0, 0.01)
+        self.c = autocorrelation(ping.iq)
+        self.kappa = rho / (1.0 + self.P * rho)
+
+    def log_likelihood(self, t: int, height: FloatArray) -> FloatArray:
+        ratio = (HEIGHT - height) / self.range[t]
+        with np.errstate(invalid='ignore'):
+            u = ratio * math.cos(TILT) - np.sqrt(1.0 - ratio**2) * math.sin(TILT)
+        waves = np.exp(-2j * math.pi * SPACING * u[..., None] * np.arange(1, self.P))
+        beam = self.c[t, 0].real + 2.0 * (waves @ self.c[t, 1:]).real
+        v = np.sqrt(np.maximum(self.c[t, 0].real - self.kappa[t] * beam, 1e-12))
+        log_q = np.log(kve(self.P - 1, 2.0 * v)) - 2.0 * v - (self.P - 1) * np.log(v)
+        return np.where(np.isnan(u), -np.inf, log_q)
+
+
+def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatArray:
+    """Mean height (T,) by the IMM particle filter, one bin after the other."""
+    likelihood, rng, N = NumpyLikelihood(ping), np.random.default_rng(seed), particles
+    x, w = rng.normal(size=(2, N)), np.full((2, N), 1.0 / N)
+    mu, sigma = np.array([0.5, 0.5]), np.array(SIGMAS)[:, None]
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        joint = CHAIN * mu[:, None]
+        c = joint.sum(axis=0)
+        points = (np.arange(N) + rng.random((2, 1))) / N
+        drawn = np.empty_like(x)
+        for j in range(2):
+            cumulative = np.cumsum(joint[:, j, None] * w)
+            index = np.searchsorted(cumulative, points[j] * cumulative[-1])
+            drawn[j] = x.ravel()[np.minimum(index, 2 * N - 1)]
+        x = drawn + sigma * rng.standard_normal((2, N))
+        log_q = likelihood.log_likelihood(t, x)
+        q = np.exp(log_q - log_q.max())
+        total = q.sum(axis=1)
+        w = q / np.maximum(total, 1e-300)[:, None]
+        mu = c * total
+        mu /= mu.sum()
+        mean[t] = mu @ (w * x).sum(axis=1)
+    return mean
+
+
+def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
+    """Mean height (T,) by Stone Soup's multi-model particle filter. Raises ModuleNotFoundError."""
+    from stonesoup.base import Property
+    from stonesoup.models.measurement.base import MeasurementModel
+    from stonesoup.models.transition.linear import RandomWalk
+    from stonesoup.predictor.particle import MultiModelPredictor
+    from stonesoup.resampler.particle import SystematicResampler
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import MultiModelParticleState
+    from stonesoup.updater.particle import MultiModelParticleUpdater
+
+    class Likelihood(MeasurementModel):
+        """A detection is the number of its bin; the likelihood has the samples."""
+
+        likelihood: NumpyLikelihood = Property()
+        ndim_meas = 1
+
+        def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
+            raise NotImplementedError
+
+        def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
+            raise NotImplementedError
+
+        def pdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
+            return np.exp(self.logpdf(state1, state2))
+
+        def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> FloatArray:
+            heights = np.asarray(state2.state_vector[0, :], np.float64)
+            return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
+
+    # Stone Soup scales the variance with the time step, which is one second here.
+    predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
+    model = Likelihood(ndim_state=1, mapping=(0,), likelihood=NumpyLikelihood(ping))
+    updater = MultiModelParticleUpdater(model, predictor, SystematicResampler())
+    np.random.seed(0)
+    start = datetime(2026, 1, 1)
+    state = MultiModelParticleState(
+        StateVectors(np.random.normal(size=(1, particles))),
+        weight=np.full(particles, 1.0 / particles),
+        dynamic_model=np.random.randint(0, 2, particles),
+        timestamp=start,
+    )
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        stamp = start + timedelta(seconds=t + 1)
+        prediction = predictor.predict(state, timestamp=stamp)
+        detection = Detection([t], timestamp=stamp)
+        state = updater.update(SingleHypothesis(prediction, detection))
+        mean[t] = float(np.mean(state.state_vector[0, :]))
+        state.hypothesis = None
+        state.parent = None
+    return mean
+
+
+def cut(ping: Snapshot, bins: int) -> Snapshot:
+    """The first `bins` bins of a ping."""
+    return Snapshot(
+        stamp_ns=ping.stamp_ns,
+        range=ping.range[:bins],
+        iq=ping.iq[:bins],
+        noise_variance=np.ones(min(bins, len(ping))),
+    )
 
 
 def a_ping(**values: Any) -> Snapshot:
@@ -108,15 +240,15 @@ def bench_sea(rounds: int = 7) -> dict[str, Any]:
     """Bins per second on a ship that moves, in CPU time: poses, rays through a profile, soundings'
     uncertainties; particles and grid."""
     config = scenario('moving_profile', {'pings': 1, 'last_range': 117.0})
-    heard = [one.measurement for one in simulate(config, 1).measurements]
-    ping = next(one for one in heard if isinstance(one, Snapshot))
+    measurements = [item.measurement for item in simulate(config, 1).measurements]
+    ping = next(item for item in measurements if isinstance(item, Snapshot))
     methods: dict[str, Timed] = {}
     for engine in ('particles', 'grid'):
-        told = BathymetryConfig.from_mapping({**config.told(), 'engine': engine})
-        tracker = BathymetryTracker(told.for_inputs(frozenset({'snapshot', 'nav'})))
-        for one in heard:
-            if one is not ping:
-                tracker.process(one)
+        values = BathymetryConfig.from_mapping({**config.told(), 'engine': engine})
+        tracker = BathymetryTracker(values.for_inputs(frozenset({'snapshot', 'nav'})))
+        for measurement in measurements:
+            if measurement is not ping:
+                tracker.process(measurement)
         methods[engine] = partial(tracker.process, ping), len(ping)
     speed = rates(methods, rounds, clock=time.process_time)
     return {
@@ -146,13 +278,10 @@ def bench_scaling(rounds: int = 7) -> dict[str, Any]:
         variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
     for P in (2, 4, 8, 16, 32):
         variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
-    methods = {
-        name: (
-            partial(BathymetryTracker(BathymetryConfig(shadow_gate=False, **values)).process, one),
-            len(one),
-        )
-        for name, (values, one) in variants.items()
-    }
+    methods: dict[str, Timed] = {}
+    for name, (values, shot) in variants.items():
+        tracker = BathymetryTracker(BathymetryConfig(shadow_gate=False, **values))
+        methods[name] = partial(tracker.process, shot), len(shot)
     return {'bins_per_second': rates(methods, rounds)}
 
 
@@ -163,7 +292,7 @@ def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
 
     def together(trackers: list[BathymetryTracker]) -> None:
         with ThreadPoolExecutor(len(trackers)) as pool:
-            list(pool.map(lambda one: [one.process(ping) for _ in range(pings)], trackers))
+            list(pool.map(lambda each: [each.process(ping) for _ in range(pings)], trackers))
 
     most = min(4, os.cpu_count() or 1)
     groups = {

@@ -28,15 +28,14 @@ from typing import Any
 from attrs import frozen
 import numpy as np
 
+from benchmarks.speed import Bench
 from sonar_imm.estimation import imm, imm_kernels
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.association import assign, association_cost, gate_threshold
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.tracker import DiverTracker
-
-from ...simulation.diver.simulator import scenario, simulate
-from ..benches import Bench
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 MODELS, STATES, STEP = 16, 4, 1.0
 RATIO_WANTED = 100.0
@@ -100,10 +99,10 @@ def run_filterpy(p: Problem) -> FloatArray:
 
     filters = []
     for F, Q in zip(p.F, p.Q):
-        one = KalmanFilter(dim_x=STATES, dim_z=2)
-        one.x, one.P = np.zeros(STATES), 10.0 * np.eye(STATES)
-        one.F, one.Q, one.H, one.R = F, Q, p.H, p.R
-        filters.append(one)
+        kalman = KalmanFilter(dim_x=STATES, dim_z=2)
+        kalman.x, kalman.P = np.zeros(STATES), 10.0 * np.eye(STATES)
+        kalman.F, kalman.Q, kalman.H, kalman.R = F, Q, p.H, p.R
+        filters.append(kalman)
     imm = IMMEstimator(filters, np.full(MODELS, 1.0 / MODELS), p.transition)
     means = np.empty((len(p.z), STATES))
     for k, z in enumerate(p.z):
@@ -219,14 +218,14 @@ def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
 def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
     """CPU milliseconds that a whole tracker takes for a scan of four divers and three false fixes
     on average, with either association in turn."""
-    told = scenario('crossing', {'duration': scans - 1.0, 'clutter': 3.0})
-    scene = [one.measurement for one in simulate(told, 0).measurements]
+    setting = scenario('crossing', {'duration': scans - 1.0, 'clutter': 3.0})
+    scene = [item.measurement for item in simulate(setting, 0).measurements]
     configs = [
-        DiverConfig(**{**told.told(), 'association': association})
+        DiverConfig(**{**setting.told(), 'association': association})
         for association in ('gnn', 'jipda')
     ]
     DiverTracker(configs[1]).warm()
-    spent = np.array([[_cpu_of_tracking(scene, one) for one in configs] for _ in range(rounds)])
+    spent = np.array([[_cpu_of_tracking(scene, each) for each in configs] for _ in range(rounds)])
     gnn, jipda = np.median(spent, axis=0) * 1e3 / len(scene)
     return {
         'scans': len(scene),

@@ -22,11 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.speed import Bench
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
-
-from ..benches import Bench
 
 OBSTACLES = 20
 WANTED_MS = 2.0
