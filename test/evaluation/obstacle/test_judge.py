@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimates import Estimate
+from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
