@@ -332,7 +332,7 @@ def page_of(text: str, parts: Mapping[str, Part]) -> str:
         head, *body = TABLES[name](parts[name])
         lines = [head, ['---'] * len(head), *body]
         told = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
-        source = f'<!-- numbers: {RESULT.name} -->'
+        source = f'<!-- numbers: {RESULT.name}; made by benchmarks.reliability -->'
         return f'{found.group(1)}{source}\n{told}\n{found.group(3)}'
 
     return _BLOCK.sub(table, text)
