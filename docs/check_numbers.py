@@ -46,14 +46,12 @@ A cell has to hold as many numbers as its paths have values (NaN, null and missi
 in that order, each the value at the digits shown, or 100 times the value where `%` follows. A cell
 may be `-` in any case, which says that it is left out.
 
-A result is as old as the number of commits that changed its script or a module which that imports,
-after the commit that changed the result last. Files that were only renamed do not count.
+How old a result is, in commits, says `result_ages`.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
 from collections.abc import Iterator
 from datetime import date
 from functools import lru_cache
@@ -68,6 +66,7 @@ import sys
 from typing import Any
 
 from attrs import frozen
+from result_ages import age_in, history, module_file, paths_of, script_of
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -78,9 +77,6 @@ MARK = re.compile(r'^<!-- numbers: (.+?) -->$', re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r'(?<![\w.])[-+]?(?:\d+(?:,\d{3})*(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?(?![\w.]*\w)')
 MADE = {'parameters'}
 """Folders of docs/ whose pages hold no measurement: they are generated."""
-SYSTEMS = ('bathymetry', 'diver', 'fathometer', 'obstacle')
-MOVED = 90
-"""Per cent: a file that was renamed and is alike by as much was only moved."""
 
 
 @frozen
@@ -177,18 +173,15 @@ class Binding:
         if len(paths) >= len(head):
             raise ValueError(f'{len(paths)} paths for {len(head)} columns')
         labels = [label(row[0]) for row in body]
-        keys = (
-            [key.strip() for key in rest[0].removeprefix('rows:').split('|')] if rest else labels
-        )
-        if len(keys) != len(body):
-            raise ValueError(f'{len(keys)} keys for {len(body)} rows')
-        keys = [row if key == '=' else key for row, key in zip(labels, keys)]
-        for place in range(1, len(keys)):
-            keys[place] = keys[place] or keys[place - 1]
-        full = (path if path == '-' else with_base(base.strip(), path) for path in paths)
-        return cls(
-            contents(file), table, ('-',) * (len(head) - len(paths)) + tuple(full), tuple(keys)
-        )
+        given = rest[0].removeprefix('rows:').split('|') if rest else ['='] * len(body)
+        if len(given) != len(body):
+            raise ValueError(f'{len(given)} keys for {len(body)} rows')
+        keys: list[str] = []
+        for row, key in zip(labels, map(str.strip, given)):
+            keys.append((row if key == '=' else key) or keys[-1])
+        unbound = ['-'] * (len(head) - len(paths))
+        full = [path if path == '-' else with_base(base.strip(), path) for path in paths]
+        return cls(contents(file), table, (*unbound, *full), tuple(keys))
 
     def wrong(self, row: int, column: int, cell: str) -> list[str]:
         """What is wrong with a cell, were it `cell`: row of the body, column of the table."""
@@ -203,11 +196,8 @@ class Binding:
 
     def filled(self, row: int, column: int) -> str:
         cells = self.table.rows[row + 2]
-        words = {
-            'row': self.keys[row],
-            'col': label(self.table.rows[0][column]),
-            'n': str(column - 1),
-        }
+        head = label(self.table.rows[0][column])
+        words = {'row': self.keys[row], 'col': head, 'n': str(column - 1)}
         for place, cell in enumerate(map(label, cells), start=1):
             words[f'{place}'] = cell
             for part, text in enumerate(cell.split(', '), start=1):
@@ -237,9 +227,7 @@ class Binding:
                     yield row, column, cell
 
     def doubts(self) -> list[str]:
-        return [
-            wrong for row, column, cell in self.cells() for wrong in self.wrong(row, column, cell)
-        ]
+        return [wrong for cell in self.cells() for wrong in self.wrong(*cell)]
 
 
 def with_base(base: str, path: str) -> str:
@@ -287,7 +275,7 @@ def item(content: Any, key: str) -> Any:
     if not key.startswith('['):
         return content[int(key)] if key.isdigit() and int(key) < len(content) else None
     wanted = dict(part.split('=', 1) for part in key[1:-1].split(','))
-    found = [one for one in content if all(same(one.get(k), v) for k, v in wanted.items())]
+    found = [entry for entry in content if all(same(entry.get(k), v) for k, v in wanted.items())]
     return found[0] if len(found) == 1 else None
 
 
@@ -334,28 +322,16 @@ def made_tables(page: str, module: str) -> list[Table]:
 
 
 def dated(place: str, day: str, command: str) -> list[str]:
+    """What is wrong with the day and the command of numbers; a command of ours has to exist."""
     try:
-        read = date.fromisoformat(day)
+        if date.fromisoformat(day) > date.today():
+            return [f'{place}: {day} has not come yet']
     except ValueError:
         return [f'{place}: {day!r} is no date']
-    if read > date.today():
-        return [f'{place}: {day} has not come yet']
-    return command_doubts(place, command)
-
-
-def command_doubts(place: str, command: str) -> list[str]:
-    """A command of ours has to exist."""
-    if not command:
-        return [f'{place}: no command']
-    if (script := script_of(command)) and not module_file(script):
+    script = script_of(command)
+    if script and not module_file(script):
         return [f'{place}: there is no {script}']
-    return []
-
-
-def script_of(command: str) -> str:
-    """The benchmark that a command runs, '' for another command."""
-    found = re.search(r'python -m (benchmarks(?:\.\w+)+)', command)
-    return found.group(1) if found else ''
+    return [] if command else [f'{place}: no command']
 
 
 def known_sources() -> dict[str, dict[str, str]]:
@@ -382,85 +358,6 @@ def all_doubts() -> list[str]:
     return found
 
 
-def module_file(module: str) -> Path | None:
-    stem = ROOT.joinpath(*module.split('.'))
-    found = (path for path in (stem.with_suffix('.py'), stem / '__init__.py') if path.is_file())
-    return next(found, None)
-
-
-def imported(module: str, path: Path) -> Iterator[str]:
-    """The modules that a module imports, anywhere in it, as far as they may be ours."""
-    package = module.split('.')[: None if path.name == '__init__.py' else -1]
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            above = package[: len(package) + 1 - node.level] if node.level else []
-            origin = '.'.join([*above, *filter(None, [node.module])])
-            yield from (origin, *(f'{origin}.{alias.name}' for alias in node.names))
-
-
-@lru_cache
-def paths_of(result: str, command: str) -> frozenset[str]:
-    """Files that a result depends on: its script, and all of ours that this imports.
-
-    Trackers are loaded by name, so those of the result's system count too, or of all systems when
-    its name has none. All of the packages for a command that is no benchmark."""
-    script = script_of(command)
-    if not script:
-        ours = (path.parent for path in ROOT.glob('*/__init__.py'))
-        return frozenset(name_of(path) for folder in ours for path in folder.rglob('*.py'))
-    found: dict[str, Path] = {}
-    waiting = [script]
-    while waiting:
-        module = waiting.pop()
-        if module not in found and (path := module_file(module)):
-            found[module] = path
-            waiting += imported(module, path)
-    files = set(found.values())
-    if 'sonar_imm.trackers' in found:
-        for system in [name for name in SYSTEMS if result.startswith(name)] or SYSTEMS:
-            files |= set((ROOT / 'sonar_imm' / 'trackers' / system).rglob('*.py'))
-    return frozenset(map(name_of, files))
-
-
-def name_of(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
-
-
-@frozen
-class Commit:
-    """A commit: its parents, and for each file it changed the name before and a share kept."""
-
-    name: str
-    parents: tuple[str, ...]
-    changes: tuple[tuple[str, str, int], ...]
-    """Name before, name after, per cent alike."""
-
-
-@lru_cache
-def history() -> tuple[Commit, ...]:
-    """All commits, newest first; none without git, or where the clone is shallow."""
-
-    def git(*words: str) -> str:
-        done = subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True)
-        return done.stdout if done.returncode == 0 else ''
-
-    if git('rev-parse', '--is-shallow-repository').strip() != 'false':
-        return ()
-    log = git('log', '-M', '--topo-order', '--name-status', '--no-relative', '--format=%x00%H %P')
-    return tuple(map(commit_of, log.split('\0')[1:]))
-
-
-def commit_of(text: str) -> Commit:
-    (name, *parents), *lines = (line.split() for line in text.splitlines() if line)
-    changes = tuple(
-        (words[1], words[-1], int(words[0][1:] or 0) if words[0][0] == 'R' else 0)
-        for words in lines
-    )
-    return Commit(name, tuple(parents), changes)
-
-
 def age(result: str) -> int | None:
     """Commits to what a result depends on since it was made, None where that is not known."""
     return age_in(
@@ -468,55 +365,9 @@ def age(result: str) -> int | None:
     )
 
 
-def age_in(commits: tuple[Commit, ...], result: str, paths: frozenset[str]) -> int | None:
-    """Of all `commits`, newest first, those that changed `paths` and are no forebears of the one
-    that changed `result` last."""
-    made = next((c for c in commits if any(result == new for _, new, _ in c.changes)), None)
-    if made is None:
-        return None
-    names, old, count = set(paths), {made.name}, 0
-    for commit in commits:
-        if commit.name in old:
-            old |= set(commit.parents)
-            continue
-        mine = [change for change in commit.changes if change[1] in names]
-        count += any(alike < MOVED for _, _, alike in mine)
-        names |= {before for before, _, _ in mine}
-    return count
-
-
 def aged(result: str) -> str:
     commits = age(result)
     return 'unknown' if commits is None else f'{commits} commits to its code since'
-
-
-def caption(mark: str, up: str) -> str:
-    """What the site shows below a table for its mark; `up` leads from the page to docs/."""
-    kind, _, rest = mark.partition(';')
-    if kind == 'none':
-        return ''
-    if kind.startswith('read '):
-        return f'*Read on {kind.removeprefix("read ").strip()}:* `{rest.strip()}`'
-    source = known_sources()[kind]
-    return (
-        f'*Values of {source["date"]} ({aged(kind)}), [{kind}]({up}results/{kind}):* '
-        f'`{source["command"]}`'
-    )
-
-
-def captioned(markdown: str, up: str) -> str:
-    """A page with a caption below each table that has a mark, in place of the mark."""
-    out: list[str] = []
-    waiting = ''
-    for line in [*on_one_line(markdown).splitlines(), '']:
-        if found := MARK.match(line):
-            waiting = caption(found.group(1), up)
-            continue
-        if waiting and out and out[-1].startswith('|') and not line.startswith('|'):
-            out += ['', waiting]
-            waiting = ''
-        out.append(line)
-    return '\n'.join(out)
 
 
 def run(name: str) -> int:
@@ -535,14 +386,6 @@ def run(name: str) -> int:
     return 0
 
 
-def counted() -> str:
-    """How many tables there are of each kind."""
-    marks = [table.mark for page in pages() for table in tables(page) if table.mark]
-    read = sum(mark.startswith('read ') for mark in marks)
-    bound = sum('.json' in mark.partition(';')[0] for mark in marks)
-    return f'{bound} tables bound to results, {read} read by hand'
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -553,7 +396,10 @@ def main() -> int:
         return status
     for name, source in known_sources().items():
         print(f'{source["date"]}  {name}: {aged(name)}; {source["command"]}')
-    print(counted())
+    marks = [table.mark for page in pages() for table in tables(page)]
+    bound = sum('.json' in mark.partition(';')[0] for mark in marks)
+    read = sum(mark.startswith('read ') for mark in marks)
+    print(f'{bound} tables bound to results, {read} read by hand')
     found = all_doubts()
     for doubt in found:
         print(doubt, file=sys.stderr)

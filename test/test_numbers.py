@@ -36,6 +36,7 @@ if not (ROOT / 'docs' / 'check_numbers.py').is_file():
 @pytest.fixture(scope='module')
 def checker():
     name = 'check_numbers'
+    sys.path.insert(0, str(ROOT / 'docs'))  # as for a script there
     spec = importlib.util.spec_from_file_location(name, ROOT / 'docs' / f'{name}.py')
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # attrs looks its classes up there
@@ -182,7 +183,12 @@ def test_numbers_without_a_mark_are_doubted(checker, tmp_path: Path, monkeypatch
     assert len(checker.doubts(bare, {})) == 1 and checker.doubts(words, {}) == []
 
 
-def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(checker) -> None:
+@pytest.fixture
+def ages(checker):
+    return sys.modules['result_ages']
+
+
+def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(ages) -> None:
     log = [
         'e d\n\nM\tpackage/new.py\n',
         'd c\n\nR100\told.py\tpackage/new.py\nM\tother.py\n',
@@ -191,30 +197,20 @@ def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(checker
         'b a\n\nA\tdocs/results/one.json\n',
         'a\n\nA\told.py\nA\tother.py\n',
     ]
-    commits = tuple(map(checker.commit_of, log))
+    commits = tuple(map(ages.commit_of, log))
     result = 'docs/results/one.json'
-    assert checker.age_in(commits, result, frozenset({'package/new.py'})) == 2  # e and x
-    assert checker.age_in(commits, result, frozenset({'other.py'})) == 1
-    assert checker.age_in(commits, result, frozenset({'unchanged.py'})) == 0
-    assert checker.age_in(commits, 'docs/results/none.json', frozenset()) is None
-    assert checker.age_in((), result, frozenset({'other.py'})) is None
+    assert ages.age_in(commits, result, frozenset({'package/new.py'})) == 2  # e and x
+    assert ages.age_in(commits, result, frozenset({'other.py'})) == 1
+    assert ages.age_in(commits, result, frozenset({'unchanged.py'})) == 0
+    assert ages.age_in(commits, 'docs/results/none.json', frozenset()) is None
+    assert ages.age_in((), result, frozenset({'other.py'})) is None
 
 
-def test_a_result_depends_on_what_its_script_imports(checker) -> None:
-    paths = checker.paths_of('diver_sea.json', 'python -m benchmarks.diver_sea --runs 30')
+def test_a_result_depends_on_what_its_script_imports(ages) -> None:
+    paths = ages.paths_of('diver_sea.json', 'python -m benchmarks.diver_sea --runs 30')
     assert {'benchmarks/diver_sea.py', 'sonar_imm/trackers/diver/tracker.py'} <= paths
     assert 'sonar_imm/estimation/imm_kernels.py' in paths
     assert not any('trackers/obstacle' in path for path in paths)
-    assert paths < checker.paths_of('reliability.json', 'make reliability') | {
+    assert paths < ages.paths_of('reliability.json', 'make reliability') | {
         path for path in paths if not path.startswith('sonar_imm')
     }
-
-
-def test_the_site_shows_the_source_below_the_table(checker) -> None:
-    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
-    assert checker.captioned(text, '') == (
-        '| a |\n|---|\n| 1.5 |\n\n*Read on 2026-11-20:* `sonar-imm bench`\n\nAfter.\n'
-    )
-    text = '<!-- numbers: bounds.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
-    shown = checker.captioned(text, '../')
-    assert '<!--' not in shown and '[bounds.json](../results/bounds.json)' in shown

@@ -97,3 +97,13 @@ def test_what_comes_from_another_server_is_seen(made) -> None:
         '//d.org/d.css',
         'https://e.org/e.png',
     ]
+
+
+def test_the_site_shows_the_source_below_the_table(made) -> None:
+    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
+    assert made.captioned(text, '') == (
+        '| a |\n|---|\n| 1.5 |\n\n*Read on 2026-11-20:* `sonar-imm bench`\n\nAfter.\n'
+    )
+    text = '<!-- numbers: bounds.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
+    shown = made.captioned(text, '../')
+    assert '<!--' not in shown and '[bounds.json](../results/bounds.json)' in shown
