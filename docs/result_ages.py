@@ -103,7 +103,10 @@ def history() -> tuple[Commit, ...]:
     """All commits, newest first; none without git, or where the clone is shallow."""
 
     def git(*words: str) -> str:
-        done = subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True)
+        try:
+            done = subprocess.run(['git', *words], cwd=ROOT, capture_output=True, text=True)
+        except OSError:
+            return ''
         return done.stdout if done.returncode == 0 else ''
 
     if git('rev-parse', '--is-shallow-repository').strip() != 'false':

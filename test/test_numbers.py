@@ -214,3 +214,14 @@ def test_a_result_depends_on_what_its_script_imports(ages) -> None:
     assert paths < ages.paths_of('reliability.json', 'make reliability') | {
         path for path in paths if not path.startswith('sonar_imm')
     }
+
+
+def test_without_git_no_age_is_known(ages, monkeypatch, tmp_path: Path) -> None:
+    ages.history.cache_clear()
+    monkeypatch.setenv('PATH', str(tmp_path))
+    assert ages.history() == ()
+    ages.history.cache_clear()
+    monkeypatch.undo()
+    monkeypatch.setattr(ages, 'ROOT', tmp_path)
+    assert ages.history() == ()
+    ages.history.cache_clear()
