@@ -245,7 +245,7 @@ def interfaces() -> str:
         '# Inputs and columns',
         'Written from the code when the site is built: the inputs that a tracker subscribes to '
         'and finds in recordings, and the columns of `~/estimate` and `estimate.csv`. What they '
-        'mean is in [Topics, services and columns](../topics.md).',
+        'mean is in [Columns](columns.md).',
     ]
     for name in SYSTEMS:
         inputs = [
