@@ -77,6 +77,15 @@ def test_the_api_has_every_public_module(made) -> None:
     assert 'imm_kernels' not in made.api_page('sonar_imm.estimation', 'x')
 
 
+def test_no_page_is_long() -> None:
+    """Marks of numbers count too. A page that grows is cut, or its tables go to docs/results."""
+    words = {
+        path.relative_to(ROOT).as_posix(): len(path.read_text(encoding='utf-8').split())
+        for path in (ROOT / 'docs').rglob('*.md')
+    }
+    assert {page for page, count in words.items() if count > 4000} == set()
+
+
 @pytest.mark.parametrize('name', ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst'])
 def test_links_of_pages_from_the_root_lead_to_pages(made, name: str) -> None:
     text = made.at_the_root(name)
