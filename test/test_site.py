@@ -77,6 +77,27 @@ def test_the_api_has_every_public_module(made) -> None:
     assert 'imm_kernels' not in made.api_page('sonar_imm.estimation', 'x')
 
 
+def test_files_and_tests_named_on_pages_exist() -> None:
+    files = [
+        path.relative_to(ROOT)
+        for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test', 'benchmarks', 'docs')
+        for path in (ROOT / room).rglob('*.py')
+    ]
+    sources = [
+        (ROOT / file).read_text(encoding='utf-8') for file in files if file.parts[0] == 'test'
+    ]
+    tests = {name for source in sources for name in re.findall(r'def (test_\w+)', source)}
+    missing = set()
+    for page in [*(ROOT / 'docs').rglob('*.md'), ROOT / 'README.md']:
+        text = page.read_text(encoding='utf-8')
+        for name in re.findall(r'`([\w./]+/\w+\.py)', text):
+            if not any(f'/{file.as_posix()}'.endswith(f'/{name}') for file in files):
+                missing.add(f'{page.name}: {name}')
+        named = set(re.findall(r'`(test_\w+)\b(?!\.py)', text))
+        missing |= {f'{page.name}: {name}' for name in named - tests}
+    assert missing == set()
+
+
 def test_no_page_is_long() -> None:
     """Marks of numbers count too. A page that grows is cut, or its tables go to docs/results."""
     words = {
