@@ -19,12 +19,13 @@ A check of numbers that never fails would pass all of that, so each number is fa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-import importlib.util
+from collections.abc import Callable, Iterator
+import importlib
 import json
 from pathlib import Path
 import re
 import sys
+from typing import Any
 
 from helpers.source import ROOT
 import pytest
@@ -33,18 +34,15 @@ if not (ROOT / 'docs' / 'check_numbers.py').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
 
 
+sys.path.insert(0, str(ROOT / 'docs'))  # as for a script there
+
+
 @pytest.fixture(scope='module')
-def checker():
-    name = 'check_numbers'
-    sys.path.insert(0, str(ROOT / 'docs'))  # as for a script there
-    spec = importlib.util.spec_from_file_location(name, ROOT / 'docs' / f'{name}.py')
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # attrs looks its classes up there
-    spec.loader.exec_module(module)
-    return module
+def checker() -> Any:
+    return importlib.import_module('check_numbers')
 
 
-def test_every_number_has_its_source(checker) -> None:
+def test_every_number_has_its_source(checker: Any) -> None:
     assert checker.all_doubts() == []
 
 
@@ -58,7 +56,7 @@ def falsified(number: str) -> Iterator[str]:
             yield f'{number[:place]}{digit}{number[place + 1 :]}'
 
 
-def falsified_cells(checker, cell: str, skipped: str) -> Iterator[str]:
+def falsified_cells(checker: Any, cell: str, skipped: str) -> Iterator[str]:
     """`cell` with one of its numbers falsified; what matches `skipped` is left alone."""
     bare = re.sub(skipped, lambda found: ' ' * len(found.group()), cell)
     for found in checker.NUMBER.finditer(bare):
@@ -66,22 +64,22 @@ def falsified_cells(checker, cell: str, skipped: str) -> Iterator[str]:
             yield f'{cell[: found.start()]}{number}{cell[found.end() :]}'
 
 
-def with_cell(checker, table, row: int, column: int, cell: str):
+def with_cell(checker: Any, table: Any, row: int, column: int, cell: str) -> Any:
     line = table.rows[row + 2]
     changed = (*line[:column], cell, *line[column + 1 :])
     rows = (*table.rows[: row + 2], changed, *table.rows[row + 3 :])
     return checker.Table(table.page, table.line, table.mark, rows)
 
 
-def test_every_falsified_number_is_found_out(checker) -> None:
+def test_every_falsified_number_is_found_out(checker: Any) -> None:
     """In every table of a result: the last digit of each compared number, wrong by 2 to 9."""
     tried, passed = 0, []
     for table in (table for page in checker.pages() for table in checker.tables(page)):
         if '.json' not in table.mark.partition(';')[0]:
             continue
         made = 'made by' in table.mark
-        binding = None if made else checker.Binding.of(table)
-        cells = binding.cells() if binding else made_cells(table)
+        binding: Any = None if made else checker.Binding.of(table)
+        cells = made_cells(table) if made else binding.cells()
         for row, column, cell in cells:
             others = '' if made or '~' in binding.filled(row, column) else r'|\([^)]*\)'
             for wrong in falsified_cells(checker, cell, f'`[^`]*`{others}'):
@@ -97,7 +95,7 @@ def test_every_falsified_number_is_found_out(checker) -> None:
     assert tried > 15_000
 
 
-def made_cells(table) -> Iterator[tuple[int, int, str]]:
+def made_cells(table: Any) -> Iterator[tuple[int, int, str]]:
     for row, cells in enumerate(table.rows[2:]):
         for column, cell in enumerate(cells[1:], start=1):
             yield row, column, cell
@@ -112,7 +110,9 @@ RESULT = {
 
 
 @pytest.fixture
-def a_page(checker, monkeypatch, tmp_path: Path):
+def a_page(
+    checker: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Callable[..., list[str]]]:
     """Give what is doubted of a table under a mark, beside a result."""
     (tmp_path / 'one.json').write_text(json.dumps(RESULT))
     monkeypatch.setattr(checker, 'ROOT', tmp_path)
@@ -164,16 +164,18 @@ def a_page(checker, monkeypatch, tmp_path: Path):
         ('read 2026-11-20; python -m benchmarks.no', 'near | 1.24 m', 'there is no'),
     ],
 )
-def test_what_is_wrong_is_found(a_page, mark: str, row: str, doubt: str | None) -> None:
+def test_what_is_wrong_is_found(a_page: Any, mark: str, row: str, doubt: str | None) -> None:
     found = a_page(mark, row)
     assert not found if doubt is None else len(found) == 1 and doubt in found[0]
 
 
-def test_an_empty_first_cell_is_that_of_the_row_above(a_page) -> None:
+def test_an_empty_first_cell_is_that_of_the_row_above(a_page: Any) -> None:
     assert a_page('one.json; rmse>{row}', 'near | 1.25', ' | 1.25') == []
 
 
-def test_numbers_without_a_mark_are_doubted(checker, tmp_path: Path, monkeypatch) -> None:
+def test_numbers_without_a_mark_are_doubted(
+    checker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(checker, 'ROOT', tmp_path)
     page = tmp_path / 'page.md'
     page.write_text(
@@ -184,11 +186,11 @@ def test_numbers_without_a_mark_are_doubted(checker, tmp_path: Path, monkeypatch
 
 
 @pytest.fixture
-def ages(checker):
-    return sys.modules['result_ages']
+def ages(checker: Any) -> Any:
+    return importlib.import_module('result_ages')
 
 
-def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(ages) -> None:
+def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(ages: Any) -> None:
     log = [
         'e d\n\nM\tpackage/new.py\n',
         'd c\n\nR100\told.py\tpackage/new.py\nM\tother.py\n',
@@ -206,7 +208,7 @@ def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(ages) -
     assert ages.age_in((), result, frozenset({'other.py'})) is None
 
 
-def test_a_result_depends_on_what_its_script_imports(ages) -> None:
+def test_a_result_depends_on_what_its_script_imports(ages: Any) -> None:
     paths = ages.paths_of('diver_sea.json', 'python -m benchmarks.diver_sea --runs 30')
     assert {'benchmarks/diver_sea.py', 'sonar_imm/trackers/diver/tracker.py'} <= paths
     assert 'sonar_imm/estimation/imm_kernels.py' in paths
@@ -216,7 +218,9 @@ def test_a_result_depends_on_what_its_script_imports(ages) -> None:
     }
 
 
-def test_without_git_no_age_is_known(ages, monkeypatch, tmp_path: Path) -> None:
+def test_without_git_no_age_is_known(
+    ages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     ages.history.cache_clear()
     monkeypatch.setenv('PATH', str(tmp_path))
     assert ages.history() == ()
