@@ -39,8 +39,7 @@ from ...acoustics import geometry
 from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign_fits, gate_threshold, Tracks
-from ...estimation.association_kernels import TENTATIVE
+from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...measurements import Altitude, Detections, Frames, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
