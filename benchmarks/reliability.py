@@ -293,7 +293,7 @@ def page_of(text: str, parts: Mapping[str, Part]) -> str:
         head, *body = table_of(name, parts[name])
         lines = [head, ['---'] * len(head), *body]
         text = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
-        source = f'<!-- numbers: {RESULT.name} -->'
+        source = f'<!-- numbers: {RESULT.name}; made by benchmarks.reliability -->'
         return f'{found.group(1)}{source}\n{text}\n{found.group(3)}'
 
     return _BLOCK.sub(table, text)
