@@ -30,11 +30,12 @@ from pathlib import Path
 import re
 from typing import Any, TextIO
 
-from attrs import field, frozen
+from attrs import frozen
 
 from sonar_imm.parameters import did_you_mean
 
 from .csv_times import BadRow, dated, iso_ns, TIME_OF_DAY, TIME_TEXT, zone_of
+from .options import nanoseconds, option
 from .sources import BagError
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
@@ -129,21 +130,24 @@ _NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
 class CsvOptions:
     """How to read a CSV file.
 
-    columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``. What is not listed is
-    found by its usual names (`ALIASES`); case and units are ignored.
-    time_unit: of numeric times, one of s, ms, us, ns. Empty: from the header (``time_ms``), else
-    s. ISO 8601 texts are recognised, also as a date and a time of day in two columns.
-    time_zone: of texts that do not say theirs: ``UTC``, ``+02:00`` or a name such as
-    ``Europe/Berlin``. Empty: UTC where the header says so (``utc_time``), else they are refused.
-    time_offset_ns: added to every time, for files that count from their own start.
-    delimiter: empty to find it from the header line.
+    columns: what is not listed is found by its usual names (`ALIASES`); case and units are
+    ignored. time_zone, empty: UTC where the header says so (``utc_time``), else times without a
+    zone are refused. time_unit, empty: from the header (``time_ms``), else s; ISO 8601 texts are
+    recognised, also as a date and a time of day in two columns.
     """
 
-    columns: Mapping[str, str] = field(factory=dict)
-    time_unit: str = ''
-    time_zone: str = ''
-    time_offset_ns: int = 0
-    delimiter: str = ''
+    # fmt: off
+    columns: Mapping[str, str] = option({}, 'NAME=HEADER',
+        'Header of a column of {what}, e.g. x=easting.', flag='column', kind='pairs')
+    time_zone: str = option('', 'ZONE',
+        'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
+    time_unit: str = option('', 'UNIT',
+        'Unit of numeric times in {what}: s, ms, us or ns.', choices=('', *TIME_UNITS))
+    time_offset_ns: int = option(0, 'SECONDS',
+        'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
+    delimiter: str = option('', '',
+        'Delimiter between the columns of {what}; found automatically by default.')
+    # fmt: on
 
     def __attrs_post_init__(self) -> None:
         if self.time_unit not in ('', *TIME_UNITS):

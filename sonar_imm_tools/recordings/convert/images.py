@@ -22,7 +22,7 @@ here the detections are kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from sonar_imm.measurements import Rejection
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
 from ..conversion import ConversionReport, provenance
+from ..convert_options import ImagesOptions
 from ..detected import DetectedImages
 from ..messages import ros_message
 from ..reader import BagReader
@@ -44,28 +45,22 @@ SYSTEM = 'obstacle'
 FURTHER = {entry.name: entry for entry in inputs_of(SYSTEM) if entry.name != 'detections'}
 
 
-def convert_images(
-    path: str | Path,
-    out: str | Path,
-    *,
-    topic: str | None = None,
-    parameters: Mapping[str, Any] | None = None,
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_images(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Find the echoes in all images of the bag at `path`.
 
-    topic: of the images; None for the only one that holds some. parameters: of `DetectorConfig` by
-    name. Messages that cannot be used are counted and named. Raises `ConfigError`, and `BagError`
-    when the bag has no images.
+    values: as in `ImagesOptions`; parameters are those of `DetectorConfig` by name. Messages that
+    cannot be used are counted and named. Raises `ConfigError`, and `BagError` when the bag has no
+    images.
     """
-    config = DetectorConfig.from_mapping(parameters or {})
+    how = ImagesOptions(**values)
+    config = DetectorConfig.from_mapping(how.parameters)
     report = ConversionReport(Path(out))
     report.notes['detector'] = ', '.join(f'{k} {v}' for k, v in config.as_dict().items())
     with BagReader(path) as bag:
-        images = _image_topic(bag, topic)
+        images = _image_topic(bag, how.topic)
         readers = _readers(bag, images, config)
         with BagWriter(
-            out, storage=storage, custom_data=provenance(Path(path).name, report.notes)
+            out, storage=how.storage, custom_data=provenance(Path(path).name, report.notes)
         ) as made:
             for item in bag.messages(sorted({name for name, _ in readers})):
                 report.rows += 1
@@ -115,7 +110,7 @@ def _readers(
             read = detected.reader(image, topic.type_name)
             readers[topic.name, topic.type_name] = (
                 detections.name,
-                lambda message, read=read: _written(detections, read(message)),
+                partial(_detections, detections, read),
             )
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic_name, name in companion_topics(bag, FURTHER).items():
@@ -124,7 +119,8 @@ def _readers(
     return readers
 
 
-def _written(entry: InputTopic, measurement: Any) -> Any:
+def _detections(entry: InputTopic, read: Callable[[Any], Any], message: Any) -> Any:
+    measurement = read(message)
     return None if measurement is None else entry.write(measurement, ros_message)
 
 

@@ -20,7 +20,7 @@ altitudes are copied to ``/nav`` and ``/altitude``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,10 @@ from msg_adapters.headers import stamp_ns
 from msg_adapters.inputs import inputs_of
 from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Rejection
+from sonar_imm.measurements import Rejection, Snapshot
 
 from ..conversion import ConversionReport, provenance
+from ..convert_options import InterferometerOptions
 from ..messages import ros_message
 from ..reader import BagReader
 from ..sources import BagError
@@ -43,34 +44,29 @@ MOST_WAITING = 64
 """Pings that wait for the rest of their images; the oldest is given up for one more."""
 
 
-def convert_interferometer(
-    path: str | Path,
-    out: str | Path,
-    *,
-    amplitude: str = '',
-    phase: str = '',
-    iq: Sequence[str] = (),
-    fields: Mapping[str, str] | None = None,
-    side: str = '',
-    radians_per_count: float | None = None,
-    storage: str = 'mcap',
-    **how: Any,
-) -> ConversionReport:
+def convert_interferometer(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert the bag at `path` to ``/snapshot``, or ``/<side>/snapshot``.
 
-    amplitude and phase: topics, one image of each a ping; or iq: topics, one a stave. fields:
-    names of fields that differ from `FIELDS`. how: order, sound_speed, element_spacing, see
-    `msg_adapters.interferometer`. Raises `BagError`.
+    values: as in `InterferometerOptions`, either amplitude and phase or iq; fields are those that
+    differ from `FIELDS`. Raises `BagError`.
     """
-    topics = _topics(amplitude, phase, iq)
-    if unknown := [name for name in fields or {} if name not in FIELDS]:
+    how = InterferometerOptions(**values)
+    topics = _topics(how.amplitude, how.phase, how.iq)
+    if unknown := [name for name in how.fields if name not in FIELDS]:
         raise BagError(f"unknown field '{unknown[0]}'; the names are {', '.join(FIELDS)}")
-    how |= {'fields': {**FIELDS, **(fields or {})}, 'side': side}
-    if iq:
-        make = partial(_of_staves, how)
+    reading: dict[str, Any] = {
+        'fields': {**FIELDS, **how.fields},
+        'side': how.side,
+        'order': how.order,
+        'sound_speed': how.sound_speed,
+        'element_spacing': how.element_spacing,
+    }
+    make: Callable[..., Snapshot]
+    if how.iq:
+        make = partial(_of_staves, reading)
     else:
-        make = partial(snapshot_of_phase, radians_per_count=radians_per_count, **how)
-    target = f'/{side}/snapshot' if side else '/snapshot'
+        make = partial(snapshot_of_phase, radians_per_count=how.radians_per_count, **reading)
+    target = f'/{how.side}/snapshot' if how.side else '/snapshot'
     report = ConversionReport(Path(out))
     with BagReader(path) as bag:
         there = {topic.name for topic in bag.topics}
@@ -81,7 +77,7 @@ def convert_interferometer(
         beside = companion_topics(bag, FURTHER)
         pings = _Pings(topics)
         with BagWriter(
-            out, storage=storage, custom_data=provenance(Path(path).name, report.notes)
+            out, storage=how.storage, custom_data=provenance(Path(path).name, report.notes)
         ) as made:
             for item in bag.messages([*set(topics), *beside]):
                 report.rows += 1
@@ -111,8 +107,8 @@ def convert_interferometer(
     return report
 
 
-def _of_staves(how: Mapping[str, Any], *images: Any) -> Any:
-    return snapshot_of_staves(images, **how)
+def _of_staves(reading: Mapping[str, Any], *images: Any) -> Snapshot:
+    return snapshot_of_staves(images, **reading)
 
 
 def _topics(amplitude: str, phase: str, iq: Sequence[str]) -> list[str]:

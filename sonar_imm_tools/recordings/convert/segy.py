@@ -40,6 +40,7 @@ from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
 
 from ..conversion import ConversionReport, Record, write_bag
+from ..convert_options import SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
 from ..sources import BagError
@@ -51,54 +52,41 @@ if TYPE_CHECKING:
 SECOND = 10**9
 
 
-def convert_segy(
-    path: str | Path,
-    out: str | Path,
-    *,
-    sample_spacing: float | None = None,
-    sound_speed: float = 1500.0,
-    first_sample: int = 0,
-    samples: int | None = None,
-    stack: int = 1,
-    depth_offset: float = 0.0,
-    frame_id: str = 'profiler',
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_segy(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert a SEG-Y file to the topic ``/trace``, and ``/position`` where it states places.
 
-    sample_spacing: m from sample to sample; None: from the sample interval and `sound_speed`.
-    first_sample, samples: which part of a trace is taken. stack: how many successive traces are
-    averaged into one, which has the stamp of the last. depth_offset: m, of the transducer. Of
-    envelopes the bag gets ``parameters.yaml``. Raises `BagError`, and ModuleNotFoundError without
-    segyio.
+    values: as in `SegyOptions`. Without sample_spacing the sample interval and sound_speed say it.
+    A stack of traces has the stamp of the last. For envelopes the bag gets ``parameters.yaml``.
+    Raises `BagError`, and ModuleNotFoundError without segyio.
     """
+    how = SegyOptions(**values)
     report = ConversionReport(Path(out))
     line = read_segy(path)
-    spacing = sample_spacing or 0.5 * sound_speed * line.interval
+    spacing = how.sample_spacing or 0.5 * how.sound_speed * line.interval
     if not spacing > 0.0:
         raise BagError(f'{path} states no sample interval; give the sample spacing')
-    start = 0.5 * sound_speed * line.delay
-    depth = depth_offset + start + spacing * np.arange(line.amplitude.shape[1])
-    part = slice(first_sample, None if samples is None else first_sample + samples)
+    start = 0.5 * how.sound_speed * line.delay
+    depth = how.depth_offset + start + spacing * np.arange(line.amplitude.shape[1])
+    part = slice(how.first_sample, None if how.samples is None else how.first_sample + how.samples)
     depth, amplitude = depth[part], line.amplitude[:, part]
     if amplitude.shape[1] < 2:
         raise BagError(f'{path}: fewer than two samples of a trace are left')
     report.notes['sample_spacing'] = f'{spacing:.9g} m'
-    report.notes['stack'] = str(stack)
-    report.notes['depth_of_sample_0'] = f'{depth_offset + start:.9g} m'
-    if not sample_spacing:
-        offset = start + spacing * first_sample
+    report.notes['stack'] = str(how.stack)
+    report.notes['depth_of_sample_0'] = f'{how.depth_offset + start:.9g} m'
+    if not how.sample_spacing:
+        offset = start + spacing * how.first_sample
         if doubt := doubted_spacing(amplitude, spacing, offset, line.water_depth):
             report.notes['sample_interval'] = doubt
-    records = _records(report, Path(path), line.stamps, depth, amplitude, stack, frame_id)
+    records = _records(report, Path(path), line.stamps, depth, amplitude, how.stack, how.frame_id)
     records += _positions(line) if records else []
-    own = _instrument(report, amplitude, spacing, stack)
+    own = _instrument(report, amplitude, spacing, how.stack)
     return write_bag(
         out,
         records,
         report,
         source=Path(path).name,
-        storage=storage,
+        storage=how.storage,
         parameters={'fathometer': own},
     )
 
