@@ -88,6 +88,8 @@ HEADER = """\
 """
 # Path below the root: why it may exceed 400 lines.
 LONG_FILES: dict[str, str] = {
+    'sonar_imm_tools/recordings/csv_table.py': 'one table of columns and all that reads it',
+    'sonar_imm_tools/recordings/sources.py': 'every way in which a recording can be damaged',
     'test/acoustics/test_localisation.py': 'every doubt of one function, to be read together',
     'test/estimation/test_imm.py': 'every closed form of one filter, to be read together',
     'test/estimation/test_smoothing.py': 'holds its oracle, the enumeration of all mode sequences',

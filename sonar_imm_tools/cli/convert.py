@@ -146,7 +146,7 @@ def _detector(source: Path, overrides: dict[str, str]) -> dict[str, Any]:
     """The parameters of the detector of images: those beside the recording, then ``--set``."""
     from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
-    from ..recordings.own_parameters import own_parameters
+    from ..recordings.own_files import own_parameters
 
     own = load_detector(SYSTEMS['obstacle'], own_parameters(source), {})
     return own | typed_overrides(DetectorConfig, overrides)

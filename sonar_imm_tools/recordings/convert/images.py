@@ -16,8 +16,8 @@
 
 Every image gives one message on ``/detections``, also when nothing is found in it; of a scanning
 sonar every sweep does. Navigation and altitudes, which the tracker needs too, are copied to
-``/nav`` and ``/altitude``. Tracking a recording of images does the same on the way (`detected`);
-here the detections are kept.
+``/nav`` and ``/altitude``. Tracking a recording of images does the same on the way
+(`DetectedImages`); here the detections are kept.
 """
 
 from __future__ import annotations
@@ -31,15 +31,13 @@ from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
-from ..conversion import ConversionReport, provenance
+from ..conversion import companion_topics, ConversionReport, copied, write_from_bag
 from ..convert_options import ImagesOptions
-from ..detected import DetectedImages
+from ..measurements import DetectedImages
 from ..messages import ros_message
-from ..reader import BagReader
+from ..reader import BagMessage, BagReader
 from ..sources import BagError
 from ..topics import made_topics
-from ..writer import BagWriter
-from .companions import companion_topics, copied
 
 SYSTEM = 'obstacle'
 FURTHER = {entry.name: entry for entry in inputs_of(SYSTEM) if entry.name != 'detections'}
@@ -59,21 +57,14 @@ def convert_images(path: str | Path, out: str | Path, **values: Any) -> Conversi
     with BagReader(path) as bag:
         images = _image_topic(bag, how.topic)
         readers = _readers(bag, images, config)
-        with BagWriter(
-            out, storage=how.storage, custom_data=provenance(Path(path).name, report.notes)
-        ) as made:
-            for item in bag.messages(sorted({name for name, _ in readers})):
-                report.rows += 1
-                name, read = readers.get((item.topic, item.type_name), ('', _wrong_type))
-                try:
-                    message = read(item.message)
-                except Rejection as rejection:
-                    report.bad_row(Path(path), f'{item.topic} #{item.index}', rejection)
-                    continue
-                if message is None:
-                    continue
-                made.write(f'/{name}', message, item.log_ns)
-                report.messages[f'/{name}'] = report.messages.get(f'/{name}', 0) + 1
+
+        def make(item: BagMessage) -> tuple[str, Any] | None:
+            name, read = readers.get((item.topic, item.type_name), ('', _wrong_type))
+            message = read(item.message)
+            return None if message is None else (f'/{name}', message)
+
+        topics = sorted({name for name, _ in readers})
+        write_from_bag(out, bag, topics, make, report, storage=how.storage)
         report.problems += bag.problems
     return report
 

@@ -29,15 +29,13 @@ from msg_adapters.headers import stamp_ns
 from msg_adapters.inputs import inputs_of
 from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Rejection, Snapshot
+from sonar_imm.measurements import Snapshot
 
-from ..conversion import ConversionReport, provenance
+from ..conversion import companion_topics, ConversionReport, copied, write_from_bag
 from ..convert_options import InterferometerOptions
 from ..messages import ros_message
-from ..reader import BagReader
+from ..reader import BagMessage, BagReader
 from ..sources import BagError
-from ..writer import BagWriter
-from .companions import companion_topics, copied
 
 FURTHER = {entry.name: entry for entry in inputs_of('bathymetry') if entry.companion}
 MOST_WAITING = 64
@@ -76,33 +74,21 @@ def convert_interferometer(path: str | Path, out: str | Path, **values: Any) -> 
             )
         beside = companion_topics(bag, FURTHER)
         pings = _Pings(topics)
-        with BagWriter(
-            out, storage=how.storage, custom_data=provenance(Path(path).name, report.notes)
-        ) as made:
-            for item in bag.messages([*set(topics), *beside]):
-                report.rows += 1
-                where = f'{item.topic} #{item.index}'
-                try:
-                    if item.topic in beside:
-                        name = beside[item.topic]
-                        topic, message = (
-                            f'/{name}',
-                            copied(FURTHER[name], item.type_name, item.message),
-                        )
-                    elif (images := pings.add(item)) is not None:
-                        topic, message = target, write_snapshot(make(*images), ros_message)
-                    else:
-                        continue
-                except Rejection as rejection:
-                    report.bad_row(Path(path), where, rejection)
-                    continue
-                made.write(topic, message, item.log_ns)
-                report.messages[topic] = report.messages.get(topic, 0) + 1
-            if pings.lonely:
-                report.bad_rows += pings.lonely
-                report.problems.append(
-                    f'{pings.lonely} pings have not all of their images: stamps have to be equal'
-                )
+
+        def written(item: BagMessage) -> tuple[str, Any] | None:
+            if item.topic in beside:
+                name = beside[item.topic]
+                return f'/{name}', copied(FURTHER[name], item.type_name, item.message)
+            images = pings.add(item)
+            return None if images is None else (target, write_snapshot(make(*images), ros_message))
+
+        chosen = [*set(topics), *beside]
+        write_from_bag(out, bag, chosen, written, report, storage=how.storage)
+        if pings.lonely:
+            report.bad_rows += pings.lonely
+            report.problems.append(
+                f'{pings.lonely} pings have not all of their images: stamps have to be equal'
+            )
         report.problems += bag.problems
     return report
 

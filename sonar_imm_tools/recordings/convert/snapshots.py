@@ -35,10 +35,9 @@ from sonar_imm.acoustics import array
 from sonar_imm.measurements import Rejection, Snapshot
 from sonar_imm.truth import TrueProfile
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, read_npz, Record, write_bag
 from ..convert_options import SnapshotsOptions
 from ..messages import ros_message
-from ..npz import read_npz
 from ..sources import BagError
 from ..truth import records_of
 
@@ -157,7 +156,7 @@ def _samples(content: _Archive, staves: Sequence[Sequence[int]] | None) -> NDArr
     if staves is None:
         return iq
     channels = iq.shape[2]
-    if wrong := [one for stave in staves for one in stave if not 0 <= one < channels]:
+    if wrong := [k for stave in staves for k in stave if not 0 <= k < channels]:
         raise BagError(f'{content.path} has the channels 0 to {channels - 1}, not {wrong[0]}')
     return np.stack([iq[:, :, list(stave)].sum(axis=2) for stave in staves], axis=2)
 

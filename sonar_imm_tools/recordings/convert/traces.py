@@ -27,11 +27,10 @@ from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.truth import PRESENT, TrueReflectors
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, read_npz, Record, write_bag
 from ..convert_options import TracesOptions
 from ..csv_table import CsvTable, Row
 from ..messages import ros_message
-from ..npz import read_npz
 from ..sources import BagError
 from ..truth import records_of
 

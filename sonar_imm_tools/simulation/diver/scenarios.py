@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a diver scene can be told, and the scenes that have a name."""
+"""Parameters of a diver scene, and the scenes that have a name."""
 
 from __future__ import annotations
 

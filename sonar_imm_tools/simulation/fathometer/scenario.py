@@ -166,19 +166,19 @@ class FathometerScenario(Scenario):
 
     def told(self) -> dict[str, Any]:
         """See `Scenario.told`."""
-        told = Scenario.told(self)
+        known = Scenario.told(self)
         if self.level == 'csdm':
             # They are drawn frequency by frequency: no window makes their noise fade with depth.
-            told |= {'window': 'rectangular', 'overlap': 0.0}
+            known |= {'window': 'rectangular', 'overlap': 0.0}
         if self.level == 'pressure':
             # Snapshots are the tracker's own; they are as long as the depths to be tracked need.
-            del told['snapshot_seconds']
-            told |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
+            del known['snapshot_seconds']
+            known |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
         if self.level == 'envelope':
             # A profiler has no array: of the instrument only its pulse and its noise matter.
-            told = {'sound_speed': self.sound_speed}
-            told |= envelope_parameters(self.pulse_width, self.noise_sigma)
-        return told
+            known = {'sound_speed': self.sound_speed}
+            known |= envelope_parameters(self.pulse_width, self.noise_sigma)
+        return known
 
     def spectra_bytes(self) -> float:
         """Size of all cross-spectra of the scene."""
@@ -316,7 +316,7 @@ def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:
     swing = np.exp(config.amplitude_swing * np.sin(2.0 * np.pi * turns))
     turns = record / config.heave_records + rng.uniform()
     array_depth = config.array_depth + config.heave * np.sin(2.0 * np.pi * turns)
-    told = array_depth + config.array_depth_std * rng.standard_normal(T)
+    stated = array_depth + config.array_depth_std * rng.standard_normal(T)
     return Drift(
-        depth, np.clip(level * share * swing, 0.0, 1.0), share > PRESENT, array_depth, told
+        depth, np.clip(level * share * swing, 0.0, 1.0), share > PRESENT, array_depth, stated
     )
