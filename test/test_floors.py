@@ -129,7 +129,7 @@ def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None
     )
     assert set(imported_names(source, file)) >= {
         'sonar_imm.nodes.diver',
-        'sonar_imm.cli',
+        'sonar_imm_tools.cli',
         'sonar_imm.estimation.kalman',
         'rclpy.node',
     }

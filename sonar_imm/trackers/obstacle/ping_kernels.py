@@ -39,7 +39,7 @@ def mounted(
 ) -> tuple[FloatArray, FloatArray]:
     """Position (3,) and rotation (3, 3), NED and FRD, of a sensor at `lever` (3,) of a vehicle at
     `position`, turned by R, itself turned by `turned` (3, 3), all of these ENU and FLU
-    (`geometry.mounted`, `geometry.flip_pose`)."""
+    (`geometry.mounted`, `geometry.flip_rotation`)."""
     there, look = np.empty(3), np.empty((3, 3))
     for a in range(3):
         i, sign = (1 - a, 1.0) if a < 2 else (2, -1.0)
@@ -92,18 +92,18 @@ def echoes(
 
 
 @kernel
-def finite(x: FloatArray, P: FloatArray) -> BoolArray:
+def is_finite(x: FloatArray, P: FloatArray) -> BoolArray:
     """Which of the mixtures x (T, K, n), P (T, K, n, n) have finite numbers throughout, (T,)."""
     T = len(x)
-    sound = np.empty(T, dtype=np.bool_)
+    usable = np.empty(T, dtype=np.bool_)
     for t in range(T):
         flaws = 0
         for value in x[t].reshape(-1):
             flaws += not math.isfinite(value)
         for value in P[t].reshape(-1):
             flaws += not math.isfinite(value)
-        sound[t] = flaws == 0
-    return sound
+        usable[t] = flaws == 0
+    return usable
 
 
 @kernel
