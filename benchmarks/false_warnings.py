@@ -40,7 +40,7 @@ from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarIma
 from sonar_imm.nodes.health import Finding, Hysteresis, WARN
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli.common import load_config
-from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.own_files import own_parameters
 
 FIRST_SEED = 70_000
 """Bounds were looked for with seeds from 1000 on: these are others."""

@@ -45,7 +45,7 @@ from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTr
 from sonar_imm.truth import Received, Scene
 from sonar_imm_tools.cli.checking import check_recording, CheckedRecording
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.own_parameters import unusual
+from sonar_imm_tools.recordings.own_files import unusual
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.scenes import write_scene
 from sonar_imm_tools.simulation.fathometer.scenario import drift_of, FathometerScenario

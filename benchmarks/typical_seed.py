@@ -49,7 +49,7 @@ from sonar_imm_tools.cli import main as sonar_imm
 from sonar_imm_tools.cli.sweep import planned
 from sonar_imm_tools.evaluation.judging import Limit
 from sonar_imm_tools.evaluation.sweep import Outcome, run_here, run_on_processes
-from sonar_imm_tools.recordings.own_limit import write_own_limit
+from sonar_imm_tools.recordings.own_files import write_own_limit
 
 SHARE = 0.9
 """Of the runs that are within the limit of `check`."""

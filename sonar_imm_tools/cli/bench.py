@@ -111,7 +111,7 @@ def _measure(speed: ModuleType, system: str, rounds: int, *, quiet: bool) -> dic
 
 
 def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
-    from ..recordings.own_parameters import own_parameters
+    from ..recordings.own_files import own_parameters
     from ..replay.harness import run_lockstep
     from .checking import shipped_bags
 

@@ -149,7 +149,7 @@ class Plan:
 
     def parameters_of(self, bag: Path) -> Path | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
-        from ..recordings.own_parameters import own_parameters
+        from ..recordings.own_files import own_parameters
 
         return self.params if self.params is not None else own_parameters(bag)
 

@@ -27,7 +27,7 @@ from sonar_imm_tools.evaluation.fathometer.crossing import common_shift, crossin
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.own_parameters import write_own_parameters
+from sonar_imm_tools.recordings.own_files import write_own_parameters
 from sonar_imm_tools.recordings.positions import write_position
 from sonar_imm_tools.recordings.sources import BagError
 

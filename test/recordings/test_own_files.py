@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a recording says of its instruments reaches the tracker."""
+"""Files beside a recording: the parameters of its instruments reach the tracker, the limit of its
+error reaches the check."""
 
 import json
 
@@ -21,7 +22,14 @@ import pytest
 from sonar_imm.parameters import parameters_from_yaml
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.own_parameters import own_parameters, unusual, write_own_parameters
+from sonar_imm_tools.recordings.own_files import (
+    own_limit,
+    own_parameters,
+    unusual,
+    write_own_limit,
+    write_own_parameters,
+)
+from sonar_imm_tools.recordings.sources import BagError
 from sonar_imm_tools.simulation.fathometer.simulator import scenario as fathometer_scenario
 from sonar_imm_tools.simulation.obstacle.simulator import scenario as obstacle_scenario
 
@@ -122,3 +130,37 @@ def test_a_sweep_knows_the_instruments_of_its_scene(tmp_path):
     )
     told = json.loads((tmp_path / 'sweep.json').read_text())['parameters']
     assert told['sonar_lever'] == [2.0, 0.0, -0.3]
+
+
+# -- the limit ------------------------------------------------------------------------------------
+
+
+def test_a_limit_that_is_written_is_read_and_without_a_file_there_is_none(tmp_path):
+    assert own_limit(tmp_path) is None
+    write_own_limit(tmp_path, 0.88)
+    assert own_limit(tmp_path) == 0.88
+
+
+@pytest.mark.parametrize(
+    'text, sentence',
+    [
+        ('limit: ten', 'states no number'),
+        ('limit: true', 'states no number'),
+        ('[1, 2]', 'states no number'),
+        ('', 'states no number'),
+        ('limit: .nan', 'finite'),
+        ('limit: .inf', 'finite'),
+        ('limit: -1', 'not negative'),
+        ('limit: [', 'not YAML'),
+    ],
+)
+def test_any_other_limit_is_one_sentence(tmp_path, text, sentence):
+    (tmp_path / 'check.yaml').write_text(text)
+    with pytest.raises(BagError, match=sentence):
+        own_limit(tmp_path)
+
+
+def test_a_limit_of_bytes_is_one_sentence(tmp_path):
+    (tmp_path / 'check.yaml').write_bytes(b'\xff\xfe\x00limit')
+    with pytest.raises(BagError, match='not YAML'):
+        own_limit(tmp_path)
