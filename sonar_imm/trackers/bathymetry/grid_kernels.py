@@ -14,7 +14,7 @@
 
 """The grid filter and smoother along the range bins of one ping, compiled.
 
-The verbs are those of `estimation.grid_kernels`. Shapes: T bins of a ping, M models, G cells.
+The verbs are those of `estimation.grid`. Shapes: T bins of a ping, M models, G cells.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics import likelihood_kernels
-from ...estimation import grid_kernels as grid
+from ...estimation import grid
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.jit import kernel
 from .kernels import drift, Geometry, PingLikelihood, sines_of, Track
@@ -164,10 +164,10 @@ def filter_ping(
         else:
             for g in range(n):
                 here[g] = 0.0
-        track.log_likelihood[t] = grid.update(p, low, high, here, work)
+        track.log_likelihood[t] = grid.weigh(p, low, high, here, work)
         low, high = grid.trim(p, low, high)
         window[t, 0], window[t, 1] = low, high
-        track.mean[t, 0], track.covariance[t, 0, 0] = grid.combine(
+        track.mean[t, 0], track.covariance[t, 0, 0] = grid.summarise(
             p, low, high, cells, track.probability[t]
         )
         if keep:
@@ -213,7 +213,7 @@ def smooth_ping(
         if heard:
             n = high - low
             _log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
-            grid.update(beta, low, high, value[:n], work)
+            grid.weigh(beta, low, high, value[:n], work)
         new_low, new_high = window[t, 0], window[t, 1]
         drifts = t + 1 >= ping.geometry.drift_from
         to_low, to_high = new_low, new_high
@@ -247,7 +247,7 @@ def smooth_ping(
         for j in range(M):
             for g in range(low, high):
                 p[j, g] /= total
-        track.mean[t, 0], track.covariance[t, 0, 0] = grid.combine(
+        track.mean[t, 0], track.covariance[t, 0, 0] = grid.summarise(
             p, low, high, cells, track.probability[t]
         )
 

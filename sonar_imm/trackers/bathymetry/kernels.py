@@ -14,7 +14,7 @@
 
 """The particle filter along a block of range bins of one ping, compiled as one loop.
 
-Each verb is a kernel of its own room (`estimation.imm_particles_kernels`,
+Each verb is a kernel of its own room (`estimation.imm_particles`,
 `acoustics.likelihood_kernels`); here they are called bin after bin on arrays that stay in the
 cache.
 
@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics import likelihood_kernels, rays
-from ...estimation import imm_particles_kernels as imm
+from ...estimation import imm_particles as imm
 from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
 from ...estimation.elementary import phasors
 from ...estimation.jit import kernel
@@ -208,14 +208,14 @@ def filter_block(
     F, G, scale, noise = motion.F, motion.G, motion.scale, draws.noise
     heard, geometry, table = ping.heard, ping.geometry, ping.table
     form, base, spread, signal = ping.form, ping.base, ping.spread, ping.signal
-    scratch = imm.MixScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
+    scratch = imm.ResampleScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
     sines, value = np.empty(N), np.empty((M, N))
     mixed, work, c = np.empty((M, n, N)), np.empty((4, N)), np.empty(M)
     step, alone = np.empty((n, G.shape[2])), np.eye(M)
     for b in range(noise.shape[0]):
         t = first + b
         if heard[t]:
-            imm.mix(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
+            imm.resample(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
             if motion.favour.shape[0] > 0:
                 favoured(c, motion.favour[t])
         for j in range(M):
@@ -227,7 +227,7 @@ def filter_block(
                 before = mixed[j, 0] if heard[t] else x[j, 0]
                 drift(before, t, geometry, before)
             if heard[t]:
-                imm.predict(mixed[j], F[model], step, noise[b, j], x[j])
+                imm.propagate(mixed[j], F[model], step, noise[b, j], x[j])
                 # Written out: a call that takes the whole of `ping` would cost 5 % of the ping.
                 sines_of(x[j, 0], t, geometry, work, sines)
                 likelihood_kernels.log_likelihoods(
@@ -244,19 +244,19 @@ def filter_block(
                 for s in range(N):
                     w[j, s] = 1.0 / N
             else:
-                imm.predict(x[j], F[model], step, noise[b, j], mixed[j])
+                imm.propagate(x[j], F[model], step, noise[b, j], mixed[j])
                 for a in range(n):
                     for s in range(N):
                         x[j, a, s] = mixed[j, a, s]
-        track.log_likelihood[t] = imm.update(value, c, w, mu, work[:2]) if heard[t] else 0.0
+        track.log_likelihood[t] = imm.weigh(value, c, w, mu, work[:2]) if heard[t] else 0.0
         track.sample_size[t] = imm.effective_sample_size(w, mu)
         if resample and heard[t]:
-            imm.mix(x, w, mu, alone, draws.uniform[b, 1], scratch, mixed, c)
+            imm.resample(x, w, mu, alone, draws.uniform[b, 1], scratch, mixed, c)
             for j in range(M):
                 for s in range(N):
                     w[j, s] = 1.0 / N
                     for a in range(n):
                         x[j, a, s] = mixed[j, a, s]
-        imm.combine(x, w, mu, track.mean[t], track.covariance[t])
+        imm.summarise(x, w, mu, track.mean[t], track.covariance[t])
         for j in range(M):
             track.probability[t, j] = mu[j]
