@@ -84,8 +84,8 @@ def resample(
     mixed: FloatArray,
     c: FloatArray,
 ) -> None:
-    """Equally weighted particles for each model into mixed (M, n, N), and the predicted probability
-    of each into c (M,). uniform (M,) in [0, 1).
+    """Equally weighted particles for each model into mixed (M, n, N), and the predicted
+    probability of each into c (M,). uniform (M,) in [0, 1).
 
     A model that nothing can become (c_j below `LEAST_CHANCE`) draws from the mixture of all, so
     that it stays finite and can come back when the chain allows.

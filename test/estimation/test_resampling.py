@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.resampling import invert, SCHEMES
+from sonar_imm.estimation.particles import invert, SCHEMES
 
 W = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
 schemes = pytest.mark.parametrize('name', SCHEMES)

@@ -33,7 +33,7 @@ from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.set_members import Members
+from ...estimation.set_filter import Members
 from .config import FathometerConfig
 from .multiples import Seen
 from .response import Lattice, Response

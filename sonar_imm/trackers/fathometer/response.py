@@ -28,7 +28,7 @@ import numpy as np
 from ...acoustics import fathometer
 from ...acoustics.pulse import band_pulse, envelope_pulse, gaussian_pulse, measured_pulse, Pulse
 from ...estimation.arrays import FloatArray
-from ...estimation.set_model import move_reach
+from ...estimation.set_model import walk_reach
 from ...estimation.set_shifts import Shift
 from ...measurements import Rejection, Trace
 from ...parameters import ConfigError
@@ -221,7 +221,7 @@ def _checked(first: float, step: float, high: float, config: FathometerConfig) -
             'too_large',
             f'the depths to be tracked make {heard:.0f} steps of {step:g} m; {MAX_CELLS} at most',
         )
-    reach = move_reach(config.depth_std / step)
+    reach = walk_reach(config.depth_std / step)
     if heard * (2.0 * reach + 1.0) > MAX_MOVES:
         raise Rejection(
             'too_large',

@@ -42,9 +42,8 @@ import numpy as np
 from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
-from ...estimation.set_members import find_members
-from ...estimation.set_model import banded_transition, gaussian_move, SetModel
+from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
+from ...estimation.set_model import banded_transition, gaussian_walk, SetModel
 from ...measurements import ArrayDepth, CrossSpectra, Frames, Pressure, Rejection, Trace
 from ..stream import OnceStream, StreamRules
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
@@ -300,7 +299,12 @@ class FathometerTracker:
             assert self._lattice is not None
             lags = self._lattice.step * np.arange(self._lattice.cells)
             gram = np.ascontiguousarray(response.pulse(lags))
-        return self._filter.step(self._before, b, key, gram)
+        record = self._filter.record(b, key, gram)
+        before = self._before or self._filter.start(record)
+        sets = self._filter.propagate(before, record)
+        step = self._filter.weigh(sets, record)
+        step = self._filter.resample(step, record)
+        return self._filter.move(step, record)
 
     def _record(self, response: Response) -> list[Estimate]:
         response, step = self._try(response)
@@ -365,15 +369,14 @@ class FathometerTracker:
     def _reflectors(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
         """Those of the most probable number, and the PMF (orders,) of the number."""
         assert self._filter is not None and self._lattice is not None
-        pmf, sums = self._filter.summary(step)
+        pmf, sums, shift = self._filter.summarise(step)
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
         modes = bool(self.config.scatter_decay)
         members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
-        if self._filter.model.shift:
-            mean, std = self._filter.shift(step)
-            heave = self._lattice.step * mean, self._lattice.step * std
+        if shift:
+            heave = self._lattice.step * shift[0], self._lattice.step * shift[1]
         pulse = response.pulse or self.pulse
         found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
         return found, pmf
@@ -391,7 +394,7 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         separation=max(1, math.ceil(config.min_separation / step - 1e-6)),
         order_min=config.order_min,
         transition=transition,
-        move=gaussian_move(config.depth_std / step),
+        walk=gaussian_walk(config.depth_std / step),
         gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells))),
         amplitude_prior=config.amplitude_prior,
         amplitude_std=config.amplitude_std_sigmas,
@@ -400,5 +403,5 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         negative_probability=config.negative_share,
         shift=heave_shift(config, step),
         scatter=scatter_of(config, lattice),
-        **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
+        **({'walk_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )
