@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.tables import markdown, write_json
-from sonar_imm.trackers.fathometer.multiples import Multiples, Seen, ways_above
+from sonar_imm.trackers.fathometer.reflectors import Multiples, Seen, ways_above
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 PRIMARIES, DEEPEST, ERROR, RECORDS = 4, 45.0, 0.03, (1, 5, 20, 60)

@@ -48,8 +48,7 @@ from sonar_imm.measurements import CrossSpectra
 from sonar_imm.simulation.fathometer.field import expected_csdm
 from sonar_imm.simulation.fathometer.scenario import Drift, drift_of
 from sonar_imm.simulation.fathometer.simulator import cross_spectra, FathometerScenario, scenario
-from sonar_imm.trackers.fathometer.array_response import array_response
-from sonar_imm.trackers.fathometer.response import lattice_of_array, pulse_of
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array, pulse_of
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
 DEPTHS = np.array([52.0, 55.2, 58.5, 61.7, 66.0, 69.3])

@@ -32,13 +32,13 @@ from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.set_filter import SetFilter, Weighted
 from sonar_imm.estimation.set_model import gaussian_walk, SetModel, Sets
 from sonar_imm.measurements import Pressure
-from sonar_imm.trackers.fathometer.array_response import (
+from sonar_imm.trackers.fathometer.pressure import PressureStream
+from sonar_imm.trackers.fathometer.response import (
     array_coherence,
     array_response,
+    Lattice,
     processor_pulse,
 )
-from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 EXACT_LOG_EVIDENCE = 298.6663117

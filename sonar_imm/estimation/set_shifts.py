@@ -257,8 +257,8 @@ def draw_shift(
     memory: ShiftMemory,
 ) -> tuple[int, float]:
     """The shift plus pad, drawn from q of the module's text, and log of model to q. The members
-    are rows[:count], their cell plus `cells` (n + 2 pad) where they are negative; shift: that of the
-    record before, plus pad. `memory` changes the time and nothing else."""
+    are rows[:count], their cell plus `cells` (n + 2 pad) where they are negative; shift: that of
+    the record before, plus pad. `memory` changes the time and nothing else."""
     before = shift // tables.step if len(tables.prior) > 1 else 0
     slot = before
     for k in range(count):

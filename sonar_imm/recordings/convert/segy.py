@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from msg_adapters.array_records import write_trace
 
 from ...measurements import Rejection, Trace
-from ...trackers.fathometer.envelopes import envelope_parameters
+from ...trackers.fathometer.response import envelope_parameters
 from ..conversion import ConversionReport, Record, write_bag
 from ..messages import ros_message
 from ..positions import write_position

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ...acoustics.fathometer import PROCESSORS
 from ...estimation.arrays import FloatArray
 from ...parameters import parameter
-from ...trackers.fathometer.envelopes import envelope_parameters
+from ...trackers.fathometer.response import envelope_parameters
 from ..scene import Scenario
 
 LEVELS = ('csdm', 'response', 'trace', 'pressure', 'envelope')

@@ -29,7 +29,7 @@ from sonar_imm.recordings.messages import ros_message
 from sonar_imm.recordings.own_parameters import write_own_parameters
 from sonar_imm.recordings.positions import write_position
 from sonar_imm.recordings.sources import BagError
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 
 SECOND = 10**9
 LON, LAT, METRE = -91.64, 17.13, 180.0 / (np.pi * 6_371_008.8)

@@ -21,10 +21,9 @@ import pytest
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.simulation.fathometer.simulator import scenario, simulate
-from sonar_imm.trackers.fathometer import array_depths
-from sonar_imm.trackers.fathometer.array_depths import ToldDepths
-from sonar_imm.trackers.fathometer.array_response import array_response
-from sonar_imm.trackers.fathometer.response import lattice_of_array
+from sonar_imm.trackers.fathometer import pressure
+from sonar_imm.trackers.fathometer.pressure import CompanionDepths
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 SMALL = {**scenario('small').told(), 'particles': 2000}
@@ -251,19 +250,19 @@ def test_where_the_array_is(spectra):
         assert tracker.counts['array_depth_unknown'] == (expected == 0.0)
 
 
-def test_the_nearest_word_on_the_depth_counts_before_or_after(monkeypatch):
+def test_the_nearest_depth_counts_before_or_after(monkeypatch):
     second = 10**9
     config = FathometerConfig(array_depth_age=5.0)
-    told = ToldDepths()
-    assert told.nearest(0, config) is None and told.spread(0, second) == 0.0
+    depths = CompanionDepths()
+    assert depths.nearest(0, config) is None and depths.spread(0, second) == 0.0
     for seconds, depth in ((30, 73.0), (10, 71.0), (20, 72.0)):  # in the order of arrival
-        told.hear(ArrayDepth(stamp_ns=seconds * second, depth=depth))
+        depths.add(ArrayDepth(stamp_ns=seconds * second, depth=depth))
     for seconds, depth in ((4, None), (5, 71.0), (14, 71.0), (16, 72.0), (35, 73.0), (36, None)):
-        assert told.nearest(seconds * second, config) == depth, seconds
-    assert told.over(25 * second, 15 * second, config) == 71.5
-    assert told.spread(25 * second, 15 * second) == 0.5
-    assert told.over(29 * second, second, config) == 73.0  # nothing within: the nearest
-    monkeypatch.setattr(array_depths, '_DEPTHS_KEPT', 2)
-    told.hear(ArrayDepth(stamp_ns=40 * second, depth=74.0))
-    assert told.nearest(20 * second, config) is None
-    assert told.nearest(30 * second, config) == 73.0
+        assert depths.nearest(seconds * second, config) == depth, seconds
+    assert depths.over(25 * second, 15 * second, config) == 71.5
+    assert depths.spread(25 * second, 15 * second) == 0.5
+    assert depths.over(29 * second, second, config) == 73.0  # nothing within: the nearest
+    monkeypatch.setattr(pressure, '_DEPTHS_KEPT', 2)
+    depths.add(ArrayDepth(stamp_ns=40 * second, depth=74.0))
+    assert depths.nearest(20 * second, config) is None
+    assert depths.nearest(30 * second, config) == 73.0

@@ -25,10 +25,9 @@ import pytest
 from sonar_imm.acoustics.fathometer import depth_response
 from sonar_imm.measurements import Pressure, Rejection, Trace
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.fathometer.array_response import array_response, mirror_sigma
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.response import array_response, Lattice, mirror_sigma
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}

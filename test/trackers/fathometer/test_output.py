@@ -22,9 +22,8 @@ from sonar_imm.acoustics.pulse import envelope_pulse
 from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.fathometer.scenario import Drift
 from sonar_imm.simulation.fathometer.simulator import cross_spectra, scenario
-from sonar_imm.trackers.fathometer.array_response import array_response
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.response import array_response, Lattice
 
 LAYER, ARRAY = 130.0, 73.5
 

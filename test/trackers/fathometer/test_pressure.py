@@ -28,10 +28,9 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm.simulation.fathometer.field import expected_csdm
 from sonar_imm.simulation.fathometer.scenario import Drift
 from sonar_imm.simulation.fathometer.simulator import scenario
-from sonar_imm.trackers.fathometer.array_response import array_coherence, processor_pulse
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot, MAX_BYTES, PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.response import array_coherence, Lattice, processor_pulse
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 SHORT = {
