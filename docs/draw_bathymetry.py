@@ -37,8 +37,7 @@ from matplotlib import pyplot as plt  # noqa: E402
 from sonar_imm.acoustics import array, spatial  # noqa: E402
 from sonar_imm.simulation.bathymetry.hearing import snr  # noqa: E402
 from sonar_imm.simulation.bathymetry.simulator import scenario, simulate  # noqa: E402
-from sonar_imm.trackers.bathymetry.engines import run_particles  # noqa: E402
-from sonar_imm.trackers.bathymetry.ping import look, Ping  # noqa: E402
+from sonar_imm.trackers.bathymetry.ping import look, Ping, run_particles  # noqa: E402
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'

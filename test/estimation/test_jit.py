@@ -70,7 +70,7 @@ def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path)
 import numpy as np
 from sonar_imm.estimation import imm_particles as imm
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 out = np.empty(1)
 sines_of(np.zeros(1), 0, level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5), np.empty((2, 1)), out)
 drawn, c = np.empty((1, 1, 2)), np.empty(1)
@@ -167,7 +167,7 @@ def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypat
     code = """
 import numpy as np
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 geometry = level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5)
 try:
     sines_of(np.zeros(1), 0, geometry, np.empty((1, 2)), np.empty(1)[:0])

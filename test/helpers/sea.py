@@ -20,8 +20,8 @@ import numpy as np
 
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.pose_queue import bin_stamps
-from sonar_imm.trackers.bathymetry.swath import ship_swath
+from sonar_imm.trackers.bathymetry.likelihood import ship_swath
+from sonar_imm.trackers.bathymetry.ping import bin_stamps
 from sonar_imm.trackers.navigation import NavigationBuffer
 
 VECTOR = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'motion_0.npz'

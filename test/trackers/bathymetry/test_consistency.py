@@ -23,8 +23,8 @@ import pytest
 from sonar_imm.measurements import Snapshot
 from sonar_imm.simulation.bathymetry import simulator as swath
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.consistency import noise_warnings, residual_ratio
-from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
+from sonar_imm.trackers.bathymetry.ping import residual_ratio
+from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker, noise_warnings
 
 
 @pytest.mark.parametrize('fading', [False, True])

@@ -24,9 +24,14 @@ import pytest
 
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.bathymetry.coupling import Alone, favour_of, NEIGHBOURS_NS
 from sonar_imm.trackers.bathymetry.ping import look, Ping, run
-from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm.trackers.bathymetry.tracker import (
+    Alone,
+    BathymetryConfig,
+    BathymetryTracker,
+    favour_of,
+    NEIGHBOURS_NS,
+)
 
 RANGES = 20.0 + 0.05 * np.arange(60)
 EXACT = BathymetryConfig(engine='grid', smoothing='states', grid_extent=4.0)

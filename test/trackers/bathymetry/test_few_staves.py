@@ -151,5 +151,5 @@ def test_a_ping_without_any_noise_is_answered(staves):
 def test_a_few_loud_bins_are_no_evidence():
     tracker = BathymetryTracker(BathymetryConfig())
     for count, said in ((150, 0), (49, 0), (1, 2)):  # 200 in all are enough
-        tracker._loud.append(LoudBins(count=count, silent=count, decorrelation=0.5))
+        tracker._loud.append(LoudBins(bins=count, silent=count, decorrelation=0.5))
         assert len(tracker.warnings()) == said

@@ -21,7 +21,8 @@ import pytest
 
 from sonar_imm.measurements import Altitude, Navigation, Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.pose_queue import bin_stamps, PoseQueue
+from sonar_imm.trackers.bathymetry.ping import bin_stamps
+from sonar_imm.trackers.bathymetry.tracker import PoseQueue
 from sonar_imm.trackers.navigation import MOST_WAITING
 
 SECOND = 10**9

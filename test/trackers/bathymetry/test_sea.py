@@ -26,9 +26,9 @@ from sonar_imm.measurements import Altitude, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.grid_kernels import _log_likelihoods as log_likelihoods
+from sonar_imm.trackers.bathymetry.kernels import _log_likelihoods as log_likelihoods
 from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
 
 CASE = motion_case()
@@ -159,7 +159,7 @@ def test_a_floor_out_of_reach_is_impossible_not_unknown():
     g = level_geometry(np.full(T, 20.0), 15.0, 0.5, 0.5)
     ping = PingLikelihood(
         ranges=np.full(T, 20.0),
-        heard=np.ones(T, bool),
+        echo=np.ones(T, bool),
         form=np.ones((T, P), complex),
         base=np.zeros(T),
         spread=np.empty((T, 0), complex),
