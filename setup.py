@@ -20,6 +20,8 @@ import re
 from setuptools import find_packages, setup
 
 PACKAGE = 'sonar_imm'
+# What runs on the boat, the workbench on the desk, and what both read messages with.
+PACKAGES = (PACKAGE, f'{PACKAGE}_tools', 'msg_adapters')
 # Resolved, because `colcon build --symlink-install` runs a link to this file.
 ROOT = Path(__file__).resolve().parent
 
@@ -108,14 +110,14 @@ setup(
         'Topic :: Scientific/Engineering',
     ],
     python_requires='>=3.10,<3.14',
-    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_adapters', 'msg_adapters.*']),
+    packages=find_packages(include=[f'{top}{rest}' for top in PACKAGES for rest in ('', '.*')]),
     data_files=shared_files(),
     install_requires=REQUIRES,
     extras_require=EXTRAS,
     zip_safe=False,
     entry_points={
         'console_scripts': [
-            'sonar-imm = sonar_imm.cli:main',
+            'sonar-imm = sonar_imm_tools.cli:main',
             'fls_detector_node = sonar_imm.nodes.commands:main',
             *(f'{system}_node = sonar_imm.nodes.commands:main' for system in SYSTEMS),
         ],

@@ -35,8 +35,8 @@ def main(prefix: Path) -> None:
     from ament_index_python.packages import get_package_prefix
 
     import sonar_imm
-    from sonar_imm.resources import shared_file
     from sonar_imm.trackers import SYSTEMS
+    from sonar_imm_tools.resources import shared_file
 
     expect(Path(get_package_prefix('sonar_imm')) == prefix, 'the ament index knows the package')
     expect(prefix in Path(sonar_imm.__file__).parents, 'Python imports the installed package')

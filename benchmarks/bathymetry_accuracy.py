@@ -33,8 +33,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_imm.acoustics import array, spatial
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 PAPER_CHAIN = (0.98, 0.02, 0.02, 0.98)
 SLOPES_ONLY = {'transition_matrix': (1.0, 0.0, 0.0, 1.0), 'initial_probabilities': (0.0, 1.0)}

@@ -32,11 +32,11 @@ from typing import Any
 
 from benchmarks.tables import markdown, write_json
 from msg_adapters.estimates import read_estimate
-from sonar_imm.evaluation.bathymetry.profiles import profiles_of
-from sonar_imm.evaluation.bathymetry.scoring import score
-from sonar_imm.recordings.truth import records_of
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
+from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 SIGMAS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 PAPER = {'variant': 'paper'}

@@ -29,11 +29,11 @@ from pathlib import Path
 
 from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
 from msg_adapters.estimates import read_estimate
-from sonar_imm.evaluation.bathymetry.profiles import profiles_of
-from sonar_imm.evaluation.bathymetry.scoring import score
-from sonar_imm.recordings.truth import records_of
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
+from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 BANK = {
     'model_set': 'height_bank',

@@ -32,11 +32,11 @@ from typing import Any
 import numpy as np
 
 from msg_adapters.estimates import read_estimate
-from sonar_imm.evaluation.bathymetry.profiles import Profile, profiles_of
-from sonar_imm.evaluation.bathymetry.scoring import score
-from sonar_imm.recordings.truth import records_of
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, profiles_of
+from sonar_imm_tools.evaluation.bathymetry.scoring import score
+from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 APART = {'ping_rate': 0.3, 'patch_along': []}
 GRID = {'engine': 'grid'}

@@ -45,8 +45,8 @@ from msg_adapters.inputs import inputs_of
 from msg_adapters.scans import MAX_FIXES
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import Altitude, Navigation, Rejection
-from sonar_imm.recordings.messages import ros_message, typestore
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 SECOND = 10**9
 TIMES = 3

@@ -34,9 +34,9 @@ from sonar_imm.estimation import imm_kernels
 from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.consistency import average_bounds, nees
 from sonar_imm.estimation.smoothing import imm_smooth
-from sonar_imm.simulation.diver.simulator import scenario, simulate
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 COLUMNS = {
     'Table 1 legs': ['table1'],

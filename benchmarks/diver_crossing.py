@@ -34,13 +34,13 @@ import numpy as np
 
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
-from sonar_imm.evaluation.diver.matching import match
-from sonar_imm.evaluation.diver.scoring import score
-from sonar_imm.evaluation.diver.series import Series, series_of
-from sonar_imm.evaluation.diver.truth import Truth
-from sonar_imm.simulation.diver.simulator import scenario, simulate
-from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm.truth import Scene
+from sonar_imm_tools.evaluation.diver.matching import match
+from sonar_imm_tools.evaluation.diver.scoring import score
+from sonar_imm_tools.evaluation.diver.series import Series, series_of
+from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 CASES = ((0.9, 2.0), (0.9, 10.0), (0.7, 2.0), (0.7, 10.0))
 ASSOCIATIONS = ('gnn', 'jipda')

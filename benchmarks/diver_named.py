@@ -35,12 +35,12 @@ import numpy as np
 
 from benchmarks.diver_crossing import true_paths
 from benchmarks.tables import markdown, write_json
-from sonar_imm.evaluation.diver.scoring import score
-from sonar_imm.evaluation.diver.series import series_of
 from sonar_imm.measurements import Fix, Fixes
-from sonar_imm.simulation.diver.simulator import scenario, simulate
-from sonar_imm.simulation.scene import Scene, TrueTrack
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm.truth import Scene, TrueTrack
+from sonar_imm_tools.evaluation.diver.scoring import score
+from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 SCENES = ('apart', 'buddies')
 HALF, FALSE, SCAN_STD, NAMED_STD, P_DETECTION = 60.0, 2.0, 0.5, 2.0, 0.9

@@ -32,9 +32,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.tables import write_json
-from sonar_imm.simulation.diver.simulator import scenario, simulate
-from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm.truth import Scene
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 SETTLED = 10.0
 """Seconds from the start that are not scored."""

@@ -38,11 +38,11 @@ import yaml
 
 from benchmarks.image_tracks import detected
 from benchmarks.tables import write_json
-from sonar_imm.cli.common import load_config
 from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarImage, Trace
 from sonar_imm.nodes.health import Finding, Hysteresis, WARN
-from sonar_imm.recordings.own_parameters import own_parameters
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli.common import load_config
+from sonar_imm_tools.recordings.own_parameters import own_parameters
 
 FIRST_SEED = 70_000
 """Bounds were looked for with seeds from 1000 on: these are others."""

@@ -37,14 +37,14 @@ import numpy as np
 from benchmarks import fathometer_vectors
 from benchmarks.tables import write_json
 from msg_adapters.array_records import write_trace
-from sonar_imm.cli import main as command
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import ospa
-from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.measurements import Trace
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.simulation.fathometer.scenario import PRESENT
+from sonar_imm.truth import PRESENT
+from sonar_imm_tools.cli import main as command
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.writer import BagWriter
 
 FOLDER = Path(__file__).parents[1] / 'test' / 'vectors'
 Truth = Mapping[str, np.ndarray]

@@ -35,9 +35,9 @@ from benchmarks.tables import markdown, write_json
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra, Trace
-from sonar_imm.simulation.fathometer.scenario import drift_of
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, FathometerScenario
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.simulation.fathometer.scenario import drift_of
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, FathometerScenario
 
 DEPTHS = (122.0, 1 / 32, 1600)
 NEAR = 0.4

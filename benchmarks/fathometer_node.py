@@ -41,16 +41,16 @@ import numpy as np
 from benchmarks.tables import markdown, write_json
 from msg_adapters.array_records import read_pressure
 from sonar_imm.acoustics.spectra import effective_snapshots
-from sonar_imm.cli.checking import check_recording, CheckedRecording
-from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.measurements import CrossSpectra, Pressure
-from sonar_imm.recordings.own_parameters import unusual
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.scenes import write_scene
-from sonar_imm.simulation.fathometer.scenario import drift_of, FathometerScenario
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, scenario, simulate
-from sonar_imm.simulation.scene import Received, Scene
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm.truth import Received, Scene
+from sonar_imm_tools.cli.checking import check_recording, CheckedRecording
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.own_parameters import unusual
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.scenes import write_scene
+from sonar_imm_tools.simulation.fathometer.scenario import drift_of, FathometerScenario
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario, simulate
 
 KINDS = ('pressure', 'its cross-spectra', 'cross-spectra drawn')
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}

@@ -37,9 +37,10 @@ from scipy.signal import hilbert
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import Trace
-from sonar_imm.simulation.fathometer.scenario import drift_of, PRESENT
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, FathometerScenario
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm.truth import PRESENT
+from sonar_imm_tools.simulation.fathometer.scenario import drift_of
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, FathometerScenario
 
 VECTORS = Path(__file__).parents[1] / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'
 ORDERS: dict[str, Any] = {

@@ -49,15 +49,15 @@ from typing import Any
 
 import numpy as np
 
-from sonar_imm.cli import main as command
-from sonar_imm.evaluation.fathometer.crossing import crossing_metrics, summary
-from sonar_imm.evaluation.fathometer.records import records_of
-from sonar_imm.evaluation.fathometer.scoring import pair
-from sonar_imm.evaluation.run_folder import RunFolder
-from sonar_imm.recordings.convert.profiler import arrival_edges, first_arrivals
-from sonar_imm.recordings.convert.segy import read_segy
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.cli import main as command
+from sonar_imm_tools.evaluation.fathometer.crossing import crossing_metrics, summary
+from sonar_imm_tools.evaluation.fathometer.records import records_of
+from sonar_imm_tools.evaluation.fathometer.scoring import pair
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.convert.profiler import arrival_edges, first_arrivals
+from sonar_imm_tools.recordings.convert.segy import read_segy
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data')) / 'sbp_chiapas'
 FILES = {

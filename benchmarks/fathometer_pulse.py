@@ -45,11 +45,15 @@ from benchmarks.tables import markdown, write_json
 from sonar_imm.acoustics.fathometer import coherence_and_power, echo_spectrum, steering
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra
-from sonar_imm.simulation.fathometer.field import expected_csdm
-from sonar_imm.simulation.fathometer.scenario import Drift, drift_of
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, FathometerScenario, scenario
 from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array, pulse_of
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.simulation.fathometer.field import expected_csdm
+from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
+from sonar_imm_tools.simulation.fathometer.simulator import (
+    cross_spectra,
+    FathometerScenario,
+    scenario,
+)
 
 DEPTHS = np.array([52.0, 55.2, 58.5, 61.7, 66.0, 69.3])
 STRENGTHS = np.array([0.35, 0.3, 0.25, 0.22, 0.2, 0.15])

@@ -40,10 +40,14 @@ import numpy as np
 from benchmarks.tables import markdown, write_json
 from sonar_imm.acoustics.spectra import effective_snapshots
 from sonar_imm.estimation.consistency import ospa
-from sonar_imm.simulation.fathometer.scenario import Drift, FathometerScenario
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, pressure_blocks, scenario
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.simulation.fathometer.scenario import Drift, FathometerScenario
+from sonar_imm_tools.simulation.fathometer.simulator import (
+    cross_spectra,
+    pressure_blocks,
+    scenario,
+)
 
 LAYERS, AMPLITUDES = np.array([52.0, 58.5, 66.0]), np.array([0.35, 0.25, 0.2])
 SETTLED = 4

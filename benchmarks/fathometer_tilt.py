@@ -36,8 +36,8 @@ from scipy.special import j0
 from benchmarks.fathometer_pulse import ARRAYS
 from benchmarks.tables import markdown, write_json
 from sonar_imm.acoustics.fathometer import coherence, depth_response, steering
-from sonar_imm.simulation.fathometer.field import expected_csdm
-from sonar_imm.simulation.fathometer.scenario import Drift, FathometerScenario
+from sonar_imm_tools.simulation.fathometer.field import expected_csdm
+from sonar_imm_tools.simulation.fathometer.scenario import Drift, FathometerScenario
 
 AMPLITUDE = 0.35
 TILTS = (0.0, 2.0, 5.0, 10.0)

@@ -38,9 +38,9 @@ from benchmarks.tables import write_json
 from sonar_imm.acoustics.cfar import quiet_level, tail_factor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, SonarImage
-from sonar_imm.simulation.obstacle.images import ImageSonar
-from sonar_imm.simulation.obstacle.scenario import ObstacleScenario
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig
+from sonar_imm_tools.simulation.obstacle.images import ImageSonar
+from sonar_imm_tools.simulation.obstacle.scenario import ObstacleScenario
 
 DEPTH = 20.0
 LEVEL = Pose(np.array([0.0, 0.0, DEPTH]), np.eye(3))

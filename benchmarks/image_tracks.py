@@ -36,16 +36,16 @@ import numpy as np
 
 from benchmarks.obstacle_sea import told
 from benchmarks.tables import markdown, write_json
-from sonar_imm.evaluation.obstacle.motion import motion_metrics
-from sonar_imm.evaluation.obstacle.scoring import score
-from sonar_imm.evaluation.obstacle.series import series_of, truth_of
 from sonar_imm.measurements import Measurement, SonarImage
-from sonar_imm.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
-from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.obstacle import bodies
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+from sonar_imm.truth import Scene
+from sonar_imm_tools.evaluation.obstacle.motion import motion_metrics
+from sonar_imm_tools.evaluation.obstacle.scoring import score
+from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
+from sonar_imm_tools.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
 
 CASES: dict[str, dict[str, Any]] = {
     'float, 3 m below': {},

@@ -47,13 +47,13 @@ from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import inputs_of
-from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id
-from sonar_imm.nodes.link import Link, LinkError
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos, output_qos
-from sonar_imm.simulation.diver import simulator as diver
-from sonar_imm.simulation.obstacle import simulator as obstacle
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
+from sonar_imm_tools.replay.link import Link, LinkError
+from sonar_imm_tools.simulation.diver import simulator as diver
+from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 
 LIMIT = 90.0
 SETTLED = 20

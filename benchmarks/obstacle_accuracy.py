@@ -38,15 +38,15 @@ from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.simulation.obstacle.simulator import (
+from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses
+from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm.truth import Scene
+from sonar_imm_tools.simulation.obstacle.simulator import (
     ObstacleScenario,
     scenario,
     simulate,
     TrueObstacle,
 )
-from sonar_imm.simulation.scene import Scene
-from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses
-from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 
 RANGES = (50.0, 30.0, 20.0)
 CASES = {

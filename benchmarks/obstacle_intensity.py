@@ -34,10 +34,10 @@ from scipy.spatial.transform import Rotation
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.simulation.obstacle import scenario, simulate
-from sonar_imm.simulation.obstacle.images import vertical_pattern
-from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm.truth import Scene
+from sonar_imm_tools.simulation.obstacle import scenario, simulate
+from sonar_imm_tools.simulation.obstacle.images import vertical_pattern
 
 WIDTH_DEG = 15.0
 NODDING = {'pitch_rms_deg': 3.54, 'pitch_period': 10.0}

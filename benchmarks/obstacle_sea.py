@@ -53,11 +53,11 @@ from benchmarks.obstacle_accuracy import (
 )
 from benchmarks.tables import markdown, write_json
 from sonar_imm.estimates import Estimate
-from sonar_imm.evaluation.obstacle.scoring import score
-from sonar_imm.evaluation.obstacle.series import series_of, truth_of
-from sonar_imm.simulation.obstacle.scenario import SCENARIOS
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
+from sonar_imm_tools.evaluation.obstacle.scoring import score
+from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
+from sonar_imm_tools.simulation.obstacle.scenario import SCENARIOS
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate, TrueObstacle
 
 CALM = {
     name: value

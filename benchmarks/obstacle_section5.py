@@ -43,9 +43,9 @@ from benchmarks.tables import markdown, write_json
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
-from sonar_imm.simulation.scene import Scene
 from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses
+from sonar_imm.truth import Scene
+from sonar_imm_tools.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
 
 EXACT = {
     **LEVER,

@@ -33,10 +33,10 @@ import numpy as np
 
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
-from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id
-from sonar_imm.nodes.link import Link, LinkError
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import latched_qos, output_qos
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
+from sonar_imm_tools.replay.link import Link, LinkError
 
 LATE_EVERY, LATE_BY = 3.0, 9.0
 

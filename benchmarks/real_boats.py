@@ -35,8 +35,8 @@ from scipy.optimize import linear_sum_assignment
 from benchmarks.real_recordings import boat_scores, BOATS, DATA, header, load, row
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
-from sonar_imm.recordings.convert import convert_autoferry
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.recordings.convert import convert_autoferry
 
 STDS, LIVES = (2.0, 3.0, 4.0, 6.0), ((3, 5), (4, 6))
 OFFSETS = {'radar': (0.0, -1.5), 'lidar': (0.0,)}

@@ -43,9 +43,9 @@ from scipy.stats import theilslopes
 
 from benchmarks.tables import markdown, write_json
 from msg_adapters.inputs import inputs_of
-from sonar_imm.recordings.measurements import fitting_topics
-from sonar_imm.recordings.reader import BagReader
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.recordings.measurements import fitting_topics
+from sonar_imm_tools.recordings.reader import BagReader
 
 ROOT = Path(__file__).parents[1]
 SECOND = 10**9
@@ -113,16 +113,16 @@ def live(system: str, hours: float) -> dict[str, float]:
     """The node as a process of its own, in lock-step."""
     from rclpy.serialization import deserialize_message
 
-    from sonar_imm.nodes.harness import (
+    from sonar_imm.nodes.messages import message_class
+    from sonar_imm.nodes.qos import lockstep_qos
+    from sonar_imm_tools.replay.harness import (
         local_discovery,
         NodeProcess,
         reserved_domain_id,
         START_LIMIT,
     )
-    from sonar_imm.nodes.link import Link
-    from sonar_imm.nodes.lockstep import LockStep
-    from sonar_imm.nodes.messages import message_class
-    from sonar_imm.nodes.qos import lockstep_qos
+    from sonar_imm_tools.replay.link import Link
+    from sonar_imm_tools.replay.lockstep import LockStep
 
     arguments, publishers = [], {}
     for topic in {topic for topic, _ in recorded(system)[0]}:

@@ -28,14 +28,14 @@ import time
 
 import numpy as np
 
-from sonar_imm.cli.common import load_config
 from sonar_imm.measurements import Rejection
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.own_parameters import own_parameters
-from sonar_imm.recordings.reader import BagReader
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.state_file import json_parameters, Saved, write_state
 from sonar_imm.trackers.state_values import frozen_state
+from sonar_imm_tools.cli.common import load_config
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.reader import BagReader
 
 TIMES = 20
 

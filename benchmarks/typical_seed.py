@@ -44,12 +44,12 @@ from attrs import frozen
 import numpy as np
 
 from benchmarks.tables import markdown
-from sonar_imm.cli import main as sonar_imm
-from sonar_imm.cli.sweep import planned
-from sonar_imm.evaluation.judging import Limit
-from sonar_imm.evaluation.sweep import Outcome, run_here, run_on_processes
-from sonar_imm.recordings.own_limit import write_own_limit
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli import main as sonar_imm
+from sonar_imm_tools.cli.sweep import planned
+from sonar_imm_tools.evaluation.judging import Limit
+from sonar_imm_tools.evaluation.sweep import Outcome, run_here, run_on_processes
+from sonar_imm_tools.recordings.own_limit import write_own_limit
 
 SHARE = 0.9
 """Of the runs that are within the limit of `check`."""

@@ -37,8 +37,8 @@ from matplotlib.axes import Axes  # noqa: E402
 
 from benchmarks.diver_accuracy import track, tuned  # noqa: E402
 from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian  # noqa: E402
-from sonar_imm.simulation.diver.simulator import scenario, simulate  # noqa: E402
 from sonar_imm.trackers.diver.tracker import DiverConfig  # noqa: E402
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images' / 'diver_paper.png'
 BLUE, RED, INK, PALE = '#0072B2', '#D55E00', '#1b2733', '#b8c0c8'

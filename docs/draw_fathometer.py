@@ -36,18 +36,18 @@ sys.path.insert(0, str(ROOT))
 from matplotlib import pyplot as plt  # noqa: E402
 
 from sonar_imm.acoustics import fathometer  # noqa: E402
-from sonar_imm.evaluation.fathometer.records import records_of  # noqa: E402
 from sonar_imm.measurements import Trace  # noqa: E402
-from sonar_imm.recordings.convert import convert_segy  # noqa: E402
-from sonar_imm.recordings.measurements import measurements_of  # noqa: E402
-from sonar_imm.recordings.reader import BagReader  # noqa: E402
-from sonar_imm.simulation.fathometer.scenario import (  # noqa: E402
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker  # noqa: E402
+from sonar_imm_tools.evaluation.fathometer.records import records_of  # noqa: E402
+from sonar_imm_tools.recordings.convert import convert_segy  # noqa: E402
+from sonar_imm_tools.recordings.measurements import measurements_of  # noqa: E402
+from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
+from sonar_imm_tools.simulation.fathometer.scenario import (  # noqa: E402
     drift_of,
     FathometerScenario,
     scenario,
 )
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, simulate  # noqa: E402
-from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker  # noqa: E402
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, simulate  # noqa: E402
 
 IMAGES = ROOT / 'docs' / 'images'
 DATA = Path(os.environ.get('SONAR_IMM_DATA', ROOT.parent / 'shared' / 'data')) / 'sbp_chiapas'

@@ -42,10 +42,10 @@ from benchmarks.obstacle_section5 import echoes, encounter, OFFSETS, read  # noq
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
-from sonar_imm.simulation.obstacle.images import ImageSonar  # noqa: E402
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
 from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: E402
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
+from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
 
 OUT = ROOT / 'docs' / 'images'
 SECTION5 = ROOT / 'docs' / 'results' / 'obstacle_section5.json'

@@ -48,10 +48,10 @@ API = {
     'measurements': ('sonar_imm.measurements', 'What a tracker takes in'),
     'core': ('sonar_imm', 'What a tracker gives out, and its parameters'),
     'trackers': ('sonar_imm.trackers', 'The trackers'),
-    'recordings': ('sonar_imm.recordings', 'Bags in and out, other formats'),
-    'evaluation': ('sonar_imm.evaluation', 'Scores and reports'),
-    'viewing': ('sonar_imm.viewing', 'Recordings, runs and nodes in Foxglove and Rerun'),
-    'simulation': ('sonar_imm.simulation', 'Scenes'),
+    'recordings': ('sonar_imm_tools.recordings', 'Bags in and out, other formats'),
+    'evaluation': ('sonar_imm_tools.evaluation', 'Scores and reports'),
+    'viewing': ('sonar_imm_tools.viewing', 'Recordings, runs and nodes in Foxglove and Rerun'),
+    'simulation': ('sonar_imm_tools.simulation', 'Scenes'),
     'msg_adapters': ('msg_adapters', 'ROS messages to measurements and estimates, and back'),
 }
 """Packages whose modules are described, by the name of their page."""
@@ -188,7 +188,7 @@ def options() -> str:
     """What `--help` of every command and of every kind of conversion says."""
     import click
 
-    from sonar_imm.cli import command, PROGRAM
+    from sonar_imm_tools.cli import command, PROGRAM
 
     def helps(one: click.Command, name: str, parent: click.Context | None) -> list[str]:
         context = click.Context(one, parent, info_name=name, max_content_width=100)
@@ -237,8 +237,8 @@ def types(readers: Iterable[str]) -> str:
 
 def estimated_columns(bag: Path) -> dict[str, str]:
     """Name and type of each column that the tracker gives for `bag`; runs of models in one row."""
-    from sonar_imm.cli import main
-    from sonar_imm.evaluation.run_folder import RunFolder
+    from sonar_imm_tools.cli import main
+    from sonar_imm_tools.offline.run_folder import RunFolder
 
     with tempfile.TemporaryDirectory(prefix='sonar_imm_docs_') as scratch:
         out = Path(scratch) / 'out'

@@ -20,9 +20,9 @@ import sys
 import numpy as np
 import plotly.graph_objects as go
 
-from sonar_imm.simulation import bathymetry as scenes
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
+from sonar_imm_tools.simulation import bathymetry as scenes
 
 config = scenes.scenario('paper', {'pings': 2})
 scene = scenes.simulate(config, seed=1)

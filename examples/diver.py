@@ -20,9 +20,9 @@ import sys
 import numpy as np
 import plotly.graph_objects as go
 
-from sonar_imm.simulation import diver as scenes
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm_tools.simulation import diver as scenes
 
 scene = scenes.simulate(scenes.scenario('table1'), seed=1)
 tracker = SYSTEMS['diver'].build(DiverConfig())

@@ -20,9 +20,9 @@ import sys
 import numpy as np
 import plotly.graph_objects as go
 
-from sonar_imm.simulation import fathometer as scenes
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.fathometer.config import FathometerConfig
+from sonar_imm_tools.simulation import fathometer as scenes
 
 config = scenes.scenario('drift_traces', {'records': 40})
 scene = scenes.simulate(config, seed=1)

@@ -20,9 +20,9 @@ import sys
 import numpy as np
 import plotly.graph_objects as go
 
-from sonar_imm.simulation import obstacle as scenes
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm_tools.simulation import obstacle as scenes
 
 config = scenes.scenario('approach')
 scene = scenes.simulate(config, seed=1)

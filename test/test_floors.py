@@ -18,6 +18,8 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+import subprocess
+import sys
 
 from helpers.source import (
     circle_of,
@@ -37,55 +39,86 @@ if not (ROOT / 'setup.py').is_file():
 # A room may import from its own floor and from lower ones.
 FLOORS = {
     'sonar_imm.files': 0,
-    'sonar_imm.resources': 0,
     'sonar_imm.texts': 0,
     'sonar_imm.threads': 0,
     'sonar_imm.estimation': 0,
     'sonar_imm.acoustics': 1,
     'sonar_imm.parameters': 2,
     'sonar_imm.measurements': 2,
+    'sonar_imm.truth': 2,
     'sonar_imm.estimates': 2,
     'sonar_imm.soundings': 2,
     'msg_adapters': 3,
     'sonar_imm.trackers': 3,
-    'sonar_imm.simulation': 4,
     'sonar_imm.node_config': 4,
-    'sonar_imm.recordings': 5,
-    'sonar_imm.evaluation': 6,
-    'sonar_imm.viewing': 7,
-    'sonar_imm.nodes': 7,
-    'sonar_imm.cli': 8,
+    'sonar_imm.nodes': 5,
+    'sonar_imm_tools.resources': 6,
+    'sonar_imm_tools.recordings': 6,
+    'sonar_imm_tools.simulation': 7,
+    'sonar_imm_tools.replay': 7,
+    'sonar_imm_tools.offline': 7,
+    'sonar_imm_tools.evaluation': 8,
+    'sonar_imm_tools.viewing': 9,
+    'sonar_imm_tools.cli': 10,
 }
-SIDE_BY_SIDE = {
-    ('sonar_imm.viewing', 'sonar_imm.nodes'),
-    ('sonar_imm.nodes', 'sonar_imm.viewing'),
+# Rooms of one floor, or of neighbouring ones, that must not know each other.
+APART = (
     ('msg_adapters', 'sonar_imm.trackers'),
-    ('sonar_imm.trackers', 'msg_adapters'),
+    ('sonar_imm_tools.simulation', 'sonar_imm_tools.replay'),
+    ('sonar_imm_tools.simulation', 'sonar_imm_tools.offline'),
+    ('sonar_imm_tools.replay', 'sonar_imm_tools.offline'),
+    ('sonar_imm_tools.recordings', 'sonar_imm.nodes'),
+)
+ONLY_IN = {
+    'rclpy': {'sonar_imm.nodes', 'sonar_imm_tools.replay'},
+    'rosbags': {'sonar_imm_tools.recordings'},
 }
-ONLY_IN = {'rclpy': {'sonar_imm.nodes'}, 'rosbags': {'sonar_imm.recordings'}}
+DESK = {'click', 'plotly', 'rich', 'rosbags', 'sonar_imm_tools'}
+"""What only the workbench may import: the live package runs without it."""
 
 
-@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_down_the_floors(path: Path) -> None:
-    here = room_of(module_name(path))
-    if here is None:  # sonar_imm/__init__.py only looks whether msg_adapters is its own
-        assert module_name(path) == 'sonar_imm'
-        assert {room_of(name) for name in imports(path)} <= {None, 'msg_adapters'}
-        return
-    for name in imports(path):
-        there = room_of(name)
-        if there is not None:
-            assert FLOORS[there] <= FLOORS[here], f'{here} must not import {name}'
-            assert (here, there) not in SIDE_BY_SIDE, f'{here} must not import {name}'
+def test_imports_go_down_the_floors() -> None:
+    for path in MODULES:
+        here = room_of(module_name(path))
+        if here is None:  # sonar_imm/__init__.py only looks whether msg_adapters is its own
+            assert module_name(path) in {'sonar_imm', 'sonar_imm_tools'}
+            assert {room_of(name) for name in imports(path)} <= {None, 'msg_adapters'}
+            continue
+        for name in imports(path):
+            there = room_of(name)
+            if there is not None:
+                assert FLOORS[there] <= FLOORS[here], f'{here} must not import {name}'
+                assert (here, there) not in APART, f'{here} must not import {name}'
+                assert (there, here) not in APART, f'{here} must not import {name}'
 
 
-@pytest.mark.parametrize('path', MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_ros_and_rosbags_stay_in_their_rooms(path: Path) -> None:
-    here = room_of(module_name(path))
-    for name in imports(path):
-        top = name.split('.')[0]
-        rooms = ONLY_IN.get('rclpy' if top in ROS_MODULES else top)
-        assert rooms is None or here in rooms, f'{here} must not import {name}'
+def test_ros_and_the_workbench_stay_in_their_rooms() -> None:
+    for path in MODULES:
+        here = room_of(module_name(path))
+        for name in imports(path):
+            top = name.split('.')[0]
+            rooms = ONLY_IN.get('rclpy' if top in ROS_MODULES else top)
+            assert rooms is None or here in rooms, f'{here} must not import {name}'
+            if not module_name(path).startswith('sonar_imm_tools'):
+                assert top not in DESK, f'{here} must not import {name}'
+
+
+def test_the_live_package_is_there_without_the_workbench() -> None:
+    """Trackers are imported and built by a process that can import nothing of the desk."""
+    program = f"""
+import sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split('.')[0] in {DESK!r}:
+            raise ImportError(name)
+sys.meta_path.insert(0, Refuse())
+from sonar_imm.trackers import SYSTEMS
+import sonar_imm.node_config
+for system in SYSTEMS.values():
+    system.build(system.config_type()())
+"""
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None:

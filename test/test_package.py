@@ -57,18 +57,18 @@ IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
 # those that some commands need, each with an extra of its own.
 PEERS = {
-    'sonar_imm.evaluation.jobs': {'distributed'},
-    'sonar_imm.evaluation.tables': {'pyarrow'},
-    'sonar_imm.viewing.rerun_file': {'rerun'},
-    'sonar_imm.viewing.server': {'foxglove'},
-    'sonar_imm.evaluation.diver.bench': {'filterpy', 'stonesoup'},
-    'sonar_imm.evaluation.bathymetry.peers': {'stonesoup'},
-    'sonar_imm.evaluation.sweep': {'distributed'},
-    'sonar_imm.recordings.convert.segy': {'segyio'},
-    'sonar_imm.recordings.export.grid': {'rasterio'},
-    'sonar_imm.recordings.export.horizons': {'rasterio'},
-    'sonar_imm.recordings.export.picks': {'segyio'},
-    'sonar_imm.recordings.export.points': {'laspy', 'rasterio'},
+    'sonar_imm_tools.offline.jobs': {'distributed'},
+    'sonar_imm_tools.offline.tables': {'pyarrow'},
+    'sonar_imm_tools.viewing.rerun_file': {'rerun'},
+    'sonar_imm_tools.viewing.server': {'foxglove'},
+    'sonar_imm_tools.evaluation.diver.bench': {'filterpy', 'stonesoup'},
+    'sonar_imm_tools.evaluation.bathymetry.peers': {'stonesoup'},
+    'sonar_imm_tools.evaluation.sweep': {'distributed'},
+    'sonar_imm_tools.recordings.convert.segy': {'segyio'},
+    'sonar_imm_tools.recordings.export.grid': {'rasterio'},
+    'sonar_imm_tools.recordings.export.horizons': {'rasterio'},
+    'sonar_imm_tools.recordings.export.picks': {'segyio'},
+    'sonar_imm_tools.recordings.export.points': {'laspy', 'rasterio'},
 }
 
 HEADER = """\
@@ -166,7 +166,7 @@ def test_every_import_is_declared(
         for name in (distribution(line) for line in setup_lists['REQUIRES'])
     }
     declared |= texts(manifest, 'depend') | texts(manifest, 'exec_depend')
-    declared |= {'msg_adapters', 'sonar_imm', *sys.stdlib_module_names}
+    declared |= {'msg_adapters', 'sonar_imm', 'sonar_imm_tools', *sys.stdlib_module_names}
     for path in MODULES:
         used = {name.split('.')[0] for name in imports(path)}
         assert used - declared <= PEERS.get(module_name(path), set()), path
@@ -179,7 +179,7 @@ def test_declared_messages_come_with_the_ros_extra(manifest: ElementTree.Element
 def test_files_begin_with_the_licence_and_are_not_too_long() -> None:
     files = [
         path
-        for room in ('sonar_imm', 'msg_adapters', 'test', 'benchmarks', 'docs')
+        for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test', 'benchmarks', 'docs')
         for path in (ROOT / room).rglob('*.py')
     ]
     texts_of = {
@@ -251,7 +251,11 @@ def test_every_folder_of_a_system_is_listed_and_built() -> None:
 
     folders = {
         room: {path.parent.name for path in (ROOT / room).glob('*/__init__.py')}
-        for room in ('sonar_imm/trackers', 'sonar_imm/simulation', 'sonar_imm/evaluation')
+        for room in (
+            'sonar_imm/trackers',
+            'sonar_imm_tools/simulation',
+            'sonar_imm_tools/evaluation',
+        )
     }
     folders['msg_adapters/inputs'] = {
         path.stem for path in (ROOT / 'msg_adapters' / 'inputs').glob('*.py')
@@ -295,7 +299,7 @@ def test_default_parameter_file_holds_the_defaults() -> None:
 
 
 def test_the_page_of_commands_names_every_subcommand() -> None:
-    from sonar_imm.cli import COMMANDS
+    from sonar_imm_tools.cli import COMMANDS
 
     page = (ROOT / 'docs' / 'reference' / 'commands.md').read_text(encoding='utf-8')
     table = page.partition('| subcommand |')[2].partition('\n\n')[0]

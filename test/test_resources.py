@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-from sonar_imm.resources import share_folder, shared_file
+from sonar_imm_tools.resources import share_folder, shared_file
 
 
 def touch(path: Path) -> Path:

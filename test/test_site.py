@@ -29,7 +29,7 @@ import yaml
 if not (ROOT / 'mkdocs.yml').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
 
-NO_API = {'sonar_imm.cli', 'sonar_imm.nodes'}
+NO_API = {'sonar_imm_tools.cli', 'sonar_imm.nodes'}
 """Packages that are no library: the command has a page, the nodes have topics."""
 
 

@@ -82,7 +82,7 @@ sys.argv[0] = '/opt/lib/sonar_imm/{}_node'
 from sonar_imm.nodes.commands import main
 main()
 """
-INFO = ('-m', 'sonar_imm.cli', 'info', str(ROOT / 'bags' / 'diver_table1'))
+INFO = ('-m', 'sonar_imm_tools.cli', 'info', str(ROOT / 'bags' / 'diver_table1'))
 
 
 def test_the_command_has_one_thread(threads_of, loaded_alone):
@@ -96,7 +96,7 @@ def test_what_the_user_says_wins(threads_of, loaded_alone, name):
 
 def test_the_library_leaves_the_process_alone(threads_of, loaded_alone):
     imports = (
-        'import sonar_imm, sonar_imm.cli, sonar_imm.estimation.imm, sonar_imm.trackers; '
+        'import sonar_imm, sonar_imm_tools.cli, sonar_imm.estimation.imm, sonar_imm.trackers; '
         'from sonar_imm.trackers.diver.tracker import DiverTracker'
     )
     assert threads_of('-c', imports) >= loaded_alone > 1  # scipy brings a BLAS of its own

@@ -16,13 +16,13 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, content_key, floats, Rejection
+from .checks import check_stamp, column, content_key, floats, point, quaternion, Rejection
 
 BEAM_AXES = ('marine', 'rep103', 'auto')
 """What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
@@ -35,6 +35,11 @@ MAX_IMAGE_CELLS = 4_000_000
 
 OPTIONAL_COLUMNS = ('var_range', 'var_bearing', 'intensity', 'extent_range', 'extent_bearing')
 """What a detection may say besides range and bearing."""
+
+
+def _unknown() -> Any:
+    """A column that is left out: NaN in each row, whose number is known after the others."""
+    return None
 
 
 @frozen(eq=False, kw_only=True)
@@ -51,21 +56,21 @@ class Detections:
     FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
-    range: FloatArray = field(converter=floats(None))
-    bearing: FloatArray = field(converter=floats(None))
-    var_range: FloatArray | None = None
-    var_bearing: FloatArray | None = None
-    intensity: FloatArray | None = None
+    range: FloatArray = field(converter=column)
+    bearing: FloatArray = field(converter=column)
+    var_range: FloatArray = field(factory=_unknown)
+    var_bearing: FloatArray = field(factory=_unknown)
+    intensity: FloatArray = field(factory=_unknown)
     frame_id: str = ''
-    extent_range: FloatArray | None = None
-    extent_bearing: FloatArray | None = None
+    extent_range: FloatArray = field(factory=_unknown)
+    extent_bearing: FloatArray = field(factory=_unknown)
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
         for name in OPTIONAL_COLUMNS:
             given = getattr(self, name)
-            column = np.full(len(self.range), np.nan) if given is None else given
-            object.__setattr__(self, name, floats(None)(column))
+            values = np.full(len(self.range), np.nan) if given is None else given
+            object.__setattr__(self, name, column(values))
         for name in ('bearing', *OPTIONAL_COLUMNS):
             rows = len(getattr(self, name))
             if rows != len(self):
@@ -96,8 +101,8 @@ class SonarImage:
     FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
-    range: FloatArray = field(converter=floats(None))
-    bearing: FloatArray = field(converter=floats(None))
+    range: FloatArray = field(converter=column)
+    bearing: FloatArray = field(converter=column)
     amplitude: FloatArray
     frame_id: str = ''
     scanning: bool = False
@@ -124,10 +129,10 @@ class Navigation:
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=floats(3))
-    orientation: FloatArray = field(converter=floats(4))
-    velocity: FloatArray = field(converter=floats(3), factory=lambda: np.full(3, np.nan))
-    turn_rate: FloatArray = field(converter=floats(3), factory=lambda: np.full(3, np.nan))
+    position: FloatArray = field(converter=point)
+    orientation: FloatArray = field(converter=quaternion)
+    velocity: FloatArray = field(converter=point, factory=lambda: np.full(3, np.nan))
+    turn_rate: FloatArray = field(converter=point, factory=lambda: np.full(3, np.nan))
     pose_covariance: FloatArray | None = None
     twist_covariance: FloatArray | None = None
     frame_id: str = ''
@@ -149,7 +154,7 @@ class Navigation:
             )
         for name in ('pose_covariance', 'twist_covariance'):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, floats(6, 6)(getattr(self, name)))
+                object.__setattr__(self, name, floats(getattr(self, name), 6, 6))
 
     def key(self) -> bytes:
         """See `content_key`; velocities are not used."""

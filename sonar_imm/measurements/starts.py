@@ -16,12 +16,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_covariance, check_stamp, content_key, floats, Rejection
+from .checks import check_covariance, check_stamp, content_key, floats, point, Rejection
 from .diver import FARTHEST_FIX
+
+
+def plane_covariance(value: Any) -> FloatArray:
+    """Read-only (2, 2)."""
+    return floats(value, 2, 2)
 
 
 @frozen(eq=False, kw_only=True)
@@ -33,8 +40,8 @@ class Start:
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=floats(3))
-    covariance: FloatArray = field(converter=floats(2, 2))
+    position: FloatArray = field(converter=point)
+    covariance: FloatArray = field(converter=plane_covariance)
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:

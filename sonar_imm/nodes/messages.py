@@ -19,8 +19,8 @@ Since Jazzy a Python message does not check what is put into it: a float32 or an
 exactly what its definition asks for, and raises where that cannot be done. Bulk data go through
 ``array.array``, which is hundreds of times faster than element by element.
 
-`make` is the live half of the factory that `msg_adapters` takes; `sonar_imm.recordings` has the
-other half, for bags.
+`make` is the live half of the factory that `msg_adapters` takes; `sonar_imm_tools.recordings` has
+the other half, for bags.
 """
 
 from __future__ import annotations

@@ -136,12 +136,12 @@ class System:
     @property
     def scenes(self) -> str:
         """The module with `SCENARIOS`, `scenario` and `simulate`."""
-        return f'sonar_imm.simulation.{self.name}'
+        return f'sonar_imm_tools.simulation.{self.name}'
 
     @property
     def judge(self) -> str:
         """The module with `judge` and `LIMIT`, see `evaluation.judging`."""
-        return f'sonar_imm.evaluation.{self.name}'
+        return f'sonar_imm_tools.evaluation.{self.name}'
 
     @property
     def benches(self) -> str:

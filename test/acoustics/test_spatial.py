@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.acoustics import array, spatial
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 TILT, HEIGHT = math.radians(30.0), 15.0
 GRID = np.linspace(-0.9, 0.9, 361)

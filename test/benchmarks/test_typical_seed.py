@@ -21,8 +21,8 @@ import numpy as np
 import pytest
 
 from benchmarks.typical_seed import readme, rounded_up, typical
-from sonar_imm.evaluation.judging import Limit
-from sonar_imm.evaluation.sweep import Outcome
+from sonar_imm_tools.evaluation.judging import Limit
+from sonar_imm_tools.evaluation.sweep import Outcome
 
 
 def outcomes(**metrics):

@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.cli import main
 from sonar_imm.measurements import Snapshot
-from sonar_imm.recordings.writer import BagWriter, ros_message
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
 

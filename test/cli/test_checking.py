@@ -22,11 +22,11 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.cli import checking, main  # noqa: E402
-from sonar_imm.evaluation.judging import Check  # noqa: E402
-from sonar_imm.evaluation.run_folder import RunFolder  # noqa: E402
-from sonar_imm.nodes.harness import LockstepResult  # noqa: E402
-from sonar_imm.nodes.lockstep import Counts  # noqa: E402
+from sonar_imm_tools.cli import checking, main  # noqa: E402
+from sonar_imm_tools.evaluation.judging import Check  # noqa: E402
+from sonar_imm_tools.offline.run_folder import RunFolder  # noqa: E402
+from sonar_imm_tools.replay.harness import LockstepResult  # noqa: E402
+from sonar_imm_tools.replay.lockstep import Counts  # noqa: E402
 
 
 @pytest.fixture(scope='module')
@@ -112,7 +112,7 @@ def test_a_node_that_loses_messages_or_dies_is_found_out(check, said, name):
 
 
 def test_a_recording_may_state_its_own_limit(check, dive):
-    from sonar_imm.recordings.own_limit import write_own_limit
+    from sonar_imm_tools.recordings.own_limit import write_own_limit
 
     try:
         write_own_limit(dive, 0.001)
@@ -133,6 +133,6 @@ def test_the_exit_code_is_one_when_anything_fell_short(dive, monkeypatch, capsys
         )
         for one in good
     ]
-    monkeypatch.setattr('sonar_imm.cli.check.run_checks', lambda *_, **__: checked)
+    monkeypatch.setattr('sonar_imm_tools.cli.check.run_checks', lambda *_, **__: checked)
     assert main(['check', 'diver', *(['--json'] if as_json else [])]) == int(not all(good))
     assert as_json or capsys.readouterr().out.count('FAIL') == len(good) - sum(good)

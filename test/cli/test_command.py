@@ -23,7 +23,7 @@ import time
 import pytest
 
 from sonar_imm import __version__
-from sonar_imm.cli import COMMANDS, main
+from sonar_imm_tools.cli import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,7 +32,7 @@ def run(*arguments, **options):
     """The command as a process of its own."""
     environment = dict(os.environ, PYTHONPATH=str(ROOT))
     return subprocess.run(
-        [sys.executable, '-m', 'sonar_imm.cli', *arguments],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', *arguments],
         text=True,
         capture_output=True,
         env=environment,
@@ -70,7 +70,7 @@ def test_version(capsys):
 
 def test_help_loads_no_heavy_module():
     code = (
-        "import sys; from sonar_imm.cli import main; main(['--help']); "
+        "import sys; from sonar_imm_tools.cli import main; main(['--help']); "
         "print([name for name in ('numpy', 'scipy', 'rosbags', 'numba', 'plotly', 'rclpy', "
         "'rich') if name in sys.modules])"
     )
@@ -112,14 +112,14 @@ def test_mistakes_end_in_one_line_and_exit_code_2(arguments, words, capsys, tmp_
 
 
 def test_a_bug_is_not_hidden(monkeypatch):
-    from sonar_imm.cli import info
+    from sonar_imm_tools.cli import info
 
     def broken(*arguments, **options):
         raise RuntimeError('a bug')
 
     monkeypatch.setattr(info, 'progress', broken)
     monkeypatch.setattr(
-        'sonar_imm.recordings.reader.BagReader.__enter__',
+        'sonar_imm_tools.recordings.reader.BagReader.__enter__',
         lambda self: (_ for _ in ()).throw(RuntimeError('a bug')),
     )
     with pytest.raises(RuntimeError, match='a bug'):
@@ -130,7 +130,7 @@ def test_a_package_that_is_not_there_is_named(monkeypatch, capsys):
     def absent(self):
         raise ModuleNotFoundError("No module named 'rclpy'", name='rclpy')
 
-    monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__', absent)
+    monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', absent)
     assert main(['info', 'x.bag']) == 2
     assert 'sonar_imm[ros]' in capsys.readouterr().err
 
@@ -139,7 +139,7 @@ def test_ctrl_c_is_clean(monkeypatch, capsys):
     def interrupted(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr('sonar_imm.recordings.reader.BagReader.__enter__', interrupted)
+    monkeypatch.setattr('sonar_imm_tools.recordings.reader.BagReader.__enter__', interrupted)
     assert main(['info', 'x.bag']) == 130
     assert 'Traceback' not in capsys.readouterr().err
 
@@ -147,7 +147,7 @@ def test_ctrl_c_is_clean(monkeypatch, capsys):
 @pytest.mark.skipif(sys.platform == 'win32', reason='pipes end otherwise there')
 def test_a_reader_that_goes_away_is_no_trouble():
     process = subprocess.Popen(
-        [sys.executable, '-m', 'sonar_imm.cli', 'simulate', 'diver', '--list'],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', 'simulate', 'diver', '--list'],
         env=dict(os.environ, PYTHONPATH=str(ROOT)),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -171,7 +171,7 @@ def test_help_is_fast():
 
 ENDED = """
 import signal
-from sonar_imm import cli
+from sonar_imm_tools import cli
 
 class Half:
     def __init__(self):

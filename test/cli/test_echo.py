@@ -22,8 +22,8 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.cli.echo import json_line, readable, text_lines  # noqa: E402
-from sonar_imm.nodes.listening import HeardTable  # noqa: E402
+from sonar_imm_tools.cli.echo import json_line, readable, text_lines  # noqa: E402
+from sonar_imm_tools.replay.listening import HeardTable  # noqa: E402
 
 ESTIMATE = single_run(count=20)[0][-1]
 

@@ -19,8 +19,8 @@ import json
 import numpy as np
 import pytest
 
-from sonar_imm.cli import main
-from sonar_imm.recordings.export.points import read_points
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.export.points import read_points
 
 SMALL = ('--set', 'pings=3', '--set', 'last_range=30', '--set', 'bin_width=0.1')
 

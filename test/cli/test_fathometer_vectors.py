@@ -24,13 +24,13 @@ import pytest
 
 from msg_adapters.array_records import write_csdm
 from msg_adapters.table import encode_table
-from sonar_imm.cli import main
-from sonar_imm.evaluation.run_folder import RunFolder
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 VECTORS = ROOT / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'

@@ -22,13 +22,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msg_adapters.inputs import inputs_of
-from sonar_imm.cli import main
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.topics import fitting_topics
-from sonar_imm.recordings.writer import BagWriter
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.topics import fitting_topics
+from sonar_imm_tools.recordings.writer import BagWriter
 
 BAG = Path(__file__).resolve().parents[2] / 'bags' / 'obstacle_tethers'
 TO_NED, TO_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])

@@ -21,10 +21,10 @@ from helpers.source import ROOT
 import pytest
 
 from msg_adapters.geodetic import write_geodetic
-from sonar_imm.cli import main
 from sonar_imm.measurements import GeodeticFix
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.writer import BagWriter, ros_message
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 SHIPPED = sorted(path.name for path in (ROOT / 'bags').iterdir() if path.is_dir())
 

@@ -21,10 +21,10 @@ from helpers.dive_bags import write_dive
 from helpers.source import ROOT
 import pytest
 
-from sonar_imm.cli import main
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.topics import fitting_systems, fitting_topics, instruments
-from sonar_imm.recordings.writer import BagWriter
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.topics import fitting_systems, fitting_topics, instruments
+from sonar_imm_tools.recordings.writer import BagWriter
 
 FEW = ('--set', 'particles_per_model=10')
 

@@ -25,7 +25,7 @@ import sys
 from helpers.dive_bags import write_dive
 import pytest
 
-from sonar_imm.cli import main
+from sonar_imm_tools.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -156,7 +156,7 @@ def test_bad_parameter_files_are_one_sentence(dive, tmp_path, capsys, text, word
 
 
 def test_the_shipped_parameter_file_is_understood(call, dive, tmp_path):
-    from sonar_imm.resources import shared_file
+    from sonar_imm_tools.resources import shared_file
 
     run = call('track', dive, tmp_path / 'out', '--params', shared_file('config/diver.yaml'))
     assert run['estimates'] == 118
@@ -218,7 +218,7 @@ def test_convert_does_not_replace_a_bag(call, tmp_path, capsys):
 
 
 def test_info_on_what_no_tracker_knows_exits_with_1(tmp_path, capsys):
-    from sonar_imm.recordings.writer import BagWriter, ros_message
+    from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('/note', ros_message('std_msgs/msg/String', data='hello'), 10**9)
@@ -247,7 +247,7 @@ def test_a_full_disk_is_named(command, tmp_path):
     if command == 'simulate':
         arguments = ['diver', str(out)]
     done = subprocess.run(
-        [sys.executable, '-m', 'sonar_imm.cli', command, *arguments],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', command, *arguments],
         capture_output=True,
         text=True,
         preexec_fn=limit_files,

@@ -51,7 +51,7 @@ EXACT = {'stamp_ns', 'track_id', 'track_state', 'valid', 'label', 'nis_dof'}
 PROGRAM = """
 import sys
 from helpers.kernel_types import in_effect
-from sonar_imm.cli import main
+from sonar_imm_tools.cli import main
 code = main(['track', *sys.argv[1:]])
 print(' '.join(sorted(in_effect())))
 sys.exit(code)

@@ -20,8 +20,8 @@ import sys
 
 import pytest
 
-from sonar_imm.cli import main
-from sonar_imm.evaluation.sweep import finite_numbers
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.sweep import finite_numbers
 
 TINY = ('--set', 'duration=15', '--workers', '1')
 
@@ -112,7 +112,7 @@ def test_when_most_runs_fail_the_exit_code_is_1(capsys):
 
 @pytest.mark.parametrize('failing, status', [(1, 0), (2, 1)])
 def test_few_failures_leave_a_result(failing, status, monkeypatch, capsys):
-    from sonar_imm.simulation import diver
+    from sonar_imm_tools.simulation import diver
 
     simulate = diver.simulate
 

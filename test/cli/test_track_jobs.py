@@ -19,7 +19,7 @@ import json
 from helpers.dive_bags import write_dive
 import pytest
 
-from sonar_imm.cli import main
+from sonar_imm_tools.cli import main
 
 FEW = ('--set', 'particles_per_model=10')
 COUPLED = ('--set', 'engine=grid', '--set', 'grid_extent=3', '--set', 'smoothing=states')
@@ -88,7 +88,7 @@ def test_two_bags_of_one_name_are_refused(swaths, tmp_path, capsys):
 def test_a_worker_that_dies_is_one_sentence(swaths, tmp_path, capsys, monkeypatch):
     from concurrent.futures.process import BrokenProcessPool
 
-    from sonar_imm.evaluation.tracking import OfflineRun
+    from sonar_imm_tools.offline.tracking import OfflineRun
 
     def dies(self, done):
         raise BrokenProcessPool('gone')

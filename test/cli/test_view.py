@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 
 from msg_adapters.fixes import write_fix
-from sonar_imm.cli import main
-from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings.writer import BagWriter, ros_message
-from sonar_imm.resources import shared_file
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
+from sonar_imm_tools.resources import shared_file
 
 
 @pytest.fixture(scope='module')
@@ -64,7 +64,7 @@ def test_a_topic_that_is_not_there(run, capsys):
 
 def test_without_the_package_it_says_what_to_do(run, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'foxglove', None)
-    monkeypatch.delitem(sys.modules, 'sonar_imm.viewing.server', raising=False)
+    monkeypatch.delitem(sys.modules, 'sonar_imm_tools.viewing.server', raising=False)
     assert main(['view', str(run), '--port', '0']) == 2
     said = capsys.readouterr().err
     assert "pip install 'sonar_imm[view]'" in said and '--browser' in said

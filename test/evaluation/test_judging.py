@@ -19,12 +19,12 @@ from importlib import import_module
 from helpers.dive_bags import write_dive
 import pytest
 
-from sonar_imm.evaluation.benches import benches_of
-from sonar_imm.evaluation.judging import judge, JudgeOptions, Limit
-from sonar_imm.evaluation.run_folder import read_measurements, read_truth, RunFolder
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings.reader import BagError
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.evaluation.benches import benches_of
+from sonar_imm_tools.evaluation.judging import judge, JudgeOptions, Limit
+from sonar_imm_tools.offline.run_folder import read_measurements, read_truth, RunFolder
+from sonar_imm_tools.recordings.reader import BagError
 
 
 def folder_of(tmp_path, estimates=(), **run):

@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.numbers import (
+from sonar_imm_tools.evaluation.numbers import (
     bounds_remark,
     chi2_line,
     chi2_summary,

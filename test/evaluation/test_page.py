@@ -18,7 +18,7 @@ import re
 
 import plotly.graph_objects as go
 
-from sonar_imm.evaluation.page import LEAST_GL_POINTS, MOST_GL_FIGURES, Part, render, Section
+from sonar_imm_tools.evaluation.page import LEAST_GL_POINTS, MOST_GL_FIGURES, Part, render, Section
 
 
 def kinds(sizes):

@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.plotting import nis_figure, thin
+from sonar_imm_tools.evaluation.plotting import nis_figure, thin
 
 
 @pytest.mark.parametrize('count, most', [(0, 10), (10, 10), (11, 10), (99, 10)])

@@ -20,16 +20,16 @@ from helpers.dive_scenes import single_run
 import numpy as np
 
 from msg_adapters.fixes import write_fix
-from sonar_imm.cli import main
-from sonar_imm.evaluation.diver.scoring import score
-from sonar_imm.evaluation.diver.sections import diver_part, Material
-from sonar_imm.evaluation.diver.series import series_of
-from sonar_imm.evaluation.diver.truth import Truth
-from sonar_imm.evaluation.judging import Check
-from sonar_imm.evaluation.page import Card, Section
-from sonar_imm.evaluation.report import report_html, run_part
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings.writer import BagWriter, ros_message
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.diver.scoring import score
+from sonar_imm_tools.evaluation.diver.sections import diver_part, Material
+from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.evaluation.judging import Check
+from sonar_imm_tools.evaluation.page import Card, Section
+from sonar_imm_tools.evaluation.report import report_html, run_part
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 RUN = {
     'system': 'diver',

@@ -24,14 +24,14 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation import jobs
-from sonar_imm.evaluation import sweep as sweeps
-from sonar_imm.evaluation.sweep import Outcome, Sweep
-from sonar_imm.evaluation.tracking import InputOptions
 from sonar_imm.parameters import ConfigError
-from sonar_imm.recordings.sources import BagError
-from sonar_imm.simulation import diver as diver_scenes
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.evaluation import sweep as sweeps
+from sonar_imm_tools.evaluation.sweep import Outcome, Sweep
+from sonar_imm_tools.offline import jobs
+from sonar_imm_tools.offline.tracking import InputOptions
+from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.simulation import diver as diver_scenes
 
 TINY = {
     'bathymetry': ('paper', {'pings': 1, 'last_range': 22.0}, 'height.all.rmse_m'),
@@ -44,7 +44,7 @@ TINY = {
 
 def sweep_of(system, topics=None):
     name, overrides, _ = TINY[system]
-    scene = import_module(f'sonar_imm.simulation.{system}').scenario(name, overrides)
+    scene = import_module(f'sonar_imm_tools.simulation.{system}').scenario(name, overrides)
     config = SYSTEMS[system].config_type()()
     return Sweep(
         system=system,

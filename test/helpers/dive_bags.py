@@ -19,9 +19,9 @@ import numpy as np
 from helpers.dive_scenes import legs, stamps
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings.truth import records_of
-from sonar_imm.recordings.writer import BagWriter, ros_message
-from sonar_imm.simulation.scene import TrueTrack
+from sonar_imm.truth import TrueTrack
+from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
 
 FIX_SIGMA = 1.2
 

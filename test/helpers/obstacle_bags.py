@@ -14,7 +14,7 @@
 
 """Runs of simulated obstacles, made as the command makes them."""
 
-from sonar_imm.cli import main
+from sonar_imm_tools.cli import main
 
 
 def tracked(folder, scenario='tethers', seed=1, **settings):

@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
 from sonar_imm.trackers.navigation import NavigationBuffer
 from sonar_imm.trackers.obstacle.behaviours import build_filter
 from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.navigation import Mount
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 SECOND = 10**9
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'obstacle'

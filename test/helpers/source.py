@@ -22,7 +22,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 MODULES = sorted(
-    path for room in ('sonar_imm', 'msg_adapters') for path in (ROOT / room).rglob('*.py')
+    path
+    for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters')
+    for path in (ROOT / room).rglob('*.py')
 )
 
 COMMON_INTERFACES = {

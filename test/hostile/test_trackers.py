@@ -30,10 +30,10 @@ import numpy as np
 import pytest
 
 from msg_adapters.inputs import inputs_of, made_inputs
-from sonar_imm.cli import main
 from sonar_imm.measurements import Fixes
-from sonar_imm.recordings.own_parameters import write_own_parameters
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.own_parameters import write_own_parameters
 
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
 

@@ -32,7 +32,7 @@ from msg_adapters.array_records import (
 )
 from msg_adapters.table import decode_table, encode_table
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 10**18
 F, N = 5, 4

@@ -20,7 +20,7 @@ import pytest
 from msg_adapters.arrivals import COLUMNS, read_arrivals, REQUIRED, write_arrivals
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import Arrivals, Rejection
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 
 def columns(rows=3, **changes):

@@ -31,7 +31,7 @@ from msg_adapters.detections import (
 )
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import Detections, Rejection
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 PORT, STARBOARD = 0.3, -0.2
 NASTY = (0.0, -1.0, 1e-300, 1e9, 7.0, np.nan, np.inf, -np.inf, 0.25, 30.0)

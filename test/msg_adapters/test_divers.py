@@ -22,7 +22,7 @@ import pytest
 from msg_adapters.displays import displays_of
 from msg_adapters.divers import NAMES, write_markers, write_poses
 from sonar_imm.estimates import Estimate
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 ADD, DELETE, DELETE_ALL = 0, 2, 3
 

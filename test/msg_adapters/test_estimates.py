@@ -25,7 +25,7 @@ from msg_adapters.estimates import (
 from msg_adapters.table import encode_table
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Rejection
-from sonar_imm.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 STATES = ('px', 'py', 'vx', 'vy')
 

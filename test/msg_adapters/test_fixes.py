@@ -21,7 +21,7 @@ import pytest
 
 from msg_adapters.fixes import doubt_fix, read_fix, write_fix
 from sonar_imm.measurements import Fix, Rejection
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 

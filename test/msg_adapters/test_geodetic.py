@@ -28,7 +28,7 @@ from msg_adapters.geodetic import (
 from sonar_imm.acoustics.geodesy import Origin
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import GeodeticFix, Rejection, VesselFix
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 1_700_000_000_123_456_789
 

@@ -21,7 +21,7 @@ from msg_adapters.arrivals import read_arrivals, write_arrivals
 from msg_adapters.fixes import read_fix, write_fix
 from msg_adapters.headers import make_header, stamp_ns, to_enu
 from sonar_imm.measurements import Arrivals, Fix, Rejection
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 
 def fix(frame_id='map'):

@@ -21,8 +21,8 @@ import pytest
 
 from msg_adapters.inputs import inputs_of
 from sonar_imm.measurements import Measurement, Rejection
-from sonar_imm.recordings.messages import ros_message, typestore
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 FOREIGN = ('marine_acoustic_msgs/', 'stonefish_ros2/', 'dave_interfaces/')
 

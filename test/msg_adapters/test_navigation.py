@@ -30,7 +30,7 @@ from msg_adapters.navigation import (
     write_range,
 )
 from sonar_imm.measurements import Altitude, Navigation, Rejection
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 TURNED = Rotation.from_euler('ZYX', [0.7, -0.2, 0.4])
 

@@ -22,8 +22,8 @@ from msg_adapters.geodetic import read_geodetic, read_vessel_fix
 from msg_adapters.relative import read_beacon, read_modem, read_relative, read_usbl_data
 from msg_adapters.vessel import read_heading, read_vessel_pose
 from sonar_imm.measurements import Rejection
-from sonar_imm.recordings.messages import ros_message
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.recordings.messages import ros_message
 
 ODD = [
     np.nan,

@@ -30,7 +30,7 @@ from msg_adapters.estimates import (
 from msg_adapters.fixes import read_fix, write_fix
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Arrivals, Fix
-from sonar_imm.recordings.messages import decode_cdr, ros_message, typestore
+from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
 
 pytest.importorskip('rclpy')
 rclpy_serialization = pytest.importorskip('rclpy.serialization')

@@ -28,7 +28,7 @@ from msg_adapters.relative import (
 from msg_adapters.vessel import read_heading, read_vessel_pose, write_heading
 from sonar_imm.acoustics.geometry import flip_quaternion, rotation_of_quaternion
 from sonar_imm.measurements import NOBODY, Rejection, RelativeFix, VesselHeading, VesselPose
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 7_000_000_000
 

@@ -23,7 +23,7 @@ from msg_adapters.fixes import UNKNOWN_VARIANCE
 from msg_adapters.scans import doubt_scan, read_poses, read_scan, write_poses, write_scan
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import Fixes, Rejection
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 1_700_000_000_123_456_789
 

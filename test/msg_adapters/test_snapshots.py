@@ -20,7 +20,7 @@ import pytest
 from msg_adapters.snapshots import CONSTANTS, read_snapshot, VARIANCES, write_snapshot
 from msg_adapters.table import encode_table
 from sonar_imm.measurements import Rejection, Snapshot
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 BINS, STAVES = 6, 3
 

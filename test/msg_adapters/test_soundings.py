@@ -19,8 +19,8 @@ from msg_adapters.soundings import read_soundings, write_soundings
 from msg_adapters.table import encode_table
 from sonar_imm.estimates import PLACES
 from sonar_imm.measurements import Rejection
-from sonar_imm.recordings.messages import ros_message
 from sonar_imm.soundings import COLUMNS, Soundings
+from sonar_imm_tools.recordings.messages import ros_message
 
 
 def soundings(n=4):

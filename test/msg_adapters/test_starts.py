@@ -21,7 +21,7 @@ import pytest
 
 from msg_adapters.starts import read_start, write_start
 from sonar_imm.measurements import Rejection, Start
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 STAMP = 1_700_000_000_123_456_789
 

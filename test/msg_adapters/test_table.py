@@ -25,7 +25,7 @@ import pytest
 from msg_adapters import table
 from msg_adapters.table import decode_table, encode_table
 from sonar_imm.measurements import Rejection
-from sonar_imm.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 FORMATS = list(table.DATATYPES.values())
 

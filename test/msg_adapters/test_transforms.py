@@ -23,7 +23,7 @@ from msg_adapters.transforms import read_transforms, write_transforms
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Rejection, StaticTransforms
-from sonar_imm.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.messages import ros_message, typestore
 
 
 def message(parent='base_link', child='sonar', rpy=(0.1, -0.4, 2.9)):

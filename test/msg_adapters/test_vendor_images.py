@@ -21,7 +21,7 @@ import pytest
 from msg_adapters.inputs import inputs_of
 from msg_adapters.sonar_images import write_picture
 from sonar_imm.measurements import Rejection, SonarImage
-from sonar_imm.recordings.messages import ros_message
+from sonar_imm_tools.recordings.messages import ros_message
 
 (IMAGE,) = inputs_of('fls_detector')
 GEOMETRY = {'image_near_range': 2.0, 'image_far_range': 22.0, 'image_fov_deg': 60.0}

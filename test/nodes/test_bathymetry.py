@@ -30,8 +30,8 @@ from sonar_imm.measurements import Navigation
 from sonar_imm.nodes.bathymetry import BathymetryNode
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.soundings import soundings_of
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 SHORT = {'pings': 3, 'last_range': 24.0}
 

@@ -20,12 +20,12 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
 import yaml
 
-from sonar_imm.cli import main
-from sonar_imm.cli.common import load_config
 from sonar_imm.nodes.base import TrackerNode
 from sonar_imm.nodes.fls_detector import FlsDetectorNode
 from sonar_imm.parameters import ConfigError, sections_of
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.cli.common import load_config
 
 NODES = {name: lambda name=name, **more: TrackerNode(name, **more) for name in SYSTEMS}
 

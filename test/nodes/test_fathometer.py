@@ -36,8 +36,8 @@ from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
 from sonar_imm.nodes.fathometer import FathometerNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.qos import input_qos, lockstep_qos, output_qos
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SMALL = ('phones:=8', 'element_spacing:=0.36', 'frequency_max:=2000.0', 'particles:=2000')
 START = 1_700_000_000 * 10**9

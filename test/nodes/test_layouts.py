@@ -23,13 +23,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 import pytest
 import yaml
 
-from sonar_imm.evaluation.tracking import OfflineRun
 from sonar_imm.nodes.messages import message_class
-from sonar_imm.recordings.own_parameters import own_parameters
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.resources import shared_file
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm.viewing.layouts import fitting_layouts, write_layout
+from sonar_imm_tools.offline.tracking import OfflineRun
+from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.resources import shared_file
+from sonar_imm_tools.viewing.layouts import fitting_layouts, write_layout
 
 BAGS = {
     'bathymetry': 'bathymetry_paper',

@@ -27,9 +27,9 @@ from sonar_imm.nodes.diver import DiverNode
 from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import lockstep_qos, transforms_qos
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.simulation.bathymetry import simulator as swath
-from sonar_imm.simulation.obstacle import simulator as ahead
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.simulation.bathymetry import simulator as swath
+from sonar_imm_tools.simulation.obstacle import simulator as ahead
 
 LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -5.0, 8.0)
 ALONE = 'geometry_msgs/msg/TransformStamped'

@@ -32,8 +32,8 @@ from sonar_imm.nodes.messages import make, message_class
 from sonar_imm.nodes.obstacle import ObstacleNode
 from sonar_imm.nodes.qos import lockstep_qos
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 WRITERS = {
     Detections: ('/detections', 'sensor_msgs/msg/PointCloud2', write_detections),

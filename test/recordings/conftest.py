@@ -19,8 +19,8 @@ import pytest
 
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.writer import BagWriter
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.writer import BagWriter
 
 START = 1_700_000_000 * 10**9
 

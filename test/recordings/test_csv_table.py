@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import pytest
 
-from sonar_imm.recordings.csv_table import BadRow, CsvOptions, CsvTable
-from sonar_imm.recordings.sources import BagError
+from sonar_imm_tools.recordings.csv_table import BadRow, CsvOptions, CsvTable
+from sonar_imm_tools.recordings.sources import BagError
 
 
 @pytest.fixture

@@ -26,10 +26,10 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from sonar_imm.recordings import mcap_records
-from sonar_imm.recordings.mcap_scan import McapScan
-from sonar_imm.recordings.messages import ros_message, typestore
-from sonar_imm.recordings.reader import BagError, BagReader
+from sonar_imm_tools.recordings import mcap_records
+from sonar_imm_tools.recordings.mcap_scan import McapScan
+from sonar_imm_tools.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.reader import BagError, BagReader
 
 TEXT = 'std_msgs/msg/String'
 
@@ -238,7 +238,7 @@ def test_a_chunk_of_a_great_many_zeros_costs_no_memory(tmp_path, compression, wi
     packed = zeros(compression, 600 << 20, with_size=with_size)
     file = bomb(tmp_path / 'bomb.mcap', compression, packed, stated)
     code = (
-        'import sys; from sonar_imm.cli import main; status = main(["info", sys.argv[1]]); '
+        'import sys; from sonar_imm_tools.cli import main; status = main(["info", sys.argv[1]]); '
         'print(*(line for line in open("/proc/self/status") if line.startswith("VmHWM"))); '
         'sys.exit(status)'
     )

@@ -20,13 +20,13 @@ import zlib
 import numpy as np
 import pytest
 
-from sonar_imm.recordings.mcap_records import CHUNK, MAGIC, RECORD, records
-from sonar_imm.recordings.mcap_sums import seal, wrong_sums
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagError, BagReader
-from sonar_imm.recordings.sources import RosbagsSource
-from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.resources import share_folder
+from sonar_imm_tools.recordings.mcap_records import CHUNK, MAGIC, RECORD, records
+from sonar_imm_tools.recordings.mcap_sums import seal, wrong_sums
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagError, BagReader
+from sonar_imm_tools.recordings.sources import RosbagsSource
+from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.resources import share_folder
 
 TEXT = 'std_msgs/msg/String'
 SHIPPED = sorted((share_folder() / 'bags').glob('*/*.mcap'))

@@ -17,13 +17,13 @@ import pytest
 
 from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Fix, Rejection
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagError, BagReader
-from sonar_imm.recordings.topics import fitting_topics
-from sonar_imm.recordings.truth import records_of
-from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.simulation.scene import TrueTrack
+from sonar_imm.truth import TrueTrack
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagError, BagReader
+from sonar_imm_tools.recordings.topics import fitting_topics
+from sonar_imm_tools.recordings.truth import records_of
+from sonar_imm_tools.recordings.writer import BagWriter
 
 POINT = 'geometry_msgs/msg/PointStamped'
 

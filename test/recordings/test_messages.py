@@ -15,7 +15,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.recordings.messages import decode_cdr, ros_message, typestore
+from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
 
 
 def test_every_common_message_can_be_made_empty_and_survives_cdr():

@@ -17,8 +17,8 @@
 
 import pytest
 
-from sonar_imm.recordings.own_limit import own_limit, write_own_limit
-from sonar_imm.recordings.sources import BagError
+from sonar_imm_tools.recordings.own_limit import own_limit, write_own_limit
+from sonar_imm_tools.recordings.sources import BagError
 
 
 def test_what_is_written_is_read_and_without_a_file_there_is_none(tmp_path):

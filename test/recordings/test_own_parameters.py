@@ -18,12 +18,12 @@ import json
 
 import pytest
 
-from sonar_imm.cli import main
 from sonar_imm.parameters import parameters_from_yaml
-from sonar_imm.recordings.own_parameters import own_parameters, unusual, write_own_parameters
-from sonar_imm.simulation.fathometer.simulator import scenario as fathometer_scenario
-from sonar_imm.simulation.obstacle.simulator import scenario as obstacle_scenario
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.own_parameters import own_parameters, unusual, write_own_parameters
+from sonar_imm_tools.simulation.fathometer.simulator import scenario as fathometer_scenario
+from sonar_imm_tools.simulation.obstacle.simulator import scenario as obstacle_scenario
 
 
 def test_only_what_differs_from_the_defaults_is_told():

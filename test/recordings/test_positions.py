@@ -26,16 +26,16 @@ from msg_adapters.geodetic import write_geodetic
 from msg_adapters.navigation import write_navigation
 from msg_adapters.scans import write_scan
 from sonar_imm.acoustics.geodesy import Origin
-from sonar_imm.evaluation.inspection import inspect
-from sonar_imm.evaluation.run_folder import RunFolder
-from sonar_imm.evaluation.tracking import InputOptions, OfflineRun, write_run
 from sonar_imm.measurements import Fix, Fixes, GeodeticFix, VesselPose
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.positions import GAP_S, Positions, read_positions, write_position
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.topics import fitting_topics
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm_tools.offline.inspection import inspect
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.offline.tracking import InputOptions, OfflineRun, write_run
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.positions import GAP_S, Positions, read_positions, write_position
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.topics import fitting_topics
 
 START, SECOND = 1_700_000_000, 10**9
 ORIGIN = Origin(59.0, 10.0)

@@ -22,9 +22,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 import yaml
 
-from sonar_imm.recordings.messages import ros_message, typestore
-from sonar_imm.recordings.reader import BagError, BagReader
-from sonar_imm.recordings.writer import BagWriter
+from sonar_imm_tools.recordings.messages import ros_message, typestore
+from sonar_imm_tools.recordings.reader import BagError, BagReader
+from sonar_imm_tools.recordings.writer import BagWriter
 
 FIX = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 CUSTOM = 'my_msgs/msg/Custom'

@@ -19,10 +19,10 @@ import numpy as np
 
 from msg_adapters.estimates import read_estimate
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings import scenes
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.truth import records_of
-from sonar_imm.simulation.scene import Received, Scene, TrueReflectors, TrueTrack, TruthTable
+from sonar_imm.truth import Received, Scene, TrueReflectors, TrueTrack, TruthTable
+from sonar_imm_tools.recordings import scenes
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.truth import records_of
 
 START_NS = 1_700_000_000_000_000_000
 

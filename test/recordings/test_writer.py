@@ -16,9 +16,9 @@ import filecmp
 
 import pytest
 
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.sources import BagError
-from sonar_imm.recordings.writer import BagWriter
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import BagError
+from sonar_imm_tools.recordings.writer import BagWriter
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])

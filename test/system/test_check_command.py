@@ -25,7 +25,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.cli import main  # noqa: E402
+from sonar_imm_tools.cli import main  # noqa: E402
 
 pytestmark = pytest.mark.system
 
@@ -113,7 +113,7 @@ def test_a_limit_that_is_not_reached_exits_with_1(bag, capsys):
 
 
 def test_lockstep_with_nobody_is_one_line_and_exit_code_1(bag, capsys, monkeypatch):
-    from sonar_imm.nodes import player
+    from sonar_imm_tools.replay import player
 
     monkeypatch.setattr(player, 'MATCH_LIMIT', 0.5)
     assert main(['play', str(bag), '--lockstep', '/nobody']) == 1
@@ -128,7 +128,7 @@ def children(pid):
 @pytest.mark.parametrize('how', [signal.SIGTERM, signal.SIGHUP])
 def test_a_check_that_is_ended_takes_its_node_along(bag, how):
     check = subprocess.Popen(
-        [sys.executable, '-m', 'sonar_imm.cli', 'check', 'diver', '--bag', str(bag)],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', 'check', 'diver', '--bag', str(bag)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

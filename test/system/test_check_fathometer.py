@@ -18,7 +18,7 @@ import json
 
 import pytest
 
-from sonar_imm.cli import main
+from sonar_imm_tools.cli import main
 
 pytestmark = pytest.mark.system
 
@@ -37,7 +37,7 @@ def test_the_shipped_recordings_pass(tmp_path, capsys):
 
 
 def test_a_limit_that_cannot_be_met_fails(tmp_path, capsys):
-    from sonar_imm.resources import share_folder
+    from sonar_imm_tools.resources import share_folder
 
     bag = share_folder() / 'bags' / 'fathometer_array'
     assert main(['check', 'fathometer', '--json', '--bag', str(bag), '--limit', '1e-6']) == 1
@@ -46,7 +46,7 @@ def test_a_limit_that_cannot_be_met_fails(tmp_path, capsys):
 
 
 def test_told_otherwise_than_it_says_a_recording_of_another_array_is_counted_out(tmp_path, capsys):
-    from sonar_imm.resources import share_folder
+    from sonar_imm_tools.resources import share_folder
 
     bag = share_folder() / 'bags' / 'fathometer_array'
     assert main(['track', str(bag), str(tmp_path / 'out'), '--set', 'phones=32', '--json']) == 0

@@ -26,11 +26,11 @@ from msg_adapters.inputs import inputs_of  # noqa: E402
 from msg_adapters.transforms import write_transforms  # noqa: E402
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
-from sonar_imm.cli import main  # noqa: E402
 from sonar_imm.measurements import StaticTransforms  # noqa: E402
-from sonar_imm.recordings.messages import ros_message  # noqa: E402
-from sonar_imm.recordings.writer import BagWriter  # noqa: E402
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
+from sonar_imm_tools.cli import main  # noqa: E402
+from sonar_imm_tools.recordings.messages import ros_message  # noqa: E402
+from sonar_imm_tools.recordings.writer import BagWriter  # noqa: E402
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
 
 pytestmark = pytest.mark.system
 LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -5.0, 8.0)

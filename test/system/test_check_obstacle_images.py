@@ -20,7 +20,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.cli import main  # noqa: E402
+from sonar_imm_tools.cli import main  # noqa: E402
 
 pytestmark = pytest.mark.system
 

@@ -23,10 +23,10 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.cli import main  # noqa: E402
 from sonar_imm.measurements import Start  # noqa: E402
-from sonar_imm.recordings.scenes import write_scene  # noqa: E402
-from sonar_imm.simulation.diver.simulator import scenario, simulate  # noqa: E402
+from sonar_imm_tools.cli import main  # noqa: E402
+from sonar_imm_tools.recordings.scenes import write_scene  # noqa: E402
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate  # noqa: E402
 
 pytestmark = pytest.mark.system
 

@@ -26,13 +26,13 @@ import pytest
 
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix, FrameGuard, Rejection
-from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id, run_lockstep
-from sonar_imm.nodes.link import LinkError
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.writer import BagWriter
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id, run_lockstep
+from sonar_imm_tools.replay.link import LinkError
 
 pytestmark = pytest.mark.system
 

@@ -27,7 +27,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id  # noqa: E402
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id  # noqa: E402
 
 pytestmark = pytest.mark.system
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.system
 def command(domain, *arguments):
     """A started command in the ROS domain `domain`."""
     return subprocess.Popen(
-        [sys.executable, '-m', 'sonar_imm.cli', *map(str, arguments)],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, arguments)],
         cwd=ROOT,
         env=dict(os.environ, ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST'),
         stdout=subprocess.PIPE,

@@ -26,17 +26,17 @@ from helpers.faults.figures import count
 from helpers.source import ROOT
 import pytest
 
-from sonar_imm.evaluation.batch import run_folders
-from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.files import UNFINISHED
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm_tools.offline.batch import run_folders
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.reader import BagReader
 
 pytestmark = pytest.mark.system
 MOMENTS = count(6, 20)
 
 
 def command(*arguments):
-    return [sys.executable, '-m', 'sonar_imm.cli', *map(str, arguments)]
+    return [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, arguments)]
 
 
 def whole_run(path):

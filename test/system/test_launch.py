@@ -30,8 +30,8 @@ import time
 
 import pytest
 
-from sonar_imm.nodes.harness import reserved_domain_id
 from sonar_imm.trackers import SYSTEMS
+from sonar_imm_tools.replay.harness import reserved_domain_id
 
 pytestmark = pytest.mark.system
 START_LIMIT = 240.0  # seconds; four nodes compile their kernels at once when the cache is empty

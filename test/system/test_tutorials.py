@@ -32,7 +32,7 @@ import sys
 from helpers.source import ROOT
 import pytest
 
-from sonar_imm.nodes.harness import reserved_domain_id
+from sonar_imm_tools.replay.harness import reserved_domain_id
 
 pytestmark = pytest.mark.system
 

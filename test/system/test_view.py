@@ -30,12 +30,12 @@ pytest.importorskip('websockets')
 
 from helpers.foxglove_client import Viewer  # noqa: E402
 
-from sonar_imm.cli import main  # noqa: E402
-from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id  # noqa: E402
-from sonar_imm.nodes.link import Link  # noqa: E402
-from sonar_imm.nodes.player import play, PlayOptions  # noqa: E402
-from sonar_imm.recordings.reader import BagReader  # noqa: E402
-from sonar_imm.resources import shared_file  # noqa: E402
+from sonar_imm_tools.cli import main  # noqa: E402
+from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id  # noqa: E402
+from sonar_imm_tools.replay.link import Link  # noqa: E402
+from sonar_imm_tools.replay.player import play, PlayOptions  # noqa: E402
+from sonar_imm_tools.resources import shared_file  # noqa: E402
 
 pytestmark = pytest.mark.system
 
@@ -47,7 +47,7 @@ LIMIT = 240.0
 def viewing(*arguments, **environment):
     """The command as a process, and a viewer connected to the address that it says."""
     process = subprocess.Popen(
-        [sys.executable, '-m', 'sonar_imm.cli', 'view', *arguments, '--port', '0'],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', 'view', *arguments, '--port', '0'],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -30,10 +30,10 @@ from sonar_imm.measurements import (
     StaticTransforms,
 )
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.bathymetry import simulator as swath
-from sonar_imm.simulation.obstacle import simulator as obstacle
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.frames import FrameDoor
+from sonar_imm_tools.simulation.bathymetry import simulator as swath
+from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 
 LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -15.0, 8.0)
 MOUNT = Pose(np.array(LEVER), geometry.rotation(*np.radians(RPY)))

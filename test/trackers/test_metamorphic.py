@@ -47,8 +47,8 @@ from msg_adapters.estimates import read_estimate, write_estimate
 from msg_adapters.obstacles import write_markers, write_poses
 from msg_adapters.soundings import read_soundings, write_soundings
 from sonar_imm.measurements import Fix
-from sonar_imm.recordings.messages import ros_message
 from sonar_imm.soundings import soundings_of
+from sonar_imm_tools.recordings.messages import ros_message
 
 BILLION = 10**9 * SECOND
 """From 1970 on a stamp may be so much later."""

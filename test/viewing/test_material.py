@@ -21,12 +21,12 @@ import pytest
 
 from msg_adapters.estimates import read_estimate
 from msg_adapters.headers import stamp_ns
-from sonar_imm.cli import main
-from sonar_imm.recordings.messages import decode_cdr, ros_message, typestore
-from sonar_imm.recordings.reader import BagError, BagReader
-from sonar_imm.recordings.writer import BagWriter
-from sonar_imm.resources import shared_file
-from sonar_imm.viewing.material import Material, opened, Recording
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.messages import decode_cdr, ros_message, typestore
+from sonar_imm_tools.recordings.reader import BagError, BagReader
+from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.resources import shared_file
+from sonar_imm_tools.viewing.material import Material, opened, Recording
 
 START = 10**18
 

@@ -19,8 +19,8 @@ import time
 
 import pytest
 
-from sonar_imm.viewing.material import Shown
-from sonar_imm.viewing.playback import Playback, Status
+from sonar_imm_tools.viewing.material import Shown
+from sonar_imm_tools.viewing.playback import Playback, Status
 
 STEP = 20_000_000
 FIRST = 1_700_000_000 * 10**9

@@ -25,12 +25,12 @@ pytest.importorskip('websockets')
 
 from helpers.foxglove_client import Viewer  # noqa: E402
 
-from sonar_imm.recordings.messages import message_definition  # noqa: E402
-from sonar_imm.recordings.reader import BagReader  # noqa: E402
-from sonar_imm.resources import shared_file  # noqa: E402
-from sonar_imm.viewing.material import Channel, opened  # noqa: E402
-from sonar_imm.viewing.playback import Playback  # noqa: E402
-from sonar_imm.viewing.server import ViewServer  # noqa: E402
+from sonar_imm_tools.recordings.messages import message_definition  # noqa: E402
+from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
+from sonar_imm_tools.resources import shared_file  # noqa: E402
+from sonar_imm_tools.viewing.material import Channel, opened  # noqa: E402
+from sonar_imm_tools.viewing.playback import Playback  # noqa: E402
+from sonar_imm_tools.viewing.server import ViewServer  # noqa: E402
 
 BAG = 'bags/obstacle_movers'
 PLAYING, PAUSED, ENDED = 0, 1, 3

@@ -16,8 +16,8 @@
 
 import pytest
 
-from sonar_imm.evaluation.bathymetry import bench
-from sonar_imm.evaluation.bathymetry.peers import cut, stone_soup_filter
+from sonar_imm_tools.evaluation.bathymetry import bench
+from sonar_imm_tools.evaluation.bathymetry.peers import cut, stone_soup_filter
 
 
 @pytest.fixture

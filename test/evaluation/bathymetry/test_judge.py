@@ -19,14 +19,14 @@ import json
 import numpy as np
 import pytest
 
-from sonar_imm.cli import main
-from sonar_imm.evaluation.bathymetry import truth_topics
-from sonar_imm.evaluation.bathymetry.figures import spectrum_figure
-from sonar_imm.evaluation.bathymetry.profiles import profile_of
-from sonar_imm.evaluation.judging import judge, JudgeOptions
-from sonar_imm.evaluation.run_folder import RunFolder
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.bathymetry import truth_topics
+from sonar_imm_tools.evaluation.bathymetry.figures import spectrum_figure
+from sonar_imm_tools.evaluation.bathymetry.profiles import profile_of
+from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 
 def run(*arguments):

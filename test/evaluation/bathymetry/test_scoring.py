@@ -17,9 +17,9 @@
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
-from sonar_imm.evaluation.bathymetry.scoring import runs, score
-from sonar_imm.evaluation.bathymetry.summary import lines, summary_sentence
+from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, Swath, TrueFloor
+from sonar_imm_tools.evaluation.bathymetry.scoring import runs, score
+from sonar_imm_tools.evaluation.bathymetry.summary import lines, summary_sentence
 
 N = 20
 PATCH = slice(8, 14)

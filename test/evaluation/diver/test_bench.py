@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.diver import bench
+from sonar_imm_tools.evaluation.diver import bench
 
 
 def test_turns_compose_and_keep_the_speed():

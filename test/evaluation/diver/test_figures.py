@@ -18,11 +18,11 @@ from helpers.dive_scenes import single_run
 import numpy as np
 from scipy.stats import chi2
 
-from sonar_imm.evaluation.diver import figures
-from sonar_imm.evaluation.diver.scoring import fix_series
-from sonar_imm.evaluation.diver.series import series_of
-from sonar_imm.evaluation.diver.truth import Truth
 from sonar_imm.measurements import Fix
+from sonar_imm_tools.evaluation.diver import figures
+from sonar_imm_tools.evaluation.diver.scoring import fix_series
+from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.truth import Truth
 
 
 def test_ellipses_hold_the_probability_they_claim():

@@ -20,9 +20,9 @@ from helpers.dive_scenes import estimate_at, SECOND, START_NS, truth_estimate
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.diver.matching import assign, match, track_summary
-from sonar_imm.evaluation.diver.series import series_of
-from sonar_imm.evaluation.diver.truth import Truth
+from sonar_imm_tools.evaluation.diver.matching import assign, match, track_summary
+from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.truth import Truth
 
 FAR = 1000.0
 

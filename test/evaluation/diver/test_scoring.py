@@ -29,11 +29,11 @@ from helpers.dive_scenes import (
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.diver.scoring import fix_series, score
-from sonar_imm.evaluation.diver.series import series_of
-from sonar_imm.evaluation.diver.truth import Truth
-from sonar_imm.evaluation.run_folder import finite
 from sonar_imm.measurements import Fix
+from sonar_imm_tools.evaluation.diver.scoring import fix_series, score
+from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.truth import Truth
+from sonar_imm_tools.offline.run_folder import finite
 
 
 def scored(estimates, truth, **options):

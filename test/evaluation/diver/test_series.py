@@ -18,7 +18,7 @@ from helpers.dive_scenes import covariance, estimate_at, HEADINGS, START_NS, tru
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.series import series_of
 
 STATES = np.array([[1.0, 2.0, 0.5, -0.5], [3.0, 4.0, 0.0, 0.8]])
 

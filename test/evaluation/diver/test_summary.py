@@ -14,7 +14,7 @@
 
 """The sentences about a run of the diver tracker."""
 
-from sonar_imm.evaluation.diver.summary import summary_sentence
+from sonar_imm_tools.evaluation.diver.summary import summary_sentence
 
 
 def metrics(tracked, raw):

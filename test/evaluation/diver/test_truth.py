@@ -18,8 +18,8 @@ from helpers.dive_scenes import SECOND, START_NS, truth_estimate
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.diver.series import series_of
-from sonar_imm.evaluation.diver.truth import Truth, TruthPath
+from sonar_imm_tools.evaluation.diver.series import series_of
+from sonar_imm_tools.evaluation.diver.truth import Truth, TruthPath
 
 PATH = TruthPath(
     1,

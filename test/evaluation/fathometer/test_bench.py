@@ -16,7 +16,7 @@
 
 import pytest
 
-from sonar_imm.evaluation.fathometer import bench
+from sonar_imm_tools.evaluation.fathometer import bench
 
 
 @pytest.fixture(autouse=True)

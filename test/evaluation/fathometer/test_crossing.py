@@ -20,16 +20,16 @@ import numpy as np
 import pytest
 
 from msg_adapters.array_records import write_trace
-from sonar_imm.cli import main
-from sonar_imm.evaluation.fathometer.crossing import common_shift, crossing_metrics, summary
-from sonar_imm.evaluation.run_folder import RunFolder
 from sonar_imm.measurements import Trace
-from sonar_imm.recordings.conversion import ConversionReport, write_bag
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.own_parameters import write_own_parameters
-from sonar_imm.recordings.positions import write_position
-from sonar_imm.recordings.sources import BagError
 from sonar_imm.trackers.fathometer.response import envelope_parameters
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.fathometer.crossing import common_shift, crossing_metrics, summary
+from sonar_imm_tools.offline.run_folder import RunFolder
+from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.own_parameters import write_own_parameters
+from sonar_imm_tools.recordings.positions import write_position
+from sonar_imm_tools.recordings.sources import BagError
 
 SECOND = 10**9
 LON, LAT, METRE = -91.64, 17.13, 180.0 / (np.pi * 6_371_008.8)

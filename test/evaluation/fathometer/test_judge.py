@@ -19,17 +19,17 @@ import json
 import numpy as np
 import pytest
 
-from sonar_imm.cli import main
-from sonar_imm.evaluation.fathometer import LIMIT
-from sonar_imm.evaluation.fathometer.bench import bench_likelihood, bench_record
-from sonar_imm.evaluation.fathometer.fixed_order import fixed_orders
-from sonar_imm.evaluation.fathometer.records import Record, records_of, Reflections
-from sonar_imm.evaluation.fathometer.scoring import pair, score
-from sonar_imm.evaluation.fathometer.sections import response_image
-from sonar_imm.evaluation.judging import judge
-from sonar_imm.evaluation.run_folder import read_measurements, read_truth, RunFolder
 from sonar_imm.measurements import Trace
-from sonar_imm.recordings.sources import BagError
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.fathometer import LIMIT
+from sonar_imm_tools.evaluation.fathometer.bench import bench_likelihood, bench_record
+from sonar_imm_tools.evaluation.fathometer.fixed_order import fixed_orders
+from sonar_imm_tools.evaluation.fathometer.records import Record, records_of, Reflections
+from sonar_imm_tools.evaluation.fathometer.scoring import pair, score
+from sonar_imm_tools.evaluation.fathometer.sections import response_image
+from sonar_imm_tools.evaluation.judging import judge
+from sonar_imm_tools.offline.run_folder import read_measurements, read_truth, RunFolder
+from sonar_imm_tools.recordings.sources import BagError
 
 SECOND = 10**9
 

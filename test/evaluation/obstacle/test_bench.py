@@ -16,7 +16,7 @@
 
 import pytest
 
-from sonar_imm.evaluation.obstacle import bench
+from sonar_imm_tools.evaluation.obstacle import bench
 
 
 def test_all_obstacles_are_tracked_and_every_ping_is_timed():

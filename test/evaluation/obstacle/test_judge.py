@@ -20,13 +20,13 @@ from helpers.obstacle_bags import tracked
 import numpy as np
 import pytest
 
-from sonar_imm.cli import main
 from sonar_imm.estimates import Estimate
-from sonar_imm.evaluation.judging import judge, JudgeOptions
-from sonar_imm.evaluation.obstacle.bench import bench_ping
-from sonar_imm.evaluation.obstacle.scoring import score
-from sonar_imm.evaluation.obstacle.series import series_of, TruePath, truth_of
-from sonar_imm.evaluation.run_folder import RunFolder
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
+from sonar_imm_tools.evaluation.obstacle.bench import bench_ping
+from sonar_imm_tools.evaluation.obstacle.scoring import score
+from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
+from sonar_imm_tools.offline.run_folder import RunFolder
 
 SECOND = 10**9
 

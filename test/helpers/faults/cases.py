@@ -27,8 +27,8 @@ from rclpy.serialization import deserialize_message
 
 from msg_adapters.inputs import inputs_of
 from sonar_imm.nodes.messages import message_class
-from sonar_imm.recordings.measurements import fitting_topics
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm_tools.recordings.measurements import fitting_topics
+from sonar_imm_tools.recordings.reader import BagReader
 
 BAGS = Path(__file__).parents[3] / 'bags'
 SECOND = 10**9

@@ -25,10 +25,15 @@ import time
 from typing import Any
 
 from helpers.live import own_words
-from sonar_imm.nodes.harness import local_discovery, NodeProcess, reserved_domain_id, START_LIMIT
-from sonar_imm.nodes.link import Link
-from sonar_imm.nodes.lockstep import LockStep
 from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm_tools.replay.harness import (
+    local_discovery,
+    NodeProcess,
+    reserved_domain_id,
+    START_LIMIT,
+)
+from sonar_imm_tools.replay.link import Link
+from sonar_imm_tools.replay.lockstep import LockStep
 
 from .cases import CASES
 

@@ -33,11 +33,16 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from sonar_imm.estimates import Estimate
-from sonar_imm.nodes.harness import local_discovery, NodeProcess, reserved_domain_id, START_LIMIT
-from sonar_imm.nodes.link import Link
-from sonar_imm.nodes.lockstep import LockStep, Recorder
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import lockstep_qos
+from sonar_imm_tools.replay.harness import (
+    local_discovery,
+    NodeProcess,
+    reserved_domain_id,
+    START_LIMIT,
+)
+from sonar_imm_tools.replay.link import Link
+from sonar_imm_tools.replay.lockstep import LockStep, Recorder
 
 from .cases import Action, Case, Message, SECOND, Step
 from .closeness import agrees

@@ -17,10 +17,10 @@ import pytest
 from scipy.optimize import least_squares
 
 from msg_adapters.arrivals import read_arrivals
-from sonar_imm.recordings.convert import convert_arrivals
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.sources import BagError
+from sonar_imm_tools.recordings.convert import convert_arrivals
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import BagError
 
 RECEIVERS = 'receiver,x,y,depth\n0,0,0,1\n1,10,0,2\n2,0,20,3\n'
 

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
-from sonar_imm.recordings.convert import convert_autoferry
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.sources import BagError
+from sonar_imm_tools.recordings.convert import convert_autoferry
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import BagError
 
 
 def record(time, measurement, sensor=2, own_ship=(100.0, 200.0)):

@@ -20,19 +20,19 @@ import pytest
 import yaml
 
 from msg_adapters.estimates import read_estimate
-from sonar_imm.recordings.conversion import MOST_NAMED
-from sonar_imm.recordings.convert import (
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm_tools.recordings.conversion import MOST_NAMED
+from sonar_imm_tools.recordings.convert import (
     ConversionReport,
     convert_fixes,
     convert_truth,
     CsvOptions,
     KINDS,
 )
-from sonar_imm.recordings.convert.truth import difference_velocity, number_names
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.sources import BagError
-from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm_tools.recordings.convert.truth import difference_velocity, number_names
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import BagError
 
 
 @pytest.fixture

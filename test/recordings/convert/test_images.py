@@ -22,11 +22,11 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from msg_adapters.navigation import write_navigation
-from sonar_imm.cli import main
 from sonar_imm.measurements import Detections, Navigation, Rejection
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagReader
 
 BEARINGS = np.radians(np.linspace(20.0, -20.0, 41))
 

@@ -25,13 +25,13 @@ from rosbags.typesys import get_types_from_msg
 from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
 from msg_adapters.navigation import write_navigation
 from msg_adapters.sonar_images import DTYPES
-from sonar_imm.cli import main
 from sonar_imm.measurements import Navigation, Rejection, Snapshot
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 RATE, FIRST = 15_000.0, 400  # 0.05 m a bin, from 20 m on
 SCENE = scenario(

@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 import yaml
 
-from sonar_imm.recordings.convert import convert_segy
-from sonar_imm.recordings.convert.profiler import (
+from sonar_imm_tools.recordings.convert import convert_segy
+from sonar_imm_tools.recordings.convert.profiler import (
     doubted_spacing,
     first_arrivals,
     is_envelope,
     measured_instrument,
 )
-from sonar_imm.recordings.positions import read_positions
-from sonar_imm.recordings.reader import BagReader
+from sonar_imm_tools.recordings.positions import read_positions
+from sonar_imm_tools.recordings.reader import BagReader
 
 segyio = pytest.importorskip('segyio')
 T, N = 40, 90

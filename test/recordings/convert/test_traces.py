@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 from msg_adapters.estimates import read_estimate
-from sonar_imm.cli import main
-from sonar_imm.recordings.convert import convert_segy, convert_traces, KINDS
-from sonar_imm.recordings.measurements import measurements_of
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.sources import BagError
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.convert import convert_segy, convert_traces, KINDS
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.sources import BagError
 
 DEPTH = 120.0 + 0.25 * np.arange(40)
 ONES = np.ones((3, 40))

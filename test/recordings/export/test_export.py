@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimates import PLACES
-from sonar_imm.recordings.export.grid import grid_of, write_geotiff
-from sonar_imm.recordings.export.points import Points, read_points, write_las, write_xyz
-from sonar_imm.recordings.sources import BagError
 from sonar_imm.soundings import COLUMNS
+from sonar_imm_tools.recordings.export.grid import grid_of, write_geotiff
+from sonar_imm_tools.recordings.export.points import Points, read_points, write_las, write_xyz
+from sonar_imm_tools.recordings.sources import BagError
 
 
 def points(n=300, seed=2):

@@ -22,13 +22,13 @@ import numpy as np
 import pytest
 
 from msg_adapters.navigation import write_navigation
-from sonar_imm.cli import main
 from sonar_imm.measurements import Navigation
-from sonar_imm.recordings.convert import convert_segy
-from sonar_imm.recordings.messages import ros_message
-from sonar_imm.recordings.positions import read_positions
-from sonar_imm.recordings.reader import BagReader
-from sonar_imm.recordings.writer import BagWriter
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.recordings.convert import convert_segy
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.positions import read_positions
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.writer import BagWriter
 
 segyio = pytest.importorskip('segyio')
 T, N, STACK = 48, 90, 4

@@ -19,7 +19,7 @@ import math
 import numpy as np
 import pytest
 
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 TILT, SPACING, STAVES, NOISE = 37.0, 0.37, 5, 2.5
 ODD = {

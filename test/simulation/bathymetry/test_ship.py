@@ -18,7 +18,7 @@ import pytest
 from sonar_imm.acoustics import geometry, rays, sounding
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate, SUMMER
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate, SUMMER
 
 
 def exact(**more):

@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.simulation.diver.simulator import RECEIVERS, scenario, simulate, TRANSMITTER
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate, TRANSMITTER
 
 
 def run(name, seed=1, **overrides):

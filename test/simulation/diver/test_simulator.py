@@ -21,16 +21,16 @@ import pytest
 
 from sonar_imm.measurements import Fix
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.diver.afloat import ORIGIN
-from sonar_imm.simulation.diver.simulator import (
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.placing import Placer
+from sonar_imm_tools.simulation.diver.afloat import ORIGIN
+from sonar_imm_tools.simulation.diver.simulator import (
     RECEIVERS,
     scenario,
     SCENARIOS,
     simulate,
     TRANSMITTER,
 )
-from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.placing import Placer
 
 
 def content(scene):

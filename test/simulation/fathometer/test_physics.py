@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from scipy.signal import csd
 
-from sonar_imm.simulation.fathometer.scenario import Drift, drift_of
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, scenario, simulate
+from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario, simulate
 
 ODD = {
     'level': 'csdm',

@@ -20,7 +20,7 @@ import pytest
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.fathometer.simulator import drift_of, scenario, SCENARIOS, simulate
+from sonar_imm_tools.simulation.fathometer.simulator import drift_of, scenario, SCENARIOS, simulate
 
 TINY = {'records': 2, 'phones': 6, 'snapshot_seconds': 0.1, 'frequency_max': 1000.0}
 

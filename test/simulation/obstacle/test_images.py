@@ -21,8 +21,8 @@ from scipy.signal.windows import taylor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import SonarImage
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle import scenario, simulate
-from sonar_imm.simulation.obstacle.images import ImageSonar, vertical_pattern
+from sonar_imm_tools.simulation.obstacle import scenario, simulate
+from sonar_imm_tools.simulation.obstacle.images import ImageSonar, vertical_pattern
 
 LEVEL = Pose(np.array([0.0, 0.0, 20.0]), np.eye(3))
 NOWHERE = {'reverberation': 0.0, 'altitude': 5000.0, 'image_gain': 40.0}

@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle.simulator import DOES, scenario, simulate
+from sonar_imm_tools.simulation.obstacle.simulator import DOES, scenario, simulate
 
 
 def test_a_swaying_obstacle_stays_about_its_place():

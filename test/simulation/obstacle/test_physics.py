@@ -21,7 +21,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_imm.measurements import Altitude, Detections, Navigation
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 LEVER, MOUNT = np.array([1.3, -0.4, 0.7]), (4.0, -3.0, 6.0)
 EXACT = {

@@ -22,7 +22,7 @@ from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle.simulator import scenario, SCENARIOS, simulate
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, SCENARIOS, simulate
 
 EXACT = {
     'ideal_navigation': True,

@@ -27,7 +27,7 @@ from helpers.faults.figures import count, long_form
 import numpy as np
 import pytest
 
-from sonar_imm.cli import main
+from sonar_imm_tools.cli import main
 
 pytestmark = pytest.mark.system
 
@@ -92,7 +92,7 @@ def test_damage_of_a_recording_is_said_or_harmless(kind, tmp_path, figures):
 def limited(size, *words):
     """The command as a process that may not write files above `size` bytes, as on a full disk."""
     return subprocess.run(
-        [sys.executable, '-m', 'sonar_imm.cli', *map(str, words)],
+        [sys.executable, '-m', 'sonar_imm_tools.cli', *map(str, words)],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
         capture_output=True,
         text=True,

@@ -24,7 +24,7 @@ from helpers.live import own_words
 import numpy as np
 import pytest
 
-from sonar_imm.nodes.harness import NodeProcess, reserved_domain_id
+from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id
 
 pytestmark = pytest.mark.system
 

@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Snapshot
-from sonar_imm.simulation.bathymetry import simulator as swath
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
 from sonar_imm.trackers.bathymetry.ping import residual_ratio
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker, noise_warnings
+from sonar_imm_tools.simulation.bathymetry import simulator as swath
 
 
 @pytest.mark.parametrize('fading', [False, True])

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Snapshot
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.ping import LoudBins
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 WIDE = {'staves': 2, 'spacing_wavelengths': 3.66, 'pings': 4, 'last_range': 57.0}
 

@@ -21,9 +21,9 @@ import pytest
 from scipy.stats import kstest, truncnorm
 
 from sonar_imm.acoustics import coherence
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.models import UnknownHeight
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 WATER = 5.0 + 0.05 * np.arange(900)
 

@@ -27,10 +27,10 @@ import pytest
 from sonar_imm.acoustics import array
 from sonar_imm.measurements import Fix, Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.bathymetry.config import MODEL_SETS
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 RNG = np.random.default_rng(1)
 PATCH = np.zeros(300)

@@ -22,8 +22,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_imm.measurements import Navigation, Snapshot
-from sonar_imm.simulation.bathymetry.simulator import scenario, simulate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
 CASE = motion_case()
 EXACT = {

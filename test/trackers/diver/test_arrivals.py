@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Arrivals
-from sonar_imm.simulation.diver.simulator import RECEIVERS, scenario, simulate
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS, scenario, simulate
 
 
 def test_arrivals_are_better_than_fixes_made_of_them():

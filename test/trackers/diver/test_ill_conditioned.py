@@ -20,10 +20,10 @@ import pytest
 
 from sonar_imm.estimation.covariance import is_psd
 from sonar_imm.measurements import Arrivals, Fix
-from sonar_imm.simulation.diver.simulator import RECEIVERS
 from sonar_imm.trackers.diver.config import MODEL_SETS
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
 QUIET = {'cv': (1e-4,), 'cv_cv': (0.0, 0.1), 'cv_ct': (0.0, 0.1, 0.1)}
 

@@ -23,13 +23,13 @@ from sonar_imm.acoustics.arrivals_3d import observe
 from sonar_imm.estimation.student_t import student_t_maximum
 from sonar_imm.estimation.subset_update import subset_update
 from sonar_imm.measurements import Arrivals
-from sonar_imm.simulation.diver.simulator import RECEIVERS
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import Numbers, subset_ping
 from sonar_imm.trackers.diver.pings import optima, ping_numbers, update_by_ping
 from sonar_imm.trackers.diver.robust_kernels import student_t_ping
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
 N = 14
 

@@ -24,7 +24,6 @@ import pytest
 
 from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
-from sonar_imm.simulation.diver.simulator import scenario, simulate
 from sonar_imm.trackers.diver import fix_kernels, soft
 from sonar_imm.trackers.diver import scan as scan_module
 from sonar_imm.trackers.diver.fix_consistency import FixConsistency, MEMORY
@@ -32,6 +31,7 @@ from sonar_imm.trackers.diver.scan import SCALE_MEMORY
 from sonar_imm.trackers.diver.sensing import position_groups
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 ASSOCIATIONS = ('gnn', 'jipda')
 

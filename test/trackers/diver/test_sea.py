@@ -21,11 +21,11 @@ import numpy as np
 import pytest
 
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.diver.simulator import scenario, simulate
 from sonar_imm.trackers.diver.config import DiverConfig
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 OFF = {'receiver_position_std': 1.0, 'receiver_clock_std': 5e-4, 'sound_speed_std': 5.0}
 

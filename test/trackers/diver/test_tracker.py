@@ -24,12 +24,12 @@ import pytest
 from sonar_imm.estimation.consistency import average_bounds
 from sonar_imm.estimation.imm_kernels import combine
 from sonar_imm.measurements import Fix
-from sonar_imm.simulation.diver.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import ADAPTATIONS, MODEL_SETS
 from sonar_imm.trackers.diver.scan import cross
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 
 @pytest.mark.parametrize('model_set', MODEL_SETS)

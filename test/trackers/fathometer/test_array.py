@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers.fathometer import pressure
 from sonar_imm.trackers.fathometer.pressure import CompanionDepths
 from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SMALL = {**scenario('small').told(), 'particles': 2000}
 

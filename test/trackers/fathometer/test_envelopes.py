@@ -19,12 +19,12 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm.evaluation.fathometer.records import records_of
 from sonar_imm.measurements import Trace
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers.fathometer.reflectors import Identities
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.evaluation.fathometer.records import records_of
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 SECOND = 10**9
 

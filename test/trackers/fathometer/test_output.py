@@ -20,10 +20,10 @@ import pytest
 from sonar_imm.acoustics.fathometer import printed_correlation, steering
 from sonar_imm.acoustics.pulse import envelope_pulse
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.fathometer.scenario import Drift
-from sonar_imm.simulation.fathometer.simulator import cross_spectra, scenario
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.response import array_response, Lattice
+from sonar_imm_tools.simulation.fathometer.scenario import Drift
+from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario
 
 LAYER, ARRAY = 130.0, 73.5
 

@@ -25,12 +25,12 @@ import pytest
 from sonar_imm.acoustics.spectra import effective_snapshots, window_of
 from sonar_imm.measurements import ArrayDepth, Pressure, Rejection
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.fathometer.field import expected_csdm
-from sonar_imm.simulation.fathometer.scenario import Drift
-from sonar_imm.simulation.fathometer.simulator import scenario
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot, MAX_BYTES, PressureStream
 from sonar_imm.trackers.fathometer.response import array_coherence, Lattice, processor_pulse
+from sonar_imm_tools.simulation.fathometer.field import expected_csdm
+from sonar_imm_tools.simulation.fathometer.scenario import Drift
+from sonar_imm_tools.simulation.fathometer.simulator import scenario
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 SHORT = {

@@ -25,10 +25,10 @@ import pytest
 from sonar_imm.estimation.consistency import nees, ospa
 from sonar_imm.measurements import Fix, Rejection, Trace
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.fathometer.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.fathometer.response import lattice_of_trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 VECTORS = Path(__file__).parents[2] / 'vectors' / 'fathometer'
 RECORD_NS = 90 * 10**9

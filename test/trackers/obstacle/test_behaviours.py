@@ -24,11 +24,11 @@ import pytest
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
 from sonar_imm.trackers.obstacle.behaviours import behaviour_columns, build_filter
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar
 from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 
 def velocity_errors(scene, final, ping):

@@ -34,9 +34,9 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.simulation.obstacle.simulator import scenario, simulate
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate
 
 NAME = 'approach_dst+3_noisy'
 

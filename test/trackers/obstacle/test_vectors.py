@@ -35,8 +35,8 @@ from scipy.spatial.transform import Rotation
 from msg_adapters.navigation import read_navigation, write_navigation
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.recordings.messages import ros_message
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
+from sonar_imm_tools.recordings.messages import ros_message
 
 NOISY = ('approach_dst+3_noisy', 'approach_level_mirror_noisy')
 NOISE_FREE = ('approach_dst+0.5_noisefree', 'approach_dst+3_noisefree')

@@ -1,0 +1,183 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The ``sonar-imm`` command: one small module per subcommand, loaded only when it is called.
+
+Exit codes: 0 done, 1 failed or a check fell short, 2 bad usage or input, 130 interrupted, 141 the
+reader of the output went away, 129 and 143 ended by SIGHUP and SIGTERM. A mistake of the user
+gives one line on standard error; a traceback is a bug.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+import contextlib
+import functools
+import os
+import signal
+import sys
+import threading
+from typing import Any, NoReturn
+
+import click
+
+from sonar_imm import __version__
+from sonar_imm.texts import visible
+from sonar_imm.threads import one_blas_thread
+
+from .lazy import LazyGroup, READER_GONE
+
+PROGRAM = 'sonar-imm'
+
+COMMANDS = {
+    'simulate': 'Write a bag of simulated measurements with truth.',
+    'convert': 'Turn other formats (CSV, JSON, ...) into a bag.',
+    'info': 'Show what is in a bag, which tracker fits it and what is wrong with it.',
+    'track': 'Track a recorded bag offline: estimates as bag and CSV.',
+    'evaluate': 'Score a tracked bag: metrics.json and one HTML report.',
+    'export': 'Write the soundings of a tracked bag as XYZ, LAS, LAZ or GeoTIFF.',
+    'view': 'Show a recording, a run or running nodes in Foxglove.',
+    'play': 'Publish a bag to live nodes.',
+    'echo': 'Show the estimates of running nodes as a live table.',
+    'check': 'Start the real nodes, play the bags, compare with track and truth.',
+    'sweep': 'Monte Carlo: simulate, track and score under many seeds.',
+    'bench': 'Measure speed against other libraries, in one run.',
+    'demo': 'Live node, offline tracker, scores and one report on the shipped bags.',
+}
+
+
+@click.group(
+    name=PROGRAM,
+    cls=LazyGroup,
+    package=__name__,
+    summaries=COMMANDS,
+    invoke_without_command=True,
+    context_settings={'help_option_names': ['-h', '--help'], 'max_content_width': 100},
+    epilog=f'`{PROGRAM} COMMAND --help` shows the options of a command and an example.',
+)
+@click.version_option(__version__, prog_name=PROGRAM)
+@click.pass_context
+def command(ctx: click.Context) -> None:
+    """Track targets and terrain with sonar, by several models at once."""
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and give its exit code. The only place that prints errors."""
+    one_blas_thread()
+    with _signals_unwind():
+        return _run(arguments)
+
+
+@contextlib.contextmanager
+def _signals_unwind() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP unwind every ``with`` block, as Ctrl-C does; otherwise a node that
+    was started would live on. Handlers that a program has set itself are kept."""
+    ours = []
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, _leave)
+                ours.append(number)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _leave(number: int, _frame: object) -> NoReturn:
+    # A second signal must not interrupt the unwinding.
+    for one in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(one, signal.SIG_IGN)
+    sys.unraisablehook = functools.partial(_quiet_on_half_made, sys.unraisablehook)
+    raise SystemExit(128 + number)
+
+
+def _quiet_on_half_made(others: Callable[[Any], None], problem: Any) -> None:
+    """Say nothing of objects whose constructor the signal broke off: they miss their attributes
+    when they are taken down."""
+    taken_down = getattr(problem.object, '__name__', '') == '__del__'
+    if not (taken_down and isinstance(problem.exc_value, AttributeError)):
+        others(problem)
+
+
+def _run(arguments: Sequence[str] | None) -> int:
+    try:
+        status = command.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
+        if status == READER_GONE:
+            # The buffered rest cannot be written; Python would report an error at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return status if isinstance(status, int) else 0
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx else PROGRAM
+        return _complain(f'{error.format_message().rstrip(".")} (see {path} --help)')
+    except click.ClickException as error:
+        return _complain(error.format_message())
+    except click.Abort:
+        return _complain('interrupted', 130)
+    except Exception as error:
+        if _replay_failed(error):
+            return _complain(str(error), 1)
+        sentence = _user_error(error)
+        if sentence is None:
+            raise
+        return _complain(sentence)
+
+
+def _replay_failed(error: Exception) -> bool:
+    """Whether a live node failed. Only commands that load rclpy can have this error."""
+    link = sys.modules.get('sonar_imm_tools.replay.link')
+    return link is not None and isinstance(error, link.LinkError)
+
+
+def _user_error(error: Exception) -> str | None:
+    """Sentence for an error in the input, the configuration or the machine; None for a bug."""
+    from sonar_imm.measurements import Rejection
+    from sonar_imm.parameters import ConfigError
+
+    from ..recordings.reader import BagError
+
+    if isinstance(error, (ConfigError, Rejection, BagError)):
+        return str(error)
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        return missing_package(error.name.split('.')[0])
+    if isinstance(error, OSError):
+        known = error.filename and error.strerror
+        return f'{error.filename}: {error.strerror}' if known else str(error)
+    return None
+
+
+def missing_package(name: str) -> str | None:
+    """How to install a package that only some commands need; None for one that all need."""
+    remedies = {
+        'distributed': 'dask.distributed, which distributes the runs, is not installed: pip '
+        "install 'sonar_imm[sweep]', or use --workers 1",
+        'rclpy': "ROS 2 is not found: source a Jazzy workspace, or pip install 'sonar_imm[ros]'",
+        'segyio': "segyio, which reads SEG-Y, is not installed: pip install 'sonar_imm[segy]'",
+        'laspy': "laspy, which writes LAS and LAZ, is not here: pip install 'sonar_imm[chart]'",
+        'rasterio': "rasterio, which writes GeoTIFF, is not here: pip install 'sonar_imm[chart]'",
+        'pyarrow': "pyarrow, which writes Parquet, is not here: pip install 'sonar_imm[parquet]'",
+        'foxglove': 'foxglove-sdk, which serves the view, is not here: pip install '
+        "'sonar_imm[view]', or use --browser",
+        'rerun': "rerun-sdk, which writes the file, is not here: pip install 'sonar_imm[rerun]'",
+        'filterpy': "FilterPy is not installed: pip install 'sonar_imm[test]'",
+    }
+    return remedies.get(name)
+
+
+def _complain(sentence: str, status: int = 2) -> int:
+    print(f'{PROGRAM}: {visible(" ".join(sentence.split()))}', file=sys.stderr)
+    return status

@@ -1,0 +1,100 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm bench``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sonar_imm.trackers import SYSTEMS
+
+from .common import BAG, example, json_option, print_json, say
+
+
+@click.command(epilog=example('sonar-imm bench', 'sonar-imm bench diver --json --skip-node'))
+@click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
+@click.option(
+    '--rounds',
+    type=click.IntRange(min=1),
+    default=7,
+    show_default=True,
+    help='Paired rounds against other programs.',
+)
+@click.option('--bag', type=BAG, help='Recording to time the node with; a shipped one by default.')
+@click.option('--skip-node', is_flag=True, help='Leave out the live node (needs ROS 2).')
+@click.option('--strict', is_flag=True, help='Exit code 1 when a measurement misses its goal.')
+@json_option
+def command(
+    systems: tuple[str, ...],
+    rounds: int,
+    bag: Path | None,
+    skip_node: bool,
+    strict: bool,
+    as_json: bool,
+) -> None:
+    """Measure the speed of the filters, beside other libraries in the same run, and of the nodes.
+
+    Times depend on the machine and its load; the ratio to another program hardly does. Without
+    SYSTEMS all are measured.
+    """
+    if bag is not None and len(systems or SYSTEMS) > 1:
+        raise click.UsageError('--bag needs exactly one system')
+    results = {}
+    for system in systems or SYSTEMS:
+        say(f'{system}:', quiet=as_json)
+        results[system] = _measure(system, rounds, quiet=as_json)
+        if not skip_node:
+            results[system]['node_ms'] = latency = _node_latency(system, bag)
+            say(
+                f'  live node, message to estimate: p50 {latency["p50"]:.2f} ms, '
+                f'p99 {latency["p99"]:.2f} ms',
+                quiet=as_json,
+            )
+    if as_json:
+        print_json(results)
+    if strict and not all(
+        part.get('good', True) for result in results.values() for part in result.values()
+    ):
+        raise click.exceptions.Exit(1)
+
+
+def _measure(system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
+    """The benches of one system, without those that need a library that is not installed."""
+    from ..evaluation.benches import benches_of
+    from . import missing_package
+
+    result = {}
+    for bench in benches_of(system):
+        try:
+            result[bench.name] = bench.measure(rounds)
+        except ModuleNotFoundError as error:
+            if (remedy := missing_package((error.name or '').split('.')[0])) is None:
+                raise
+            say(f'  {bench.name} left out, nothing to compare with: {remedy}', quiet=quiet)
+        else:
+            say(f'  {bench.sentence(result[bench.name])}', quiet=quiet)
+    return result
+
+
+def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
+    from ..recordings.own_parameters import own_parameters
+    from ..replay.harness import run_lockstep
+    from .checking import shipped_bags
+
+    bag = bag or shipped_bags(system)[0]
+    return run_lockstep(bag, system, params_file=own_parameters(bag)).latency_ms()

@@ -1,0 +1,129 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm check``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import tempfile
+from typing import TYPE_CHECKING
+
+import click
+
+from sonar_imm.trackers import SYSTEMS
+
+from .common import BAG, example, json_option, print_json, say
+
+if TYPE_CHECKING:
+    from .checking import CheckedRecording
+
+
+@click.command(
+    epilog=example('sonar-imm check diver', 'sonar-imm check diver --bag dive.bag --limit 3')
+)
+@click.argument('systems', nargs=-1, type=click.Choice(list(SYSTEMS)))
+@click.option('--bag', type=BAG, help='Play this recording instead of the shipped ones.')
+@click.option(
+    '--params',
+    type=click.Path(path_type=Path, dir_okay=False),
+    help='Parameter file for the node and the offline run.',
+)
+@click.option(
+    '--limit',
+    type=click.FloatRange(min=0.0),
+    metavar='ERROR',
+    help='Largest error allowed, of the kind and in the unit that the check prints, e.g. '
+    'position RMSE in metres for the diver. By default that of the recording (check.yaml in its '
+    'folder), or else of the system.',
+)
+@click.option(
+    '--out',
+    type=click.Path(path_type=Path, file_okay=False),
+    help='Keep both runs in this folder.',
+)
+@json_option
+def command(
+    systems: tuple[str, ...],
+    bag: Path | None,
+    params: Path | None,
+    limit: float | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Start the real nodes, play recordings to them in lock-step and check their estimates.
+
+    The estimates have to equal those of `track`, byte for byte, and to lie near the truth. Without
+    SYSTEMS all are checked. Exit code 1 when a check fails.
+    """
+    if bag is not None and len(systems or SYSTEMS) > 1:
+        raise click.UsageError('--bag needs exactly one system')
+    with tempfile.TemporaryDirectory(prefix='sonar_imm_check_') as scratch:
+        recordings = run_checks(
+            systems or tuple(SYSTEMS),
+            out or Path(scratch),
+            bag=bag,
+            params=params,
+            limit=limit,
+            quiet=as_json,
+        )
+    if as_json:
+        print_json([recording.as_dict() for recording in recordings])
+    else:
+        for recording in recordings:
+            print_checks(recording)
+    if not all(recording.good for recording in recordings):
+        raise click.exceptions.Exit(1)
+
+
+def run_checks(
+    systems: tuple[str, ...],
+    folder: Path,
+    *,
+    bag: Path | None = None,
+    params: Path | None = None,
+    limit: float | None = None,
+    quiet: bool = False,
+) -> list[CheckedRecording]:
+    """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`."""
+    from .checking import check_recording, instruments_in, shipped_bags
+
+    return [
+        check_recording(
+            path,
+            system,
+            folder / path.stem / name,
+            params=params,
+            limit=limit,
+            topics=topics,
+            quiet=quiet,
+        )
+        for system in systems
+        for path in ([bag] if bag else shipped_bags(system))
+        for name, topics in instruments_in(path, system).items()
+    ]
+
+
+def print_checks(recording: CheckedRecording) -> None:
+    """Print the checks of one recording."""
+    say(f'{recording.system}: {recording.bag.name}')
+    for check in recording.checks:
+        say(
+            f'  {"ok  " if check.good else "FAIL"}  {check.name}: {check.result}'
+            f' (wanted: {check.wanted})'
+        )
+    say(
+        f'        latency of an estimate: p50 {recording.latency_ms["p50"]:.1f} ms, '
+        f'p99 {recording.latency_ms["p99"]:.1f} ms'
+    )

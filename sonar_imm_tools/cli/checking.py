@@ -1,0 +1,196 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One recording through the real node and through the offline tracker, compared and scored.
+
+``check`` prints the result, ``demo`` makes a report of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from attrs import asdict, frozen
+
+from sonar_imm.node_config import hears_transforms
+from sonar_imm.parameters import Config
+from sonar_imm.trackers import SYSTEMS
+
+from ..evaluation.judging import Check, Judgement
+from ..offline.batch import Job
+from ..offline.run_folder import BAG, CSV, RunFolder
+from ..offline.tracking import final_estimates, InputOptions
+from ..recordings.own_limit import own_limit
+from ..recordings.own_parameters import own_parameters
+from ..recordings.reader import BagReader
+from ..recordings.topics import instruments
+from ..replay.harness import LockstepResult, run_lockstep
+from ..resources import share_folder
+from .common import load_config, load_detector, progress
+from .evaluate import evaluate_run
+from .track import track_one
+
+
+@frozen
+class CheckedRecording:
+    """All checks of one recording, and the judgement of the offline run.
+
+    `folder` holds the runs ``offline`` and ``live``.
+    """
+
+    system: str
+    bag: Path
+    folder: Path
+    checks: tuple[Check, ...]
+    latency_ms: dict[str, float]
+    judgement: Judgement
+
+    @property
+    def good(self) -> bool:
+        """Whether all checks passed."""
+        return all(check.good for check in self.checks)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, fit for JSON."""
+        return {
+            'system': self.system,
+            'bag': str(self.bag),
+            'good': self.good,
+            'checks': [asdict(check) for check in self.checks],
+            'latency_ms': self.latency_ms,
+        }
+
+
+def shipped_bags(system: str) -> list[Path]:
+    """The recordings of `system` that come with the package. Raises FileNotFoundError if none."""
+    found = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
+    if not found:
+        raise FileNotFoundError(f'no recordings for {system} in {share_folder() / "bags"}')
+    return found
+
+
+def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
+    """The inputs by topic of each instrument in a recording, by its name; None: all there are."""
+    with BagReader(bag) as reader:
+        found = instruments(reader, system)
+    if len(found) == 1:
+        return {'': None}
+    return {
+        name: {topic: entry.name for topic, entry in inputs.items()}
+        for name, inputs in found.items()
+    }
+
+
+def check_recording(
+    bag: Path,
+    system: str,
+    folder: Path,
+    *,
+    params: Path | None = None,
+    limit: float | None = None,
+    topics: Mapping[str, str] | None = None,
+    quiet: bool = False,
+) -> CheckedRecording:
+    """Track `bag` offline and by the live node into `folder`, compare, score.
+
+    params: parameter file; None for the one that comes with the recording, if any. limit: largest
+    error allowed, in the unit of the system; None for that of the recording, if it states one, or
+    else of the system. topics: input by topic name; None for those that fit.
+    Raises `BagError`, `ConfigError` and `LinkError`.
+    """
+    params = params or own_parameters(bag)
+    limit = own_limit(bag) if limit is None else limit
+    config, node = load_config(SYSTEMS[system], params, {})
+    options = InputOptions(
+        topics=topics,
+        frame_id=node.frame_id,
+        use_tf_static=hears_transforms(node),
+        world_frame=node.world_frame_convention,
+        detector=load_detector(SYSTEMS[system], params, {}),
+    )
+    run = track_one(
+        Job(
+            bag=bag,
+            folder=folder / 'offline',
+            instrument='',
+            system=system,
+            config=config,
+            options=options,
+            overwrite=True,
+        ),
+        quiet,
+    )
+    with progress('playing to the node', run['messages'], quiet=quiet) as advance:
+        live = run_lockstep(
+            bag,
+            system,
+            params_file=params,
+            settings={**config.as_dict(), 'use_tf_static': hears_transforms(node)},
+            topics=topics,
+            progress=advance,
+        )
+    _keep(live, config, system, folder / 'live')
+    judgement = evaluate_run(folder / 'offline')
+    checks = [_answered(live, run), _equal(folder), _ended(live)]
+    if (accuracy := judgement.accuracy(limit)) is not None:
+        checks.append(accuracy)
+    return CheckedRecording(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
+
+
+def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:
+    """Write the estimates that the node published in the same form as the offline run."""
+    with RunFolder(path).fresh(overwrite=True) as folder:
+        folder.write_estimates(final_estimates(live.estimates, config), system)
+
+
+def _answered(live: LockstepResult, run: dict[str, Any]) -> Check:
+    taken, refused = live.counts.messages, live.counts.refused
+    offline_refused = sum(entry['count'] for entry in run['refused'].values())
+    return Check(
+        'messages taken / refused by the node',
+        f'{taken} / {refused}',
+        f'{run["messages"]} / {offline_refused}',
+        (taken, refused) == (run['messages'], offline_refused),
+    )
+
+
+def _equal(folder: Path) -> Check:
+    """Bag and CSV of both runs, byte for byte; tells how many rows differ when they do."""
+    first, second = folder / 'offline', folder / 'live'
+    names = sorted(path.name for path in (first / BAG).iterdir())
+    files = [Path(CSV), *(Path(BAG) / name for name in names)]
+    same = all(
+        (second / file).is_file() and (first / file).read_bytes() == (second / file).read_bytes()
+        for file in files
+    )
+    result = 'equal bytes' if same else f'{_rows_apart(first / CSV, second / CSV)} rows differ'
+    return Check('estimates of the node against offline', result, 'equal bytes', same)
+
+
+def _rows_apart(first: Path, second: Path) -> int:
+    with first.open(encoding='utf-8') as one, second.open(encoding='utf-8') as other:
+        return sum(a != b for a, b in zip_longest(one, other))
+
+
+def _ended(live: LockstepResult) -> Check:
+    clean = live.exit_code == 0 and 'Traceback' not in live.log
+    return Check(
+        'end of the node after Ctrl-C',
+        f'exit code {live.exit_code}{"" if clean else ", see its log"}',
+        'exit code 0',
+        clean,
+    )

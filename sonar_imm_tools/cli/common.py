@@ -1,0 +1,270 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What several subcommands share: ``--set``, ``--params``, JSON and progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+import contextlib
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+import click
+
+from msg_adapters.inputs import FEEDERS
+from sonar_imm.node_config import node_config_type, NodeConfig, type_specs
+from sonar_imm.parameters import (
+    Config,
+    ConfigError,
+    did_you_mean,
+    parameters_from_yaml,
+    ParameterSpec,
+    sections_of,
+)
+from sonar_imm.texts import visible
+from sonar_imm.trackers import System, SYSTEMS
+
+from ..recordings.own_parameters import NAME as OWN_PARAMETERS
+
+Advance = Callable[[int], None]
+
+BAG = click.Path(path_type=Path)
+SECONDS_BETWEEN_LINES = 5.0
+OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_service')
+"""Parameters that `ros2 param dump` writes of every node, and no tracker needs."""
+
+
+def example(*lines: str) -> str:
+    """The epilog of a help page: example command lines, kept as they are."""
+    return '\b\nExample:\n' + '\n'.join(f'  {line}' for line in lines)
+
+
+def json_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--json``: the result as one JSON object on standard output."""
+    return click.option('--json', 'as_json', is_flag=True, help='Print the result as JSON.')(
+        function
+    )
+
+
+def set_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--set name=value``, may be repeated."""
+    return pairs_option(
+        '--set',
+        'overrides',
+        metavar='NAME=VALUE',
+        help='Change one parameter; may be given several times.',
+    )(function)
+
+
+def pairs_option(*names: str, metavar: str, help: str) -> Callable[..., Any]:
+    """An option of the form NAME=VALUE that may be repeated; the command gets a dict."""
+
+    def split(
+        _ctx: click.Context, _param: click.Parameter, values: Iterable[str]
+    ) -> dict[str, str]:
+        pairs = {}
+        for value in values:
+            name, equals, text = value.partition('=')
+            if not equals or not name.strip():
+                raise click.BadParameter(f"'{value}' is not of the form {metavar}")
+            pairs[name.strip()] = text.strip()
+        return pairs
+
+    return click.option(*names, metavar=metavar, multiple=True, callback=split, help=help)
+
+
+def topic_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--topic input=topic``, may be repeated; the command gets topics by input."""
+    return pairs_option(
+        '--topic',
+        'topics',
+        metavar='INPUT=TOPIC',
+        help='Topic of an input, e.g. fix=/usbl/pose; may be given several times.',
+    )(function)
+
+
+def system_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``--system``: which tracker; not needed when the bag fits only one."""
+    return click.option(
+        '--system',
+        type=click.Choice(list(SYSTEMS)),
+        default=None,
+        help='Which tracker; by default the one whose inputs are in the bag.',
+    )(function)
+
+
+def typed_overrides(config_type: type[Config], overrides: dict[str, str]) -> dict[str, Any]:
+    """Texts of ``--set`` in the types of the parameters. Others stay texts; Config refuses
+    them."""
+    specs = {spec.name: spec for spec in config_type.specs()}
+    return {name: _typed(text, specs.get(name)) for name, text in overrides.items()}
+
+
+def _typed(text: str, spec: ParameterSpec | None) -> Any:
+    if spec is None:
+        return text
+    if spec.kind.endswith('[]'):
+        parts = [part.strip() for part in text.strip('[]() ').split(',') if part.strip()]
+        return [_scalar(part, spec.kind[:-2]) for part in parts]
+    return _scalar(text, spec.kind)
+
+
+def _scalar(text: str, kind: str) -> Any:
+    if kind == 'bool':
+        return {'true': True, 'false': False}.get(text.lower(), text)
+    if kind == 'str':
+        return text
+    try:
+        return int(text) if kind == 'int' else float(text)
+    except ValueError:
+        return text
+
+
+def load_config(
+    system: System, params: Path | None, overrides: dict[str, str]
+) -> tuple[Config, NodeConfig]:
+    """The parameters of tracker and node: defaults, then the file, then ``--set``.
+
+    Raises `ConfigError` with one sentence for each mistake.
+    """
+    types = (system.config_type(), node_config_type(system))
+    choices = {spec.name: spec for spec in type_specs(system.name)}
+    values = _parameters_of(params, system.name) if params else {}
+    specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices
+    values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
+    others = _detector_specs(system)
+    unknown = [
+        f"unknown parameter '{name}'{did_you_mean(name, specs)}"
+        for name in values
+        if name not in specs and name not in others
+    ]
+    # The message types a live node subscribes to are checked too, though a recording has its own.
+    problems = unknown + [
+        trouble
+        for name, spec in choices.items()
+        if name in values and (trouble := spec.problem(values[name]))
+    ]
+    if problems:
+        raise ConfigError(*problems)
+    tracker, node = (
+        config_type.from_mapping(values, ignore_unknown=True) for config_type in types
+    )
+    return tracker, node
+
+
+def load_detector(
+    system: System, params: Path | None, overrides: dict[str, str]
+) -> dict[str, Any]:
+    """Parameters of the detector before the tracker that are not the default: of the section of
+    its node in the file, then ``--set``. Empty for a system without one.
+
+    Raises `ConfigError` with one sentence for each mistake.
+    """
+    if not params and not overrides:
+        return {}
+    specs = _detector_specs(system)
+    if not specs:
+        return {}
+    from sonar_imm.trackers.obstacle.detector import DetectorConfig
+
+    # A file for the tracker's node alone says nothing of the detector.
+    values = _parameters_of(params, FEEDERS[system.name], needed=False) if params else {}
+    values.update(
+        {name: _typed(text, specs[name]) for name, text in overrides.items() if name in specs}
+    )
+    config = DetectorConfig.from_mapping(values, ignore_unknown=True)
+    defaults = DetectorConfig().as_dict()
+    return {k: value for k, value in config.as_dict().items() if value != defaults[k]}
+
+
+def _detector_specs(system: System) -> dict[str, ParameterSpec]:
+    """Parameters of the detector before the tracker, by name."""
+    if system.name not in FEEDERS:
+        return {}
+    from sonar_imm.trackers.obstacle.detector import DetectorConfig
+
+    return {spec.name: spec for spec in DetectorConfig.specs()}
+
+
+def _parameters_of(path: Path, node_name: str, *, needed: bool = True) -> dict[str, Any]:
+    """What a file says for a node; needed: it is a mistake when it is for others only."""
+    try:
+        text = path.read_text(encoding='utf-8')
+        values = parameters_from_yaml(text, node_name=node_name)
+    except UnicodeDecodeError:
+        raise ConfigError(f'{path} is not a text file') from None
+    except ConfigError as error:
+        raise ConfigError(f'{path}: {error}') from None
+    # Beside a recording the file describes the instruments for one tracker; others do without.
+    foreign = needed and not values and path.name != OWN_PARAMETERS
+    if foreign and (names := _others(text, node_name)):
+        raise ConfigError(
+            f"{path} is for {', '.join(names)}, and not for '{node_name}': rename the section, or "
+            "call it '/**' for any node"
+        )
+    return {key: value for key, value in values.items() if key.split('.')[0] not in OF_EVERY_NODE}
+
+
+def _others(text: str, node_name: str) -> list[str]:
+    """The nodes that a parameter file is for where `node_name` is not among them."""
+    names = sections_of(text)
+    mine = [one for one in names if one in ('/**', '/*') or one.split('/')[-1] == node_name]
+    return [] if mine else names
+
+
+def print_json(result: Any) -> None:
+    """Print `result` as JSON; NaN and infinity, which JSON lacks, become null."""
+    from ..offline.run_folder import finite
+
+    click.echo(json.dumps(finite(result), indent=2))
+
+
+def say(text: str = '', *, quiet: bool = False) -> None:
+    """Print a line on standard output, unless the output is JSON (`quiet`)."""
+    if not quiet:
+        click.echo(visible(text))
+
+
+@contextlib.contextmanager
+def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[Advance]:
+    """Yields ``advance(count)``: a bar on a terminal, else a line every few seconds (stderr)."""
+    if quiet or not total:
+        yield lambda count: None
+    elif sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(stderr=True), transient=True) as bar:
+            task = bar.add_task(what, total=total)
+            yield lambda count: bar.advance(task, count)
+    else:
+        yield _plain_progress(what, total)
+
+
+def _plain_progress(what: str, total: int) -> Advance:
+    """Print a line every few seconds, so that the log of a short job stays empty."""
+    done, told = 0, time.monotonic()
+
+    def advance(count: int) -> None:
+        nonlocal done, told
+        done += count
+        if time.monotonic() - told > SECONDS_BETWEEN_LINES:
+            told = time.monotonic()
+            click.echo(f'{what}: {done} of {total}', err=True)
+
+    return advance

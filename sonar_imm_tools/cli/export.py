@@ -1,0 +1,196 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sonar_imm.files import whole
+
+from .common import example, json_option, print_json, say
+
+FORMATS = ('xyz', 'las', 'laz', 'tif')
+HORIZON_FORMATS = ('csv', 'geojson', 'sgy', 'segy', 'seg')
+
+
+def _numbers(
+    _ctx: click.Context, _param: click.Parameter, value: str
+) -> tuple[float, float, float]:
+    try:
+        numbers = tuple(float(part) for part in value.split(','))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (2, 3):
+        raise click.BadParameter(f"'{value}' is not of the form X,Y or X,Y,Z")
+    x, y, z = (*numbers, 0.0)[:3]
+    return x, y, z
+
+
+@click.command(
+    epilog=example(
+        'sonar-imm export out survey.laz --epsg 32632 --origin 500000,6000000',
+        'sonar-imm export out survey.tif --cell 0.5 --epsg 32632 --origin 500000,6000000',
+        'sonar-imm export out survey.xyz',
+        'sonar-imm export out horizons.csv --epsg 32615',
+        'sonar-imm export out picks.sgy --segy line.seg',
+    )
+)
+@click.argument('run', type=click.Path(path_type=Path, file_okay=False))
+@click.argument('out', type=click.Path(path_type=Path, dir_okay=False))
+@click.option('--epsg', type=click.IntRange(min=1), help='Coordinate system, by its EPSG number.')
+@click.option(
+    '--origin',
+    default='0,0',
+    callback=_numbers,
+    metavar='X,Y[,Z]',
+    help='Coordinates in that system of the origin of the navigation.',
+)
+@click.option(
+    '--cell',
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help='Side of the cells of a grid, in metres.',
+)
+@click.option(
+    '--segy',
+    'original',
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help='horizons: the SEG-Y file that the recording was converted from.',
+)
+@click.option('--overwrite', is_flag=True, help='Replace OUT.')
+@json_option
+def command(
+    run: Path,
+    out: Path,
+    epsg: int | None,
+    origin: tuple[float, float, float],
+    cell: float,
+    original: Path | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Write the soundings or horizons of a tracked RUN to OUT for charts and other programs.
+
+    What is written follows from the ending of OUT. Soundings: .xyz (easting, northing, height and
+    its standard deviation as text), .las and .laz (points with all columns), .tif (a grid of
+    depth, uncertainty, label and count); they come from recordings with navigation. Horizons of
+    the fathometer: .csv (picks by horizon), .geojson (points along the track), .sgy, .segy or .seg
+    (the file given by --segy with picks in place of its samples). Where the recording has no fixes
+    by satellite, the places of horizons come from its navigation, with --epsg and --origin.
+    """
+    from ..offline.run_folder import RunFolder, SOUNDINGS
+    from ..recordings.export.grid import grid_of, write_geotiff
+    from ..recordings.export.points import read_points, write_las, write_xyz
+    from ..recordings.sources import BagError
+
+    kind = out.suffix.lower().lstrip('.')
+    if kind not in FORMATS + HORIZON_FORMATS:
+        known = ', '.join(f'.{name}' for name in FORMATS + HORIZON_FORMATS)
+        raise click.UsageError(f"'{out.name}' ends in none of {known}")
+    if out.exists() and not overwrite:
+        raise BagError(f'{out} is there already; choose another name or say --overwrite')
+    told = RunFolder(run).read_run()
+    if kind in HORIZON_FORMATS:
+        _export_horizons(run, told, out, kind, epsg, origin, original, as_json)
+        return
+    if not (run / SOUNDINGS).is_file():
+        raise BagError(
+            f'{run} holds no soundings: the recording has no navigation, or is of another system'
+        )
+    points = read_points(run / SOUNDINGS)
+    points = points.moved(origin)
+    result: dict[str, Any] = {'out': str(out), 'soundings': len(points)}
+    with whole(out) as unfinished:
+        if kind == 'tif':
+            grid = grid_of(points, cell)
+            write_geotiff(unfinished, grid, epsg)
+            result |= {'rows': grid.height.shape[0], 'columns': grid.height.shape[1]}
+        elif kind == 'xyz':
+            write_xyz(unfinished, points)
+        else:
+            write_las(unfinished, points, epsg)
+    if as_json:
+        print_json(result)
+        return
+    shape = f' in {result["rows"]} by {result["columns"]} cells' if 'rows' in result else ''
+    say(f'{out}: {len(points)} soundings{shape}')
+
+
+def _export_horizons(
+    run: Path,
+    told: dict[str, Any],
+    out: Path,
+    kind: str,
+    epsg: int | None,
+    origin: tuple[float, float, float],
+    original: Path | None,
+    as_json: bool,
+) -> None:
+    """Picks of a run of the fathometer; told: its run.json."""
+    import numpy as np
+
+    from ..offline.run_folder import RunFolder
+    from ..recordings.export.horizons import picks_of, write_geojson, write_horizons
+    from ..recordings.export.picks import write_picks
+    from ..recordings.export.points import degrees_of
+    from ..recordings.positions import navigation_topics, read_navigated, read_positions
+    from ..recordings.reader import BagReader
+    from ..recordings.sources import BagError
+
+    if told['system'] != 'fathometer':
+        raise BagError(f'{run} is of {told["system"]}: only the fathometer has horizons')
+    segy = kind in ('sgy', 'segy', 'seg')
+    if segy and original is None:
+        raise click.UsageError(
+            'SEG-Y needs --segy, the file that the recording was converted from'
+        )
+    if segy and original is not None and out.exists() and out.samefile(original):
+        raise click.UsageError('OUT is the file given by --segy, which stays as it is')
+    positions, notes = None, {}
+    if Path(told['bag']).exists():
+        with BagReader(told['bag']) as bag:
+            positions, notes = read_positions(bag), bag.custom_data
+            if positions is None and epsg is not None:
+                positions = read_navigated(
+                    bag, lambda places: degrees_of(places + np.array(origin[:2]), epsg)
+                )
+            elif positions is None and kind == 'geojson' and navigation_topics(bag):
+                raise BagError(
+                    'the recording has navigation in metres: say with --epsg and --origin where '
+                    'its origin lies'
+                )
+    elif segy or kind == 'geojson':
+        raise BagError(f'{told["bag"]}, the recording of {run}, is gone')
+    speed = float(told['parameters'].get('sound_speed', 1500.0))
+    picks = picks_of(RunFolder(run).read_estimates(), speed, positions)
+    result: dict[str, Any] = {'out': str(out), 'picks': len(picks), 'left_out': 0}
+    result['horizons'] = len(set(picks.horizon.tolist()))
+    with whole(out) as unfinished:
+        if kind == 'csv':
+            write_horizons(unfinished, picks, notes.get('source', run.name), epsg)
+        elif kind == 'geojson':
+            result['left_out'] = write_geojson(unfinished, picks)
+        elif original is not None:
+            result['left_out'] = write_picks(unfinished, picks, original, notes)
+    if as_json:
+        print_json(result)
+        return
+    left = f', {result["left_out"]} left out' if result['left_out'] else ''
+    say(f'{out}: {result["picks"]} picks of {result["horizons"]} horizons{left}')

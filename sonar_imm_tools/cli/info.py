@@ -1,0 +1,89 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm info``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import shlex
+from typing import Any
+
+import click
+
+from sonar_imm.trackers import SYSTEMS
+
+from .common import BAG, example, json_option, load_detector, print_json, progress, say
+
+
+@click.command(epilog=example('sonar-imm info dive.bag', 'sonar-imm info --json dive.mcap'))
+@click.argument('bag', type=BAG)
+@click.option('--strict', is_flag=True, help='Stop at the first damage instead of reading on.')
+@json_option
+def command(bag: Path, strict: bool, as_json: bool) -> None:
+    """Show what is in BAG, which tracker fits it and what is wrong with it.
+
+    BAG is a rosbag2 folder, a bare .mcap or .db3 file, or a ROS 1 .bag file. Exit code 1 when
+    no tracker can use it.
+    """
+    from ..offline.inspection import inspect
+    from ..recordings.reader import BagReader
+
+    with BagReader(bag, strict=strict) as reader:
+        total = sum(topic.count for topic in reader.topics)
+        with progress('reading', total, quiet=as_json) as advance:
+            found = inspect(reader, advance, _detector(bag))
+    print_json(found) if as_json else _print(found)
+    if not found['systems']:
+        raise click.exceptions.Exit(1)
+
+
+def _detector(bag: Path) -> dict[str, Any]:
+    """What the parameter file beside a recording says of its images."""
+    from ..recordings.own_parameters import own_parameters
+
+    return load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})
+
+
+def _print(found: dict[str, Any]) -> None:
+    say(f'{found["bag"]}: {found["messages"]} messages in {found["duration_s"]:.1f} s')
+    for topic in found['topics']:
+        rate = f', {topic["rate_hz"]:.3g} Hz' if topic['rate_hz'] else ''
+        frames = f', frame {", ".join(topic["frames"])}' if any(topic['frames']) else ''
+        say(
+            f'  {topic["name"]}  {topic["type"]}  {topic["count"]} messages{rate}'
+            f'{_scans(topic["scans"])}{frames}'
+        )
+        for suited in topic['suits']:
+            say(f'      fits {suited}')
+        for problem in topic['problems']:
+            say(f'      problem: {problem}')
+    for problem in found['problems']:
+        say(f'problem: {problem}')
+    for number, (system, named) in enumerate(found['topic_options'].items()):
+        told = 'or as something else' if number else 'to track it'
+        say(f'{told}: {track_line(found["bag"], system, named)}')
+    if not found['systems']:
+        say('no tracker can use it')
+
+
+def _scans(scans: dict[str, int] | None) -> str:
+    several = scans is not None and scans['most'] > 1
+    return f', {scans["count"]} scans, up to {scans["most"]} per scan' if several else ''
+
+
+def track_line(bag: str, system: str, named: dict[str, str]) -> str:
+    """The command that tracks the recording, with --topic where the names do not fit."""
+    topics = [f' --topic {shlex.quote(f"{name}={topic}")}' for name, topic in named.items()]
+    return f'sonar-imm track {shlex.quote(bag)} OUT_DIR --system {system}{"".join(topics)}'

@@ -1,0 +1,133 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm simulate``."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+
+from msg_adapters.inputs import FEEDERS
+from sonar_imm import __version__
+from sonar_imm.trackers import SYSTEMS
+
+from .common import example, json_option, print_json, say, set_option, typed_overrides
+
+
+@click.command(
+    epilog=example(
+        'sonar-imm simulate diver dive.bag --scenario table1 --seed 7',
+        'sonar-imm simulate diver --list',
+    )
+)
+@click.argument('system', type=click.Choice(list(SYSTEMS)))
+@click.argument('out_bag', type=click.Path(path_type=Path), required=False)
+@click.option('--scenario', default=None, help='Name of the scene; by default the first one.')
+@click.option(
+    '--seed',
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help='The same scenario and seed give the same bag.',
+)
+@set_option
+@click.option('--compress', is_flag=True, help='Compress the bag: pressure takes a third.')
+@click.option(
+    '--list',
+    'list_scenarios',
+    is_flag=True,
+    help='Only list scenarios and what --set can change.',
+)
+@json_option
+def command(
+    system: str,
+    out_bag: Path | None,
+    scenario: str | None,
+    seed: int,
+    overrides: dict[str, str],
+    compress: bool,
+    list_scenarios: bool,
+    as_json: bool,
+) -> None:
+    """Write a bag of simulated measurements with their truth to OUT_BAG."""
+    scenes = import_module(SYSTEMS[system].scenes)
+    if list_scenarios:
+        _list(scenes, as_json)
+        return
+    if out_bag is None:
+        raise click.UsageError("Missing argument 'OUT_BAG'")
+    from sonar_imm.truth import TrueTrack
+
+    from ..recordings.own_parameters import own_parameters, unusual
+    from ..recordings.scenes import write_scene
+
+    name = scenario or next(iter(scenes.SCENARIOS))
+    config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
+    scene = scenes.simulate(config, seed)
+    told = unusual(config.told(), SYSTEMS[system].config_type())
+    sections = {system: told}
+    if fed := config.told_feeder():
+        # A scene writes its images as the only type that needs no further package.
+        sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
+    report = write_scene(
+        scene,
+        out_bag,
+        compressed=compress,
+        parameters=sections,
+        provenance={
+            'source': f'simulated: {system} {name}',
+            'seed': str(seed),
+            'sonar_imm': __version__,
+            **{f'set {key}': value for key, value in sorted(overrides.items())},
+        },
+    )
+    parameters = own_parameters(out_bag)
+    targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
+    result = {
+        'bag': str(out_bag),
+        'scenario': name,
+        'seed': seed,
+        'messages': report.messages,
+        'targets': targets,
+        'parameters': told,
+    }
+    if as_json:
+        print_json(result)
+        return
+    what = ', '.join(f'{count} on {topic}' for topic, count in sorted(report.messages.items()))
+    say(f'{out_bag}: {what} ({name}, seed {seed}' + (f', {targets} targets)' if targets else ')'))
+    if parameters:
+        say(f'  parameters of the instruments, for the tracker: {parameters}')
+
+
+def _list(scenes: Any, as_json: bool) -> None:
+    described = {name: entry[0] for name, entry in scenes.SCENARIOS.items()}
+    specs = type(scenes.scenario(next(iter(described)))).specs()
+    if as_json:
+        print_json(
+            {'scenarios': described, 'parameters': {spec.name: spec.description for spec in specs}}
+        )
+        return
+    for name, description in described.items():
+        say(f'{name:<20} {description}')
+    say()
+    for spec in specs:
+        say(
+            f'--set {spec.name + "=" + str(spec.default):<34} {spec.description}'
+            + (f' [{spec.unit}]' if spec.unit else '')
+        )

@@ -1,0 +1,325 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""``sonar-imm track``."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+import contextlib
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from attrs import evolve, field, frozen
+import click
+
+from sonar_imm.node_config import hears_transforms
+from sonar_imm.trackers import System, SYSTEMS
+
+from .common import (
+    BAG,
+    example,
+    json_option,
+    load_config,
+    load_detector,
+    print_json,
+    progress,
+    say,
+    set_option,
+    system_option,
+    topic_option,
+)
+
+if TYPE_CHECKING:
+    from ..offline.batch import Job, Outcome
+    from ..recordings.reader import BagReader
+
+
+@click.command(
+    epilog=example(
+        'sonar-imm track dive.bag out',
+        'sonar-imm track dive.bag out --set model_set=cv_cv',
+        'sonar-imm track dive.bag out --topic fix=/usbl/pose --params my_diver.yaml',
+        'sonar-imm track line1.bag line2.bag line3.bag out --jobs 3 --parquet',
+        'sonar-imm track /survey/*.bag /survey/out --scheduler tcp://10.0.0.5:8786',
+    )
+)
+@click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=BAG)
+@click.argument('out_dir', type=click.Path(path_type=Path))
+@system_option
+@click.option(
+    '--params',
+    type=click.Path(path_type=Path, dir_okay=False),
+    help='Parameter file: ROS 2 form or a plain mapping.',
+)
+@set_option
+@topic_option
+@click.option(
+    '--order',
+    type=click.Choice(['recorded', 'stamp']),
+    default='recorded',
+    show_default=True,
+    help='Messages in the order of arrival, or sorted by their stamps.',
+)
+@click.option('--smooth', is_flag=True, help='Condition each estimate on later measurements too.')
+@click.option(
+    '--jobs',
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help='Processes: for several runs, or for the pings of one where no ping needs another '
+    '(bathymetry). The estimates do not depend on it.',
+)
+@click.option(
+    '--scheduler',
+    metavar='ADDRESS',
+    help='Do the runs on the cluster of this dask scheduler instead; its workers need the same '
+    'sonar_imm, and reach BAG and OUT_DIR by the same paths.',
+)
+@click.option('--parquet', is_flag=True, help='Write the tables as Parquet too (needs pyarrow).')
+@click.option('--overwrite', is_flag=True, help='Replace an earlier run in OUT_DIR.')
+@click.option('--strict', is_flag=True, help='Stop at the first damage in BAG.')
+@json_option
+def command(
+    bags: tuple[Path, ...],
+    out_dir: Path,
+    jobs: int,
+    scheduler: str | None,
+    parquet: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Track the recording BAG offline and write the estimates to OUT_DIR.
+
+    OUT_DIR gets the bag `estimate`, `estimate.csv` and `run.json`. The same command writes the
+    same bytes in bag and CSV. Without --params the file `parameters.yaml` in the folder of BAG is
+    used, if there is one. --set changes single parameters.
+
+    Several sonars in one BAG that each need a tracker (two topics `snapshot`, say) are all
+    tracked, each into a folder of OUT_DIR named after its namespace; --topic chooses one. Of
+    several bags each gets a folder of its name. Then OUT_DIR also gets `summary.json`; a run that
+    fails is named and does not stop the others, and the same command again makes only what is
+    missing.
+    """
+    if scheduler is not None and jobs > 1:
+        raise click.UsageError('--jobs and --scheduler exclude each other')
+    if parquet:
+        from ..offline.tables import require_parquet
+
+        require_parquet()
+    plan = Plan(parquet=parquet, **options)
+    if len(bags) == 1:
+        runs = plan.jobs(bags[0], out_dir)
+        say_parameters(bags[0], plan, quiet=as_json)
+        if len(runs) == 1 and scheduler is None:
+            run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
+            print_json(run) if as_json else _print(run, out_dir)
+            return
+        failures = []
+    else:
+        runs, failures = _of_all(plan, bags, out_dir)
+    _track_all(runs, failures, out_dir, jobs, scheduler, as_json)
+
+
+@frozen(kw_only=True)
+class Plan:
+    """What the options of the command ask for, for any bag."""
+
+    system: str | None = None
+    params: Path | None = None
+    overrides: dict[str, str] = field(factory=dict)
+    topics: dict[str, str] = field(factory=dict)
+    order: str = 'recorded'
+    smooth: bool = False
+    overwrite: bool = False
+    strict: bool = False
+    parquet: bool = False
+
+    def parameters_of(self, bag: Path) -> Path | None:
+        """The parameter file for `bag`: the one that was named, else the bag's own."""
+        from ..recordings.own_parameters import own_parameters
+
+        return self.params if self.params is not None else own_parameters(bag)
+
+    def jobs(self, bag: Path, folder: Path) -> list[Job]:
+        """The runs that one bag takes: one into `folder`, or, of several instruments, one each
+        into a folder below it. Raises `BagError` and `ConfigError`."""
+        from ..offline.batch import Job
+        from ..offline.tracking import InputOptions
+        from ..recordings.reader import BagReader
+        from ..recordings.topics import instruments
+
+        wanted = inputs_by_topic(self.topics)
+        with BagReader(bag, strict=self.strict) as reader:
+            system = choose_system(reader, self.system, wanted)
+            found = instruments(reader, system.name, wanted)
+        params = self.parameters_of(bag)
+        config, node = load_config(system, params, self.overrides)
+        detector = load_detector(system, params, self.overrides)
+        several = len(found) > 1
+        return [
+            Job(
+                bag=bag,
+                folder=folder / name,
+                instrument=name,
+                system=system.name,
+                config=config,
+                options=InputOptions(
+                    topics={t: entry.name for t, entry in inputs.items()} if several else wanted,
+                    order=self.order,
+                    frame_id=node.frame_id,
+                    use_tf_static=hears_transforms(node),
+                    world_frame=node.world_frame_convention,
+                    smooth=self.smooth,
+                    detector=detector,
+                ),
+                overwrite=self.overwrite,
+                strict=self.strict,
+                parquet=self.parquet,
+            )
+            for name, inputs in found.items()
+        ]
+
+
+def say_parameters(bag: Path, plan: Plan, *, quiet: bool = False) -> None:
+    """Say where the parameters of `bag` come from, when that was not asked for."""
+    if plan.params is None and (own := plan.parameters_of(bag)):
+        say(f'using the parameters of the recording, {own}', quiet=quiet)
+
+
+def _of_all(plan: Plan, bags: Sequence[Path], out_dir: Path) -> tuple[list[Job], list[Outcome]]:
+    """The runs that `bags` take, in their order, and what cannot be a run."""
+    from sonar_imm.parameters import ConfigError
+
+    from ..offline.batch import Outcome
+    from ..recordings.reader import BagError
+
+    folders = [out_dir / bag.name.removesuffix('.bag').removesuffix('.mcap') for bag in bags]
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise click.UsageError(f'two bags would be tracked into {folder}')
+    runs: list[Job] = []
+    failures = []
+    for bag, folder in zip(bags, folders):
+        try:
+            runs += plan.jobs(bag, folder)
+        except (BagError, ConfigError) as error:
+            failures.append(Outcome(bag=bag, folder=folder, failure=str(error)))
+    return runs, failures
+
+
+def _track_all(
+    runs: Sequence[Job],
+    failures: Sequence[Outcome],
+    out_dir: Path,
+    jobs: int,
+    scheduler: str | None,
+    as_json: bool,
+) -> None:
+    """Do all runs, write and print their summary; ends with 1 when one failed."""
+    from ..offline.batch import run_jobs, summary_of, write_summary
+    from ..offline.run_folder import RUN
+    from ..recordings.reader import BagError
+
+    if (out_dir / RUN).exists() and runs and runs[0].folder != out_dir:
+        raise BagError(f'{out_dir} holds a run itself; choose another folder for several')
+    outcomes = list(failures)
+    for outcome in failures:
+        click.echo(f'{outcome.bag}: {outcome.failure}', err=True)
+    todo = [evolve(job, resume=True) for job in runs]
+    if scheduler is not None:
+        todo = [evolve(job, bag=job.bag.resolve(), folder=job.folder.resolve()) for job in todo]
+    with progress('runs', len(runs), quiet=as_json) as advance:
+        for outcome in run_jobs(
+            todo, count=jobs, address=scheduler, note=lambda text: click.echo(text, err=True)
+        ):
+            if outcome.failure:
+                name = ' '.join(filter(None, (str(outcome.bag), outcome.instrument)))
+                click.echo(f'{name}: {outcome.failure}', err=True)
+            outcomes.append(outcome)
+            advance(1)
+    content = summary_of(out_dir, sorted(outcomes, key=lambda one: (str(one.bag), one.instrument)))
+    write_summary(out_dir, content)
+    print_json(content) if as_json else _print_summary(content, out_dir)
+    if any(outcome.failure for outcome in outcomes):
+        raise click.exceptions.Exit(1)
+
+
+def inputs_by_topic(topics: dict[str, str]) -> dict[str, str] | None:
+    """``--topic`` as `recordings` takes it: input by topic name, None to choose by name."""
+    return {topic: name for name, topic in topics.items()} or None
+
+
+def choose_system(
+    reader: BagReader, name: str | None, topics: Mapping[str, str] | None = None
+) -> System:
+    """The tracker called `name`, or else the one that fits an open recording best. Raises
+    `BagError` when none does."""
+    from ..recordings.topics import fitting_systems, instruments
+
+    if name is not None:
+        return SYSTEMS[name]
+    found = fitting_systems(reader, topics)
+    if not found:
+        instruments(reader, next(iter(SYSTEMS)), topics)  # says what is there
+    return SYSTEMS[found[0]]
+
+
+def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
+    """Do one run with a progress bar; gives the content of run.json. Raises `BagError`."""
+    from ..offline.batch import track
+
+    with contextlib.ExitStack() as stack:
+        outcome = track(
+            job, lambda total: stack.enter_context(progress('tracking', total, quiet=quiet))
+        )
+    return dict(outcome.run or {})
+
+
+def _print(run: Mapping[str, Any], out_dir: Path) -> None:
+    say(
+        f'{run["messages"]} messages read, {run["estimates"]} estimates with {run["rows"]} rows '
+        f'written to {out_dir}'
+    )
+    say('  ' + ', '.join(f'{name} {count}' for name, count in run['counts'].items()))
+    for sentence in run['warnings']:
+        say(f'  warning: {sentence}')
+    for reason, entry in run['refused'].items():
+        say(f'  refused ({reason}) {entry["count"]}: {entry["example"]}')
+    for problem in run['problems']:
+        say(f'  problem: {problem}')
+    if run['rows'] == 0:
+        say('  no track was made; sonar-imm info may show why')
+
+
+def _print_summary(content: Mapping[str, Any], out_dir: Path) -> None:
+    """One line for each run, then what deserves a look."""
+    runs = content['runs']
+    width = max((len(run['folder']) for run in runs), default=0)
+    width = max(width, len('run'))
+    heads = ('messages', 'refused', 'estimates', 'rows')
+    say(f'{"run":<{width}} {"state":<8} {"system":<11}' + ''.join(f'{n:>10}' for n in heads))
+    for run in runs:
+        numbers = ''.join(f'{run[name]:>10}' for name in heads)
+        say(f'{run["folder"]:<{width}} {run["state"]:<8} {run["system"]:<11}{numbers}')
+    for run in runs:
+        for kind in ('warning', 'problem'):
+            for sentence in run[f'{kind}s']:
+                say(f'{run["folder"]}: {kind}: {sentence}')
+        if run['state'] != 'failed' and run['rows'] == 0:
+            say(f'{run["folder"]}: no track was made; sonar-imm info may show why')
+    counts = Counter(run['state'] for run in runs)
+    told = ', '.join(f'{counts[state]} {state}' for state in ('tracked', 'kept', 'failed'))
+    say(f'{len(runs)} runs in {out_dir}: {told}')

@@ -1,0 +1,161 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Other filters for the same floor, to compare speed and result with.
+
+`numpy_filter` is the IMM particle filter in plain numpy: all particles of a model at once, one bin
+after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup. That is
+another algorithm (one set of particles that carry their model) with the same likelihood and as
+many particles in all. Both suppose the scene of the paper, two random walks and noise of unit
+variance.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+import math
+from typing import Any
+
+import numpy as np
+from scipy.special import kve
+
+from sonar_imm.acoustics.laplace import autocorrelation
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig
+
+CHAIN = np.array([[0.98, 0.02], [0.02, 0.98]])
+SIGMAS = (0.01, 1.0)
+HEIGHT, TILT, SPACING = 15.0, math.radians(30.0), 0.5
+
+
+def config(**values: Any) -> BathymetryConfig:
+    """Parameters with which the tracker computes what the peers compute."""
+    defaults = {'sigmas': SIGMAS, 'initial_std': 1.0, 'transition_matrix': tuple(CHAIN.ravel())}
+    return BathymetryConfig(**{**defaults, **values})
+
+
+class NumpyLikelihood:
+    """Log likelihood of heights for every bin of a ping, complex Laplace, without constants."""
+
+    def __init__(self, ping: Snapshot):
+        self.range, self.P = ping.range, ping.staves
+        power = (np.abs(ping.iq) ** 2).mean(axis=1)
+        window = np.ones(21)
+        level = np.convolve(power, window, 'same') / np.convolve(power**0, window, 'same')
+        rho = np.maximum(level - 1.0, 0.01)
+        self.c = autocorrelation(ping.iq)
+        self.kappa = rho / (1.0 + self.P * rho)
+
+    def log_likelihood(self, t: int, height: FloatArray) -> FloatArray:
+        ratio = (HEIGHT - height) / self.range[t]
+        with np.errstate(invalid='ignore'):
+            u = ratio * math.cos(TILT) - np.sqrt(1.0 - ratio**2) * math.sin(TILT)
+        waves = np.exp(-2j * math.pi * SPACING * u[..., None] * np.arange(1, self.P))
+        beam = self.c[t, 0].real + 2.0 * (waves @ self.c[t, 1:]).real
+        v = np.sqrt(np.maximum(self.c[t, 0].real - self.kappa[t] * beam, 1e-12))
+        log_q = np.log(kve(self.P - 1, 2.0 * v)) - 2.0 * v - (self.P - 1) * np.log(v)
+        return np.where(np.isnan(u), -np.inf, log_q)
+
+
+def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatArray:
+    """Mean height (T,) by the IMM particle filter, one bin after the other."""
+    likelihood, rng, N = NumpyLikelihood(ping), np.random.default_rng(seed), particles
+    x, w = rng.normal(size=(2, N)), np.full((2, N), 1.0 / N)
+    mu, sigma = np.array([0.5, 0.5]), np.array(SIGMAS)[:, None]
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        joint = CHAIN * mu[:, None]
+        c = joint.sum(axis=0)
+        points = (np.arange(N) + rng.random((2, 1))) / N
+        drawn = np.empty_like(x)
+        for j in range(2):
+            cumulative = np.cumsum(joint[:, j, None] * w)
+            index = np.searchsorted(cumulative, points[j] * cumulative[-1])
+            drawn[j] = x.ravel()[np.minimum(index, 2 * N - 1)]
+        x = drawn + sigma * rng.standard_normal((2, N))
+        log_q = likelihood.log_likelihood(t, x)
+        q = np.exp(log_q - log_q.max())
+        total = q.sum(axis=1)
+        w = q / np.maximum(total, 1e-300)[:, None]
+        mu = c * total
+        mu /= mu.sum()
+        mean[t] = mu @ (w * x).sum(axis=1)
+    return mean
+
+
+def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
+    """Mean height (T,) by Stone Soup's multi-model particle filter."""
+    from stonesoup.base import Property
+    from stonesoup.models.measurement.base import MeasurementModel
+    from stonesoup.models.transition.linear import RandomWalk
+    from stonesoup.predictor.particle import MultiModelPredictor
+    from stonesoup.resampler.particle import SystematicResampler
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import MultiModelParticleState
+    from stonesoup.updater.particle import MultiModelParticleUpdater
+
+    class Likelihood(MeasurementModel):
+        """A detection is the number of its bin; the likelihood has the samples."""
+
+        likelihood: NumpyLikelihood = Property()
+        ndim_meas = 1
+
+        def function(self, state, noise=False, **kwargs):
+            raise NotImplementedError
+
+        def rvs(self, num_samples=1, **kwargs):
+            raise NotImplementedError
+
+        def pdf(self, state1, state2, **kwargs):
+            return np.exp(self.logpdf(state1, state2))
+
+        def logpdf(self, state1, state2, **kwargs):
+            heights = np.asarray(state2.state_vector[0, :], np.float64)
+            return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
+
+    # Stone Soup scales the variance with the time step, which is one second here.
+    predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
+    model = Likelihood(ndim_state=1, mapping=(0,), likelihood=NumpyLikelihood(ping))
+    updater = MultiModelParticleUpdater(model, predictor, SystematicResampler())
+    np.random.seed(0)
+    start = datetime(2026, 1, 1)
+    state = MultiModelParticleState(
+        StateVectors(np.random.normal(size=(1, particles))),
+        weight=np.full(particles, 1.0 / particles),
+        dynamic_model=np.random.randint(0, 2, particles),
+        timestamp=start,
+    )
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        stamp = start + timedelta(seconds=t + 1)
+        prediction = predictor.predict(state, timestamp=stamp)
+        detection = Detection([t], timestamp=stamp)
+        state = updater.update(SingleHypothesis(prediction, detection))
+        mean[t] = float(np.mean(state.state_vector[0, :]))
+        state.hypothesis = None
+        state.parent = None
+    return mean
+
+
+def cut(ping: Snapshot, bins: int) -> Snapshot:
+    """The first `bins` bins of a ping."""
+    return Snapshot(
+        stamp_ns=ping.stamp_ns,
+        range=ping.range[:bins],
+        iq=ping.iq[:bins],
+        noise_variance=np.ones(min(bins, len(ping))),
+    )

@@ -1,0 +1,158 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Estimate and truth of each ping, bin by bin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from attrs import frozen
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.soundings import SIDES
+
+FAR = 0.55
+"""Share of a bin by which the range of the true floor may differ from that of the estimate: half a
+bin, and a margin for single precision."""
+
+
+@frozen(eq=False)
+class TrueFloor:
+    """The true floor at the bins of one ping, each (n,): height m and angle rad, NaN where
+    unknown; patch: rough floor; echo: neither shadow nor water column."""
+
+    height: FloatArray
+    angle: FloatArray
+    patch: BoolArray
+    echo: BoolArray
+
+
+@frozen(eq=False)
+class Profile:
+    """The estimate of one ping, each (n,): height m, angle rad and their standard deviations;
+    probabilities (n, M) of the models; heard: bins with an echo; truth: None where unknown;
+    side: empty where the estimate does not say it; rough: probability (n,) of rough floor where
+    the estimate itself says it, as those of a bank do."""
+
+    stamp_ns: int
+    range: FloatArray
+    height: FloatArray
+    height_std: FloatArray
+    angle: FloatArray
+    angle_std: FloatArray
+    heard: BoolArray
+    probabilities: FloatArray
+    truth: TrueFloor | None
+    side: str = ''
+    rough: FloatArray | None = None
+
+
+@frozen(eq=False)
+class Swath:
+    """All pings of a run in order; rough: which of `model_names` mean rough floor."""
+
+    profiles: tuple[Profile, ...]
+    model_names: tuple[str, ...]
+    rough: BoolArray
+
+    def roughness(self, profile: Profile) -> FloatArray:
+        """Probability (n,) that the floor is rough; NaN when no model means rough floor."""
+        if profile.rough is not None:
+            return profile.rough
+        if not self.rough.any():
+            return np.full(len(profile.range), np.nan)
+        return profile.probabilities[:, self.rough].sum(axis=1)
+
+
+def profiles_of(estimates: Iterable[Estimate], truth: Iterable[Estimate] | None) -> Swath:
+    """The estimates of a run, each with the truth of the same stamp and side."""
+    known = {(one.stamp_ns, one.source): one for one in truth or ()}
+    profiles, names = [], ()
+    for estimate in estimates:
+        names = estimate.model_names
+        # A single side that is no namespace: its truth names no side.
+        single = known.get((estimate.stamp_ns, 0))
+        profiles.append(
+            profile_of(estimate, known.get((estimate.stamp_ns, estimate.source), single))
+        )
+    return Swath(tuple(profiles), names, rough_models(names))
+
+
+def rough_models(names: tuple[str, ...]) -> BoolArray:
+    """Which models (M,) mean rough floor. Beside a constant slope it is the random walk, in a
+    bank, whose noise grows from model to model, the upper half. A single model never does."""
+    if 'ncs' in names:
+        return np.array([name == 'rw' for name in names])
+    rough = np.arange(len(names)) >= len(names) // 2
+    return rough & (len(names) > 1)
+
+
+def profile_of(estimate: Estimate, truth: Estimate | None) -> Profile:
+    """One ping; the state is a height or an angle, and the other one follows from it. With
+    navigation the stated error is that of the soundings: pose and sound speed are in it."""
+    ranges, height, angle = (_column(estimate, name) for name in ('range', 'height', 'angle'))
+    std = np.sqrt(estimate.covariance[:, 0, 0])
+    # A small angle moves the point along the circle around the sonar: dh = |y| d(angle).
+    arm = np.abs(estimate.xyz[:, 1].astype(np.float64))
+    arm = np.where(arm > 0.0, arm, np.nan)
+    in_angle = estimate.state_names[0] == 'angle'
+    height_std = std * arm if in_angle else std
+    if 'vertical_uncertainty' in estimate.extras:
+        arm = np.abs(ranges * np.sin(_column(estimate, 'beam_angle')))
+        height_std = np.sqrt(_column(estimate, 'vertical_uncertainty'))
+    return Profile(
+        stamp_ns=estimate.stamp_ns,
+        range=ranges,
+        height=height,
+        height_std=height_std,
+        angle=angle,
+        angle_std=std if in_angle else std / arm,
+        heard=estimate.extras['valid'].astype(bool),
+        probabilities=estimate.probabilities,
+        truth=None if truth is None else true_floor(truth, ranges),
+        rough=_column(estimate, 'rough') if 'rough' in estimate.extras else None,
+        side=SIDES[estimate.source] if 'side' in estimate.extras else '',
+    )
+
+
+def true_floor(truth: Estimate, ranges: FloatArray) -> TrueFloor:
+    """The true floor at `ranges` (n,); unknown in bins that the truth does not have."""
+    where = _column(truth, 'range')
+    if not len(where):
+        unknown, no = np.full(len(ranges), np.nan), np.zeros(len(ranges), bool)
+        return TrueFloor(unknown, unknown, no, no)
+    after = np.clip(np.searchsorted(where, ranges), 1, max(len(where) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(where) - 1)
+    nearest = np.where(ranges - where[before] <= where[after] - ranges, before, after)
+    width = float(np.median(np.diff(ranges))) if len(ranges) > 1 else np.inf
+    found = np.abs(where[nearest] - ranges) <= FAR * width
+    return TrueFloor(
+        height=np.where(found, _column(truth, 'height')[nearest], np.nan),
+        angle=np.where(found, _column(truth, 'angle')[nearest], np.nan),
+        patch=found & (_column(truth, 'patch')[nearest] > 0),
+        echo=found & (_column(truth, 'valid')[nearest] > 0),
+    )
+
+
+def _column(estimate: Estimate, name: str) -> FloatArray:
+    """A state or a further column as float64; NaN when the table has none."""
+    if name in estimate.state_names:
+        return estimate.state[:, estimate.state_names.index(name)]
+    if name not in estimate.extras:
+        return np.full(len(estimate), np.nan)
+    return np.asarray(estimate.extras[name], np.float64)

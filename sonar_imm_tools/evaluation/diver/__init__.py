@@ -1,0 +1,114 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How runs of the diver tracker are judged: tracks of positions against true paths.
+
+`series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
+belongs to which diver, `scoring` compares them. `summary`, `sections` and `figures` present the
+result; `bench` measures the speed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+import functools
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.placing import Placer
+
+from ...offline.run_folder import read_measurements, read_truth, RunFolder
+from ...recordings.sources import BagError
+from ..judging import Check, Judgement, JudgeOptions, Limit
+from .scoring import fix_series, score
+from .series import Series, series_of
+from .summary import lines, summary_sentence
+from .truth import Truth
+
+if TYPE_CHECKING:
+    from ..page import Part
+
+LIMIT = Limit(1.25, 'm', 'position RMSE', 'position.rmse_m')
+"""Limit for recordings without one of their own. The raw fixes of Table 1 have 1.71 m and its best
+tracker
+0.85 m on average; one recording can be worse than the average."""
+
+CUTOFF = 10.0
+"""Metres from which an estimate is on no diver, where there are several."""
+
+
+def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
+    """Score the tracks of `folder`. Raises `BagError` when they or the truth cannot be read."""
+    run = folder.read_run()
+    series = _series(folder.read_estimates(), folder.path)
+    truth = _truth(run, options)
+    placer = Placer(DiverConfig.from_mapping(run['parameters'], ignore_unknown=True), Counter())
+    placed = (one for measurement in read_measurements(run) for one in placer.place(measurement))
+    fixes = [one for one in placed if isinstance(one, (Fix, Fixes))]
+    raw = fix_series(fixes) if fixes else None
+    cutoff = CUTOFF if options.cutoff is None else options.cutoff
+    metrics = score(series, truth, fixes=raw, cutoff=cutoff)
+    metrics['truth_lag_s'] = options.lag
+    return Judgement(
+        metrics=metrics,
+        summary=summary_sentence(metrics),
+        lines=tuple(lines(metrics)),
+        part=functools.partial(_part, run, metrics, series, truth, raw),
+        accuracy=functools.partial(_accuracy, metrics),
+    )
+
+
+def _series(estimates: Iterable[Estimate], where: Path) -> Series:
+    try:
+        return series_of(estimates)
+    except ValueError as error:
+        raise BagError(f'{where}: {error}') from None
+
+
+def _truth(run: Mapping[str, Any], options: JudgeOptions) -> Truth | None:
+    rows = read_truth(run, options.truth_bag)
+    if rows is None:
+        return None
+    series = _series(rows, options.truth_bag or Path(run['bag']))
+    return Truth.from_series(series, max_gap=options.gap).shifted(options.lag)
+
+
+def _part(
+    run: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    series: Series,
+    truth: Truth | None,
+    fixes: Series | None,
+    checks: Sequence[Check],
+) -> Part:
+    # plotly, which only a report needs, takes a second to load.
+    from .sections import diver_part, Material
+
+    return diver_part(
+        Material(run=run, metrics=metrics, series=series, truth=truth, fixes=fixes), checks
+    )
+
+
+def _accuracy(metrics: Mapping[str, Any], at_most: float | None) -> Check | None:
+    position = metrics.get('position', {})
+    if not position.get('n'):
+        return None
+    raw = metrics.get('raw_fix', {}).get('rmse_m')
+    return LIMIT.check(
+        position['rmse_m'], at_most=at_most, remark=f' (raw fixes {raw:.2f} m)' if raw else ''
+    )

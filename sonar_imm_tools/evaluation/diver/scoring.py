@@ -1,0 +1,208 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Scores of a tracked recording: errors, and whether the stated uncertainty holds.
+
+`score` gives one nested dict of plain numbers, which is `metrics.json`:
+
+position, velocity   RMSE, median and 95 % point of the error of confirmed tracks
+raw_fix              the same for the raw fixes, which a tracker has to beat
+lag                  the shift of truth with the smallest error: late stamps, a towed tag
+consistency          NEES and NIS with their chi-square bounds, coverage of the ellipses
+tracks, gospa        several targets: identity switches, losses, false tracks, and GOSPA
+models               probability of each motion model, and how often the most probable one changed
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+from sonar_imm.estimation.consistency import gospa, switches_by_scan, switching_gospa
+from sonar_imm.measurements import Fix, Fixes, scan_of
+
+from ... import SECOND
+from ..numbers import chi2_summary, error_summary, nis_summary, usable_nees
+from .matching import match, Matching, track_summary
+from .series import Series
+from .truth import Truth
+
+COVERAGE_LEVELS = (0.5, 0.9, 0.95)
+LAG_RANGE = 30.0
+
+
+def score(
+    series: Series,
+    truth: Truth | None = None,
+    *,
+    fixes: Series | None = None,
+    cutoff: float = 10.0,
+) -> dict[str, Any]:
+    """All metrics of a run. Without `truth` only those that need none: NIS, models, counts.
+
+    fixes: the raw fixes, see `fix_series`; cutoff: metres from which an estimate is on no target.
+    """
+    confirmed = series.confirmed()
+    hits = confirmed.hits()
+    span = (series.scan_ns[-1] - series.scan_ns[0]) / SECOND if len(series.scan_ns) else 0.0
+    metrics: dict[str, Any] = {
+        'stamps': len(series.scan_ns),
+        'span_s': float(span),
+        'rows_confirmed': len(confirmed),
+        'rows_tentative': len(series) - len(confirmed),
+        'tracks_confirmed': len(np.unique(confirmed.track_id)),
+        'consistency': {'nis': nis_summary(hits.nis, hits.nis_dof)},
+        'models': model_summary(confirmed),
+    }
+    if truth is None or not len(truth):
+        return metrics
+    matching = match(confirmed, truth, cutoff=cutoff)
+    metrics['cutoff_m'] = float(cutoff)
+    metrics['scored_stamps'] = len(matching.scan_ns)
+    metrics['position'] = error_summary(matching.distance)
+    speed_error = np.hypot(*matching.error[:, 2:].T)
+    metrics['velocity'] = error_summary(speed_error[np.isfinite(speed_error)], unit='mps')
+    if fixes is not None and len(fixes):
+        metrics['raw_fix'] = error_summary(match(fixes, truth, cutoff=cutoff).distance)
+    metrics['consistency'].update(truth_consistency(matching))
+    metrics['tracks'] = track_summary(matching)
+    metrics['gospa'] = gospa_summary(matching, truth, cutoff)
+    metrics['lag'] = best_lag(matching, truth)
+    return metrics
+
+
+def fix_series(fixes: Iterable[Fix | Fixes]) -> Series:
+    """Fixes as a series without tracks: every row has track id 0, no velocity, no models."""
+    ordered = [scan_of(one) for one in sorted(fixes, key=lambda fix: fix.stamp_ns)]
+    counts = [len(scan) for scan in ordered]
+    stamps = np.array([scan.stamp_ns for scan in ordered], np.int64)
+    n = sum(counts)
+    state, covariance = np.full((n, 4), np.nan), np.full((n, 4, 4), np.nan)
+    for scan, start in zip(ordered, np.cumsum([0, *counts])):
+        rows = slice(start, start + len(scan))
+        state[rows, :2] = scan.position[:, :2]
+        if scan.covariance is not None:
+            covariance[rows, :2, :2] = scan.covariance
+    return Series(
+        scan_ns=np.unique(stamps),
+        stamp_ns=np.repeat(stamps, counts),
+        track_id=np.zeros(n, np.int64),
+        track_state=np.ones(n, np.int64),
+        state=state,
+        covariance=covariance,
+        model_names=(),
+        probabilities=np.empty((n, 0)),
+        nis=np.full(n, np.nan),
+        nis_dof=np.full(n, np.nan),
+    )
+
+
+def truth_consistency(matching: Matching) -> dict[str, Any]:
+    """NEES on position and on the whole state, and the coverage of the position ellipses."""
+    error, covariance = matching.error, matching.series.covariance[matching.row]
+    position = usable_nees(error[:, :2], covariance[:, :2, :2])
+    state = usable_nees(error, covariance)
+    result: dict[str, Any] = {
+        'nees_position': chi2_summary(position, 2),
+        'coverage': {
+            f'{100 * level:g}': float(np.mean(position <= chi2.ppf(level, 2)))
+            if len(position)
+            else float('nan')
+            for level in COVERAGE_LEVELS
+        },
+        'singular_position_covariances': len(error) - len(position),
+    }
+    if known := int(np.isfinite(error).all(axis=1).sum()):
+        result['nees_state'] = chi2_summary(state, 4)
+        result['singular_state_covariances'] = known - len(state)
+    return result
+
+
+def model_summary(series: Series) -> dict[str, Any]:
+    """Mean probability of each model, the share of rows in which it is the most probable one, and
+    how often per minute the most probable one changes."""
+    if not len(series) or not series.model_names:
+        return {}
+    leader = np.argmax(series.probabilities, axis=1)
+    changes, duration = 0, 0.0
+    for track_id in np.unique(series.track_id):
+        rows = series.track_id == track_id
+        changes += int(np.count_nonzero(np.diff(leader[rows])))
+        duration += float(np.ptp(series.stamp_ns[rows])) / SECOND
+    return {
+        'mean_probability': dict(
+            zip(series.model_names, series.probabilities.mean(axis=0).tolist())
+        ),
+        'leads': {
+            name: float(np.mean(leader == index)) for index, name in enumerate(series.model_names)
+        },
+        'leader_changes_per_minute': 60.0 * changes / duration if duration > 0 else float('nan'),
+    }
+
+
+def gospa_summary(matching: Matching, truth: Truth, cutoff: float) -> dict[str, float]:
+    """GOSPA (p = 2, alpha = 2) averaged over the scored stamps, and its parts; and the same of the
+    run as a whole with half of the cutoff for each identity switch."""
+    series, states = matching.series, truth.at(matching.scan_ns)
+    starts = np.searchsorted(series.stamp_ns, matching.scan_ns, side='left')
+    ends = np.searchsorted(series.stamp_ns, matching.scan_ns, side='right')
+    parts = []
+    for scan, (start, end) in enumerate(zip(starts, ends)):
+        there = states[matching.present[:, scan], scan, :2]
+        parts.append(gospa(there, series.state[start:end, :2], cutoff))
+    if not parts:
+        return {}
+    half = 0.5 * cutoff**2
+    return {
+        'mean_m': float(np.mean([part.distance for part in parts])),
+        'rms_m': float(np.sqrt(np.mean([part.distance**2 for part in parts]))),
+        'with_switches_m': switching_gospa(
+            np.array([part.distance for part in parts]),
+            switches_by_scan(matching.followed_by.T),
+            0.5 * cutoff,
+        ),
+        'missed_per_scan': float(np.mean([part.missed for part in parts])) / half,
+        'false_per_scan': float(np.mean([part.false for part in parts])) / half,
+    }
+
+
+def best_lag(matching: Matching, truth: Truth) -> dict[str, float]:
+    """The lag of `Truth.shifted` with the least RMSE: a coarse search, then a fine one.
+
+    Positive: the estimates agree best with the truth that much later. The pairing is kept.
+    """
+    stamp_ns = matching.series.stamp_ns[matching.row]
+    position = matching.series.state[matching.row, :2]
+
+    def rmse(lag: float) -> float:
+        states = truth.shifted(lag).at(stamp_ns)[matching.target, np.arange(len(stamp_ns)), :2]
+        distance = np.hypot(*(position - states).T)
+        return error_summary(distance[np.isfinite(distance)])['rmse_m']
+
+    reach = min(LAG_RANGE, float(np.ptp(stamp_ns)) / SECOND / 4.0) if len(stamp_ns) else 0.0
+    if reach <= 0.0:
+        return {}
+    grid = np.linspace(-reach, reach, 61)
+    coarse = grid[int(np.nanargmin([rmse(lag) for lag in grid]))]
+    step = grid[1] - grid[0]
+    fine = minimize_scalar(rmse, bounds=(coarse - step, coarse + step), method='bounded')
+    return {
+        'best_s': float(fine.x),
+        'rmse_at_best_m': float(fine.fun),
+        'rmse_at_zero_m': rmse(0.0),
+    }

@@ -1,0 +1,101 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Truth, interpolated to the stamps of the estimates.
+
+Truth has its own rate (GPS once per second, a simulation at each step). Between two points
+position and velocity are interpolated linearly. Beyond the ends, and in gaps longer than a limit,
+truth is unknown and nothing is scored.
+"""
+
+from __future__ import annotations
+
+from attrs import frozen
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.estimation.arrays import FloatArray
+
+from ... import SECOND
+from .series import IntArray, Series
+
+
+@frozen(eq=False)
+class TruthPath:
+    """One true target: stamp_ns (n,) strictly increasing; state (n, 4), unknown velocity NaN."""
+
+    track_id: int
+    stamp_ns: IntArray
+    state: FloatArray
+
+    def at(self, stamp_ns: IntArray, *, max_gap: float) -> FloatArray:
+        """(m, 4) state at `stamp_ns`; NaN outside the path and inside gaps over `max_gap` s."""
+        wanted = np.asarray(stamp_ns, np.int64)
+        after = np.searchsorted(self.stamp_ns, wanted, side='left')
+        inside = after < len(self.stamp_ns)
+        after = np.minimum(after, len(self.stamp_ns) - 1)
+        exact = inside & (self.stamp_ns[after] == wanted)
+        before = np.maximum(after - 1, 0)
+        gap = self.stamp_ns[after] - self.stamp_ns[before]
+        inside &= exact | ((after > 0) & (gap <= max_gap * SECOND))
+        # Differences of int64 stamps first: a float64 of an absolute stamp is only good to 0.2 us.
+        fraction = (wanted - self.stamp_ns[before]) / np.maximum(gap, 1)
+        state = self.state[before] + fraction[:, None] * (self.state[after] - self.state[before])
+        state[exact] = self.state[after[exact]]
+        state[~inside] = np.nan
+        return state
+
+
+@frozen(eq=False)
+class Truth:
+    """All true targets of a recording."""
+
+    paths: tuple[TruthPath, ...]
+    max_gap: float = 60.0
+
+    @classmethod
+    def from_series(cls, series: Series, *, max_gap: float = 60.0) -> Truth:
+        """Split a truth `series` by track id.
+
+        Of several rows of one target with one stamp the last counts. Rows with a position that is
+        not finite are left out.
+        """
+        good = series.pick(np.isfinite(series.state[:, :2]).all(axis=1))
+        paths = []
+        for track_id in np.unique(good.track_id):
+            rows = good.pick(good.track_id == track_id)
+            last = np.append(np.diff(rows.stamp_ns) > 0, True)
+            paths.append(TruthPath(int(track_id), rows.stamp_ns[last], rows.state[last]))
+        return cls(tuple(paths), max_gap)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def shifted(self, lag: float) -> Truth:
+        """The truth shifted by `lag` seconds: estimates at t are compared with truth at t +
+        lag."""
+        shift = round(lag * SECOND)
+        return Truth(
+            tuple(
+                TruthPath(path.track_id, path.stamp_ns - shift, path.state) for path in self.paths
+            ),
+            self.max_gap,
+        )
+
+    def at(self, stamp_ns: IntArray) -> NDArray[np.float64]:
+        """(paths, m, 4) states at `stamp_ns`, NaN where unknown."""
+        empty = np.empty((0, len(stamp_ns), 4))
+        return np.concatenate(
+            [empty, *[path.at(stamp_ns, max_gap=self.max_gap)[None] for path in self.paths]]
+        )

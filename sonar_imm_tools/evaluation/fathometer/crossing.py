@@ -1,0 +1,371 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Two lines that cross: the horizons of both at the place where they do, compared.
+
+Where two profiler lines cross, each saw the same floor at another time and on another course, with
+nothing in common but the instrument. The difference of a horizon's depths, divided by what both
+runs state of its error, is the only independent judgement that such data allow.
+
+The tracks are straight between positions, in metres around the first of them. At each crossing a
+horizon counts that was found within `AT` metres of it, or two `position_std` where they are more,
+and within `REACH` metres often enough for a slope; its depth is that of the nearest record, moved
+along the slope. Its variance is that of the record, or the scatter of its records about the slope
+where this is more. A place that is wrong counts by the slope in every direction, which the slopes
+along both lines give together, and for both lines. Horizons are matched by least total distance,
+none further apart than the larger `min_separation` of both runs.
+
+Not judged is what is cut: a horizon at the first or last depth that is tracked lies there or
+beyond, and below a floor that is cut nobody can tell multiples from horizons. The others are also
+judged after the shift that is common to all of a crossing (another depth of the instrument, of the
+water, another speed of sound near the surface), and together they say how far lines differ by
+more than is stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from attrs import evolve
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
+
+from ...offline.run_folder import read_measurements, RunFolder
+from ...recordings.positions import read_positions
+from ...recordings.reader import BagReader
+from ...recordings.sources import BagError
+
+AT, REACH, LEAST = 5.0, 25.0, 5
+_EARTH = 6_371_008.8
+
+
+class Line(NamedTuple):
+    """A tracked line: its records in order of time that have a place; east and north (T,) m;
+    separation: `min_separation` of the run, m; first and last depth that is tracked, and the step
+    of depths, m."""
+
+    name: str
+    records: tuple[Estimate, ...]
+    longitude: FloatArray
+    latitude: FloatArray
+    separation: float
+    first: float
+    last: float
+    step: float
+
+
+class Horizon(NamedTuple):
+    """A horizon at a crossing: depth and std m, slope in m per m along the line; cut: it lies at
+    the end of the depths that are tracked."""
+
+    track_id: int
+    depth: float
+    std: float
+    slope: float
+    is_bottom: float
+    multiple: float
+    cut: bool
+
+
+def crossing_metrics(a: RunFolder, b: RunFolder, position_std: float) -> dict[str, Any]:
+    """The crossings of two runs of the fathometer as plain values. Raises `BagError`."""
+    lines = _line(a), _line(b)
+    origin = float(lines[0].longitude[0]), float(lines[0].latitude[0])
+    tracks = [_plane(line, origin) for line in lines]
+    crossings = []
+    for i, j, s, t, angle in _meetings(*tracks):
+        found = [
+            _horizons(line, track, row + share, position_std)
+            for line, track, row, share in zip(lines, tracks, (i, j), (s, t))
+        ]
+        limit = max(line.separation for line in lines)
+        directions = np.array([track[row + 1] - track[row] for track, row in zip(tracks, (i, j))])
+        directions /= np.hypot(*directions.T)[:, None]
+        crossings.append(
+            {
+                'stamp_a_ns': lines[0].records[i].stamp_ns,
+                'stamp_b_ns': lines[1].records[j].stamp_ns,
+                'longitude': _between(lines[0].longitude, i, s),
+                'latitude': _between(lines[0].latitude, i, s),
+                'angle_deg': angle,
+                **_compared(*found, limit, directions, position_std),
+            }
+        )
+    matched = [one for crossing in crossings for one in crossing['horizons']]
+    return {
+        'line_a': lines[0].name,
+        'line_b': lines[1].name,
+        'position_std_m': position_std,
+        'crossings': crossings,
+        'matched': len(matched),
+        **summary([one for one in matched if one['judged']]),
+    }
+
+
+def summary(judged: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Numbers of horizons that are judged. between_lines_m: standard deviation that, added to what
+    is stated, makes their mean square 1 (Paule and Mandel); 0 where none is missing."""
+    sigmas = np.array([one['sigmas'] for one in judged])
+    difference, std = (np.array([one[key] for one in judged]) for key in ('difference_m', 'std_m'))
+    return {
+        'judged': len(judged),
+        'rms_difference_m': _rms(difference),
+        'rms_sigmas': _rms(sigmas),
+        'inside_2_sigmas': float(np.mean(np.abs(sigmas) <= 2.0)) if len(sigmas) else float('nan'),
+        'between_lines_m': _missing(difference, std) if len(judged) else float('nan'),
+    }
+
+
+def _missing(difference: FloatArray, std: FloatArray) -> float:
+    from scipy.optimize import brentq
+
+    def excess(missing: float) -> float:
+        return float(np.mean(difference**2 / (std**2 + missing**2))) - 1.0
+
+    # With all of the differences for it, nothing is left.
+    return float(brentq(excess, 0.0, _rms(difference))) if excess(0.0) > 0.0 else 0.0
+
+
+def crossing_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """What `crossing_metrics` found, as sentences."""
+    if not metrics['crossings']:
+        return [f'{metrics["line_a"]} and {metrics["line_b"]} do not cross']
+    lines = []
+    for one in metrics['crossings']:
+        lines.append(
+            f'crossing at {one["latitude"]:.6f}, {one["longitude"]:.6f} under '
+            f'{one["angle_deg"]:.0f} deg: {len(one["horizons"])} horizons matched, '
+            f'{one["only_a"]} and {one["only_b"]} seen by one line only'
+        )
+        for h in one['horizons']:
+            depths = f'{h["depth_a_m"]:8.2f} m and {h["depth_b_m"]:8.2f} m'
+            marks = {'bottom': h['bottom'], 'multiple': h['multiple'], 'cut': h['cut']}
+            lines.append(
+                f'  {depths}: {h["difference_m"]:+.2f} m = {h["sigmas"]:+.1f} stated sigma of '
+                f'{h["std_m"]:.2f} m' + ''.join(f', {name}' for name, has in marks.items() if has)
+            )
+        if one['floor_cut']:
+            lines.append(
+                '  not judged: the floor lies at the first depth that is tracked, or above it, so '
+                'that what is below may be multiples of it'
+            )
+        if 'shift_m' in one:
+            lines.append(
+                f'  common shift {one["shift_m"]:+.2f} m +- {one["shift_std_m"]:.2f} m; after it '
+                f'{one["residual_rms_m"]:.2f} m rms, {one["residual_rms_sigmas"]:.1f} stated '
+                'sigmas rms'
+            )
+    if metrics['judged']:
+        lines.append(
+            f'{metrics["judged"]} horizons: {metrics["rms_difference_m"]:.2f} m rms, '
+            f'{metrics["rms_sigmas"]:.1f} stated sigmas rms, '
+            f'{100.0 * metrics["inside_2_sigmas"]:.0f} % within two'
+        )
+        if metrics['between_lines_m'] > 0.0:
+            lines.append(f'lines differ by {metrics["between_lines_m"]:.2f} m more than is stated')
+    return lines
+
+
+def _line(folder: RunFolder) -> Line:
+    run = folder.read_run()
+    if run['system'] != 'fathometer':
+        raise BagError(f'{folder.path} is a run of {run["system"]}, not of the fathometer')
+    if not Path(run['bag']).exists():
+        raise BagError(f'{run["bag"]}, the recording of {folder.path}, is gone; it has the places')
+    with BagReader(run['bag']) as bag:
+        positions = read_positions(bag)
+    if positions is None:
+        raise BagError(f'{run["bag"]} has no positions (sensor_msgs/NavSatFix)')
+    records = [one for one in folder.read_estimates() if not one.columns()['preview'][0]]
+    stamps = np.array([one.stamp_ns for one in records], np.int64)
+    east, north = positions.at(stamps)
+    there = np.isfinite(east)
+    if there.sum() < 2:
+        raise BagError(f'{folder.path}: fewer than two records have a place')
+    kept = tuple(one for one, good in zip(records, there) if good)
+    config = FathometerConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    depth = tracked_depths(run, config)
+    return Line(
+        folder.path.name,
+        kept,
+        east[there],
+        north[there],
+        config.min_separation,
+        float(depth[0]),
+        float(depth[-1]),
+        float(depth[1] - depth[0]),
+    )
+
+
+def tracked_depths(run: Mapping[str, Any], config: FathometerConfig) -> FloatArray:
+    """The depths (n,) m on which a run looked for reflectors: as its tracker has them after the
+    first record. Raises `BagError`."""
+    tracker = FathometerTracker(evolve(config, particles=2, smoothing_lag=0, preview_seconds=0.0))
+    for measurement in read_measurements(run):
+        tracker.process(measurement)
+        if tracker.response is not None:
+            return tracker.response.depth
+    raise BagError(f'{run["bag"]} holds no record of the fathometer')
+
+
+def _plane(line: Line, origin: tuple[float, float]) -> FloatArray:
+    """East and north (T, 2) of the origin in metres: lines are short against the Earth."""
+    turned = (line.longitude - origin[0] + 180.0) % 360.0 - 180.0
+    east = np.radians(turned) * _EARTH * np.cos(np.radians(origin[1]))
+    return np.column_stack([east, np.radians(line.latitude - origin[1]) * _EARTH])
+
+
+def _meetings(a: FloatArray, b: FloatArray) -> list[tuple[int, int, float, float, float]]:
+    """Where the polygons a (T, 2) and b (U, 2) cross: segment of each, the share of it that is
+    passed, and the angle between them in degrees."""
+    found = []
+    u, v = np.diff(a, axis=0), np.diff(b, axis=0)
+    for i in np.flatnonzero(np.hypot(*u.T) > 0.0):
+        apart = b[:-1] - a[i]
+        across = u[i, 0] * v[:, 1] - u[i, 1] * v[:, 0]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            s = (apart[:, 0] * v[:, 1] - apart[:, 1] * v[:, 0]) / across
+            t = (apart[:, 0] * u[i, 1] - apart[:, 1] * u[i, 0]) / across
+        # Half-open, so that a crossing at a position counts once.
+        for j in np.flatnonzero((s >= 0.0) & (s < 1.0) & (t >= 0.0) & (t < 1.0)):
+            angle = np.degrees(np.arctan2(abs(across[j]), abs(float(u[i] @ v[j]))))
+            found.append((int(i), int(j), float(s[j]), float(t[j]), float(angle)))
+    return found
+
+
+def _horizons(line: Line, track: FloatArray, at: float, position_std: float) -> list[Horizon]:
+    """The horizons of a line around the fractional record `at`."""
+    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(track, axis=0).T)))
+    here = float(np.interp(at, np.arange(len(way)), way))
+    seen: dict[int, list[tuple[float, ...]]] = {}
+    for k in np.flatnonzero(np.abs(way - here) <= REACH):
+        columns = line.records[k].columns()
+        for row in np.flatnonzero(np.isfinite(columns['depth'])):
+            seen.setdefault(int(columns['track_id'][row]), []).append(
+                (
+                    float(way[k]) - here,
+                    float(columns['depth'][row]),
+                    float(columns['cov_depth_depth'][row]),
+                    float(columns['is_bottom'][row]),
+                    float(columns['multiple_probability'][row]),
+                )
+            )
+    horizons = []
+    for track_id, rows in seen.items():
+        ahead, depth, variance, bottom, multiple = (np.array(column) for column in zip(*rows))
+        near = int(np.argmin(np.abs(ahead)))
+        # Of two records side by side the slope is noise, and without one the error of a place
+        # says nothing.
+        if len(rows) < LEAST or np.ptp(ahead) <= 0.5 * REACH:
+            continue
+        if abs(ahead[near]) > max(AT, 2.0 * position_std):
+            continue
+        spread = ahead - ahead.mean()
+        slope = float(spread @ depth / (spread @ spread))
+        left = depth - depth.mean() - slope * spread
+        scatter = float(left @ left / (len(rows) - 2))
+        std = float(np.sqrt(max(variance[near], scatter)))
+        place = float(depth[near] - slope * ahead[near])
+        within = min(depth[near] - line.first, line.last - depth[near])
+        horizons.append(
+            Horizon(
+                track_id,
+                place,
+                std,
+                slope,
+                float(bottom[near]),
+                float(multiple[near]),
+                bool(within <= line.step),
+            )
+        )
+    return sorted(horizons, key=lambda one: one.depth)
+
+
+def _compared(
+    a: Sequence[Horizon],
+    b: Sequence[Horizon],
+    limit: float,
+    directions: FloatArray,
+    position_std: float,
+) -> dict[str, Any]:
+    """directions (2, 2): unit vectors along both lines."""
+    from scipy.optimize import linear_sum_assignment
+
+    depth_a, depth_b = np.array([one.depth for one in a]), np.array([one.depth for one in b])
+    distance = np.abs(depth_a.reshape(-1, 1) - depth_b.reshape(1, -1))
+    rows, columns = linear_sum_assignment(np.minimum(distance, limit))
+    pairs = [(a[i], b[j]) for i, j in zip(rows, columns) if distance[i, j] < limit]
+    floor_cut = any(one.cut and one.is_bottom > 0.5 for one in (*a, *b))
+    horizons = []
+    for one, other in pairs:
+        # Lines that are nearly parallel say nothing of the slope across them.
+        slopes = np.array([one.slope, other.slope])
+        gradient = np.linalg.lstsq(directions, slopes, rcond=0.3)[0]
+        place = np.sqrt(2.0) * position_std * np.hypot(*gradient)
+        std = float(np.sqrt(one.std**2 + other.std**2 + place**2))
+        cut = one.cut or other.cut
+        horizons.append(
+            {
+                'track_id_a': one.track_id,
+                'track_id_b': other.track_id,
+                'depth_a_m': one.depth,
+                'depth_b_m': other.depth,
+                'difference_m': one.depth - other.depth,
+                'std_m': std,
+                'sigmas': (one.depth - other.depth) / std,
+                'bottom': one.is_bottom > 0.5 and other.is_bottom > 0.5,
+                'multiple': max(one.multiple, other.multiple) > 0.5,
+                'cut': cut,
+                'judged': not (cut or floor_cut),
+            }
+        )
+    return {
+        'horizons': horizons,
+        'only_a': len(a) - len(pairs),
+        'only_b': len(b) - len(pairs),
+        'floor_cut': floor_cut,
+        **common_shift([one for one in horizons if one['judged']]),
+    }
+
+
+def common_shift(judged: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The shift of line a against line b that horizons have in common, weighted by what they
+    state, its standard deviation, and what it leaves; nothing for fewer than two."""
+    if len(judged) < 2:
+        return {}
+    difference, std = (np.array([one[key] for one in judged]) for key in ('difference_m', 'std_m'))
+    weight = std**-2
+    shift = float(weight @ difference / weight.sum())
+    left = difference - shift
+    # One number of them went into the shift.
+    free = len(left) - 1
+    return {
+        'shift_m': shift,
+        'shift_std_m': float(weight.sum() ** -0.5),
+        'residual_rms_m': float(np.sqrt(left @ left / free)),
+        'residual_rms_sigmas': float(np.sqrt(weight @ left**2 / free)),
+    }
+
+
+def _between(values: FloatArray, row: int, share: float) -> float:
+    return float(values[row] + share * (values[row + 1] - values[row]))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float('nan')

@@ -1,0 +1,157 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Scores of sets of reflectors against the true sets.
+
+OSPA of second order (Schuhmacher, Vo and Vo 2008) is one number in metres: the RMS error of a
+reflector, where one too many or too few counts as an error of the cutoff. For the other metrics
+found and true reflectors are paired by least total distance, none further apart than `NEAR` times
+the cutoff. Found reflectors without a partner are false, true ones are missed.
+
+Previews are not scored, because their record revises them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.consistency import ospa
+
+from ..numbers import error_summary
+from .records import Record, Reflections
+
+CUTOFF = 2.0
+"""OSPA cutoff, m: the error that a false or missed reflector counts as."""
+NEAR = 0.2
+"""Share of the cutoff within which a found reflector can be paired with a true one."""
+
+
+class Pairing(NamedTuple):
+    """Indices (pairs,) into the found and the true reflectors, and the OSPA distance, m."""
+
+    found: NDArray[np.intp]
+    true: NDArray[np.intp]
+    ospa: float
+
+
+def pair(found: FloatArray, true: FloatArray, cutoff: float) -> Pairing:
+    """Pair depths (K,) with depths (J,)."""
+    from scipy.optimize import linear_sum_assignment
+
+    distance = np.abs(found[:, None] - true)
+    rows, columns = linear_sum_assignment(np.minimum(distance, NEAR * cutoff))
+    near = distance[rows, columns] < NEAR * cutoff
+    apart = ospa(true[:, None], found[:, None], cutoff, order=2.0)
+    return Pairing(rows[near], columns[near], apart)
+
+
+def score(records: Sequence[Record], cutoff: float = CUTOFF) -> dict[str, Any]:
+    """The content of ``metrics.json``."""
+    committed = [record for record in records if not record.preview]
+    metrics: dict[str, Any] = {
+        'records': len(committed),
+        'previews': len(records) - len(committed),
+        'span_s': (records[-1].stamp_ns - records[0].stamp_ns) / 1e9 if records else 0.0,
+        'reflectors_mean': _mean([len(record.found) for record in committed]),
+        'ids': len({int(i) for record in committed for i in record.found.track_id}),
+        'cutoff_m': cutoff,
+    }
+    scored = [(record, record.true) for record in committed if record.true is not None]
+    if scored:
+        metrics.update(_against_truth(scored, cutoff))
+    return metrics
+
+
+def _against_truth(scored: Sequence[tuple[Record, Reflections]], cutoff: float) -> dict[str, Any]:
+    pairs = [pair(record.found.depth, true.depth, cutoff) for record, true in scored]
+    error = np.concatenate(
+        [r.found.depth[p.found] - t.depth[p.true] for (r, t), p in zip(scored, pairs)]
+    )
+    std = np.concatenate([r.depth_std[p.found] for (r, _), p in zip(scored, pairs)])
+    extra = [len(r.found) - len(p.found) for (r, _), p in zip(scored, pairs)]
+    return {
+        'scored_records': len(scored),
+        'order_right': _mean([record.order == len(true) for record, true in scored]),
+        'ospa_m': _mean([p.ospa for p in pairs]),
+        'false_per_record': _mean(extra),
+        'missed_per_record': _mean([len(t) - len(p.true) for (_, t), p in zip(scored, pairs)]),
+        'depth': {
+            **error_summary(np.abs(error)),
+            'bias_m': _mean(error),
+            'inside_2_sigma': _mean(np.abs(error) <= 2.0 * std),
+        },
+        'amplitude': _amplitudes(scored, pairs),
+        'existence': _existence(scored, pairs),
+        'identity_switches': _switches(scored, pairs),
+    }
+
+
+def _amplitudes(
+    scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
+) -> dict[str, float]:
+    """Relative errors after one common factor, because a passive array measures ratios only."""
+    found = np.concatenate([r.found.strength[p.found] for (r, _), p in zip(scored, pairs)])
+    true = np.concatenate([t.strength[p.true] for (_, t), p in zip(scored, pairs)])
+    use = np.isfinite(found) & (true > 0.0)
+    if not use.any():
+        return {'n': 0}
+    ratio = found[use] / true[use]
+    factor = float(np.median(ratio))
+    error = np.abs(ratio / factor - 1.0)
+    return {
+        'n': int(use.sum()),
+        'factor': factor,
+        'median_relative_error': float(np.median(error)),
+        'p95_relative_error': float(np.percentile(error, 95.0)),
+    }
+
+
+def _existence(
+    scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]
+) -> dict[str, float]:
+    """Stated probability of existence, and the share that was true."""
+    stated = np.concatenate([record.existence for record, _ in scored])
+    right = np.concatenate(
+        [np.isin(np.arange(len(r.found)), p.found) for (r, _), p in zip(scored, pairs)]
+    )
+    doubtful = stated < 0.95
+    return {
+        'stated_mean': _mean(stated),
+        'true_share': _mean(right),
+        'doubtful': int(doubtful.sum()),
+        'doubtful_stated': _mean(stated[doubtful]),
+        'doubtful_true': _mean(right[doubtful]),
+    }
+
+
+def _switches(scored: Sequence[tuple[Record, Reflections]], pairs: Sequence[Pairing]) -> int:
+    """How often a true reflector is found under another id than before."""
+    last: dict[int, int] = {}
+    switches = 0
+    for (record, true), p in zip(scored, pairs):
+        for row, column in zip(p.found, p.true):
+            who, name = int(true.track_id[column]), int(record.found.track_id[row])
+            switches += last.get(who, name) != name
+            last[who] = name
+    return switches
+
+
+def _mean(values: Any) -> float:
+    array = np.asarray(values, np.float64)
+    return float(array.mean()) if array.size else float('nan')

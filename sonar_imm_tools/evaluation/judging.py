@@ -1,0 +1,122 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Judges: scores and summaries of finished runs, one judge per system.
+
+The metrics of a diver track and of a sea floor differ. So each system has a module that judges its
+runs, `System.judge`, which provides
+
+- ``judge(folder, options) -> Judgement``: reads the run and the truth, scores them and summarises;
+- ``LIMIT``: the `Limit` of the error for the shipped recordings.
+
+Everything else is the same for all of them: the folder of a run, the page, the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol, TYPE_CHECKING
+
+from attrs import frozen
+
+from sonar_imm.trackers import SYSTEMS
+
+from ..offline.run_folder import RunFolder
+
+if TYPE_CHECKING:  # it loads plotly, which only a report needs and which takes a second
+    from .page import Part
+
+TRUTH_GAP = 60.0
+
+
+@frozen
+class Check:
+    """One check: its result, and what was wanted."""
+
+    name: str
+    result: str
+    wanted: str
+    good: bool
+
+
+@frozen
+class Limit:
+    """What an error may be at most: `meaning` names the error, e.g. 'position RMSE', and `metric`
+    is its dotted name in ``metrics.json``."""
+
+    value: float
+    unit: str
+    meaning: str
+    metric: str
+
+    def check(self, error: float, *, at_most: float | None = None, remark: str = '') -> Check:
+        """Compare `error` with the limit, or with `at_most` instead; `remark` follows it."""
+        limit = self.value if at_most is None else at_most
+        return Check(
+            f'{self.meaning} against truth',
+            f'{error:.2f} {self.unit}{remark}',
+            f'at most {limit:g} {self.unit}',
+            error <= limit,
+        )
+
+
+@frozen(kw_only=True)
+class JudgeOptions:
+    """What a run is compared with, and how.
+
+    truth_bag: where the truth is, None for the tracked recording itself. lag: seconds by which the
+    truth is later than the estimate it is compared with. gap: seconds without truth across which
+    it is not interpolated. cutoff: distance from which an estimate is on no target, None for what
+    is usual in the system.
+    """
+
+    truth_bag: Path | None = None
+    lag: float = 0.0
+    gap: float = TRUTH_GAP
+    cutoff: float | None = None
+
+
+@frozen(eq=False, kw_only=True)
+class Judgement:
+    """Scores and summary of one run.
+
+    metrics: the content of ``metrics.json``. summary: the result in a few sentences. lines: title
+    and value of the most important numbers. part: makes the part of the report for the run, with
+    further checks. accuracy: compares the error with a limit (None for `LIMIT` of the system);
+    None without truth.
+    """
+
+    metrics: dict[str, Any]
+    summary: str
+    lines: tuple[tuple[str, str], ...]
+    part: Callable[[Sequence[Check]], Part]
+    accuracy: Callable[[float | None], Check | None]
+
+
+class Judge(Protocol):
+    """What the module `System.judge` provides."""
+
+    LIMIT: Limit
+
+    def judge(self, folder: RunFolder, options: JudgeOptions) -> Judgement:
+        """Judge the run in `folder`. Raises `BagError` when it or the truth cannot be read."""
+        ...
+
+
+def judge(folder: RunFolder, options: JudgeOptions | None = None) -> Judgement:
+    """Judge a run of any system. Raises `BagError` when it or the truth cannot be read."""
+    one: Judge = import_module(SYSTEMS[folder.read_run()['system']].judge)
+    return one.judge(folder, options or JudgeOptions())

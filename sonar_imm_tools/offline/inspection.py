@@ -1,0 +1,264 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is in a recording, which tracker it suits, and what is wrong with it."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+from attrs import define, field
+import numpy as np
+
+from msg_adapters.headers import stamp_ns
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs, needed
+from sonar_imm.measurements import Rejection
+from sonar_imm.trackers import SYSTEMS
+
+from .. import SECOND
+from ..recordings.reader import BagMessage, BagReader, TopicInfo
+from ..recordings.topics import fitting_systems, instruments
+
+LONG_GAP = 10.0
+"""A gap is reported when it is this many times the usual time between two messages."""
+
+
+@define
+class _Heard:
+    """What was found on one topic."""
+
+    topic: TopicInfo
+    logs: array[int] = field(factory=lambda: array('q'))
+    stamps: array[int] = field(factory=lambda: array('q'))
+    frames: Counter[str] = field(factory=Counter)
+    no_stamp: int = 0
+    good: Counter[tuple[str, str]] = field(factory=Counter)
+    refused: dict[tuple[str, str], Counter[str]] = field(factory=dict)
+    doubts: Counter[str] = field(factory=Counter)
+    examples: dict[str, str] = field(factory=dict)
+
+
+def inspect(
+    bag: BagReader,
+    advance: Callable[[int], None] = lambda count: None,
+    detector: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Read a whole open recording. Gives plain values, fit for JSON.
+
+    detector: what readers of images have to be told, by the names of its parameters.
+    topics: one entry per topic with count, rate, frames, scans, the tracker inputs it suits and
+    its problems. problems: of the recording as a whole. systems: topics by input for each tracker,
+    the best fitting one first. topic_options: topic by input that has to be named to the tracker;
+    nothing where the names say enough.
+    """
+    heard = {topic.name: _Heard(topic) for topic in bag.topics}
+    for item in bag.messages():
+        advance(1)
+        _look_at(item, heard[item.topic], detector or {})
+    topics = [_topic_entry(entry) for entry in heard.values()]
+    first = min((entry.logs[0] for entry in heard.values() if entry.logs), default=0)
+    last = max((entry.logs[-1] for entry in heard.values() if entry.logs), default=0)
+    systems, options = _systems(bag, list(heard.values()))
+    return {
+        'bag': str(bag.path),
+        'duration_s': (last - first) / SECOND,
+        'messages': sum(len(entry.logs) for entry in heard.values()),
+        'topics': topics,
+        'systems': systems,
+        'topic_options': options,
+        'problems': list(bag.problems),
+    }
+
+
+def _look_at(item: BagMessage, heard: _Heard, detector: Mapping[str, Any]) -> None:
+    heard.logs.append(item.log_ns)
+    header = getattr(item.message, 'header', None)
+    if header is not None:
+        heard.frames[str(header.frame_id)] += 1
+        if stamp := _usable_stamp(item.message):
+            heard.stamps.append(stamp)
+        else:
+            heard.no_stamp += 1
+    for system, entry in _readers(item):
+        try:
+            told = detector if entry.makes else {}
+            made = entry.reader(item.type_name, 'enu', told)(item.message)
+            heard.good[system, entry.name] += 1
+            if (code := entry.doubt(item.message, made)) is not None:
+                heard.doubts[code] += 1
+        except Rejection as rejection:
+            heard.refused.setdefault((system, entry.name), Counter())[rejection.reason] += 1
+            heard.examples.setdefault(rejection.reason, rejection.sentence)
+
+
+def _usable_stamp(message: Any) -> int | None:
+    try:
+        stamp = stamp_ns(message)
+    except Rejection:
+        return None
+    return stamp if stamp > 0 else None
+
+
+def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
+    """The tracker inputs that a message could be for. Truth is no input."""
+    if _is_truth(item.topic):
+        return []
+    found = []
+    for system in SYSTEMS:
+        fitting = [
+            one
+            for one in (*inputs_of(system), *made_inputs(system))
+            if one.may_be(item.topic, item.type_name)
+        ]
+        # Of several inputs that a name says, the later one counts, as in `fitting_topics`.
+        named = [one for one in fitting if one.is_named(item.topic)][-1:]
+        found += [(system, entry) for entry in named or fitting]
+    return found
+
+
+def _is_truth(topic: str) -> bool:
+    return 'truth' in topic.split('/')
+
+
+def _topic_entry(heard: _Heard) -> dict[str, Any]:
+    span = (heard.logs[-1] - heard.logs[0]) / SECOND if heard.logs else 0.0
+    suits = [f'{system} {name}' for system, name in heard.good]
+    return {
+        'name': heard.topic.name,
+        'type': heard.topic.type_name,
+        'count': heard.topic.count,
+        'rate_hz': (len(heard.logs) - 1) / span if span > 0 else None,
+        'frames': list(heard.frames),
+        'suits': suits,
+        'scans': _scans(heard),
+        'problems': _stamp_problems(heard) + _content_problems(heard),
+    }
+
+
+def _scans(heard: _Heard) -> dict[str, int] | None:
+    """Number of stamps of a topic of scans, and the most messages that share one; else None."""
+    if not heard.stamps or not _holds_scans(heard):
+        return None
+    counts = np.unique(np.array(heard.stamps, np.int64), return_counts=True)[1]
+    return {'count': len(counts), 'most': int(counts.max())}
+
+
+def _holds_scans(heard: _Heard) -> bool:
+    """Whether messages with equal stamps are one scan of several targets, not repetitions."""
+    return _is_truth(heard.topic.name) or any(
+        entry.scans
+        for system, name in heard.good
+        for entry in inputs_of(system)
+        if entry.name == name
+    )
+
+
+def _stamp_problems(heard: _Heard) -> list[str]:
+    problems = []
+    if heard.no_stamp:
+        problems.append(f'{heard.no_stamp} messages without a usable stamp')
+    steps = np.diff(np.array(heard.stamps, np.int64))
+    if backward := int(np.count_nonzero(steps < 0)):
+        problems.append(
+            f'{backward} stamps older than the one before, by up to {-steps.min() / SECOND:.3g} s'
+        )
+    repeated = int(np.count_nonzero(steps == 0))
+    if repeated and not _holds_scans(heard):
+        problems.append(f'{repeated} stamps equal to the one before')
+    forward = steps[steps > 0]
+    if len(forward) > 2 and forward.max() > LONG_GAP * np.median(forward):
+        gaps = int(np.count_nonzero(forward > LONG_GAP * np.median(forward)))
+        problems.append(
+            f'{gaps} gaps in the stamps, the longest {forward.max() / SECOND:.3g} s '
+            f'against {np.median(forward) / SECOND:.3g} s usually'
+        )
+    return problems
+
+
+def _content_problems(heard: _Heard) -> list[str]:
+    """Problems of messages; refusals only for the input that the topic suits or is named after."""
+    problems = []
+    if len(heard.frames) > 1:
+        problems.append(f'several frames: {", ".join(map(repr, heard.frames))}')
+    for key, reasons in heard.refused.items():
+        if key in heard.good or heard.topic.name.split('/')[-1] == key[1]:
+            problems += [
+                f'{count} messages refused as {key[1]} ({reason}): {heard.examples[reason]}'
+                for reason, count in reasons.items()
+            ]
+    problems += [
+        f'{count} messages with {code.replace("_", " ")}' for code, count in heard.doubts.items()
+    ]
+    return problems
+
+
+Inputs = dict[str, list[str]]
+"""Topics by input."""
+
+
+def _systems(
+    bag: BagReader, heard: list[_Heard]
+) -> tuple[dict[str, Inputs], dict[str, dict[str, str]]]:
+    """Topics by input for each tracker that can use the recording, the best fitting one first, and
+    what has to be named to it.
+
+    First come trackers whose inputs have their names, in the order of `fitting_systems`. Others
+    follow, by the number of their inputs, unless they would only take what is named after an
+    input of those.
+    """
+    found: dict[str, Inputs] = {}
+    good: Counter[tuple[str, str, str]] = Counter()
+    for one in heard:
+        for (system, name), count in one.good.items():
+            found.setdefault(system, {}).setdefault(name, []).append(one.topic.name)
+            good[system, name, one.topic.name] = count
+    systems: dict[str, Inputs] = {}
+    options: dict[str, dict[str, str]] = {}
+    for system in fitting_systems(bag):
+        named = {
+            entry.name for each in instruments(bag, system).values() for entry in each.values()
+        }
+        if _enough(system, named & found.get(system, {}).keys()):
+            systems[system], options[system] = found[system], {}
+    taken = {
+        topic.name
+        for system in systems
+        for each in instruments(bag, system).values()
+        for topic in bag.topics
+        if topic.name in each
+    }
+    for system in sorted(found.keys() - systems.keys(), key=lambda name: -len(found[name])):
+        chosen: dict[str, str] = {}
+        for key, _ in good.most_common():
+            if key[0] == system and key[1] not in chosen and key[2] not in chosen.values():
+                chosen[key[1]] = key[2]
+        primary = {_entry(system, name).companion for name in chosen}
+        free = any(t not in taken and not _entry(system, n).companion for n, t in chosen.items())
+        if False in primary and free and _enough(system, chosen.keys()):
+            systems[system], options[system] = found[system], chosen
+    return systems, options
+
+
+def _entry(system: str, name: str) -> InputTopic:
+    return next(one for one in (*inputs_of(system), *made_inputs(system)) if one.name == name)
+
+
+def _enough(system: str, names: Collection[str]) -> bool:
+    """Whether a tracker with the default parameters can do something with these inputs."""
+    there = {_entry(system, name).makes or name for name in names}
+    required, one_of = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())
+    return there.issuperset(required) and (not one_of or not there.isdisjoint(one_of))

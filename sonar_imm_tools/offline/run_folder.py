@@ -1,0 +1,301 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The folder of a tracked recording: what ``track`` writes and ``evaluate`` reads.
+
+estimate/      the estimates as a bag, topic ``/<system>/estimate``
+soundings.csv  what of them goes into a chart, when a sonar with navigation was tracked; in the bag
+               as the topic ``/<system>/soundings``
+estimate.csv   the same rows as text: stamp_ns, then the columns of the contract
+run.json       input, parameters, versions; a folder without it is unfinished
+metrics.json   and report.html, once evaluated
+
+With ``--parquet`` there are estimate.parquet and soundings.parquet beside the CSV. A run is
+written elsewhere and moved to its folder when it is finished, see `sonar_imm.files`.
+
+The bag and the CSV hold nothing that depends on the time of the run: the same command writes the
+same bytes. Times and versions are in run.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+import contextlib
+import hashlib
+from importlib.metadata import version
+import json
+import math
+from pathlib import Path
+import platform
+import shutil
+from typing import Any
+
+import numba
+import numpy
+import scipy
+
+from msg_adapters.estimates import read_estimate, write_estimate
+from msg_adapters.soundings import write_soundings
+from sonar_imm import __version__
+from sonar_imm.estimates import Estimate
+from sonar_imm.files import beside, on_disk, sync_folder, whole
+from sonar_imm.measurements import Rejection
+from sonar_imm.soundings import soundings_of
+from sonar_imm.trackers import SYSTEMS
+
+from ..recordings.measurements import measurements_of
+from ..recordings.reader import BagError, BagReader
+from ..recordings.truth import TRUTH_TOPIC
+from ..recordings.writer import BagWriter, ros_message
+from .tables import CsvTable, ParquetTable, Table
+
+BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
+    'estimate',
+    'estimate.csv',
+    'soundings.csv',
+    'run.json',
+    'metrics.json',
+    'report.html',
+)
+PARQUET = {CSV: 'estimate.parquet', SOUNDINGS: 'soundings.parquet'}
+"""The same tables as Parquet."""
+SUMMARY = 'summary.json'
+"""In a folder of several runs, which are below it: where they are, see `batch`."""
+_RUN_FILES = (RUN, METRICS, REPORT, BAG, CSV, SOUNDINGS, *PARQUET.values())
+"""All that belongs to a run; without the first one there is no finished run."""
+
+
+_KINDS = {
+    'system': str,
+    'bag': str,
+    'world_frame': str,
+    **dict.fromkeys(('topics', 'parameters', 'counts', 'refused', 'versions'), dict),
+}
+"""What of run.json is read again; what is not required may be missing."""
+_NAMES = {str: 'a text', dict: 'a mapping'}
+
+
+class RunFolder:
+    """The folder of one run."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    @contextlib.contextmanager
+    def fresh(self, *, overwrite: bool = False) -> Iterator[RunFolder]:
+        """Yields a folder elsewhere to write a run into; at the end of the block the run is moved
+        here, as a whole where there is no folder yet. An exception leaves everything as it was.
+
+        Raises `BagError` when a run is here and may not be overwritten. Other files are left
+        alone.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise BagError(f'{self.path} is a file; a folder is needed')
+        old = [self.path / name for name in _RUN_FILES if (self.path / name).exists()]
+        if old and not overwrite:
+            raise BagError(
+                f'{self.path} holds a run already ({old[0].name}); choose another '
+                'folder or say --overwrite'
+            )
+        if not self.path.exists():
+            with whole(self.path) as place:
+                place.mkdir()
+                yield RunFolder(place)
+            return
+        with beside(self.path / 'run') as place:
+            yield RunFolder(place)
+            on_disk(place)
+            for path in old:  # run.json is the first of them
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            made = [name for name in _RUN_FILES if (place / name).exists()]
+            for name in reversed(made):  # and the last one here
+                (place / name).rename(self.path / name)
+            sync_folder(self.path)
+
+    def write_estimates(
+        self,
+        estimates: Iterable[Estimate],
+        system: str,
+        *,
+        parquet: Mapping[str, str] | None = None,
+    ) -> dict[str, int]:
+        """Write bag and CSV while the estimates come; gives the number of estimates and rows, and
+        of soundings where there are any. parquet: what the metadata of Parquet files say, which
+        are written beside the CSV then."""
+        written = {'estimates': 0, 'rows': 0}
+        with contextlib.ExitStack() as stack:
+            bag = stack.enter_context(BagWriter(self.path / BAG))
+            tables = self._tables(stack, CSV, parquet)
+            chart: list[Table] = []
+            for estimate in estimates:
+                bag.write(
+                    f'/{system}/estimate', write_estimate(estimate, ros_message), estimate.stamp_ns
+                )
+                columns = estimate.columns()
+                for table in tables:
+                    table.write(estimate.stamp_ns, columns)
+                written['estimates'] += 1
+                written['rows'] += len(estimate)
+                if (soundings := soundings_of(estimate)) is None:
+                    continue
+                chart = chart or self._tables(stack, SOUNDINGS, parquet)
+                message = write_soundings(soundings, ros_message)
+                bag.write(f'/{system}/soundings', message, estimate.stamp_ns)
+                for table in chart:
+                    table.write(soundings.stamp_ns, soundings.columns)
+                written['soundings'] = written.get('soundings', 0) + len(soundings)
+        return written
+
+    def _tables(
+        self, stack: contextlib.ExitStack, name: str, parquet: Mapping[str, str] | None
+    ) -> list[Table]:
+        """The table `name` as CSV and, where wanted, as Parquet."""
+        tables: list[Table] = [CsvTable(self.path / name)]
+        if parquet is not None:
+            tables.append(ParquetTable(self.path / PARQUET[name], parquet))
+        return [stack.enter_context(table) for table in tables]
+
+    def write_json(self, name: str, content: Any) -> Path:
+        """Write `content` as JSON; NaN and infinity, which JSON lacks, become null."""
+        path = self.path / name
+        with whole(path) as unfinished:
+            text = json.dumps(finite(content), indent=2) + '\n'
+            unfinished.write_text(text, encoding='utf-8')
+        return path
+
+    def read_run(self) -> dict[str, Any]:
+        """The content of run.json. Raises `BagError` when the folder holds no finished run."""
+        path = self.path / RUN
+        if not path.is_file() and (self.path / SUMMARY).is_file():
+            raise BagError(
+                f'{self.path} holds several runs, which {SUMMARY} lists; name the folder of one'
+            )
+        if not path.is_file():
+            raise BagError(
+                f'{self.path} holds no finished run: {RUN} is missing; '
+                'make one with sonar-imm track'
+            )
+        try:
+            run = json.loads(path.read_text(encoding='utf-8'))
+            _check_run(run)
+        except (ValueError, AttributeError, TypeError) as error:
+            raise BagError(f'{path} cannot be understood: {error}') from None
+        return run
+
+    def read_estimates(self) -> list[Estimate]:
+        """The estimates of the run, as written. Raises `BagError` when its bag is damaged."""
+        return _read_estimates(self.path / BAG)
+
+
+def _check_run(run: Any) -> None:
+    """Raise ValueError or TypeError for a run.json whose entries are not what they must be."""
+    if not {'system', 'bag', 'topics', 'parameters'} <= run.keys():
+        raise ValueError('keys are missing')
+    for name, kind in _KINDS.items():
+        if not isinstance(run.get(name, kind()), kind):
+            raise ValueError(f"'{name}' is not {_NAMES[kind]}")
+    if run['system'] not in SYSTEMS:
+        raise ValueError(f"there is no system '{run['system']}'")
+    if run.get('world_frame', 'enu') not in ('enu', 'ned'):
+        raise ValueError("'world_frame' is neither enu nor ned")
+    if not all(isinstance(name, str) for name in run['topics'].values()):
+        raise ValueError("'topics' does not give the name of an input for each topic")
+    for reason, entry in run.get('refused', {}).items():
+        if not (isinstance(entry, dict) and {'count', 'example'} <= entry.keys()):
+            raise ValueError(f"'refused' has no count and example for '{reason}'")
+
+
+def read_truth(
+    run: Mapping[str, Any], truth_bag: Path | None = None, topic: str = TRUTH_TOPIC
+) -> list[Estimate] | None:
+    """The truth tables in `truth_bag`, by default in the recording that was tracked.
+
+    None when the recording has no truth or is gone. Raises `BagError`, also when `truth_bag` holds
+    no truth.
+    """
+    path = truth_bag or Path(run['bag'])
+    if truth_bag is None and not path.exists():
+        return None
+    estimates = _read_estimates(path, [topic])
+    if not estimates and truth_bag is not None:
+        raise BagError(f'{truth_bag} has no topic {topic}')
+    return estimates or None
+
+
+def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
+    """The measurements that went into `run`, in the order recorded, without those refused.
+
+    Nothing when the recording is gone. Raises `BagError`.
+    """
+    if not Path(run['bag']).exists():
+        return
+    with BagReader(run['bag']) as bag:
+        for heard in measurements_of(
+            bag,
+            run['system'],
+            run['topics'],
+            world_frame=run.get('world_frame', 'enu'),
+            settings=run.get('parameters'),
+            detector=run.get('detector'),
+        ):
+            if heard.measurement is not None and not isinstance(heard.measurement, Rejection):
+                yield heard.measurement
+
+
+def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimate]:
+    try:
+        with BagReader(path) as bag:
+            if topics is None:  # of a run: everything but the estimates is there for others
+                topics = [topic.name for topic in bag.topics if topic.name.endswith('/estimate')]
+            return [read_estimate(item.message) for item in bag.messages(topics)]
+    except Rejection as rejection:
+        raise BagError(f'{path}: {rejection}') from None
+
+
+def run_record(**facts: Any) -> dict[str, Any]:
+    """The content of run.json: `facts` and the versions of the software."""
+    versions = {
+        'sonar_imm': __version__,
+        'python': platform.python_version(),
+        'numpy': numpy.__version__,
+        'scipy': scipy.__version__,
+        'numba': numba.__version__,
+        'rosbags': version('rosbags'),
+    }
+    return {**facts, 'versions': versions}
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a recording: of the file, or of all files of the folder in order."""
+    files = sorted(item for item in path.rglob('*') if item.is_file()) if path.is_dir() else [path]
+    digest, size = hashlib.sha256(), 0
+    for file in files:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path).as_posix()).encode())
+        with file.open('rb') as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+                size += len(block)
+    return {'bag_bytes': size, 'bag_sha256': digest.hexdigest()}
+
+
+def finite(value: Any) -> Any:
+    """`value` with None for floats that are not finite, so that any JSON parser reads it."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return value

@@ -1,0 +1,339 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tracking a recording offline: the same readers, the same tracker and the same order as live.
+
+A tracker revises its estimates when late input arrives. Offline only the final estimate of each
+stamp is wanted, in order of stamps. `Revisions` holds estimates only while they can still change,
+so that memory does not grow with the recording.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
+import json
+import time
+from typing import Any
+
+from attrs import asdict, define, field, frozen
+import numpy as np
+
+from sonar_imm import __version__
+from sonar_imm.estimates import Estimate
+from sonar_imm.measurements import FrameGuard, Rejection, RepeatGuard
+from sonar_imm.parameters import Config
+from sonar_imm.trackers import System
+from sonar_imm.trackers.frames import FrameDoor
+
+from .. import SECOND
+from ..recordings.measurements import measurements_of
+from ..recordings.reader import BagReader
+from ..recordings.topics import fitting_topics
+from .jobs import processes
+from .run_folder import fingerprint, finite, RUN, run_record, RunFolder
+
+TO_THE_END = 2**62
+AHEAD = 4
+"""Tasks of each process that may wait or be done: what bounds the memory of a shared run."""
+
+
+@frozen(kw_only=True)
+class InputOptions:
+    """How to treat a recording.
+
+    topics: input by topic name, None to pick what fits by name; smooth: condition each estimate on
+    later input too, which takes memory in proportion to the recording. jobs: processes that share
+    the work where a tracker can share it; the estimates do not depend on it. detector: parameters
+    of the detector of images that are not the default.
+    """
+
+    topics: Mapping[str, str] | None = None
+    order: str = 'recorded'
+    world_frame: str = 'enu'
+    frame_id: str = ''
+    use_tf_static: bool = False
+    smooth: bool = False
+    jobs: int = 1
+    detector: Mapping[str, Any] = field(factory=dict)
+
+
+@define
+class Refused:
+    """How many messages were refused for one reason, and the sentence of the first one."""
+
+    count: int
+    example: str
+
+
+class Revisions:
+    """Holds estimates while they can still be revised; the last one of a stamp, and of each
+    instrument, counts.
+
+    window_ns: how far back a late measurement can reach. When the clock was restarted, what is
+    held from before is final.
+    """
+
+    def __init__(self, window_ns: int):
+        self.window_ns = window_ns
+        self._held: dict[tuple[int, int], Estimate] = {}
+
+    def add(self, estimates: Iterable[Estimate]) -> list[Estimate]:
+        """Add the estimates of one measurement; gives those that became final, oldest first."""
+        final: list[Estimate] = []
+        for estimate in estimates:
+            newest = max(self._held, default=(estimate.stamp_ns, 0))[0]
+            if estimate.stamp_ns < newest - self.window_ns:
+                final += self.finish()
+            self._held[estimate.stamp_ns, estimate.source] = estimate
+        if self._held:
+            oldest = max(self._held)[0] - self.window_ns
+            final += self._release(sorted(key for key in self._held if key[0] < oldest))
+        return final
+
+    def finish(self) -> list[Estimate]:
+        """Everything still held, oldest first."""
+        return self._release(sorted(self._held))
+
+    def _release(self, keys: list[tuple[int, int]]) -> list[Estimate]:
+        return [self._held.pop(key) for key in keys]
+
+
+def final_estimates(estimates: Iterable[Estimate], config: Config) -> list[Estimate]:
+    """The final estimate of each stamp out of everything a live tracker of `config` published."""
+    revisions = Revisions(window_ns(config))
+    return [
+        *(final for estimate in estimates for final in revisions.add([estimate])),
+        *revisions.finish(),
+    ]
+
+
+def window_ns(config: Config) -> int:
+    """How far back later input can change the estimates of a tracker."""
+    if getattr(config, 'smoothing_lag', 0):
+        return TO_THE_END  # a lag in records, which come at any rate
+    return round(getattr(config, 'history', 0.0) * SECOND)
+
+
+class OfflineRun:
+    """One pass of a tracker over an open recording. The counters are complete after `estimates`.
+
+    topics: input by topic name, as used. refused: by reason code. durations: seconds of each call
+    of the tracker. Raises `BagError` when no topic fits the tracker.
+    """
+
+    def __init__(
+        self, bag: BagReader, system: System, config: Config, options: InputOptions | None = None
+    ):
+        self.options = options or InputOptions()
+        self.bag = bag
+        self.system = system
+        chosen = fitting_topics(bag, system.name, self.options.topics)
+        told = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
+        self.topics = {name: entry.name for name, entry in chosen.items() if entry.wanted(told)}
+        build = system.build_smoother if self.options.smooth else system.build
+        self.tracker = build(config.for_inputs(frozenset(self.topics.values())))
+        self.refused: dict[str, Refused] = {}
+        self.messages = 0
+        self.durations = array('d')
+        self._window_ns = window_ns(config)
+        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
+        self._door = FrameDoor(self.tracker, FrameGuard(self.options.frame_id))
+
+    @property
+    def total(self) -> int:
+        """How many messages there are to read."""
+        return sum(topic.count for topic in self.bag.topics if topic.name in self.topics)
+
+    def estimates(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Estimate]:
+        """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
+        revisions = Revisions(self._window_ns)
+        self.tracker.warm()
+        share = self.options.jobs > 1 and hasattr(self.tracker, 'tasks')
+        for made in self._shared_out(advance) if share else self._one_by_one(advance):
+            final = revisions.add(made)
+            if not self.options.smooth:
+                yield from final
+        last = revisions.add(getattr(self.tracker, 'finish', list)()) + revisions.finish()
+        if not self.options.smooth:
+            yield from last
+        elif last:
+            yield from self.tracker.smoothed()
+
+    def _one_by_one(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
+        """What the tracker makes of each measurement."""
+        for measurement in self._measurements(advance):
+            begin = time.perf_counter()
+            made = self.tracker.process(measurement)
+            self.durations.append(time.perf_counter() - begin)
+            yield made
+
+    def _shared_out(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
+        """The same from a `SharingTracker`, whose tasks `jobs` processes do."""
+        ahead = AHEAD * self.options.jobs
+        waiting: deque[Future[tuple[Any, float]]] = deque()
+        with processes(self.options.jobs) as pool:
+            try:
+                for measurement in self._measurements(advance):
+                    for task in self.tracker.tasks(measurement):
+                        waiting.append(pool.submit(_timed, self.tracker.work, task))
+                    while waiting and (len(waiting) > ahead or waiting[0].done()):
+                        yield self._taken(waiting.popleft())
+                while waiting:
+                    yield self._taken(waiting.popleft())
+            finally:
+                for one in waiting:
+                    one.cancel()
+
+    def _taken(self, done: Future[tuple[Any, float]]) -> list[Estimate]:
+        found, seconds = done.result()
+        self.durations.append(seconds)
+        made: list[Estimate] = self.tracker.take(found)
+        return made
+
+    def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
+        door = self._door
+        for heard in measurements_of(
+            self.bag,
+            self.system.name,
+            self.topics,
+            world_frame=self.options.world_frame,
+            order=self.options.order,
+            settings=self.tracker.config.as_dict(),
+            detector=self.options.detector,
+        ):
+            self.messages += 1
+            advance(1)
+            if heard.measurement is None:
+                continue
+            try:
+                if isinstance(heard.measurement, Rejection):
+                    raise heard.measurement
+                measurement = door.admit(heard.measurement)
+                if measurement is not None:
+                    measurement = self._repeats.fresh(measurement)
+            except Rejection as rejection:
+                self._refuse(heard.topic, rejection)
+                continue
+            if measurement is not None:
+                yield measurement
+
+    def _refuse(self, topic: str, rejection: Rejection) -> None:
+        entry = self.refused.setdefault(
+            rejection.reason, Refused(0, f'{topic}: {rejection.sentence}')
+        )
+        entry.count += 1
+
+    def recipe(self) -> dict[str, Any]:
+        """What decides about the estimates, and is known before: as run.json has it."""
+        options = self.options
+        return {
+            'system': self.system.name,
+            **fingerprint(self.bag.path),
+            'topics': self.topics,
+            'order': options.order,
+            'smoothed': options.smooth,
+            'world_frame': options.world_frame,
+            'frame_id': options.frame_id,
+            'parameters': self.tracker.config.as_dict(),
+            **({'detector': dict(options.detector)} if options.detector else {}),
+        }
+
+    def outcomes(self) -> dict[str, int]:
+        """What happened to the messages: counts of the tracker, covariances it had to repair,
+        pings in which most obstacles moved alike, and messages refused before."""
+        counts = {name: count for name, count in sorted(self.tracker.counts.items()) if count}
+        health = self.tracker.health()
+        kept = ('covariance_repairs', 'not_started', 'pings_moving_alike', 'waiting_for_vessel')
+        for name in kept:
+            if count := health.get(name):
+                counts[name] = int(count)
+        if self._repeats.rows:
+            counts['repeated_rows'] = self._repeats.rows
+        refused = sum(entry.count for entry in self.refused.values())
+        return {**counts, 'refused': refused} if refused else counts
+
+    def warnings(self) -> list[str]:
+        """What of the input cannot be true, as the tracker says it at the end."""
+        return list(getattr(self.tracker, 'warnings', list)())
+
+    def origin(self) -> dict[str, Any]:
+        """Where the frame of the tracks lies on Earth, as plain values; nothing when not known."""
+        origin = getattr(self.tracker, 'origin', None)
+        return {} if origin is None else {'origin': asdict(origin)}
+
+    def mounting(self) -> dict[str, Any]:
+        """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
+        return {'mounting': self._door.mounting} if self._door.mounting else {}
+
+    def refusals(self) -> dict[str, dict[str, Any]]:
+        """Count and example by reason, as plain values."""
+        return {reason: asdict(entry) for reason, entry in sorted(self.refused.items())}
+
+    def timings(self) -> dict[str, float]:
+        """Milliseconds that the tracker takes per measurement: total, median and 99 % point."""
+        spent = np.array(self.durations) * 1e3
+        if not len(spent):
+            return {}
+        return {
+            'tracker_total_ms': float(spent.sum()),
+            'tracker_p50_ms': float(np.median(spent)),
+            'tracker_p99_ms': float(np.percentile(spent, 99.0)),
+        }
+
+
+def _timed(work: Callable[[Any], Any], task: Any) -> tuple[Any, float]:
+    """What a task gives, and the seconds it took."""
+    begin = time.perf_counter()
+    return work(task), time.perf_counter() - begin
+
+
+def write_run(
+    folder: RunFolder,
+    offline: OfflineRun,
+    advance: Callable[[int], None] = lambda count: None,
+    *,
+    parquet: bool = False,
+) -> dict[str, Any]:
+    """Track into a fresh folder; gives the content of run.json, which is written last. parquet:
+    write the tables as Parquet too."""
+    begin = time.perf_counter()
+    system, path = offline.system.name, offline.bag.path
+    recipe = offline.recipe()
+    notes = {
+        'system': system,
+        'sonar_imm': __version__,
+        'topics': json.dumps(offline.topics),
+        'parameters': json.dumps(finite(recipe['parameters'])),
+    }
+    written = folder.write_estimates(
+        offline.estimates(advance), system, parquet=notes if parquet else None
+    )
+    run = run_record(
+        bag=str(path.resolve()),
+        **recipe,
+        messages=offline.messages,
+        **written,
+        counts=offline.outcomes(),
+        refused=offline.refusals(),
+        warnings=offline.warnings(),
+        problems=list(offline.bag.problems),
+        **offline.origin(),
+        **offline.mounting(),
+        timings={'wall_s': time.perf_counter() - begin, **offline.timings()},
+    )
+    folder.write_json(RUN, run)
+    return run

@@ -1,0 +1,114 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What every converter shares: counting bad rows, writing the bag, reporting what was done."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+from attrs import define, Factory
+
+from sonar_imm.measurements import Rejection
+
+from .csv_table import BadRow, CsvTable, Row
+from .sources import BagError
+from .writer import BagWriter
+
+T = TypeVar('T')
+Record = tuple[int, str, Any]
+"""(stamp in ns, topic, rosbags message)"""
+
+MOST_NAMED = 20
+"""At most this many bad rows are listed; all are counted."""
+
+
+@define
+class ConversionReport:
+    """What a conversion did.
+
+    messages: by topic; rows: lines or records read; bad_rows: left out; problems: one sentence for
+    each of the first bad rows and for the file as a whole; reasons: bad rows by a word, of those
+    that have one; notes: facts worth telling, such as the
+    origin of local coordinates, also kept in the bag.
+    """
+
+    path: Path
+    rows: int = 0
+    bad_rows: int = 0
+    messages: dict[str, int] = Factory(dict)
+    problems: list[str] = Factory(list)
+    notes: dict[str, str] = Factory(dict)
+    reasons: Counter[str] = Factory(Counter)
+
+    def bad_row(self, path: Path, where: str, why: object) -> None:
+        """Count a bad row and name it while there are few."""
+        self.bad_rows += 1
+        if reason := getattr(why, 'reason', ''):
+            self.reasons[reason.replace('_', ' ')] += 1
+        if self.bad_rows <= MOST_NAMED:
+            self.problems.append(f'{path.name}, {where}: {why}')
+        elif self.bad_rows == MOST_NAMED + 1:
+            self.problems.append('further bad rows are counted but not listed')
+
+    def read_rows(self, table: CsvTable, parse: Callable[[Row], T]) -> Iterator[tuple[Row, T]]:
+        """Yield the rows of `table` that `parse` accepts; count and name the others."""
+        for row in table:
+            self.rows += 1
+            try:
+                yield row, parse(row)
+            except (BadRow, Rejection) as error:
+                self.bad_row(table.path, f'line {row.line}', error)
+        self.note_columns(table)
+
+    def note_columns(self, table: CsvTable) -> None:
+        """Note which columns of a file were taken for what, and which were not."""
+        taken, left = table.columns_used()
+        self.notes[f'columns of {table.path.name}'] = taken
+        if left:
+            self.notes[f'ignored columns of {table.path.name}'] = left
+
+
+def write_bag(
+    out: str | Path,
+    records: Iterable[Record],
+    report: ConversionReport,
+    *,
+    source: str,
+    storage: str = 'mcap',
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+) -> ConversionReport:
+    """Write `records` in time order into a new bag at `out`; log time = stamp.
+
+    parameters: those of its instruments, by the names of nodes. Raises `BagError` when there is
+    nothing to write or the bag cannot be made.
+    """
+    ordered = sorted(records, key=lambda record: record[0])
+    if not ordered:
+        first = f' (the first problem: {report.problems[0]})' if report.problems else ''
+        raise BagError(f'{source} has nothing that could be converted{first}')
+    notes = provenance(source, report.notes)
+    with BagWriter(out, storage=storage, custom_data=notes, parameters=parameters) as bag:
+        for stamp_ns, topic, message in ordered:
+            bag.write(topic, message, stamp_ns)
+            report.messages[topic] = report.messages.get(topic, 0) + 1
+    return report
+
+
+def provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
+    """What a converted bag notes beside its messages."""
+    return {'source': source, 'converted_by': 'sonar-imm convert', **notes}

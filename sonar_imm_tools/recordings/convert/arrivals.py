@@ -1,0 +1,265 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Arrival times from a CSV, with the positions of the receivers from a second one.
+
+Two kinds of file are understood:
+
+- *Synchronised one-way arrivals* of an acoustic tag: ``ping``, ``receiver`` and the absolute time
+  of ``arrival``. The time of emission is unknown. So a ping is stamped with its earliest arrival,
+  ``toa`` counts from there, and the transmitter is NaN. The emission lies before the stamp by the
+  travel time to the nearest receiver. ``tag``, where there is such a column, says which tag was
+  heard, so that each has its own track (``tx_id``; 0 is nobody's).
+- *Travel times* from known transmitters: ``stamp`` (the transmission), ``transmitter``,
+  ``receiver`` and ``toa``. Rows with the same ``ping``, or with the same stamp where there is no
+  such column, are one ping.
+
+Optional in both: ``var_toa`` or ``std_toa``, ``bearing`` [rad] with ``var_bearing`` or
+``std_bearing``, ``elevation`` [rad, up positive] and ``depth`` [m, down positive, the diver's own
+report] likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from msg_adapters.arrivals import write_arrivals
+from sonar_imm.measurements import Arrivals, Rejection
+
+from ..conversion import ConversionReport, Record, write_bag
+from ..csv_table import BadRow, CsvOptions, CsvTable, Row
+from ..local_frame import LocalFrame, origin_parameters
+from ..messages import ros_message
+from ..sources import BagError
+from .truth import number_names, truth_records
+
+_NOWHERE = (math.nan, math.nan, math.nan)
+Places = Mapping[str, tuple[float, float, float]]
+
+
+class _Arrival(NamedTuple):
+    """One line; `time_ns` is the absolute arrival, or the transmission when `toa` is a number."""
+
+    ping: str
+    time_ns: int
+    toa: float
+    transmitter: str
+    receiver: str
+    var_toa: float
+    bearing: float
+    var_bearing: float
+    elevation: float
+    var_elevation: float
+    depth: float
+    var_depth: float
+    tag: str = ''
+
+
+def convert_arrivals(
+    path: str | Path,
+    out: str | Path,
+    receivers: str | Path,
+    *,
+    transmitters: str | Path | None = None,
+    options: CsvOptions | None = None,
+    receiver_options: CsvOptions | None = None,
+    truth: str | Path | None = None,
+    truth_options: CsvOptions | None = None,
+    toa_std: float | None = None,
+    frame_id: str = 'map',
+    origin: tuple[float, ...] | None = None,
+    storage: str = 'mcap',
+) -> ConversionReport:
+    """Convert a CSV of arrivals to the topic ``/arrivals``, one message per ping.
+
+    receivers: CSV with ``receiver`` and a position (``depth`` becomes negative z). transmitters:
+    the same for transmitters, which are looked up among the receivers by default. toa_std:
+    standard deviation [s] for rows that state none. truth: as in `convert_truth`.
+    receiver_options: for both position files. Raises `BagError`.
+    """
+    report = ConversionReport(Path(out))
+    places, origin = _read_places(receivers, report, receiver_options, origin, 'receiver')
+    senders = (
+        places
+        if transmitters is None
+        else _read_places(transmitters, report, receiver_options, origin, 'transmitter')[0]
+    )
+    default = math.nan if toa_std is None else toa_std**2
+    pings: dict[tuple[object, str], list[_Arrival]] = {}
+    table = CsvTable(path, options)
+    passive = _is_passive(table)
+    rows = report.read_rows(table, lambda row: _parse(row, passive, places, senders, default))
+    for _, arrival in rows:
+        key = (arrival.ping if table.has('ping') else arrival.time_ns, arrival.tag)
+        pings.setdefault(key, []).append(arrival)
+    tags = _tag_numbers([arrival.tag for ping in pings.values() for arrival in ping], report)
+    numbers = number_names(list(places))
+    sender_numbers = tags
+    if not passive:
+        sender_numbers = numbers if senders is places else number_names(list(senders))
+    records: list[Record] = []
+    for label, ping in pings.items():
+        try:
+            measurement = _one_ping(
+                ping, passive, places, senders, numbers, sender_numbers, frame_id
+            )
+            records.append(
+                (measurement.stamp_ns, '/arrivals', write_arrivals(measurement, ros_message))
+            )
+        except Rejection as error:
+            report.bad_row(table.path, f'ping {label[0]}', error)
+    if truth is not None and records:
+        records += truth_records(truth, report, truth_options, frame_id, origin)
+    if any(name != str(number) for name, number in numbers.items()):
+        report.notes['receivers'] = ', '.join(f'{name} = {numbers[name]}' for name in numbers)
+    if passive:
+        report.notes['emission'] = 'unknown; the stamp is the earliest arrival of the ping'
+    return write_bag(
+        out,
+        records,
+        report,
+        source=Path(path).name,
+        storage=storage,
+        parameters={'diver': origin_parameters(origin)},
+    )
+
+
+def _tag_numbers(names: list[str], report: ConversionReport) -> dict[str, int]:
+    """The number of each tag, as ``tx_id`` has it: its own, or its order from 1."""
+    numbers = number_names([name for name in names if name])
+    if any(str(number) != name for name, number in numbers.items()):
+        report.notes['tag'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
+    return numbers
+
+
+def _is_passive(table: CsvTable) -> bool:
+    """Tell the two kinds of file apart by their columns."""
+    table.require('receiver')
+    if table.has('toa', 'transmitter'):
+        table.require('stamp')
+        return False
+    table.require('ping', 'arrival')
+    return True
+
+
+def _parse(row: Row, passive: bool, places: Places, senders: Places, default: float) -> _Arrival:
+    """Read one line of the arrivals."""
+    receiver, transmitter = row.text('receiver'), '' if passive else row.text('transmitter')
+    if receiver not in places:
+        raise BadRow(f"the position of receiver '{receiver}' is not known")
+    if not passive and transmitter not in senders:
+        raise BadRow(f"the position of transmitter '{transmitter}' is not known")
+    ping = row.text('ping')
+    if passive and not ping:
+        raise BadRow('the ping is empty')
+    time_ns = row.stamp_ns('arrival' if passive else 'stamp')
+    toa = math.nan if passive else row.seconds_ns('toa') * 1e-9
+    var_toa = _variance(row, 'toa')
+    return _Arrival(
+        ping,
+        time_ns,
+        toa,
+        transmitter,
+        receiver,
+        default if math.isnan(var_toa) else var_toa,
+        row.optional('bearing'),
+        _variance(row, 'bearing'),
+        row.optional('elevation'),
+        _variance(row, 'elevation'),
+        row.optional('depth'),
+        _variance(row, 'depth'),
+        row.text('tag') if passive and _names_tags(row.table) else '',
+    )
+
+
+def _names_tags(table: CsvTable) -> bool:
+    """Whether a column says which tag was heard, and not which receiver has heard it."""
+    return table.has('tag') and table.index['tag'] != table.index.get('receiver')
+
+
+def _variance(row: Row, what: str) -> float:
+    """The variance that a row states, also as a standard deviation; NaN without either."""
+    if row.table.has(f'var_{what}'):
+        return row.optional(f'var_{what}')
+    std = row.optional(f'std_{what}')
+    return std * std
+
+
+def _one_ping(
+    ping: list[_Arrival],
+    passive: bool,
+    places: Places,
+    senders: Places,
+    numbers: Mapping[str, int],
+    sender_numbers: Mapping[str, int],
+    frame_id: str,
+) -> Arrivals:
+    """Put the lines of one ping together."""
+    stamp = min(arrival.time_ns for arrival in ping)
+    if passive:
+        toa = [(arrival.time_ns - stamp) * 1e-9 for arrival in ping]
+    else:
+        toa = [arrival.toa + (arrival.time_ns - stamp) * 1e-9 for arrival in ping]
+    return Arrivals(
+        stamp_ns=stamp,
+        frame_id=frame_id,
+        toa=toa,
+        tx_id=[
+            sender_numbers.get(arrival.tag, 0) if passive else sender_numbers[arrival.transmitter]
+            for arrival in ping
+        ],
+        rx_id=[numbers[arrival.receiver] for arrival in ping],
+        tx=np.array([_NOWHERE if passive else senders[arrival.transmitter] for arrival in ping]),
+        rx=np.array([places[arrival.receiver] for arrival in ping]),
+        var_toa=[arrival.var_toa for arrival in ping],
+        bearing=[arrival.bearing for arrival in ping],
+        var_bearing=[arrival.var_bearing for arrival in ping],
+        elevation=[arrival.elevation for arrival in ping],
+        var_elevation=[arrival.var_elevation for arrival in ping],
+        depth=[arrival.depth for arrival in ping],
+        var_depth=[arrival.var_depth for arrival in ping],
+    )
+
+
+def _read_places(
+    path: str | Path,
+    report: ConversionReport,
+    options: CsvOptions | None,
+    origin: tuple[float, ...] | None,
+    name: str,
+) -> tuple[dict[str, tuple[float, float, float]], tuple[float, ...] | None]:
+    """Read the positions of receivers or transmitters by name, and the origin of local metres."""
+    table = CsvTable(path, options)
+    table.require(name)
+    frame = LocalFrame(table, origin)
+    places: dict[str, tuple[float, float, float]] = {}
+
+    def parse(row: Row) -> tuple[str, tuple[float, float, float]]:
+        if not row.text(name):
+            raise BadRow(f'the {name} has no name')
+        if row.text(name) in places:
+            raise BadRow(f"{name} '{row.text(name)}' is listed twice; the first position is used")
+        return row.text(name), frame.position(row)
+
+    for _, (label, place) in report.read_rows(table, parse):
+        places[label] = place
+    if not places:
+        raise BagError(f'{table.path} lists no {name} with a position')
+    report.notes.update(frame.notes())
+    return places, frame.origin

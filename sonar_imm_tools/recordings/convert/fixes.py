@@ -1,0 +1,177 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""CSV tables of position fixes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import math
+from pathlib import Path
+
+import numpy as np
+
+from msg_adapters.fixes import check_size, write_fix
+from msg_adapters.scans import write_scan
+from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection, RepeatGuard
+
+from ..conversion import ConversionReport, Record, write_bag
+from ..csv_table import CsvOptions, CsvTable, Row
+from ..local_frame import LocalFrame, origin_parameters
+from ..messages import ros_message
+from .truth import number_names, truth_records
+
+REPEAT_TIME = 5.0
+"""Seconds within which the same position is a repeated poll: the default of the tracker."""
+
+
+def convert_fixes(
+    path: str | Path,
+    out: str | Path,
+    *,
+    options: CsvOptions | None = None,
+    truth: str | Path | None = None,
+    truth_options: CsvOptions | None = None,
+    frame_id: str = 'map',
+    origin: tuple[float, ...] | None = None,
+    storage: str = 'mcap',
+) -> ConversionReport:
+    """Convert a CSV of position fixes to the topic ``/fix``, or ``/fixes`` with identities.
+
+    Columns: ``stamp``, ``x`` and ``y`` [m] or ``latitude`` and ``longitude`` [deg]; optional ``z``
+    (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; ``id``: whose
+    position it is, a number or a name. A row with empty uncertainties becomes a fix without
+    covariance. Latitudes become metres around `origin`
+    (latitude, longitude[, height]), the first good row when None, which is told the tracker by
+    ``parameters.yaml`` beside the bag. `truth` is a CSV as in
+    `convert_truth`, for the same bag and the same origin.
+
+    Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
+    the same diver again a moment later, see `RepeatGuard`) stay, and are counted: the tracker
+    leaves them out.
+    """
+    table = CsvTable(path, options)
+    table.require('stamp')
+    frame = LocalFrame(table, origin)
+    report = ConversionReport(Path(out))
+
+    repeats: dict[str, RepeatGuard] = {}
+    repeated: list[int] = []
+
+    def parse(row: Row) -> tuple[Fix, str]:
+        row.require_valid()
+        name = row.text('id')
+        fix = Fix(
+            stamp_ns=row.stamp_ns(),
+            position=frame.position(row),
+            covariance=_covariance(row),
+            frame_id=frame_id,
+        )
+        check_size(fix)
+        try:
+            repeats.setdefault(name, RepeatGuard(REPEAT_TIME)).fresh(fix)
+        except Rejection:
+            repeated.append(row.line)
+        return fix, name
+
+    rows = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
+    if _names_divers(table, rows, report):
+        records = _named_scans(rows, report, frame_id)
+    else:
+        records = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for _, fix, _ in rows]
+    if truth is not None and records:
+        records += truth_records(truth, report, truth_options, frame_id, frame.origin)
+    report.notes.update(frame.notes())
+    if repeated:
+        report.notes['repeated'] = (
+            f'{len(repeated)} rows hold a position that came before, the first in line '
+            f'{repeated[0]}; the tracker leaves them out (repeat_time)'
+        )
+    return write_bag(
+        out,
+        records,
+        report,
+        source=Path(path).name,
+        storage=storage,
+        parameters={'diver': origin_parameters(frame.origin)},
+    )
+
+
+def _names_divers(
+    table: CsvTable, rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport
+) -> bool:
+    """Whether the column ``id`` says whose the rows are. One that is another in most rows numbers
+    the rows."""
+    names = [name for _, _, name in rows if name]
+    if not names:
+        return False
+    if len(names) > 1 and 2 * len(set(names)) > len(names):
+        report.notes['id'] = f'{table.header("id")} changes from row to row and names no diver'
+        return False
+    return True
+
+
+def _named_scans(
+    rows: Sequence[tuple[Row, Fix, str]], report: ConversionReport, frame_id: str
+) -> list[Record]:
+    """Scans of the rows with the same stamp, each with the number of its diver."""
+    numbers = number_names([name for _, _, name in rows if name])
+    if any(str(number) != name for name, number in numbers.items()):
+        report.notes['id'] = ', '.join(f'{name} is {number}' for name, number in numbers.items())
+    by_stamp: dict[int, list[tuple[Fix, int]]] = {}
+    for row, fix, name in rows:
+        scan = by_stamp.setdefault(fix.stamp_ns, [])
+        number = numbers.get(name, NOBODY)
+        if number != NOBODY and any(number == other for _, other in scan):
+            report.bad_row(row.table.path, f'line {row.line}', f'{name} is there at this time')
+            continue
+        scan.append((fix, number))
+    unknown = np.full((2, 2), np.nan)
+    return [
+        (
+            stamp_ns,
+            '/fixes',
+            write_scan(
+                Fixes(
+                    stamp_ns=stamp_ns,
+                    position=[fix.position for fix, _ in scan],
+                    covariance=[
+                        unknown if fix.covariance is None else fix.covariance for fix, _ in scan
+                    ],
+                    target_id=[number for _, number in scan],
+                    frame_id=frame_id,
+                ),
+                ros_message,
+            ),
+        )
+        for stamp_ns, scan in by_stamp.items()
+    ]
+
+
+def _covariance(row: Row) -> np.ndarray | None:
+    """The covariance (2, 2) that a row states; None when it is empty, negative or all zero."""
+    if row.table.has('var_x', 'var_y'):
+        var_x, var_y = row.optional('var_x'), row.optional('var_y')
+        cov_xy = row.optional('cov_xy') if row.table.has('cov_xy') else 0.0
+    else:
+        names = ('std_x', 'std_y') if row.table.has('std_x', 'std_y') else ('std', 'std')
+        std_x, std_y = row.optional(names[0]), row.optional(names[1])
+        var_x, cov_xy, var_y = std_x * std_x, 0.0, std_y * std_y
+        if std_x < 0.0 or std_y < 0.0:
+            return None
+    if math.isnan(var_x + var_y + cov_xy) or var_x < 0.0 or var_y < 0.0:
+        return None
+    if var_x == var_y == cov_xy == 0.0:
+        return None
+    return np.array([[var_x, cov_xy], [cov_xy, var_y]])

@@ -1,0 +1,152 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From a bag of sonar images, amplitude and phase or one per stave, to array snapshots.
+
+The images of a ping are those of one stamp, whatever the order in which they come. Navigation and
+altitudes are copied to ``/nav`` and ``/altitude``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from msg_adapters.headers import stamp_ns
+from msg_adapters.inputs import inputs_of
+from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
+from msg_adapters.snapshots import write_snapshot
+from sonar_imm.measurements import Rejection
+
+from ..conversion import ConversionReport, provenance
+from ..messages import ros_message
+from ..reader import BagReader
+from ..sources import BagError
+from ..writer import BagWriter
+from .companions import companion_topics, copied
+
+FURTHER = {entry.name: entry for entry in inputs_of('bathymetry') if entry.companion}
+MOST_WAITING = 64
+"""Pings that wait for the rest of their images; the oldest is given up for one more."""
+
+
+def convert_interferometer(
+    path: str | Path,
+    out: str | Path,
+    *,
+    amplitude: str = '',
+    phase: str = '',
+    iq: Sequence[str] = (),
+    fields: Mapping[str, str] | None = None,
+    side: str = '',
+    radians_per_count: float | None = None,
+    storage: str = 'mcap',
+    **how: Any,
+) -> ConversionReport:
+    """Convert the bag at `path` to ``/snapshot``, or ``/<side>/snapshot``.
+
+    amplitude and phase: topics, one image of each a ping; or iq: topics, one a stave. fields:
+    names of fields that differ from `FIELDS`. how: order, sound_speed, element_spacing, see
+    `msg_adapters.interferometer`. Raises `BagError`.
+    """
+    topics = _topics(amplitude, phase, iq)
+    if unknown := [name for name in fields or {} if name not in FIELDS]:
+        raise BagError(f"unknown field '{unknown[0]}'; the names are {', '.join(FIELDS)}")
+    how |= {'fields': {**FIELDS, **(fields or {})}, 'side': side}
+    if iq:
+        make = partial(_of_staves, how)
+    else:
+        make = partial(snapshot_of_phase, radians_per_count=radians_per_count, **how)
+    target = f'/{side}/snapshot' if side else '/snapshot'
+    report = ConversionReport(Path(out))
+    with BagReader(path) as bag:
+        there = {topic.name for topic in bag.topics}
+        if missing := [name for name in topics if name not in there]:
+            raise BagError(
+                f"{path} has no topic '{missing[0]}'; it has {', '.join(sorted(there))}"
+            )
+        beside = companion_topics(bag, FURTHER)
+        pings = _Pings(topics)
+        with BagWriter(
+            out, storage=storage, custom_data=provenance(Path(path).name, report.notes)
+        ) as made:
+            for item in bag.messages([*set(topics), *beside]):
+                report.rows += 1
+                where = f'{item.topic} #{item.index}'
+                try:
+                    if item.topic in beside:
+                        name = beside[item.topic]
+                        topic, message = (
+                            f'/{name}',
+                            copied(FURTHER[name], item.type_name, item.message),
+                        )
+                    elif (images := pings.add(item)) is not None:
+                        topic, message = target, write_snapshot(make(*images), ros_message)
+                    else:
+                        continue
+                except Rejection as rejection:
+                    report.bad_row(Path(path), where, rejection)
+                    continue
+                made.write(topic, message, item.log_ns)
+                report.messages[topic] = report.messages.get(topic, 0) + 1
+            if pings.lonely:
+                report.bad_rows += pings.lonely
+                report.problems.append(
+                    f'{pings.lonely} pings have not all of their images: stamps have to be equal'
+                )
+        report.problems += bag.problems
+    return report
+
+
+def _of_staves(how: Mapping[str, Any], *images: Any) -> Any:
+    return snapshot_of_staves(images, **how)
+
+
+def _topics(amplitude: str, phase: str, iq: Sequence[str]) -> list[str]:
+    """The topic of each image of a ping."""
+    if bool(amplitude) != bool(phase) or bool(amplitude) == bool(iq):
+        raise BagError('name the topics of amplitude and phase, or those of the staves (iq)')
+    if len(iq) == 1:
+        raise BagError('an array has at least two staves; name the topic of each')
+    return list(iq) or [amplitude, phase]
+
+
+class _Pings:
+    """Images that wait for the others of their ping. lonely: pings that never got them."""
+
+    def __init__(self, topics: Sequence[str]):
+        self._topics = topics
+        self._waiting: dict[int, dict[int, Any]] = {}
+        self._given_up = 0
+
+    @property
+    def lonely(self) -> int:
+        return self._given_up + len(self._waiting)
+
+    def add(self, item: Any) -> list[Any] | None:
+        """Take an image in; gives all images of its ping when it is the last of them."""
+        stamp = stamp_ns(item.message)
+        images = self._waiting.setdefault(stamp, {})
+        for place, topic in enumerate(self._topics):
+            if topic == item.topic:
+                images[place] = item.message
+        if len(images) == len(self._topics):
+            del self._waiting[stamp]
+            return [images[place] for place in range(len(self._topics))]
+        if len(self._waiting) > MOST_WAITING:
+            del self._waiting[next(iter(self._waiting))]
+            self._given_up += 1
+        return None

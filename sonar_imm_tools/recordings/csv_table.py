@@ -1,0 +1,405 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""CSV files of any origin: any delimiter, any names of columns, any unit of time.
+
+Each quantity has one name here (``x``, ``stamp``, ...) and a list of usual names (`ALIASES`).
+Columns with other names are mapped by hand. A row that cannot be read raises `BadRow`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+import contextlib
+import csv
+from decimal import Decimal
+import itertools
+import math
+from pathlib import Path
+import re
+from typing import Any, TextIO
+
+from attrs import field, frozen
+
+from sonar_imm.parameters import did_you_mean
+
+from .csv_times import BadRow, dated, iso_ns, TIME_OF_DAY, TIME_TEXT, zone_of
+from .sources import BagError
+
+TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
+
+LONGEST_NS = 10**8 * 10**9
+"""A recording is shorter, a date since 1970 longer."""
+LOOKED_AT = 1000
+"""Rows by which a file is judged."""
+
+ALIASES: dict[str, tuple[str, ...]] = {
+    'stamp': (
+        'stamp',
+        'time',
+        'timestamp',
+        't',
+        'datetime',
+        'date_time',
+        'utc',
+        'utc_time',
+        'time_utc',
+        'timestamp_utc',
+        'datetime_utc',
+        'epoch',
+        'unix_time',
+    ),
+    'date': ('date', 'utc_date', 'gps_date', 'date_utc', 'day'),
+    'x': ('x', 'east', 'easting', 'px', 'pos_x', 'position_x', 'utm_e', 'utm_x', 'e'),
+    'y': ('y', 'north', 'northing', 'py', 'pos_y', 'position_y', 'utm_n', 'utm_y', 'n'),
+    'z': ('z', 'up', 'pz', 'pos_z', 'position_z'),
+    'depth': ('depth', 'down'),
+    'latitude': ('latitude', 'lat', 'gps_latitude', 'gps_lat', 'decimal_latitude', 'lat_dd'),
+    'longitude': (
+        'longitude',
+        'lon',
+        'lng',
+        'long',
+        'gps_longitude',
+        'gps_lon',
+        'gps_lng',
+        'gps_long',
+        'decimal_longitude',
+        'lon_dd',
+        'long_dd',
+    ),
+    'height': ('height', 'altitude', 'alt', 'ellipsoidal_height'),
+    'var_x': ('var_x', 'var_east', 'xx', 'cov_xx', 'cov_x_x'),
+    'cov_xy': ('cov_xy', 'cov_east_north', 'xy', 'cov_x_y'),
+    'var_y': ('var_y', 'var_north', 'yy', 'cov_yy', 'cov_y_y'),
+    'std_x': ('std_x', 'std_east', 'sigma_x', 'sigma_east', 'sd_x', 'sx'),
+    'std_y': ('std_y', 'std_north', 'sigma_y', 'sigma_north', 'sd_y', 'sy'),
+    'std': ('std', 'sigma', 'accuracy', 'std_xy', 'sigma_xy', 'position_std'),
+    'vx': ('vx', 'v_east', 've', 'vel_x', 'velocity_x'),
+    'vy': ('vy', 'v_north', 'vn', 'vel_y', 'velocity_y'),
+    'id': ('id', 'track_id', 'target', 'target_id', 'tag', 'diver', 'name'),
+    'valid': ('valid', 'position_valid', 'is_valid', 'fix_valid', 'validity'),
+    'tag': ('tag', 'tag_id', 'transmitter', 'transmitter_id', 'tx', 'tx_id'),
+    'ping': ('ping', 'ping_id', 'ping_number'),
+    'receiver': (
+        'receiver',
+        'rx',
+        'rx_id',
+        'receiver_id',
+        'hydro',
+        'hydrophone',
+        'station',
+        'name',
+        'id',
+    ),
+    'transmitter': ('transmitter', 'tx', 'tx_id', 'transmitter_id', 'source', 'name', 'id'),
+    'arrival': ('arrival', 'arrival_time', 'time_of_arrival', 'detection_time'),
+    'toa': ('toa', 'travel_time', 'delay', 'tof', 'time_of_flight'),
+    'var_toa': ('var_toa', 'toa_variance', 'var_arrival'),
+    'std_toa': ('std_toa', 'sigma_toa', 'std_arrival', 'sigma_arrival'),
+    'bearing': ('bearing', 'azimuth', 'doa'),
+    'amplitude': ('amplitude', 'amp', 'response', 'value'),
+    'var_bearing': ('var_bearing',),
+    'std_bearing': ('std_bearing', 'sigma_bearing'),
+    'elevation': ('elevation', 'elevation_angle'),
+    'var_elevation': ('var_elevation',),
+    'std_elevation': ('std_elevation', 'sigma_elevation'),
+    'var_depth': ('var_depth',),
+    'std_depth': ('std_depth', 'sigma_depth'),
+}
+_UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
+
+
+_YES = ('1', '1.0', 'true', 't', 'yes', 'y', 'valid', 'ok')
+_NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
+
+
+@frozen(kw_only=True)
+class CsvOptions:
+    """How to read a CSV file.
+
+    columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``. What is not listed is
+    found by its usual names (`ALIASES`); case and units are ignored.
+    time_unit: of numeric times, one of s, ms, us, ns. Empty: from the header (``time_ms``), else
+    s. ISO 8601 texts are recognised, also as a date and a time of day in two columns.
+    time_zone: of texts that do not say theirs: ``UTC``, ``+02:00`` or a name such as
+    ``Europe/Berlin``. Empty: UTC where the header says so (``utc_time``), else they are refused.
+    time_offset_ns: added to every time, for files that count from their own start.
+    delimiter: empty to find it from the header line.
+    """
+
+    columns: Mapping[str, str] = field(factory=dict)
+    time_unit: str = ''
+    time_zone: str = ''
+    time_offset_ns: int = 0
+    delimiter: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        if self.time_unit not in ('', *TIME_UNITS):
+            raise BagError(
+                f"the time unit must be one of {', '.join(TIME_UNITS)}, got '{self.time_unit}'"
+            )
+        if self.time_zone:
+            zone_of(self.time_zone)
+        for name in self.columns:
+            if name not in ALIASES:
+                raise BagError(
+                    f"there is no quantity '{name}' to map a column to"
+                    f'{did_you_mean(name, ALIASES)}'
+                )
+
+
+@frozen
+class Row:
+    """One line of data; the methods raise `BadRow`."""
+
+    table: CsvTable
+    line: int
+    cells: list[str]
+
+    def text(self, name: str) -> str:
+        """The cell as text; empty when the column is missing or the line is short."""
+        self.table.used.add(name)
+        index = self.table.index.get(name, len(self.cells))
+        return self.cells[index].strip() if index < len(self.cells) else ''
+
+    def number(self, name: str) -> float:
+        """A number that has to be there and finite. Raises `BadRow`."""
+        value = self.optional(name)
+        if math.isnan(value):
+            raise BadRow(f'{self.table.header(name)} is empty')
+        return value
+
+    def optional(self, name: str) -> float:
+        """A number; NaN when the cell is empty, missing or NaN."""
+        text = self.text(name)
+        if not text:
+            return math.nan
+        try:
+            value = float(text if self.table.delimiter == ',' else text.replace(',', '.'))
+        except ValueError:
+            raise BadRow(f"{self.table.header(name)} is '{text[:40]}', not a number") from None
+        if math.isinf(value):
+            raise BadRow(f'{self.table.header(name)} is infinite')
+        return value
+
+    def require_valid(self) -> None:
+        """Raise `BadRow` for a row whose column ``valid`` says that it is not."""
+        said = self.text('valid').lower()
+        if said in ('', *_YES):
+            return
+        if said in _NO:
+            raise BadRow('the row is flagged as invalid', 'flagged invalid')
+        raise BadRow(f"{self.table.header('valid')} is '{said[:40]}', neither true nor false")
+
+    def seconds_ns(self, name: str) -> int:
+        """A duration or a time as integer nanoseconds, exactly as written."""
+        text = self.text(name)
+        try:
+            value = Decimal(text if self.table.delimiter == ',' else text.replace(',', '.'))
+            nanoseconds = value * self.table.time_scale(name)
+            if not abs(nanoseconds) < 2**63:
+                raise BadRow(
+                    f"{self.table.header(name)} is '{text[:40]}', beyond the year 2262; "
+                    'is the time unit right?'
+                )
+            return round(nanoseconds)
+        except ArithmeticError:
+            raise BadRow(
+                f"{self.table.header(name)} is '{text[:40]}', not a time: a number or "
+                '2024-05-31T10:00:00Z'
+            ) from None
+
+    def stamp_ns(self, name: str = 'stamp') -> int:
+        """A time since 1970 in integer nanoseconds, with the offset of the options added."""
+        parts = TIME_TEXT.match(self._moment(name))
+        if parts:
+            *moment, zone = parts.groups()
+            stamp = iso_ns(*moment, zone_of(zone or self._zone(name)))
+        else:
+            stamp = self.seconds_ns(name)
+        stamp += self.table.options.time_offset_ns
+        if not stamp and self.table.counts_from_zero(name):
+            stamp = 1  # a stamp of 0 means none in ROS
+        if not 0 < stamp < 2**31 * 10**9:
+            raise BadRow(
+                f'{self.table.header(name)} is {stamp} ns since 1970, which no ROS stamp '
+                'can hold; set the time offset or the time unit'
+            )
+        return stamp
+
+    def _moment(self, name: str) -> str:
+        """The text of a time, with the date of its own column where it has only a time of day."""
+        text = self.text(name)
+        if not TIME_OF_DAY.match(text):
+            return text
+        if not self.table.has('date'):
+            raise BadRow(
+                f"{self.table.header(name)} is '{text[:40]}', a time of day, and no column holds "
+                'the date'
+            )
+        return dated(self.text('date'), text, self.table.header('date'))
+
+    def _zone(self, name: str) -> str:
+        """The zone of a time that does not say it."""
+        if self.table.options.time_zone:
+            return self.table.options.time_zone
+        headers = f'{self.table.header(name)} {self.table.header("date")}'.lower()
+        if 'utc' in headers or 'gmt' in headers:
+            return 'UTC'
+        raise BadRow(
+            f"{self.table.header(name)} is '{self.text(name)[:40]}' without a time zone; say "
+            '--time-zone UTC, or that of the clock, e.g. --time-zone +02:00',
+            'no time zone',
+        )
+
+
+class CsvTable:
+    """The header of a CSV file and an iterator over its rows. Raises `BagError` for no CSV."""
+
+    def __init__(self, path: str | Path, options: CsvOptions | None = None):
+        self.path = Path(path)
+        self.options = options or CsvOptions()
+        try:
+            with self._open() as file:
+                lines = (line for line in file if line.strip() and not line.startswith('#'))
+                first = next(lines, '')
+        except OSError as error:
+            raise BagError(f'{self.path} cannot be read: {error.strerror}') from None
+        if _wide(self.path):
+            raise BagError(f'{self.path} is text in UTF-16; save it as UTF-8')
+        if not first or '\0' in first:
+            raise BagError(f'{self.path} is {"no text" if first else "empty"}, not a CSV file')
+        if _binary(self.path):
+            raise BagError(f'{self.path} is no text, not a CSV file')
+        likely = max(',;\t|', key=first.count)
+        self.delimiter = self.options.delimiter or (likely if likely in first else ' ')
+        self.headers = [name.strip() for name in next(csv.reader([first], **self._dialect))]
+        self.index = self._find_columns()
+        self.used: set[str] = set()
+        self._from_zero: dict[str, bool] = {}
+
+    def __iter__(self) -> Iterator[Row]:
+        with self._open() as file:
+            reader = csv.reader(file, **self._dialect)
+            header_seen = False
+            while True:
+                try:
+                    cells = next(reader)
+                except StopIteration:
+                    return
+                except csv.Error:
+                    raise BagError(
+                        f'{self.path}, line {reader.line_num} is no line of a CSV file: it holds '
+                        f'more than {csv.field_size_limit()} characters in a cell, or bytes that '
+                        'are no text'
+                    ) from None
+                if not any(cell.strip() for cell in cells) or cells[0].startswith('#'):
+                    continue
+                if header_seen:
+                    yield Row(self, reader.line_num, cells)
+                header_seen = True
+
+    def has(self, *names: str) -> bool:
+        """Say whether every one of these quantities has a column."""
+        return all(name in self.index for name in names)
+
+    def require(self, *names: str) -> None:
+        """Raise `BagError` naming the quantities without a column and what the file has."""
+        if missing := [name for name in names if name not in self.index]:
+            raise BagError(
+                f'{self.path} has no column for {" and ".join(missing)}; it has '
+                f'{", ".join(self.headers)}; say which column holds '
+                f'{"it" if len(missing) == 1 else "them"}'
+            )
+
+    def counts_from_zero(self, name: str) -> bool:
+        """Whether the first times of the file are seconds from its own start rather than a date,
+        so that a time of 0 is one, and not one that is missing."""
+        if name not in self._from_zero:
+            told = []
+            for row in itertools.islice(self, LOOKED_AT):
+                with contextlib.suppress(BadRow):
+                    told.append(row.seconds_ns(name))
+            self._from_zero[name] = max(told, default=0) < LONGEST_NS
+        return self._from_zero[name]
+
+    def columns_used(self) -> tuple[str, str]:
+        """What was taken from which column so far, and which columns were not, as text."""
+        taken = {name: self.index[name] for name in self.index if name in self.used}
+        told = ', '.join(
+            name if self.headers[k] == name else f'{name} = {self.headers[k]}'
+            for name, k in taken.items()
+        )
+        left = [header for k, header in enumerate(self.headers) if k not in taken.values()]
+        return told, ', '.join(header or '(no name)' for header in left)
+
+    def header(self, name: str) -> str:
+        """What the file calls a quantity."""
+        return self.headers[self.index[name]] if name in self.index else name
+
+    def time_scale(self, name: str) -> int:
+        """Nanoseconds in one unit of a time column."""
+        if self.options.time_unit:
+            return TIME_UNITS[self.options.time_unit]
+        suffix = re.search(r'[_ \[(](ms|us|ns|s)[\])]?$', self.header(name).lower())
+        return TIME_UNITS[suffix.group(1) if suffix else 's']
+
+    @property
+    def _dialect(self) -> dict[str, Any]:
+        return {'delimiter': self.delimiter, 'skipinitialspace': True}
+
+    def _open(self) -> TextIO:
+        return self.path.open(encoding='utf-8-sig', errors='replace', newline='')
+
+    def _find_columns(self) -> dict[str, int]:
+        """Match headers with quantities: mapped by hand first, then by their usual names."""
+        by_hand = {}
+        for name, header in self.options.columns.items():
+            if header not in self.headers:
+                raise BagError(
+                    f"{self.path} has no column '{header}'{did_you_mean(header, self.headers)}"
+                )
+            by_hand[name] = self.headers.index(header)
+        found = dict(by_hand)
+        plain = [_plain(header) for header in self.headers]
+        for name, aliases in ALIASES.items():
+            matches = [plain.index(alias) for alias in aliases if alias in plain]
+            matches = [index for index in matches if index not in by_hand.values()]
+            if name not in found and matches:
+                found[name] = matches[0]
+        return found
+
+
+def _wide(path: Path) -> bool:
+    """Whether a file begins as text in UTF-16 does."""
+    with path.open('rb') as file:
+        start = file.read(64)
+    return start[:2] in (b'\xff\xfe', b'\xfe\xff') and b'\0' in start
+
+
+def _binary(path: Path) -> bool:
+    """Whether a file holds something else than text: control characters among its first bytes, or
+    many that are no UTF-8. A byte of another alphabet here and there is text all the same."""
+    with path.open('rb') as file:
+        start = file.read(4096)
+    controls = sum(byte < 32 and byte not in b'\t\n\r\f\x1a' for byte in start)
+    strange = start.decode('utf-8', errors='replace').count('\ufffd')
+    return controls > 0 or 10 * strange > len(start)
+
+
+def _plain(header: str) -> str:
+    """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
+    name = re.sub(r'[\[(].*', '', header.lower()).strip()
+    return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))

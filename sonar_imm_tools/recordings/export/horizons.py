@@ -1,0 +1,186 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tracked reflectors as horizons: picks in a CSV for interpretation packages, and GeoJSON.
+
+The CSV has one line per pick, horizon after horizon, with a header: import wizards of seismic
+interpretation packages ask which column is what. Two-way times count from the array where its
+depth is known, else from depth 0, and belong to the water's speed of sound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import csv
+from datetime import datetime, timezone
+import json
+from pathlib import Path
+
+from attrs import frozen
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.estimation.arrays import FloatArray, IntArray
+
+from ..positions import Positions
+from ..sources import BagError
+from .points import wkt_of
+
+_COPIED = ('existence', 'is_bottom', 'multiple_probability')
+
+
+@frozen(eq=False)
+class Picks:
+    """K picks by horizon, then time: horizon (K,) its number; record (K,) from 1 on; stamp_ns
+    (K,); two_way_time (K,) s; depth and depth_std (K,) m; columns (K,) by name; longitude and
+    latitude (K,) degrees, NaN where unknown."""
+
+    horizon: IntArray
+    record: IntArray
+    stamp_ns: IntArray
+    two_way_time: FloatArray
+    depth: FloatArray
+    depth_std: FloatArray
+    columns: dict[str, FloatArray]
+    longitude: FloatArray
+    latitude: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.horizon)
+
+
+def picks_of(
+    estimates: Sequence[Estimate], sound_speed: float, positions: Positions | None
+) -> Picks:
+    """The reflectors of all records, previews left out. Raises `BagError` for estimates of another
+    system."""
+    rows: list[tuple[float, ...]] = []
+    where: list[tuple[int, int, int]] = []
+    record = 0
+    for estimate in estimates:
+        columns = estimate.columns()
+        if 'two_way_time' not in columns:
+            raise BagError('these estimates have no two_way_time: they are not of the fathometer')
+        if columns['preview'][0]:
+            continue
+        record += 1
+        for k in np.flatnonzero(np.isfinite(columns['depth'])):
+            depth, time = float(columns['depth'][k]), float(columns['two_way_time'][k])
+            if not np.isfinite(time):
+                time = 2.0 * depth / sound_speed
+            std = float(np.sqrt(columns['cov_depth_depth'][k]))
+            where.append((int(columns['track_id'][k]), record, estimate.stamp_ns))
+            rows.append((time, depth, std, *(float(columns[name][k]) for name in _COPIED)))
+    if not rows:
+        raise BagError('there are no reflectors to export')
+    order = sorted(range(len(rows)), key=lambda k: where[k])
+    places = np.array([where[k] for k in order], np.int64)
+    values = np.array([rows[k] for k in order])
+    nowhere = np.full(len(rows), np.nan)
+    east, north = (nowhere, nowhere) if positions is None else positions.at(places[:, 2])
+    return Picks(
+        places[:, 0],
+        places[:, 1],
+        places[:, 2],
+        *values[:, :3].T,
+        {name: values[:, 3 + k] for k, name in enumerate(_COPIED)},
+        east,
+        north,
+    )
+
+
+def write_horizons(path: Path, picks: Picks, line: str, epsg: int | None) -> None:
+    """The CSV. line: its name; epsg: of the columns x and y, which are empty without it."""
+    x, y = _projected(picks, epsg)
+    with path.open('w', encoding='utf-8', newline='') as file:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(
+            (
+                *('horizon', 'line', 'trace', 'x', 'y', 'longitude', 'latitude', 'twt_ms'),
+                *('depth_m', 'depth_std_m', *_COPIED, 'time_utc'),
+            )
+        )
+        for k in range(len(picks)):
+            writer.writerow(
+                (
+                    int(picks.horizon[k]),
+                    line,
+                    int(picks.record[k]),
+                    *(_number(value[k], 2) for value in (x, y)),
+                    *(_number(value[k], 7) for value in (picks.longitude, picks.latitude)),
+                    f'{1e3 * picks.two_way_time[k]:.4f}',
+                    f'{picks.depth[k]:.3f}',
+                    f'{picks.depth_std[k]:.3f}',
+                    *(_number(picks.columns[name][k], 3) for name in _COPIED),
+                    _utc(int(picks.stamp_ns[k])),
+                )
+            )
+
+
+def write_geojson(path: Path, picks: Picks) -> int:
+    """Points along the track (RFC 7946), the third coordinate the height, minus the depth. Gives
+    how many picks have no place and are left out. Raises `BagError` when all are."""
+    there = np.isfinite(picks.longitude)
+    if not there.any():
+        raise BagError('the recording has no positions (sensor_msgs/NavSatFix), so no GeoJSON')
+    features = []
+    for k in np.flatnonzero(there):
+        place = [
+            round(float(picks.longitude[k]), 7),
+            round(float(picks.latitude[k]), 7),
+            round(-float(picks.depth[k]), 3),
+        ]
+        extra = {name: float(picks.columns[name][k]) for name in _COPIED}
+        properties = {
+            'horizon': int(picks.horizon[k]),
+            'trace': int(picks.record[k]),
+            'time_utc': _utc(int(picks.stamp_ns[k])),
+            'twt_ms': round(1e3 * float(picks.two_way_time[k]), 4),
+            'depth_m': round(float(picks.depth[k]), 3),
+            'depth_std_m': round(float(picks.depth_std[k]), 3),
+            # JSON has no NaN.
+            **{name: round(v, 3) if np.isfinite(v) else None for name, v in extra.items()},
+        }
+        geometry = {'type': 'Point', 'coordinates': place}
+        features.append({'type': 'Feature', 'geometry': geometry, 'properties': properties})
+    content = {'type': 'FeatureCollection', 'features': features}
+    path.write_text(json.dumps(content, allow_nan=False) + '\n', encoding='utf-8')
+    return int((~there).sum())
+
+
+def _projected(picks: Picks, epsg: int | None) -> tuple[FloatArray, FloatArray]:
+    """x and y (K,) in the coordinate system, NaN without one. Needs rasterio."""
+    x, y = np.full(len(picks), np.nan), np.full(len(picks), np.nan)
+    there = np.isfinite(picks.longitude)
+    if epsg is None:
+        return x, y
+    if not there.any():
+        raise BagError('the recording has no positions (sensor_msgs/NavSatFix) to give in x and y')
+    from rasterio.warp import transform
+
+    wkt = wkt_of(epsg)
+    x[there], y[there] = transform(
+        'EPSG:4326', wkt, picks.longitude[there].tolist(), picks.latitude[there].tolist()
+    )
+    return x, y
+
+
+def _number(value: float, digits: int) -> str:
+    return f'{value:.{digits}f}' if np.isfinite(value) else ''
+
+
+def _utc(stamp_ns: int) -> str:
+    seconds, rest = divmod(stamp_ns, 10**9)
+    moment = datetime.fromtimestamp(seconds, timezone.utc)
+    return f'{moment:%Y-%m-%dT%H:%M:%S}.{rest // 1_000_000:03d}Z'

@@ -1,0 +1,157 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Soundings as points: the table of a run, plain XYZ, LAS and LAZ.
+
+LAS keeps whole numbers times a scale: a millimetre here, from an offset at the first sounding, so
+that 32 bits reach 2000 km. What LAS has no field for becomes an extra dimension of the same name.
+"""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from attrs import frozen
+import numpy as np
+
+from sonar_imm.estimates import PLACES
+from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.soundings import COLUMNS
+
+from ..sources import BagError
+
+SCALE = 0.001
+"""Metres of one count in a LAS file."""
+_LAS_EXTRAS = (
+    'vertical_uncertainty',
+    'horizontal_uncertainty',
+    'beam_angle',
+    'label_probability',
+    'range',
+)
+
+
+@frozen(eq=False)
+class Points:
+    """All soundings of a run: stamp_ns (n,), columns (n,) by name as in `soundings.COLUMNS`, but
+    x y z in float64 in place of px py pz."""
+
+    stamp_ns: IntArray
+    columns: dict[str, FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return self.columns[name]
+
+    def moved(self, origin: tuple[float, float, float]) -> Points:
+        """The same with `origin` (3,), the map coordinates of the local frame, added to x y z."""
+        places = {name: self[name] + shift for name, shift in zip('xyz', origin)}
+        return Points(self.stamp_ns, {**self.columns, **places})
+
+
+def read_points(path: Path) -> Points:
+    """The soundings of a soundings.csv. Raises `BagError` for a file that is none."""
+    wanted = ['stamp_ns', *(name for name in COLUMNS if name not in PLACES)]
+    try:
+        with path.open(encoding='utf-8', newline='') as file:
+            reader = csv.reader(file)
+            header = next(reader, [])
+            if missing := [name for name in wanted if name not in header]:
+                raise BagError(f'{path} has no column {" and ".join(missing)}')
+            rows = list(reader)
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror}') from None
+    try:
+        stamps = np.array([int(row[header.index('stamp_ns')]) for row in rows], np.int64)
+        columns = {
+            name: np.array([float(row[header.index(name)]) for row in rows])
+            for name in COLUMNS
+            if name in header
+        }
+    except (ValueError, IndexError):
+        raise BagError(f'{path} has a row that is not numbers throughout') from None
+    for name, exact in zip('xyz', PLACES):
+        columns[name] = columns.pop(exact, columns[name])  # older tables have the coarse ones only
+    return Points(stamps, columns)
+
+
+def write_xyz(path: Path, points: Points) -> None:
+    """One line per sounding: easting, northing, height and vertical standard deviation, in m."""
+    deviation = np.sqrt(points['vertical_uncertainty'])
+    with path.open('w', encoding='ascii') as file:
+        for x, y, z, s in zip(points['x'], points['y'], points['z'], deviation):
+            file.write(f'{x:.3f} {y:.3f} {z:.3f} {s:.3f}\n')
+
+
+def write_las(path: Path, points: Points, epsg: int | None) -> None:
+    """LAS 1.4, compressed where the name ends in ``.laz``.
+
+    The intensity counts hundredths of a decibel above the weakest sounding. The class is 40,
+    bathymetric bottom; the label is in the user data, the side in the point source. Needs laspy,
+    and lazrs for ``.laz``.
+    """
+    import laspy
+
+    header = laspy.LasHeader(point_format=6, version='1.4')
+    header.scales = np.full(3, SCALE)
+    first = np.array([points[name][0] if len(points) else 0.0 for name in 'xyz'])
+    header.offsets = np.round(first)
+    header.add_extra_dims([laspy.ExtraBytesParams(name, np.float32) for name in _LAS_EXTRAS])
+    if epsg is not None:
+        _add_crs(header, epsg)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (points[name] for name in 'xyz')
+    weakest = points['intensity'].min() if len(points) else 0.0
+    las.intensity = np.clip(np.round(100.0 * (points['intensity'] - weakest)), 0, 65535).astype(
+        np.uint16
+    )
+    las.classification = np.full(len(points), 40, np.uint8)
+    las.user_data = points['label'].astype(np.uint8)
+    las.point_source_id = points['side'].astype(np.uint16)
+    las.gps_time = points.stamp_ns * 1e-9
+    for name in _LAS_EXTRAS:
+        las[name] = points[name].astype(np.float32)
+    las.write(str(path))
+
+
+def _add_crs(header: object, epsg: int) -> None:
+    """The coordinate system as text, as LAS 1.4 wants it."""
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
+    header.vlrs.append(WktCoordinateSystemVlr(wkt_of(epsg)))  # type: ignore[attr-defined]
+    header.global_encoding.wkt = True  # type: ignore[attr-defined]
+
+
+def wkt_of(epsg: int) -> str:
+    """A coordinate system by its EPSG number as text. Raises `BagError`. Needs rasterio."""
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    try:
+        return str(CRS.from_epsg(epsg).to_wkt())
+    except CRSError:
+        raise BagError(f'there is no coordinate system with the EPSG number {epsg}') from None
+
+
+def degrees_of(places: FloatArray, epsg: int) -> tuple[FloatArray, FloatArray]:
+    """Longitude and latitude (n,) of places (n, 2) in a coordinate system. Raises `BagError`.
+    Needs rasterio."""
+    wkt = wkt_of(epsg)
+    from rasterio.warp import transform
+
+    east, north = transform(wkt, 'EPSG:4326', places[:, 0].tolist(), places[:, 1].tolist())
+    return np.array(east), np.array(north)

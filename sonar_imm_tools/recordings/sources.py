@@ -1,0 +1,391 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Sources of recorded messages: rosbags for whole files, a scan of the records for damaged ones.
+
+rosbags raises many kinds of exception on damaged files. Each becomes a `BagError` or a problem of
+one sentence here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from attrs import frozen
+from backports.zstd import ZstdError
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+from sonar_imm.texts import in_one_line
+
+from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
+from .mcap_scan import Channel, McapScan
+from .mcap_sums import wrong_sums
+from .messages import decode_cdr, typestore
+from .source_hints import advice, convert_hint, leftovers, packed_hint
+
+SUFFIXES = ('.mcap', '.db3', '.bag')
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+
+
+class BagError(Exception):
+    """A recording that cannot be used, in one sentence for the user."""
+
+    def __init__(self, sentence: str):
+        self.sentence = in_one_line(sentence)
+        super().__init__(self.sentence)
+
+
+@frozen
+class TopicInfo:
+    """One topic of a recording.
+
+    `decodable` is False when the message definition is neither in the bag nor known;
+    `offered_qos` holds the profiles (rosbags `Qos`) the recorder saw, empty when unknown.
+    """
+
+    name: str
+    type_name: str
+    count: int
+    decodable: bool = True
+    offered_qos: tuple[Any, ...] = ()
+
+
+class RawMessage(NamedTuple):
+    """A recorded message before decoding. `raw` is CDR (ROS 1 serialization in a ROS 1 bag)."""
+
+    topic: str
+    type_name: str
+    log_ns: int
+    raw: bytes
+
+
+class Source(Protocol):
+    """One storage that yields its messages by log time. `types` are those it can decode."""
+
+    types: Typestore
+
+    def topics(self) -> list[TopicInfo]: ...
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]: ...
+
+    def decode(self, type_name: str, raw: bytes) -> Any: ...
+
+    def rescue(self) -> ScanSource | None:
+        """What can still be read after damage stopped `messages`, from the first one again."""
+        ...
+
+    def span(self) -> tuple[int, int] | None: ...
+
+    def close(self) -> None: ...
+
+
+class _FolderPath(type(Path())):  # type: ignore[misc]
+    """A folder whose name may end in .bag, which rosbags would take for a file of ROS 1."""
+
+    @property
+    def suffix(self) -> str:
+        return super().suffix.removesuffix('.bag')
+
+
+class RosbagsSource:
+    """A bag directory or storage file read by rosbags."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        for file in self._mcaps():
+            if oversized := oversized_chunk(file):
+                raise BagError(oversized)
+            if wrong := wrong_sums(file):
+                raise BagError(f'the checksum of {" and of ".join(wrong)} in {file.name} is wrong')
+        for file in path.glob('*.zstd') if path.is_dir() else []:
+            if oversized := oversized_file(file):
+                raise BagError(f'{file.name} cannot be unpacked: {oversized}')
+        place = _FolderPath(path) if path.is_dir() else path
+        self._reader = AnyReader([place], default_typestore=typestore())
+        self._reader.open()
+        self._unpack_here()
+        if trouble := self._trouble():
+            self._reader.close()
+            raise BagError(f'metadata.yaml has {trouble}')
+        # rosbags ignores its default types as soon as the bag defines a single one
+        self.types = self._reader.typestore
+        _add_known_types(self.types, [link.msgtype for link in self._reader.connections])
+
+    def _unpack_here(self) -> None:
+        """Have compressed messages handed out as they are: rosbags unpacks without a limit."""
+        for reader in self._reader.readers:
+            storage = getattr(reader, 'storage', None)
+            if getattr(getattr(storage, 'metadata', None), 'compression_mode', None) == 'message':
+                storage.metadata = storage.metadata._replace(compression_mode=None)
+
+    def _mcaps(self) -> list[Path]:
+        """Its files of that kind."""
+        if self._path.is_dir():
+            return sorted(self._path.glob('*.mcap'))
+        return [self._path] if self._path.suffix == '.mcap' else []
+
+    def rescue(self) -> ScanSource | None:
+        """A scan of its one MCAP file, which gives the same messages in the same order without
+        those of damaged chunks; None where it has no such file."""
+        files = self._mcaps()
+        return ScanSource(files[0]) if len(files) == 1 else None
+
+    def _trouble(self) -> str:
+        """What of the metadata is of a wrong kind, empty when nothing is; rosbags does not ask."""
+        links = self._reader.connections
+        if not all(isinstance(link.msgcount, int) for link in links):
+            return 'a message count that is no number'
+        if not all(isinstance(one, str) for link in links for one in (link.topic, link.msgtype)):
+            return 'a topic whose name or type is no text'
+        for reader in self._reader.readers:
+            storage = getattr(reader, 'storage', None)
+            if not isinstance(getattr(storage, 'files', []), list):
+                storage.files = []  # rosbags could not close it
+                return 'a list of files that is none'
+        return ''
+
+    @property
+    def custom_data(self) -> dict[str, str]:
+        """What the recorder noted beside the messages."""
+        metadata = getattr(getattr(self._reader.readers[0], 'storage', None), 'metadata', None)
+        return dict(getattr(metadata, 'custom', None) or {})
+
+    @property
+    def unordered(self) -> bool:
+        """True for MCAP without chunks: rosbags refuses it when log times are not sorted."""
+        storage = getattr(self._reader.readers[0], 'storage', None)
+        files = getattr(storage, 'storages', [storage])
+        return any(
+            hasattr(file, 'chunks') and not file.chunks and file.metadata.message_count
+            for file in files
+        )
+
+    def topics(self) -> list[TopicInfo]:
+        return [
+            TopicInfo(
+                link.topic,
+                link.msgtype,
+                link.msgcount,
+                link.msgtype in self.types.fielddefs,
+                tuple(getattr(link.ext, 'offered_qos_profiles', ())),
+            )
+            for link in self._reader.connections
+        ]
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
+        chosen = [
+            link for link in self._reader.connections if topics is None or link.topic in topics
+        ]
+        if chosen:
+            for link, log_ns, raw in self._reader.messages(connections=chosen):
+                yield RawMessage(link.topic, link.msgtype, log_ns, _unpacked(raw))
+
+    def decode(self, type_name: str, raw: bytes) -> Any:
+        if raw[:4] == _ZSTD_MAGIC:
+            unpack(raw, 'zstd')  # says why it is still packed
+        if self._reader.is2:
+            return decode_cdr(self.types, type_name, raw)
+        return self._reader.deserialize(raw, type_name)
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns, by the index of the storage."""
+        if not self._reader.message_count:
+            return None
+        return self._reader.start_time, self._reader.end_time - 1
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+class ScanSource:
+    """An MCAP file without a usable index."""
+
+    def __init__(self, path: Path):
+        self._file = path
+        self._scan = McapScan(path)
+        self.types = _types_of(frozenset(self._scan.channels.values()))
+
+    def rescue(self) -> None:
+        return None
+
+    @property
+    def damage(self) -> str:
+        """What is lost, and what is not, as a sentence."""
+        count, stated = sum(self._scan.counts.values()), self._scan.stated
+        if not self._scan.lost:
+            return (
+                f'{self._file} is damaged beside its messages; all {count} messages were recovered'
+            )
+        of = f' of {stated}' if stated is not None else ''
+        return (
+            f'{self._file} {self._scan.lost}; {count}{of} messages were recovered, the rest is '
+            'lost'
+        )
+
+    def topics(self) -> list[TopicInfo]:
+        return [
+            TopicInfo(
+                channel.topic,
+                channel.type_name,
+                self._scan.counts[number],
+                channel.type_name in self.types.fielddefs,
+            )
+            for number, channel in self._scan.channels.items()
+        ]
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
+        chosen = {
+            number: channel
+            for number, channel in self._scan.channels.items()
+            if topics is None or channel.topic in topics
+        }
+        for number, log_ns, raw in self._scan.messages(chosen):
+            yield RawMessage(chosen[number].topic, chosen[number].type_name, log_ns, raw)
+
+    def decode(self, type_name: str, raw: bytes) -> Any:
+        return decode_cdr(self.types, type_name, raw)
+
+    def span(self) -> tuple[int, int] | None:
+        """First and last log time, ns, by reading the file."""
+        times = [item.log_ns for item in self.messages(None)]
+        return (min(times), max(times)) if times else None
+
+    def close(self) -> None:
+        self._scan.close()
+
+
+def open_sources(path: Path) -> tuple[list[Source], list[str]]:
+    """Open what lies at `path`: a bag directory, a storage file or a ROS 1 bag.
+
+    Gives the sources and sentences about what is wrong with them. Raises `BagError` when nothing
+    can be read at all.
+    """
+    if not path.exists():
+        raise BagError(f'{path} does not exist')
+    if path.is_file():
+        if path.name == 'metadata.yaml':
+            return open_sources(path.parent)
+        if path.suffix not in SUFFIXES:
+            raise BagError(
+                f'{path} is not a recording: the names of recordings end in '
+                f'{", ".join(SUFFIXES)}{packed_hint([path])}{convert_hint(path)}'
+            )
+        return _open_files([path], [])
+    return _open_directory(path)
+
+
+def _open_directory(path: Path) -> tuple[list[Source], list[str]]:
+    """Open a bag directory through its metadata.yaml or, when that fails, file by file."""
+    problems = []
+    if (path / 'metadata.yaml').exists():
+        try:
+            source = RosbagsSource(path)
+        except Exception as error:  # see the module docstring
+            problems.append(
+                f'{path}: the bag as a whole cannot be read ({one_line(error)}), '
+                'its files are read one by one'
+            )
+        else:
+            if not source.unordered:
+                return [source], leftovers(path)
+            source.close()
+    files = sorted((file for file in path.iterdir() if file.suffix in SUFFIXES), key=_split_order)
+    if not files:
+        raise BagError(
+            problems[0]
+            if problems
+            else f'{path} is not a recording: it holds neither metadata.yaml nor a file that '
+            f'ends in {", ".join(SUFFIXES)}{packed_hint(path.iterdir())}'
+        )
+    if not problems and not (path / 'metadata.yaml').exists():
+        problems.append(f'{path} has no metadata.yaml, its files are read one by one')
+    return _open_files(files, problems)
+
+
+def _open_files(files: list[Path], problems: list[str]) -> tuple[list[Source], list[str]]:
+    """Open storage files one by one; those that cannot be read become problems."""
+    sources: list[Source] = []
+    failures = []
+    for file in files:
+        try:
+            source, damage = _open_file(file)
+        except Exception as error:  # see the module docstring
+            failures.append(f'{file} cannot be read: {one_line(error)}{advice(file)}')
+            continue
+        sources.append(source)
+        problems += damage + leftovers(file)
+    if not sources:
+        raise BagError('; '.join(failures))
+    return sources, problems + failures
+
+
+def _open_file(file: Path) -> tuple[Source, list[str]]:
+    """Open one storage file by rosbags or, for MCAP that it refuses, by a scan."""
+    try:
+        source = RosbagsSource(file)
+    except Exception:
+        if file.suffix != '.mcap' or not file.stat().st_size:
+            raise
+        scan = ScanSource(file)
+        return scan, [scan.damage]
+    if source.unordered:
+        source.close()
+        return ScanSource(file), []
+    return source, []
+
+
+def _unpacked(raw: bytes) -> bytes:
+    """Undo the compression of a message; one that cannot be unpacked stays as it is."""
+    if raw[:4] != _ZSTD_MAGIC:
+        return bytes(raw)
+    try:
+        return unpack(raw, 'zstd')
+    except (TooLargeError, ZstdError):
+        return bytes(raw)
+
+
+def _split_order(file: Path) -> tuple[int, str]:
+    """Order the files of a split bag: name_2 comes before name_10."""
+    return len(file.name), file.name
+
+
+@lru_cache(maxsize=8)
+def _types_of(channels: frozenset[Channel]) -> Any:
+    """What these channels define, and what is known of the rest. To parse it takes a while."""
+    types = get_typestore(Stores.EMPTY)
+    for channel in sorted(channels):
+        if channel.definition and 'idl' in channel.definition_encoding:
+            types.register(get_types_from_idl(channel.definition))
+        elif channel.definition:
+            types.register(get_types_from_msg(channel.definition, channel.type_name))
+    _add_known_types(types, [channel.type_name for channel in channels])
+    return types
+
+
+def _add_known_types(types: Any, names: list[str]) -> None:
+    """Let `types` fall back on the Jazzy definitions for what the recording does not define."""
+    known = typestore().fielddefs
+    if any(name in known and name not in types.fielddefs for name in names):
+        types.register({name: known[name] for name in known if name not in types.fielddefs})
+
+
+def one_line(error: Exception) -> str:
+    """The text of any exception as one line without a full stop."""
+    text = ' '.join(str(error).split()).rstrip('.')
+    return text if text and not isinstance(error, KeyError) else f'{type(error).__name__} {text}'

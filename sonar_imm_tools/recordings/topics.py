@@ -1,0 +1,232 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which topics of a recording feed which tracker."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+import itertools
+import re
+
+from msg_adapters.inputs import inputs_of, InputTopic, made_inputs, needed
+from sonar_imm.parameters import did_you_mean
+from sonar_imm.trackers import SYSTEMS
+
+from .reader import BagReader
+from .sources import BagError, TopicInfo
+
+
+def fitting_topics(
+    bag: BagReader, system: str, topics: Mapping[str, str] | None = None
+) -> dict[str, InputTopic]:
+    """Say which topics of `bag` feed the tracker `system`: input by topic name.
+
+    A topic fits when its type can be read and its name ends in the input's name, or has a word
+    that stands for it; where several inputs fit, the later one counts. Topics below ``/truth``
+    never fit, and companions alone are not enough. Where an input is missing, a topic fits of
+    which a node before the tracker makes it (images of a sonar for detections). `topics` maps
+    topic names to input names instead, e.g. ``{'/usbl/pose': 'fix'}``; what belongs beside those,
+    and has its name, comes along. Raises `BagError` when nothing fits, with a list of what is
+    there, and when several instruments fit; `instruments` tells them apart.
+    """
+    found = instruments(bag, system, topics)
+    if len(found) > 1:
+        names = [name for each in found.values() for name, one in each.items() if one.one_topic]
+        entry = next(iter(found.values()))[names[0]]
+        raise BagError(
+            f'several topics fit the {system} tracker as instruments of their own: '
+            f'{", ".join(names)}; choose one, e.g. --topic {entry.name}={names[0]}'
+        )
+    return next(iter(found.values()))
+
+
+def instruments(
+    bag: BagReader, system: str, topics: Mapping[str, str] | None = None
+) -> dict[str, dict[str, InputTopic]]:
+    """Say which topics feed which tracker: what `fitting_topics` gives, for each instrument by its
+    name.
+
+    Where several topics fit an input that is one instrument, each namespace that has such a topic
+    is an instrument with a tracker of its own, named after the namespace. It also hears what lies
+    below its namespace, and from outside of all what it has not of its own. Otherwise there is one
+    instrument, with the name ''. Raises `BagError` when nothing fits.
+    """
+    fitting = _matching(bag, system, topics)
+    homes = {name: entry.namespace(name) for name, entry in fitting.items() if entry.one_topic}
+    if max(Counter(fitting[name].name for name in homes).values(), default=0) < 2:
+        return {'': fitting}
+    for name in fitting.keys() - homes.keys():
+        below = [place for place in homes.values() if place and name.startswith(f'{place}/')]
+        if below:
+            homes[name] = max(below, key=len)
+    found: dict[str, dict[str, InputTopic]] = {}
+    for place in sorted({homes[name] for name in homes if fitting[name].one_topic}):
+        own = {name: entry for name, entry in fitting.items() if homes.get(name) == place}
+        there = {entry.name for entry in own.values()}
+        of_all = {
+            name: entry
+            for name, entry in fitting.items()
+            if name not in homes and entry.name not in there
+        }
+        found[_free_name(place, own, found)] = own | of_all
+    return found
+
+
+def _free_name(place: str, own: Mapping[str, InputTopic], used: Collection[str]) -> str:
+    """The name of an instrument, fit for a folder: of its namespace, or else of its input."""
+    words = place.strip('/_') or next(one.name for one in own.values() if one.one_topic)
+    name = '_'.join(re.findall(r'[^\W_]+', words))
+    further = (f'{name}_{k}' for k in itertools.count(2))
+    return name if name not in used else next(one for one in further if one not in used)
+
+
+def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> list[str]:
+    """The trackers that find their inputs in `bag`, the one with the best evidence first.
+
+    Evidence is, in this order: nothing that the tracker needs is missing, what it needs is not
+    only what may be another instrument's, and how many different inputs there are. `topics` is as
+    in `fitting_topics`; inputs it names that a tracker does not have exclude that tracker.
+    """
+    found: dict[str, tuple[bool, bool, int]] = {}
+    for system in SYSTEMS:
+        try:
+            inputs = instruments(bag, system, topics)
+        except BagError:
+            continue
+        found[system] = max(_evidence(bag, system, each) for each in inputs.values())
+    return sorted(found, key=lambda system: found[system], reverse=True)
+
+
+def _evidence(
+    bag: BagReader, system: str, fitting: Mapping[str, InputTopic]
+) -> tuple[bool, bool, int]:
+    types = {topic.name: topic.type_name for topic in bag.topics}
+    there = {entry.makes or entry.name for entry in fitting.values()}
+    required = needed(inputs_of(system), SYSTEMS[system].config_type()().as_dict())[0]
+    sure = any(
+        types[name] not in entry.second for name, entry in fitting.items() if not entry.companion
+    )
+    return there.issuperset(required), sure, len(there)
+
+
+def _matching(
+    bag: BagReader, system: str, topics: Mapping[str, str] | None
+) -> dict[str, InputTopic]:
+    """The inputs by topic name, those of several instruments together."""
+    fitting = {
+        topic.name: entry
+        for topic in bag.topics
+        for entry in inputs_of(system)
+        if _can_read(topic, entry)
+        and entry.is_named(topic.name)
+        and 'truth' not in topic.name.split('/')[:-1]
+    }
+    if topics is not None:
+        chosen = {name: _mapped(bag, system, name, wanted) for name, wanted in topics.items()}
+        wanted = {entry.name for entry in chosen.values()}
+        beside = {
+            name: entry
+            for name, entry in fitting.items()
+            if wanted & set(entry.beside) and entry.name not in wanted and name not in chosen
+        }
+        return chosen | beside
+    there = {entry.name for entry in fitting.values()}
+    fitting |= {
+        name: entry for name, entry in made_topics(bag, system).items() if entry.makes not in there
+    }
+    fitting = _of_use(bag, fitting)
+    if all(entry.companion for entry in fitting.values()):
+        raise BagError(_nothing_fits(bag, system))
+    return fitting
+
+
+def _of_use(bag: BagReader, fitting: Mapping[str, InputTopic]) -> dict[str, InputTopic]:
+    """Without companions of what is not there, and without what may be another instrument's."""
+    types = {topic.name: topic.type_name for topic in bag.topics}
+    second = {name for name, entry in fitting.items() if types[name] in entry.second}
+    sure = {
+        name: entry
+        for name, entry in fitting.items()
+        if name not in second and not entry.companion
+    }
+    kept = dict(fitting)
+    for name in sorted(second if sure else ()):
+        sentence = (
+            f'topic {name} ({types[name]}) is left out, because {", ".join(sure)} says where '
+            f'divers are; choose it with --topic {kept.pop(name).name}={name}'
+        )
+        if sentence not in bag.problems:
+            bag.add_problem(sentence)
+    inputs = {entry.makes or entry.name for entry in kept.values()}
+    return {
+        name: entry
+        for name, entry in kept.items()
+        if not entry.beside or inputs & set(entry.beside)
+    }
+
+
+def _mapped(bag: BagReader, system: str, name: str, wanted: str) -> InputTopic:
+    """Check one entry of a topic map."""
+    entries = {entry.name: entry for entry in (*inputs_of(system), *made_inputs(system))}
+    if wanted not in entries:
+        raise BagError(
+            f"the {system} tracker has no input '{wanted}'"
+            f'{did_you_mean(wanted, entries)}; it has {", ".join(entries)}'
+        )
+    found = [topic for topic in bag.topics if topic.name == name]
+    if not found:
+        names = sorted({topic.name for topic in bag.topics})
+        raise BagError(f"{bag.path} has no topic '{name}'{did_you_mean(name, names)}")
+    if not any(_can_read(topic, entries[wanted]) for topic in found):
+        raise BagError(
+            f'{name} is of type {found[0].type_name}; the input {wanted} takes '
+            f'{", ".join(entries[wanted].readers)}'
+        )
+    return entries[wanted]
+
+
+def _can_read(topic: TopicInfo, entry: InputTopic) -> bool:
+    return topic.type_name in entry.readers
+
+
+def made_topics(bag: BagReader, system: str) -> dict[str, InputTopic]:
+    """Topics of which a node before the tracker makes an input: by their type, or by their name
+    too where the type holds other things as well."""
+    return {
+        topic.name: entry
+        for entry in made_inputs(system)
+        for topic in bag.topics
+        if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')[:-1]
+    }
+
+
+def _nothing_fits(bag: BagReader, system: str) -> str:
+    """Say what was looked for, what is there, and what could be meant."""
+    wanted = ' or '.join(f"'{entry.name}'" for entry in inputs_of(system))
+    if not bag.topics:
+        return f'{bag.path} is empty: it has no topics'
+    there = ', '.join(f'{topic.name} ({topic.type_name})' for topic in bag.topics)
+    maybe = [
+        f'{topic.name} as {entry.name}'
+        for topic in bag.topics
+        for entry in inputs_of(system)
+        if entry.may_be(topic.name, topic.type_name) and 'truth' not in topic.name.split('/')
+    ]
+    hint = f'; name the topic to use {" or ".join(maybe)}' if maybe else ''
+    return (
+        f'{bag.path} has no topic for the {system} tracker, which hears {wanted}; '
+        f'there are {there}{hint}'
+    )

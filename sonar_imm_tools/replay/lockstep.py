@@ -1,0 +1,256 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lock-step: send one message, wait until the node has answered it, then the next.
+
+ROS 2 has no deterministic replay: a fast player overruns queues, and what is lost depends on the
+machine. A node of this package answers every message with a row on ``~/processed`` after the
+estimates it made, also when it made none. The row counts since the start of the node, so it says
+how many estimates are still on their way, and that nobody else feeds the node meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+import time
+from typing import Any, NamedTuple
+
+from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+
+from msg_adapters.estimates import read_estimate
+from msg_adapters.table import decode_table
+from sonar_imm.estimates import Estimate
+from sonar_imm.nodes.qos import latched_qos, lockstep_qos
+
+from .link import Link, LinkError, MATCH_LIMIT
+
+ANSWER_LIMIT = 15.0
+"""Seconds a node may take over one message. Its kernels are warm before it listens."""
+_ANSWERS = '/processed'
+_SECOND_LOOK = 0.5
+_OTHER_INPUTS = 4.0
+"""Seconds in which further inputs of a node may be found. They become known one by one, and what
+was lost of them on the way is sent again after three."""
+
+
+def only_node(link: Link) -> str:
+    """Find the node to keep step with where only one runs; gives its full name.
+
+    Raises `LinkError` when there is none after 15 seconds, or more than one.
+    """
+    found: list[str] = []
+
+    def look() -> int:
+        found[:] = [
+            topic.removesuffix(_ANSWERS)
+            for topic, types in link.node.get_topic_names_and_types()
+            if topic.endswith(_ANSWERS) and 'sensor_msgs/msg/PointCloud2' in types
+        ]
+        return len(found)
+
+    if not link.wait_for(look, MATCH_LIMIT):
+        raise LinkError('no node of this package runs in this ROS domain')
+    if link.wait_for(lambda: look() > 1, _SECOND_LOOK):
+        raise LinkError(f'several nodes run: say which of {", ".join(sorted(found))} to step with')
+    return found[0]
+
+
+class Counts(NamedTuple):
+    """One row of ``~/processed``: messages taken, refused, and estimates published."""
+
+    messages: int
+    refused: int
+    estimates: int
+
+
+class Recorder:
+    """Collects ``~/estimate`` of a node, losing nothing; decodes only when asked, to be quick."""
+
+    def __init__(self, link: Link, node_name: str):
+        self._raw: list[bytes] = []
+        link.node.create_subscription(
+            PointCloud2, f'{node_name}/estimate', self._raw.append, lockstep_qos(), raw=True
+        )
+
+    def __len__(self) -> int:
+        return len(self._raw)
+
+    def estimates(self, start: int = 0) -> list[Estimate]:
+        """Decode what was collected, from the estimate number `start` on."""
+        return [read_estimate(deserialize_message(raw, PointCloud2)) for raw in self._raw[start:]]
+
+
+class LockStep:
+    """Keeps step with one node.
+
+    delays: seconds from sending a message to the last estimate made of it, as seen from here, for
+    the messages that brought an estimate.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        node_name: str,
+        *,
+        recorder: Recorder | None = None,
+        trouble: Callable[[], str | None] = lambda: None,
+    ):
+        """Listen to the node `node_name` (full name, e.g. ``/diver``).
+
+        With a `recorder` a step also waits for the estimates to arrive there. `trouble` gives a
+        sentence when the node is known to have ended.
+        """
+        self._link = link
+        self._name = node_name
+        self._recorder = recorder
+        self._trouble = trouble
+        self._counts: Counts | None = None
+        self._start = Counts(0, 0, 0)
+        self._sent = 0
+        self._told_estimates = 0
+        self.delays: list[float] = []
+        link.node.create_subscription(
+            PointCloud2, node_name + _ANSWERS, self._answered, latched_qos()
+        )
+
+    @property
+    def counts(self) -> Counts:
+        """What the node did since `connect`."""
+        now = self._counts or self._start
+        return Counts(*(after - before for after, before in zip(now, self._start)))
+
+    def connect(self, publishers: Iterable[Publisher], limit: float = MATCH_LIMIT) -> set[str]:
+        """Wait until the node is there and hears; gives the topics of `publishers` it hears.
+
+        The node may take `limit` seconds to appear, a new node has to compile its kernels first.
+        Where it hears some only, four seconds are given to find the others: a message that is not
+        waited for could be taken for somebody else's. Raises `LinkError` saying what is missing.
+        """
+        publishers = list(publishers)
+        if not self._link.wait_for(lambda: self._counts is not None, limit, self._trouble):
+            raise LinkError(
+                f"no answer from a node '{self._name}': is it running, in this ROS "
+                'domain, and one of this package?'
+            )
+        topics = {p.topic_name for p in publishers}
+        heard: set[str] = set()
+        last = time.monotonic()
+
+        def connected() -> bool:
+            nonlocal last
+            if fresh := self._heard(publishers) - heard:
+                heard.update(fresh)
+                last = time.monotonic()
+            return (
+                bool(heard)
+                and (heard == topics or time.monotonic() - last > _OTHER_INPUTS)
+                and all(p.get_subscription_count() for p in publishers if p.topic_name in heard)
+                and self._recorded()
+            )
+
+        if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
+            raise LinkError(self._silence(publishers, heard))
+        self._start = self._counts
+        self._told_estimates = self._counts.estimates
+        return heard
+
+    def step(self, publisher: Publisher, message: Any) -> None:
+        """Publish `message` and wait for its answer. Raises `LinkError` when there is none."""
+        sent = time.monotonic()
+        publisher.publish(message)
+        self.follow(1, publisher.topic_name, sent)
+
+    def follow(self, messages: int, topic: str, sent: float) -> None:
+        """Wait for the answers to `messages` that were published for the node because of what went
+        out on `topic` at `sent`, in seconds of `time.monotonic`. Raises `LinkError` without
+        one."""
+        self._sent += messages
+        if not self.wait_for(self._caught_up, ANSWER_LIMIT):
+            raise LinkError(
+                f"node '{self._name}' did not answer message {self._sent} on "
+                f'{topic} within {ANSWER_LIMIT:g} s'
+            )
+        if self._counts.estimates > self._told_estimates:
+            self.delays.append(time.monotonic() - sent)
+        self._told_estimates = self._counts.estimates
+        if self.counts.messages > self._sent:
+            raise LinkError(
+                f"something else publishes to the node '{self._name}': it took "
+                f'{self.counts.messages} messages and {self._sent} were sent'
+            )
+
+    def wait_for(self, predicate: Callable[[], Any], limit: float = MATCH_LIMIT) -> bool:
+        """Serve the link until `predicate` holds: True, or False after `limit` seconds. Raises
+        `LinkError` when the node ends."""
+        return self._link.wait_for(predicate, limit, self._lost)
+
+    def _answered(self, message: PointCloud2) -> None:
+        columns = decode_table(message)
+        self._counts = Counts(*(int(columns[name][0]) for name in Counts._fields))
+
+    def _caught_up(self) -> bool:
+        return self.counts.messages >= self._sent and (
+            self._recorder is None or len(self._recorder) >= self.counts.estimates
+        )
+
+    def _recorded(self) -> bool:
+        return self._recorder is None or bool(
+            self._link.node.count_publishers(f'{self._name}/estimate')
+        )
+
+    def _lost(self) -> str | None:
+        if sentence := self._trouble():
+            return sentence
+        if not self._link.node.count_publishers(self._name + _ANSWERS):
+            return f"node '{self._name}' has gone"
+        return None
+
+    def _heard(self, publishers: list[Publisher]) -> set[str]:
+        """Topics among those of `publishers` that the node itself subscribes to."""
+        return {
+            p.topic_name
+            for p in publishers
+            if any(
+                _full_name(info) == self._name
+                for info in self._link.node.get_subscriptions_info_by_topic(p.topic_name)
+            )
+        }
+
+    def _silence(self, publishers: list[Publisher], heard: set[str]) -> str:
+        """Say why no topic of the bag reaches the node."""
+        for publisher in publishers:
+            for info in self._link.node.get_subscriptions_info_by_topic(publisher.topic_name):
+                wanted, offered = info.topic_type, _type_name(publisher)
+                if _full_name(info) == self._name and wanted != offered:
+                    return (
+                        f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
+                        f'bag holds {offered}; change the type parameter of the node'
+                    )
+        if heard:
+            return f"node '{self._name}' does not take what is published on {', '.join(heard)}"
+        names = ', '.join(p.topic_name for p in publishers) or 'no topics'
+        return (
+            f"node '{self._name}' listens to none of the topics of the bag ({names}); remap them"
+        )
+
+
+def _full_name(info: Any) -> str:
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+
+
+def _type_name(publisher: Publisher) -> str:
+    package, _, name = publisher.msg_type.__module__.partition('.')
+    return f'{package}/msg/{publisher.msg_type.__name__}'

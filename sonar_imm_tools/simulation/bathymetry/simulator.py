@@ -1,0 +1,355 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Pings of a tilted side-scan array over a sea floor.
+
+`paper` is the scene of Saucan et al. 2013: a sonar 15 m above a flat floor with one rough patch.
+The signal-to-noise ratio falls from 30 to 10 dB along the swath, linearly in decibels over the
+logarithm of range, as spreading loss does. The other scenarios add one difficulty each: slope,
+undulation, roughness that is correlated as real roughness is, shadows, spikes, echoes by way of
+the surface, Gaussian echoes, a second side; and a ship that moves (`ship`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from sonar_imm.acoustics import array, geometry, sounding
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.parameters import parameter
+from sonar_imm.truth import Received, Scene, TrueProfile
+
+from .hearing import hear
+from .ship import in_outline, navigation_of, see, Ship, ship_of, ShipScenario, Terrain
+
+SIDES = ('starboard', 'port', 'both')
+LAWS = ('laplace', 'gaussian', 'k')
+ROUGHNESS_LAWS = ('gaussian', 'laplace', 'fractal')
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+
+
+@frozen(kw_only=True)
+class BathymetryScenario(ShipScenario):
+    """Parameters of a bathymetry scene; the defaults are the scene of the paper."""
+
+    INSTRUMENT = ('tilt_deg', 'conjugate', 'sonar_height', 'sonar_depth')
+
+    pings: int = parameter(20, 'number of pings', low=1, high=1_000_000)
+    ping_rate: float = parameter(10.0, 'pings per second', unit='Hz', low=0.01, high=1000.0)
+    side: str = parameter('starboard', 'which sides the sonar looks to', choices=SIDES)
+
+    staves: int = parameter(8, 'staves of the array', low=2, high=64)
+    spacing_wavelengths: float = parameter(
+        0.5, 'distance between staves, in wavelengths', low=0.01, high=100.0
+    )
+    frequency: float = parameter(455e3, 'of the sonar', unit='Hz', low=1e3, high=1e7)
+    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
+    tilt_deg: float = parameter(
+        30.0, 'direction the array looks to, below the horizon', unit='deg', low=-90.0, high=90.0
+    )
+    conjugate: bool = parameter(False, 'the array is wired the other way round')
+    sonar_height: float = parameter(
+        15.0, 'height of the sonar above the reference floor', unit='m', low=0.1, high=12000.0
+    )
+    sonar_depth: float = parameter(
+        3.0, 'depth of the sonar below the surface', unit='m', low=0.0, high=12000.0
+    )
+
+    first_range: float = parameter(17.0, 'slant range of the first bin', unit='m', low=0.0)
+    last_range: float = parameter(77.0, 'slant range where the swath ends', unit='m', low=0.1)
+    bin_width: float = parameter(0.05, 'distance between bins', unit='m', low=1e-3, high=10.0)
+    snr_near_db: float = parameter(30.0, 'signal to noise at a stave, first echo', unit='dB')
+    snr_far_db: float = parameter(10.0, 'signal to noise at a stave, end of the swath', unit='dB')
+    noise_variance: float = parameter(1.0, 'noise power at a stave', low=1e-12, high=1e12)
+    state_noise: bool = parameter(True, 'the snapshot says its noise variance')
+    state_signal: bool = parameter(False, 'the snapshot says its signal variance')
+    law: str = parameter('laplace', 'how the power of echoes varies', choices=LAWS)
+    texture_shape: float = parameter(
+        0.5, 'law k: shape of the gamma law of that power; 1 is laplace', low=0.05, high=100.0
+    )
+    noise_fades: bool = parameter(
+        True,
+        'the noise varies with the echo, as the observation model has it; thermal noise does not',
+    )
+    decorrelation: float = parameter(
+        0.0, 'share of the power of an echo that differs from stave to stave', low=0.0, high=1.0
+    )
+
+    slope: float = parameter(0.0, 'rise of the floor per metre of slant range', low=-1.0, high=1.0)
+    undulation_height: float = parameter(0.0, 'amplitude of an undulation', unit='m', low=0.0)
+    undulation_length: float = parameter(20.0, 'its length in slant range', unit='m', low=0.1)
+    patch_start: float = parameter(40.0, 'slant range at which the rough patch begins', unit='m')
+    patch_end: float = parameter(50.0, 'slant range at which it ends', unit='m')
+    patch_std: float = parameter(
+        0.5, 'standard deviation of its heights', unit='m', low=0.0, high=100.0
+    )
+    patch_drift: float = parameter(
+        0.0, 'the patch lies so much further out from ping to ping', unit='m'
+    )
+    roughness_law: str = parameter(
+        'gaussian',
+        'law of its heights; fractal: Gaussian with a spectrum that falls with the square of the '
+        'wave number',
+        choices=ROUGHNESS_LAWS,
+    )
+    correlation_length: float = parameter(
+        0.0,
+        'standard deviation of the kernel that smooths its heights; 0: white',
+        unit='m',
+        low=0.0,
+        high=100.0,
+    )
+
+    shadows: tuple[float, ...] = parameter(
+        (), 'slant ranges where shadows begin and end, in pairs', kind='float[]', unit='m', low=0.0
+    )
+    spike_probability: float = parameter(0.0, 'that a bin has a burst of noise', low=0.0, high=1.0)
+    spike_db: float = parameter(20.0, 'power of bursts above echo and noise', unit='dB')
+    multipath: bool = parameter(False, 'a calm surface returns echoes too')
+    multipath_level_db: float = parameter(
+        0.0, 'power of each surface echo against the floor', unit='dB', low=-60.0, high=60.0
+    )
+
+    def check(self) -> list[str]:
+        problems = super().check()
+        if self.multipath and self.moving:
+            problems.append('multipath is for a sonar that rests, not for moving: true')
+        if self.last_range < self.first_range + 2.0 * self.bin_width:
+            problems.append('last_range must lie at least two bins beyond first_range')
+        elif (self.last_range - self.first_range) / self.bin_width > 100_000:
+            problems.append('a ping has at most 100,000 bins; bin_width is too small')
+        if self.patch_end < self.patch_start:
+            problems.append('patch_end cannot lie before patch_start')
+        if len(self.shadows) % 2 or any(np.diff(self.shadows) < 0.0):
+            problems.append('shadows needs increasing ranges in pairs, begin and end of each')
+        return problems
+
+    def told(self) -> dict[str, Any]:
+        ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
+        mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
+        return {**super().told(), **mounted}
+
+
+SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)
+"""Depth and sound speed of a shallow sea in summer."""
+_UNDER_WAY: dict[str, Any] = {
+    'moving': True,
+    'pings': 24,
+    'ping_rate': 2.0,
+    'sonar_depth': 5.0,
+    'patch_along': (8.0, 20.0),
+    'patch_outline': 1.0,
+    'nav_attitude_error_deg': 0.05,
+    'nav_heading_error_deg': 0.1,
+    'nav_heave_error': 0.05,
+    'nav_position_error': 0.1,
+}
+
+SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
+    'paper': ('flat floor with a rough patch, 30 to 10 dB: the scene of the paper', {}),
+    'slope': ('paper on a floor that rises 0.1 m per metre', {'slope': 0.1}),
+    'correlated': (
+        'paper with roughness correlated over a metre, as real roughness is',
+        {'correlation_length': 1.0},
+    ),
+    'undulating': (
+        'paper on an undulating floor',
+        {'undulation_height': 0.5, 'undulation_length': 15.0},
+    ),
+    'shadow': ('paper with two shadows', {'shadows': (30.0, 33.0, 58.0, 63.0)}),
+    'spikes': ('paper with a burst of noise in every tenth bin', {'spike_probability': 0.1}),
+    'multipath': ('paper under a calm surface', {'multipath': True}),
+    'water_column': (
+        'paper from 5 m on, so that the noise is heard and need not be stated',
+        {'first_range': 5.0, 'state_noise': False},
+    ),
+    'gaussian': ('paper with Gaussian echoes', {'law': 'gaussian'}),
+    'thermal': ('paper with noise that does not fade with the echo', {'noise_fades': False}),
+    'foreign': (
+        'paper under other laws than the tracker supposes: fractal roughness, echoes with heavier '
+        'tails, noise that does not fade',
+        {'noise_fades': False, 'law': 'k', 'roughness_law': 'fractal'},
+    ),
+    'two_sides': ('paper on both sides of the ship', {'side': 'both'}),
+    'moving': (
+        'a ship under way in a swell, with navigation and its errors; a rough patch with a wavy '
+        'outline',
+        {**_UNDER_WAY},
+    ),
+    'moving_profile': (
+        'moving in summer, when sound bends by metres at the end of the swath',
+        {**_UNDER_WAY, 'sonar_depth': 5.0, 'sound_speed_profile': SUMMER},
+    ),
+    'moving_two_sides': (
+        'moving, on both sides of the ship',
+        {**_UNDER_WAY, 'side': 'both'},
+    ),
+    'drifting_patch': (
+        'paper with a patch that lies further out each ping',
+        {'pings': 60, 'patch_drift': 0.2, 'patch_start': 32.0, 'patch_end': 42.0},
+    ),
+}
+"""Name: (what it is, what differs from the defaults of `BathymetryScenario`)."""
+
+
+def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> BathymetryScenario:
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
+    return BathymetryScenario.named(name, SCENARIOS, overrides)
+
+
+def simulate(config: BathymetryScenario, seed: int) -> Scene:
+    """Run a scene. The same config and seed give the same scene.
+
+    A measurement is received together with its last echo. With both sides, each has a namespace of
+    its own. The frame is that of the sonar: x forward, y to port, z up. With a moving ship it is
+    the world, and the navigation is part of the scene.
+    """
+    rng = np.random.default_rng(seed)
+    sides = ('port', 'starboard') if config.side == 'both' else (config.side,)
+    ranges = config.first_range + config.bin_width * np.arange(
+        round((config.last_range - config.first_range) / config.bin_width)
+    )
+    listening_ns = round(2e9 * ranges[-1] / config.sound_speed)
+    ship = ship_of(config, config.sonar_depth, rng) if config.moving else None
+    received, truth = [], []
+    for ping in range(config.pings):
+        since_start = ping / config.ping_rate
+        stamp = FIRST_STAMP_NS + round(since_start * 1e9)
+        for side in sides:
+            namespace = side if len(sides) > 1 else ''
+            if ship is None:
+                profile = _floor(config, ping, ranges, rng, stamp, side, namespace)
+            else:
+                profile = _floor_below(config, ship, since_start, ranges, rng, side, namespace)
+            truth.append(profile)
+            snapshot = hear(config, profile, rng)
+            received.append(Received(stamp + listening_ns, snapshot, namespace))
+    if ship is not None:
+        seconds = (config.pings - 1) / config.ping_rate
+        stated = navigation_of(config, ship, FIRST_STAMP_NS, seconds, rng, 'map')
+        received = [*(Received(one.stamp_ns, one) for one in stated), *received]
+        received.sort(key=lambda one: one.received_ns)
+    return Scene(tuple(received), tuple(truth), frame_id=truth[0].frame_id)
+
+
+def _floor(
+    config: BathymetryScenario,
+    ping: int,
+    ranges: FloatArray,
+    rng: np.random.Generator,
+    stamp_ns: int,
+    side: str,
+    namespace: str,
+) -> TrueProfile:
+    drift = ping * config.patch_drift
+    patch = (ranges >= config.patch_start + drift) & (ranges < config.patch_end + drift)
+    height = config.slope * (ranges - ranges[0]) + patch * _roughness(config, len(ranges), rng)
+    height += config.undulation_height * np.sin(
+        2.0 * np.pi * (ranges - ranges[0]) / config.undulation_length
+    )
+    depth = config.sonar_height - height
+    valid = np.abs(depth) <= ranges  # before that, the sound is still in the water column
+    valid &= _lit(config, ranges)
+    outward = array.across_track(depth, ranges)
+    return TrueProfile(
+        stamp_ns=stamp_ns,
+        frame_id='sonar',
+        range=ranges,
+        height=height,
+        angle=array.angle_of_depth(depth, ranges, math.radians(config.tilt_deg)),
+        patch=patch,
+        valid=valid,
+        xyz=np.column_stack(
+            [np.zeros(len(ranges)), outward if side == 'port' else -outward, -depth]
+        ),
+        namespace=namespace,
+    )
+
+
+def _floor_below(
+    config: BathymetryScenario,
+    ship: Ship,
+    since_start: float,
+    ranges: FloatArray,
+    rng: np.random.Generator,
+    side: str,
+    namespace: str,
+) -> TrueProfile:
+    """The floor that one ping of a moving ship sees."""
+
+    def rise(along: FloatArray, off: FloatArray) -> FloatArray:
+        wave = np.sin(2.0 * np.pi * off / config.undulation_length)
+        return config.slope * off + config.undulation_height * wave
+
+    def rough(along: FloatArray, off: FloatArray) -> BoolArray:
+        return in_outline(config, along, off, config.patch_start, config.patch_end)
+
+    level = config.water_level - config.sonar_depth - config.sonar_height
+    mount = geometry.rotation(*np.radians(config.sonar_mount_rpy_deg))
+    seen = see(
+        config,
+        ship,
+        Terrain(level, ship.course, rise, rough),
+        _roughness(config, len(ranges), rng),
+        since_start,
+        ranges,
+        config.sound_speed,
+        sounding.array_axes(side, math.radians(config.tilt_deg), mount),
+    )
+    valid = seen.reached & _lit(config, ranges)
+    return TrueProfile(
+        stamp_ns=FIRST_STAMP_NS + round(since_start * 1e9),
+        frame_id='map',
+        range=ranges,
+        height=seen.place[:, 2],
+        angle=np.where(seen.reached, np.arcsin(np.clip(seen.sine, -1.0, 1.0)), np.nan),
+        patch=seen.patch,
+        valid=valid,
+        xyz=np.where(seen.reached[:, None], seen.place, np.nan),
+        namespace=namespace,
+    )
+
+
+def _lit(config: BathymetryScenario, ranges: FloatArray) -> BoolArray:
+    """Bins (n,) outside the shadows."""
+    lit = np.ones(len(ranges), bool)
+    for begin, end in zip(config.shadows[::2], config.shadows[1::2]):
+        lit &= (ranges < begin) | (ranges >= end)
+    return lit
+
+
+def _roughness(config: BathymetryScenario, bins: int, rng: np.random.Generator) -> FloatArray:
+    if config.roughness_law == 'laplace':
+        white = rng.laplace(scale=math.sqrt(0.5), size=bins)
+    else:
+        white = rng.normal(size=bins)
+    if config.roughness_law == 'fractal':
+        wave = np.fft.rfft(white)
+        longest = (config.patch_end - config.patch_start) / config.bin_width
+        wave /= np.maximum(np.arange(len(wave)) * longest / bins, 1.0)
+        wave[0] = 0.0
+        white = np.fft.irfft(wave, bins)
+        white /= white.std()
+    width = config.correlation_length / config.bin_width
+    if width > 0.0:
+        smooth = gaussian_filter1d(white, width, mode='wrap')
+        kernel = gaussian_filter1d(np.eye(1, bins, bins // 2)[0], width, mode='wrap')
+        white = smooth / np.linalg.norm(kernel)
+    return config.patch_std * white

@@ -1,0 +1,149 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Divers located from a vessel, or in latitude and longitude.
+
+The sensor `usbl` is a transceiver under a vessel that circles the scene: range and direction of
+each diver in the axes of the transceiver, with the diver's number, and the vessel's pose between
+two scans, with white errors that it states. The sensor `geodetic` gives positions in latitude and
+longitude around `ORIGIN`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geodesy import Origin
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import GeodeticFix, RelativeFix, VesselPose
+
+ORIGIN = Origin(59.0, 10.0)
+LEVER = np.array([2.0, -1.0, -3.0])
+"""From the reference of the vessel's navigation to the transceiver, metres."""
+RADIUS, SPEED = 50.0, 1.0
+"""Of the vessel's circle, m, and along it, m/s."""
+_HALF_NS = 500_000_000_000
+BEFORE_NS = 300_000_000
+"""The pose is that much older than the scan."""
+POSITION_STD, HEADING_STD_DEG, ATTITUDE_STD_DEG = 0.3, 1.0, 0.3
+
+USBL = (
+    'divers with transponders, located from a vessel that circles them',
+    {'sensor': 'usbl', 'divers': 2, 'speed': 0.75, 'start': (0.0, 0.0), 'depth': (5.0, 15.0)},
+)
+GEODETIC = (
+    'fixes in latitude and longitude',
+    {'sensor': 'geodetic', 'speed': 0.75, 'random_rotation': True},
+)
+"""Scenes of `scenarios.SCENARIOS`."""
+
+
+def told_of_places(config: Any) -> dict[str, Any]:
+    """What a tracker has to know of these sensors."""
+    if config.sensor == 'geodetic':
+        return {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}
+    return {
+        'tags': tuple(f'diver_{number}' for number in range(1, config.divers + 1)),
+        'transceiver_lever': tuple(LEVER.tolist()),
+        'relative_range_std': config.range_std,
+        'relative_angle_std_deg': config.bearing_std_deg,
+    }
+
+
+def namespace_of(measurement: Any) -> str:
+    """A transponder's positions have a topic for each diver: their message has no room for the
+    number."""
+    return f'diver_{measurement.target_id}' if isinstance(measurement, RelativeFix) else ''
+
+
+def vessel_at(stamp_ns: int) -> tuple[FloatArray, FloatArray]:
+    """Position (3,) and roll, pitch, yaw (3,) of the vessel, in a light swell."""
+    seconds = (stamp_ns + _HALF_NS) % (2 * _HALF_NS) * 1e-9 - _HALF_NS * 1e-9
+    angle = SPEED * seconds / RADIUS
+    place = RADIUS * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return place, np.array(
+        [0.05 * np.sin(seconds), 0.03 * np.sin(0.7 * seconds), angle + 0.5 * np.pi]
+    )
+
+
+def sense_from_vessel(
+    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
+) -> list[VesselPose | RelativeFix]:
+    """The pose of the vessel a moment before the scan, and each diver that is heard."""
+    pose_ns = stamp_ns - BEFORE_NS
+    place, attitude = vessel_at(pose_ns)
+    std = np.radians([ATTITUDE_STD_DEG, ATTITUDE_STD_DEG, HEADING_STD_DEG])
+    wrong = attitude + std * rng.normal(size=3)
+    measured: list[VesselPose | RelativeFix] = [
+        VesselPose(
+            stamp_ns=pose_ns,
+            position=place + POSITION_STD * rng.normal(size=3),
+            orientation=_quaternion(*wrong),
+            pose_covariance=np.diag([*[POSITION_STD**2] * 3, *std**2]),
+            frame_id='map',
+        )
+    ]
+    place, attitude = vessel_at(stamp_ns)
+    R = geometry.rotation(*attitude)
+    for number, diver in enumerate(present, start=1):
+        if rng.uniform() >= config.detection_probability:
+            continue
+        seen = R.T @ (diver - place) - LEVER
+        bent = np.radians(config.bearing_std_deg) * rng.normal(size=3)
+        distance = float(np.linalg.norm(seen))
+        turned = seen + np.cross(bent, seen)
+        turned *= (distance + config.range_std * rng.normal()) / np.linalg.norm(turned)
+        measured.append(
+            RelativeFix(stamp_ns=stamp_ns, offset=turned, target_id=number, frame_id='usbl')
+        )
+    return measured
+
+
+def sense_geodetic(
+    config: Any, errors: Any, stamp_ns: int, present: FloatArray, rng: np.random.Generator
+) -> list[GeodeticFix]:
+    """Positions with a white error, in latitude and longitude."""
+    fixes = []
+    for diver in present:
+        if rng.uniform() >= config.detection_probability:
+            continue
+        where = diver + np.append(config.fix_std * rng.normal(size=2), 0.0)
+        latitude, longitude, height = ORIGIN.geodetic(where).tolist()
+        fixes.append(
+            GeodeticFix(
+                stamp_ns=stamp_ns,
+                latitude=latitude,
+                longitude=longitude,
+                height=height,
+                covariance=np.diag([config.fix_std**2, config.fix_std**2, 1.0]),
+                frame_id='gps',
+            )
+        )
+    return fixes
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """x, y, z, w of ``Rz(yaw) Ry(pitch) Rx(roll)``."""
+    (sr, cr), (sp, cp), (sy, cy) = (
+        (np.sin(0.5 * angle), np.cos(0.5 * angle)) for angle in (roll, pitch, yaw)
+    )
+    return (
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+        float(cr * cp * cy + sr * sp * sy),
+    )

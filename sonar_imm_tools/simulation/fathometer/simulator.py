@@ -1,0 +1,231 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A vertical line array that drifts over a layered floor, in the noise of the sea surface.
+
+The array receives the surface noise directly and as echoes of the layers. `level` says what is
+written of a scene:
+    csdm      cross-spectra: Wishart samples of the exact ones of `acoustics.ambient`, with red
+              noise of ships from the horizontal and noise of the hydrophones;
+    response  traces processed from such cross-spectra;
+    trace     traces made directly, of pulses and noise in the same band: hundreds per second;
+    envelope  of a sub-bottom profiler over a floor that scatters, see `envelope`;
+    pressure  time series drawn from the cross-spectral model (`field`): for short scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from sonar_imm.acoustics import fathometer
+from sonar_imm.acoustics.ambient import sample_csdm
+from sonar_imm.acoustics.pulse import band_pulse
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
+from sonar_imm.truth import Received, Scene, TrueReflectors
+
+from .envelope import envelope
+from .field import expected_csdm, pressure_field
+from .scenario import Drift, drift_of, FathometerScenario, scenario, SCENARIOS
+
+__all__ = [
+    'cross_spectra',
+    'FathometerScenario',
+    'pressure_blocks',
+    'scenario',
+    'SCENARIOS',
+    'simulate',
+    'stream',
+]
+
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+FRAME_ID = 'array'
+
+
+def simulate(config: FathometerScenario, seed: int) -> Scene:
+    """Run a scene. The same config and seed give the same scene.
+
+    The stamp of a record is that of its last sample. Array depths that are sent beside the records
+    have the stamp of their record and come before it.
+    """
+    records = list(stream(config, seed))
+    received = tuple(one for measurements, _ in records for one in measurements)
+    return Scene(received, tuple(truth for _, truth in records), frame_id=FRAME_ID)
+
+
+def stream(
+    config: FathometerScenario, seed: int
+) -> Iterator[tuple[list[Received], TrueReflectors]]:
+    """Like `simulate`, record by record: long scenes of cross-spectra do not fit into memory."""
+    rng = np.random.default_rng(seed)
+    drift = drift_of(config, rng)
+    for record, measurements in enumerate(_measurements(config, drift, rng)):
+        stamp_ns = measurements[-1].stamp_ns
+        received = [Received(one.stamp_ns, one) for one in measurements]
+        if config.depth_companion:
+            depth = float(drift.array_depth_told[record])
+            companion = ArrayDepth(stamp_ns=stamp_ns, depth=depth, frame_id=FRAME_ID)
+            received.insert(0, Received(stamp_ns, companion))
+        here = np.flatnonzero(drift.present[record])
+        truth = TrueReflectors(
+            stamp_ns,
+            FRAME_ID,
+            (1 + here).astype(np.uint32),
+            drift.depth[record, here],
+            drift.amplitude[record, here],
+        )
+        yield received, truth
+
+
+def stamp_of(config: FathometerScenario, record: int) -> int:
+    """Time of the last sample of a record."""
+    return FIRST_STAMP_NS + round((record + 1) * config.record_seconds * 1e9)
+
+
+def _measurements(
+    config: FathometerScenario, drift: Drift, rng: np.random.Generator
+) -> Iterator[list[Any]]:
+    """The measurements of each record."""
+    for record in range(config.records):
+        told = None if config.depth_companion else float(drift.array_depth_told[record])
+        if config.level == 'pressure':
+            yield pressure_blocks(config, drift, record, told, rng)
+        elif config.level == 'csdm':
+            yield [cross_spectra(config, drift, record, told, rng)]
+        else:
+            amplitude, sigma = _TRACES[config.level](config, drift, record, rng)
+            yield [
+                Trace(
+                    stamp_ns=stamp_of(config, record),
+                    frame_id=FRAME_ID,
+                    depth=_depths(config),
+                    amplitude=amplitude,
+                    sigma=None if sigma is None else np.full(len(amplitude), sigma),
+                    reference_depth=told,
+                )
+            ]
+
+
+def cross_spectra(
+    config: FathometerScenario,
+    drift: Drift,
+    record: int,
+    told: float | None,
+    rng: np.random.Generator,
+) -> CrossSpectra:
+    """A sample of the cross-spectra of one record around their expectation. told: the depth of the
+    array that the record states."""
+    spacing = 1.0 / config.snapshot_seconds
+    first = int(np.ceil(config.frequency_min / spacing - 1e-9))
+    last = int(np.floor(config.frequency_max / spacing + 1e-9))
+    frequency = spacing * np.arange(first, last + 1)
+    R = expected_csdm(config, drift, record, frequency)
+    return CrossSpectra(
+        stamp_ns=stamp_of(config, record),
+        frame_id=FRAME_ID,
+        frequency=frequency,
+        csdm=sample_csdm(R, config.snapshots, rng),
+        snapshots=config.snapshots,
+        reference_depth=told,
+    )
+
+
+def _depths(config: FathometerScenario) -> FloatArray:
+    count = int((config.depth_max - config.depth_min) / config.depth_step + 1e-6) + 1
+    return config.depth_min + config.depth_step * np.arange(count)
+
+
+def _response(
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
+    """What the processor makes of cross-spectra, and its noise."""
+    spectra = cross_spectra(config, drift, record, None, rng)
+    heights = config.element_spacing * np.arange(config.phones)
+    w = fathometer.steering(spectra.frequency, heights, config.sound_speed)
+    gamma = fathometer.coherence(spectra.csdm, w, config.processor)
+    comb = float(spectra.frequency[0]), 1.0 / config.snapshot_seconds
+    where = float(drift.array_depth_told[record])
+
+    def at(first: float, count: int) -> FloatArray:
+        lattice = first, config.depth_step, count
+        return fathometer.depth_response(gamma, *comb, lattice, where, config.sound_speed)
+
+    sigma = fathometer.noise_sigma(at(180.0, 2000))
+    return at(config.depth_min, len(_depths(config))), sigma
+
+
+def _pulses(
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
+    """Pulses, and noise through the same band, with the error of the array's depth."""
+    depth, step = _depths(config), config.depth_step
+    pulse = band_pulse(config.frequency_min, config.frequency_max, config.sound_speed)
+    size = 2 * len(depth)
+    frequency = np.fft.rfftfreq(size, 2.0 * step / config.sound_speed)
+    band = (frequency >= config.frequency_min) & (frequency <= config.frequency_max)
+    spectrum = band * (rng.standard_normal((len(band), 2)) @ np.array([1.0, 1j]))
+    noise = np.fft.irfft(spectrum, size)[: len(depth)]
+    noise *= config.noise_sigma * size / np.sqrt(4.0 * np.count_nonzero(band))
+    shift = drift.array_depth_told[record] - drift.array_depth[record]
+    # The level of an MVDR response falls with the two-way path plus the length of the array.
+    height = drift.depth[record] - drift.array_depth[record]
+    level = (
+        12.0 * drift.amplitude[record] / (2.0 * height + config.phones * config.element_spacing)
+    )
+    there = pulse(depth[:, None] - drift.depth[record] - shift) @ level
+    return there + noise, config.noise_sigma
+
+
+def _scattered(
+    config: FathometerScenario, drift: Drift, record: int, rng: np.random.Generator
+) -> tuple[FloatArray, None]:
+    """The envelope of a profiler, which says nothing of its noise."""
+    return envelope(config, drift, record, _depths(config), rng), None
+
+
+_TRACES = {'response': _response, 'trace': _pulses, 'envelope': _scattered}
+"""Level: how the amplitudes of its traces are made, and the standard deviation of their noise."""
+
+
+def pressure_blocks(
+    config: FathometerScenario,
+    drift: Drift,
+    record: int,
+    told: float | None,
+    rng: np.random.Generator,
+) -> list[Pressure]:
+    """The pressure of one record in blocks of `block_seconds`, the last ends with the record."""
+    pressure = pressure_field(config, drift, record, rng)
+    scale = 0.0
+    if config.steps_per_sigma:
+        scale = float(np.std(pressure)) / config.steps_per_sigma
+        # What is stored is a multiple of a number in single precision.
+        scale = float(np.float32(scale))
+        pressure = np.round(pressure / np.float32(scale)) * np.float32(scale)
+    block = max(2, round(config.block_seconds * config.sample_rate))
+    end_ns = stamp_of(config, record)
+    return [
+        Pressure(
+            stamp_ns=end_ns - round((len(pressure) - first) / config.sample_rate * 1e9),
+            frame_id=FRAME_ID,
+            pressure=pressure[first : first + block],
+            sample_rate=config.sample_rate,
+            reference_depth=told,
+            scale=scale,
+        )
+        for first in range(0, len(pressure) - 1, block)
+    ]

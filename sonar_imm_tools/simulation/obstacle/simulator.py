@@ -1,0 +1,384 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""An AUV that approaches obstacles and detects them with a forward-looking sonar.
+
+The vehicle is like Daurade, the sonar like a Blueview P450: 1.5 m/s along a straight course, a
+little roll, pitch, yaw and heave as in swell, two pings per second into a sector of 45 by 15
+degrees. Navigation is dead reckoning at 10 Hz from a Doppler log with a scale
+error and a bias, and from an attitude sensor with a bias. Obstacles are given by their vertical
+offset from the sonar, or as spheres on tethers, objects on the sea floor or floats at the surface.
+
+Measurements are in ROS axes, ENU and FLU; inside, all is NED and FRD as in the papers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Altitude, Detections, nanoseconds, Navigation
+from sonar_imm.truth import Received, Scene, TruthTable
+
+from .images import image_pings
+from .paths import Path, paths, Swing
+from .scenario import ObstacleScenario, SCENARIOS
+
+__all__ = ['ObstacleScenario', 'SCENARIOS', 'TrueObstacle', 'scenario', 'simulate']
+
+FIRST_STAMP_NS = 1_700_000_000_000_000_000
+DOES = ('fixed', 'swaying', 'moving', 'seabed')
+LEAD_IN = 1.0
+"""Seconds of navigation before the first ping and after the last."""
+_FINE = 0.02
+"""Seconds to either side for numerical derivatives."""
+
+
+@frozen(eq=False)
+class TrueObstacle:
+    """True position of one obstacle relative to the sonar at each ping.
+
+    stamp_ns (n,); position (n, 3) and velocity (n, 2) m/s, ENU, the latter of what moves and 0 of
+    what sways; does (n,): which of `DOES`; range m, bearing rad (to port), vertical_offset m
+    (below), in the sonar's frame, each (n,); in_beam (n,) True where a ping can show it.
+    """
+
+    track_id: int
+    stamp_ns: np.ndarray
+    position: FloatArray
+    range: FloatArray
+    bearing: FloatArray
+    vertical_offset: FloatArray
+    in_beam: np.ndarray
+    velocity: FloatArray
+    does: np.ndarray
+
+    def tables(self, frame_id: str) -> Iterator[TruthTable]:
+        """Give one row per ping: ``x y z range bearing vertical_offset in_beam track_id vx vy``
+        and ``prob_<behaviour>``, 1 for what it does and 0 else."""
+        columns = {
+            **dict(zip('xyz', self.position.astype(np.float32).T)),
+            'range': self.range,
+            'bearing': self.bearing,
+            'vertical_offset': self.vertical_offset,
+            'in_beam': self.in_beam,
+            'track_id': np.full(len(self.range), self.track_id, np.uint32),
+            'vx': self.velocity[:, 0],
+            'vy': self.velocity[:, 1],
+        }
+        columns |= {f'prob_{name}': 1.0 * (self.does == k) for k, name in enumerate(DOES)}
+        for k, stamp in enumerate(self.stamp_ns):
+            row = {name: column[k : k + 1] for name, column in columns.items()}
+            yield TruthTable(int(stamp), frame_id, row)
+
+
+def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> ObstacleScenario:
+    """The scenario `name` with some values replaced. Raises `ConfigError` naming mistakes."""
+    return ObstacleScenario.named(name, SCENARIOS, overrides)
+
+
+def simulate(config: ObstacleScenario, seed: int) -> Scene:
+    """Run a scene. The same config and seed give the same scene; `truth` holds `TrueObstacle`."""
+    rng = np.random.default_rng(seed)
+    vehicle = _Vehicle(config, rng)
+    stamps = FIRST_STAMP_NS + np.round(_ping_times(config, rng) * 1e9).astype(np.int64)
+    times = (stamps - FIRST_STAMP_NS) * 1e-9
+    obstacles = paths(config, _place(config, vehicle, rng), vehicle.course, seed)
+    sound = 1.0 + config.sound_speed_error * rng.normal()
+    received = _navigate(config, vehicle, rng)
+    if config.images:
+        places = [path.at(times) for path in obstacles]
+        received += image_pings(config, vehicle.sonar(times), stamps, places, sound, seed)
+    else:
+        echoes = [_echoes(config, vehicle, times, path, sound) for path in obstacles]
+        received += _pings(config, stamps, echoes, rng)
+    received.sort(key=lambda one: one.received_ns)
+    truth = tuple(
+        _truth(config, number, path, vehicle, stamps, times)
+        for number, path in enumerate(obstacles, start=1)
+    )
+    return Scene(tuple(received), truth)
+
+
+# -- the vehicle -------------------------------------------------------------------------------
+
+
+class _Vehicle:
+    """Pose of the vehicle at any time, NED and FRD."""
+
+    def __init__(self, config: ObstacleScenario, rng: np.random.Generator):
+        self.config = config
+        self.course = (
+            rng.uniform(-np.pi, np.pi) if config.random_course else np.radians(config.course_deg)
+        )
+        self.roll = Swing(np.radians(config.roll_rms_deg), config.roll_period, rng)
+        self.pitch = Swing(np.radians(config.pitch_rms_deg), config.pitch_period, rng)
+        self.yaw = Swing(np.radians(config.yaw_rms_deg), config.yaw_period, rng)
+        self.heave = Swing(config.heave_rms, config.heave_period, rng)
+        self.sway = Swing(config.sway_rms, config.sway_period, rng)
+        self.lever = geometry.flip_body(config.sonar_lever)
+        roll, pitch, yaw = np.radians(config.sonar_mount_rpy_deg)
+        self.mount = geometry.rotation(roll, -pitch, -yaw)  # stated in FLU
+
+    def angles(self, t: FloatArray) -> FloatArray:
+        """Roll, pitch, yaw (..., 3)."""
+        return np.stack([self.roll(t), self.pitch(t), self.course + self.yaw(t)], axis=-1)
+
+    def position(self, t: FloatArray) -> FloatArray:
+        """(..., 3) m, NED."""
+        along, across = self.config.speed * t, self.sway(t)
+        c, s = np.cos(self.course), np.sin(self.course)
+        dive = self.config.dive * np.sin(2.0 * np.pi * t / 60.0)
+        return np.stack(
+            [
+                along * c - across * s,
+                along * s + across * c,
+                self.config.depth + self.heave(t) + dive,
+            ],
+            axis=-1,
+        )
+
+    def pose(self, t: FloatArray) -> Pose:
+        return Pose(self.position(t), geometry.rotation(*np.moveaxis(self.angles(t), -1, 0)))
+
+    def sonar(self, t: FloatArray) -> Pose:
+        return geometry.mounted(self.pose(t), self.lever, self.mount)
+
+
+def _ping_times(config: ObstacleScenario, rng: np.random.Generator) -> FloatArray:
+    """Times of the pings, s, until the vehicle is `last_range` from the first obstacle."""
+    step = 1.0 / config.ping_rate
+    times = np.arange(0.0, (config.first_range - config.last_range) / config.speed, step)
+    return times + rng.uniform(-0.5, 0.5, len(times)) * config.ping_jitter * step
+
+
+def _seabed(config: ObstacleScenario, along: FloatArray) -> FloatArray:
+    """Depth of the sea floor `along` the course, m: ripples of the given relief."""
+    ripple = np.sin(2.0 * np.pi * along / 37.0) + 0.6 * np.sin(2.0 * np.pi * along / 13.0 + 1.0)
+    return config.depth + config.altitude + config.seabed_relief * ripple
+
+
+# -- obstacles ---------------------------------------------------------------------------------
+
+
+def _place(
+    config: ObstacleScenario, vehicle: _Vehicle, rng: np.random.Generator
+) -> list[FloatArray]:
+    """Positions of the obstacles, NED. The first one is `first_range` from the first ping, each
+    further one `spacing` behind. The passing distance of each is drawn at random."""
+    sonar = vehicle.sonar(np.zeros(()))
+    c, s = np.cos(vehicle.course), np.sin(vehicle.course)
+    places = []
+    for number in range(config.obstacles):
+        far = config.first_range + number * config.spacing
+        offset = _offset(config, number, float(sonar.position[2]), rng)
+        across = rng.uniform(-config.passing_distance, config.passing_distance)
+        along = np.sqrt(far**2 - across**2 - offset**2)
+        north, east = along * c - across * s, along * s + across * c
+        places.append(sonar.position + np.array([north, east, offset]))
+    return places
+
+
+def _offset(
+    config: ObstacleScenario, number: int, depth: float, rng: np.random.Generator
+) -> float:
+    """Vertical offset of one obstacle from the sonar at the first ping, m, below positive."""
+    seabed = config.depth + config.altitude
+    if config.placement == 'offset':
+        return config.vertical_offset + rng.uniform(-1.0, 1.0) * config.offset_spread
+    if config.placement == 'tether':
+        return seabed - config.tethers[number % len(config.tethers)] - depth
+    return {'seabed': seabed - 0.5, 'surface': 0.5}[config.placement] - depth
+
+
+# -- measurements ------------------------------------------------------------------------------
+
+
+def _navigate(
+    config: ObstacleScenario, vehicle: _Vehicle, rng: np.random.Generator
+) -> list[Received]:
+    """Odometry by dead reckoning, and the altimeter."""
+    last = (config.first_range - config.last_range) / config.speed + LEAD_IN
+    t = np.arange(-LEAD_IN, last, 1.0 / config.navigation_rate)
+    exact = 0.0 if config.ideal_navigation else 1.0
+    bias = exact * np.radians(
+        [config.attitude_bias_deg, config.attitude_bias_deg, config.yaw_bias_deg]
+    )
+    angles = vehicle.angles(t) + bias * rng.normal(size=3)
+    angles += exact * np.radians(config.attitude_std_deg) * rng.normal(size=angles.shape)
+    R = geometry.rotation(*angles.T)
+    position = vehicle.position(t)
+    velocity = (vehicle.position(t + _FINE) - vehicle.position(t - _FINE)) / (2.0 * _FINE)
+    true_R = vehicle.pose(t).R
+    log = geometry.apply(np.swapaxes(true_R, -1, -2), velocity)
+    log = log * (1.0 + exact * config.log_scale_error * rng.normal())
+    log = log + exact * config.log_bias * rng.normal(size=3)
+    noise = config.log_noise * np.sqrt(config.navigation_rate)
+    log = log + exact * noise * rng.normal(size=log.shape)
+    if not config.ideal_navigation:
+        over_ground = geometry.apply(R, log)
+        steps = 0.5 * (over_ground[1:] + over_ground[:-1]) * np.diff(t)[:, None]
+        position = position[0] + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        position[:, 2] = vehicle.position(t)[:, 2] + config.depth_std * rng.normal(size=len(t))
+    turn = _turn_rate(vehicle, t)
+    q = Rotation.from_matrix(geometry.flip_rotation(R)).as_quat()
+    stamps = _stamps(t + config.navigation_delay)
+    gaps = _gaps(config, t, rng)
+    received = [
+        Received(
+            int(stamps[k]) + nanoseconds(config.navigation_latency),
+            Navigation(
+                stamp_ns=int(stamps[k]),
+                position=geometry.flip_world(position[k]),
+                orientation=q[k],
+                velocity=geometry.flip_body(log[k]),
+                turn_rate=geometry.flip_body(turn[k]),
+                frame_id='odom',
+                child_frame_id='base_link',
+            ),
+        )
+        for k in np.flatnonzero(~gaps)
+    ]
+    every = max(1, round(config.navigation_rate / 2.0))
+    along = config.speed * t
+    heights = _seabed(config, along) - vehicle.position(t)[:, 2]
+    heights = heights + config.altitude_std * rng.normal(size=len(t))
+    received += [
+        Received(
+            int(stamps[k]),
+            Altitude(stamp_ns=int(stamps[k]), altitude=max(float(heights[k]), 0.0)),
+        )
+        for k in range(0, len(t), every)
+        if config.altimeter
+    ]
+    return received
+
+
+def _turn_rate(vehicle: _Vehicle, t: FloatArray) -> FloatArray:
+    """Turn rate (n, 3) of the body, rad/s."""
+    before, after = vehicle.pose(t - _FINE).R, vehicle.pose(t + _FINE).R
+    turned = Rotation.from_matrix(np.swapaxes(before, -1, -2) @ after)
+    return turned.as_rotvec() / (2.0 * _FINE)
+
+
+def _gaps(config: ObstacleScenario, t: FloatArray, rng: np.random.Generator) -> np.ndarray:
+    """True (n,) in the gaps of the navigation, of `navigation_gap` seconds each."""
+    silent = np.zeros(len(t), bool)
+    if config.navigation_gaps > 0.0:
+        for start in rng.uniform(t[0], t[-1], rng.poisson(config.navigation_gaps)):
+            silent |= (t >= start) & (t < start + config.navigation_gap)
+    return silent
+
+
+def _echoes(
+    config: ObstacleScenario,
+    vehicle: _Vehicle,
+    times: FloatArray,
+    path: Path,
+    sound: float,
+) -> tuple[FloatArray, np.ndarray]:
+    """Range and azimuth (n, 2) of an obstacle at each ping without noise, and whether it is inside
+    the beam (n,)."""
+    out = geometry.to_body(vehicle.sonar(times), path.at(times))
+    d, azimuth = geometry.project(out, config.azimuth_model)
+    if config.ping_timing == 'two_way':
+        for _ in range(3):
+            arrival = times + 2.0 * d / 1500.0
+            back = geometry.to_body(vehicle.sonar(arrival), path.at(times + d / 1500.0))
+            d_back, azimuth = geometry.project(back, config.azimuth_model)
+            d = 0.5 * (np.linalg.norm(out, axis=-1) + d_back)
+    elevation = np.arcsin(np.clip(out[:, 2] / np.linalg.norm(out, axis=-1), -1.0, 1.0))
+    plane = np.arctan2(out[:, 1], out[:, 0])
+    inside = (
+        (np.abs(elevation) <= np.radians(0.5 * config.vertical_fov_deg))
+        & (np.abs(plane) <= np.radians(0.5 * config.horizontal_fov_deg))
+        & (d <= config.max_range)
+    )
+    return np.column_stack([d * sound, azimuth]), inside
+
+
+def _pings(
+    config: ObstacleScenario,
+    stamps: np.ndarray,
+    echoes: list[tuple[FloatArray, np.ndarray]],
+    rng: np.random.Generator,
+) -> list[Received]:
+    """The detections of each ping: echoes that are seen, some of them outliers, and clutter."""
+    half = np.radians(0.5 * config.horizontal_fov_deg)
+    noise = np.array([config.range_std, np.radians(config.bearing_std_deg)])
+    step = np.array([config.range_step, np.radians(config.bearing_step_deg)])
+    largest = np.array([config.outlier_range, np.radians(config.outlier_bearing_deg)])
+    received = []
+    for k, stamp in enumerate(stamps):
+        rows = []
+        for echo, inside in echoes:
+            seen = rng.uniform() < config.detection_probability
+            outlier = rng.uniform() < config.outlier_probability
+            error = noise * rng.normal(size=2) + outlier * largest * rng.uniform(-1.0, 1.0, 2)
+            if seen and inside[k]:
+                rows.append(echo[k] + error)
+        for _ in range(rng.poisson(config.clutter)):
+            rows.append([rng.uniform(1.0, config.max_range), rng.uniform(-half, half)])
+        z = np.reshape(rows, (-1, 2))
+        z = np.where(step > 0.0, np.round(z / np.where(step > 0.0, step, 1.0)) * step, z)
+        z = z[rng.permutation(len(z))]
+        if rng.uniform() < config.ping_loss:
+            continue
+        detections = Detections(
+            stamp_ns=int(stamp), range=z[:, 0], bearing=-z[:, 1], frame_id='sonar'
+        )
+        late = config.late_delay * rng.uniform() if rng.uniform() < config.late_fraction else 0.0
+        received.append(Received(int(stamp) + nanoseconds(late), detections))
+    return received
+
+
+def _truth(
+    config: ObstacleScenario,
+    number: int,
+    path: Path,
+    vehicle: _Vehicle,
+    stamps: np.ndarray,
+    times: FloatArray,
+) -> TrueObstacle:
+    sonar, place = vehicle.sonar(times), path.at(times)
+    d, azimuth = geometry.project(geometry.to_body(sonar, place), config.azimuth_model)
+    return TrueObstacle(
+        track_id=number,
+        stamp_ns=stamps,
+        position=geometry.flip_world(place),
+        range=d,
+        bearing=-azimuth,
+        vertical_offset=place[:, 2] - sonar.position[:, 2],
+        in_beam=_echoes(config, vehicle, times, path, 1.0)[1],
+        velocity=geometry.flip_world(path.velocity(times))[:, :2],
+        does=_does(config, path, times),
+    )
+
+
+def _does(config: ObstacleScenario, path: Path, times: FloatArray) -> np.ndarray:
+    still = 'seabed' if config.placement == 'seabed' else 'fixed'
+    if path.sway is not None or path.swing is not None:
+        still = 'swaying'
+    return np.where(path.moves(times), DOES.index('moving'), DOES.index(still))
+
+
+def _stamps(t: FloatArray) -> np.ndarray:
+    return FIRST_STAMP_NS + np.round(t * 1e9).astype(np.int64)

@@ -1,0 +1,133 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What is said of a recording."""
+
+from helpers.dive_bags import write_dive
+from helpers.dive_scenes import SECOND, START_NS
+import numpy as np
+import pytest
+
+from msg_adapters.arrivals import write_arrivals
+from msg_adapters.fixes import write_fix
+from sonar_imm.measurements import Arrivals, Fix
+from sonar_imm_tools.cli import main
+from sonar_imm_tools.offline.inspection import inspect
+from sonar_imm_tools.recordings.reader import BagReader
+from sonar_imm_tools.recordings.writer import BagWriter, ros_message
+
+
+def found(path):
+    with BagReader(path) as bag:
+        result = inspect(bag)
+    return result, {topic['name']: topic for topic in result['topics']}
+
+
+def write_fixes(path, seconds, frames=('map',)):
+    with BagWriter(path) as bag:
+        for k, second in enumerate(seconds):
+            fix = Fix(stamp_ns=START_NS, position=[0, 0, 0], frame_id=frames[k % len(frames)])
+            message = write_fix(fix, ros_message)
+            stamp = 0 if second is None else START_NS + round(second * SECOND)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, SECOND)
+            bag.write('/fix', message, START_NS + k * SECOND)
+    return path
+
+
+def test_a_good_recording_has_no_problems(tmp_path):
+    result, topics = found(write_dive(tmp_path / 'dive'))
+    assert result['systems'] == {'diver': {'fix': ['/fix']}}
+    assert topics['/fix']['suits'] == ['diver fix']
+    assert topics['/fix']['rate_hz'] == pytest.approx(1.0)
+    assert topics['/fix']['problems'] == [] and topics['/truth/estimate']['problems'] == []
+    assert topics['/truth/estimate']['suits'] == []
+    assert result['duration_s'] == pytest.approx(119.5)
+
+
+def test_refused_messages_are_told_with_the_reason(tmp_path):
+    _, topics = found(write_dive(tmp_path / 'dive', spoilt=(1, 2, 3)))
+    assert len(topics['/fix']['problems']) == 1
+    assert topics['/fix']['problems'][0].startswith('3 messages refused as fix (nan): ')
+
+
+def test_a_topic_of_another_name_still_suits(tmp_path):
+    result, _ = found(write_dive(tmp_path / 'dive', topic='/usbl/pose', truth=False))
+    assert result['systems'] == {'diver': {'fix': ['/usbl/pose']}}
+
+
+@pytest.mark.parametrize(
+    'seconds, words',
+    [
+        ([0, 1, 2, 1.5, 3], '1 stamps older than the one before, by up to 0.5 s'),
+        ([0, 1, 2, 3, 40, 41], '1 gaps in the stamps, the longest 37 s against 1 s'),
+        ([None, None, 1], '2 messages without a usable stamp'),
+    ],
+)
+def test_odd_stamps_are_told(tmp_path, seconds, words):
+    _, topics = found(write_fixes(tmp_path / 'bag', seconds))
+    assert any(words in problem for problem in topics['/fix']['problems'])
+
+
+def test_several_fixes_of_one_stamp_are_a_scan(tmp_path, capsys):
+    _, topics = found(write_fixes(tmp_path / 'bag', [0, 1, 1, 1, 2, 2, 3]))
+    assert topics['/fix']['problems'] == []
+    assert topics['/fix']['scans'] == {'count': 4, 'most': 3}
+    assert main(['info', str(tmp_path / 'bag')]) == 0
+    assert '7 messages, 1 Hz, 4 scans, up to 3 per scan, frame map' in capsys.readouterr().out
+
+
+def test_two_pings_of_one_stamp_are_a_problem(tmp_path):
+    ping = Arrivals(
+        stamp_ns=START_NS,
+        frame_id='map',
+        tx_id=[0, 0, 0],
+        rx_id=[1, 2, 3],
+        tx=np.zeros((3, 3)),
+        rx=np.diag([40.0, 50.0, 60.0]),
+        toa=[0.05, 0.06, 0.07],
+        var_toa=np.full(3, np.nan),
+        bearing=np.full(3, np.nan),
+        var_bearing=np.full(3, np.nan),
+    )
+    with BagWriter(tmp_path / 'bag') as bag:
+        for k in range(2):
+            bag.write('/arrivals', write_arrivals(ping, ros_message), START_NS + k)
+    _, topics = found(tmp_path / 'bag')
+    assert topics['/arrivals']['problems'] == ['1 stamps equal to the one before']
+    assert topics['/arrivals']['scans'] is None
+
+
+def test_several_frames_are_told(tmp_path):
+    _, topics = found(write_fixes(tmp_path / 'bag', range(4), frames=('map', 'odom')))
+    assert "several frames: 'map', 'odom'" in topics['/fix']['problems']
+
+
+def test_what_no_tracker_knows_suits_nothing(tmp_path):
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/note', ros_message('std_msgs/msg/String', data='hello'), START_NS)
+    result, topics = found(tmp_path / 'bag')
+    assert result['systems'] == {} and topics['/note']['problems'] == []
+
+
+def test_an_empty_recording_is_no_trouble(tmp_path):
+    with BagWriter(tmp_path / 'bag'):
+        pass
+    result, _ = found(tmp_path / 'bag')
+    assert result['messages'] == 0 and result['duration_s'] == 0.0
+
+
+def test_a_companion_counts_by_its_name_and_not_alone(tmp_path):
+    alone, topics = found(write_dive(tmp_path / 'alone', topic='/array_depth', truth=False))
+    assert 'fathometer array_depth' in topics['/array_depth']['suits']
+    assert 'fathometer' not in alone['systems']
