@@ -166,6 +166,7 @@ class SetFilter:
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
+        self._uniforms = model.uniforms
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def record(
@@ -199,7 +200,7 @@ class SetFilter:
 
     def propagate(self, before: Weighted, record: Record) -> Weighted:
         """Sets as they may have become by the time of the record: shift, deaths, walks, births."""
-        uniform = _generator(record.key, _STEP).random((self.particles, self.model.uniforms))
+        uniform = _generator(record.key, _STEP).random((self.particles, self._uniforms))
         sets, log_ratio = self._drawn(before.sets, record, uniform)
         path, shift = None, self.model.shift
         if shift is not None:
@@ -362,9 +363,6 @@ class LagSmoother:
         return evolve(
             first, sets=first.sets.take(line), w=step.w, amplitude=first.amplitude[line], path=path
         )
-
-    def clear(self) -> None:
-        self._steps.clear()
 
 
 class Members(NamedTuple):
