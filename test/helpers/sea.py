@@ -34,13 +34,13 @@ def motion_case():
 
 
 def sea_config(case, **values):
-    told = {
+    stated = {
         'sonar_lever': case['lever'].tolist(),
         'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
         'tilt_deg': float(case['tilt_deg']),
         'side': str(case['side']),
     }
-    return BathymetryConfig.from_mapping({**told, **values})
+    return BathymetryConfig.from_mapping({**stated, **values})
 
 
 def navigation(case, *, late_s=0.0):
@@ -72,7 +72,7 @@ def swath_of(case, config, snapshot, *, late_s=0.0, pose_of='reception'):
     """The swath of one ping, right or with a mistake: `pose_of` all bins is that of
     ``transmission`` or of the ``middle`` of the ping."""
     poses = navigation(case, late_s=late_s)
-    buffer = NavigationBuffer(tuple(one.stamp_ns for one in poses), tuple(poses))
+    buffer = NavigationBuffer(tuple(each.stamp_ns for each in poses), tuple(poses))
     stamps = bin_stamps(snapshot, config)
     if pose_of == 'transmission':
         stamps = np.full_like(stamps, stamps[0])

@@ -14,11 +14,14 @@
 
 """One cycle of the particle filter for sets."""
 
+from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.set_filter import SetFilter, SetStep, Weighted
 
 
-def cycle(filter_: SetFilter, before: Weighted | None, b, key, gram=None) -> SetStep:
+def cycle(
+    filter_: SetFilter, before: Weighted | None, b: FloatArray, key: tuple[int, int]
+) -> SetStep:
     """Take the record b in; before: None before the first one."""
-    record = filter_.record(b, key, gram)
+    record = filter_.record(b, key)
     sets = filter_.propagate(before or filter_.start(record), record)
     return filter_.move(filter_.resample(filter_.weigh(sets, record), record), record)

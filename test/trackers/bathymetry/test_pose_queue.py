@@ -96,7 +96,7 @@ def test_what_waits_too_long_is_given_up_the_oldest_first_and_counted(queue):
     for second in range(41, 60):
         queue.add_pose(pose(second))
     ready = queue.ready(CONFIG)
-    assert [one.snapshot.stamp_ns for one in (ready[0], ready[-1])] == [
+    assert [each.snapshot.stamp_ns for each in (ready[0], ready[-1])] == [
         ping(50.03).stamp_ns,
         ping(52.02).stamp_ns,
     ]

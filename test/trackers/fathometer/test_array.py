@@ -58,10 +58,10 @@ PRESSURE = {
 
 def blocks(scene, size=None):
     """The scene's pressure, as it is or in blocks of `size` samples."""
-    own = [one.measurement for one in scene.measurements]
+    own = [each.measurement for each in scene.measurements]
     if size is None:
         return own
-    p = np.concatenate([one.pressure for one in own])
+    p = np.concatenate([each.pressure for each in own])
     return [
         Pressure(
             stamp_ns=own[0].stamp_ns + round(first / own[0].sample_rate * 1e9),
@@ -80,7 +80,7 @@ def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
     assert len(found) == 1 and tracker.counts['blocks'] == len(own)
     (estimate,) = found.values()
 
-    p = np.concatenate([one.pressure for one in own]).astype(np.float64)
+    p = np.concatenate([each.pressure for each in own]).astype(np.float64)
     n = 4200
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
     parts = [
@@ -137,7 +137,7 @@ def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
     own = blocks(pressure_scene)
     tracker, found = run(own[:3] + own[4:], **PRESSURE)
     assert tracker.counts['gaps'] == 1 and not found
-    late = [evolve(one, stamp_ns=one.stamp_ns + 60 * 10**9) for one in own]
+    late = [evolve(each, stamp_ns=each.stamp_ns + 60 * 10**9) for each in own]
     tracker, found = run(own[:6] + late, **PRESSURE)
     assert tracker.counts['records_abandoned'] == 1
     assert len(found) == 1
@@ -146,25 +146,25 @@ def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
 def test_a_preview_is_not_committed(pressure_scene):
     own = blocks(pressure_scene)
     again = [
-        evolve(one, stamp_ns=one.stamp_ns + k * round(9.8e9)) for k in range(3) for one in own
+        evolve(each, stamp_ns=each.stamp_ns + k * round(9.8e9)) for k in range(3) for each in own
     ]
     plain, found = run(again, **PRESSURE)
     eager, more = run(again, preview_seconds=2.8, **PRESSURE)
     assert eager.counts['previews'] > 3
     assert set(found) < set(more)
-    for stamp, one in more.items():
-        assert one.extras['preview'].all() == (stamp not in found)
+    for stamp, each in more.items():
+        assert each.extras['preview'].all() == (stamp not in found)
         if stamp in found:
-            assert one.state.tobytes() == found[stamp].state.tobytes()
+            assert each.state.tobytes() == found[stamp].state.tobytes()
 
 
 def test_the_small_drift_is_followed_from_cross_spectra_and_a_companion():
     scene = simulate(scenario('small'), 3)
-    tracker, found = run([one.measurement for one in scene.measurements], **SMALL)
+    tracker, found = run([each.measurement for each in scene.measurements], **SMALL)
     assert tracker.counts['array_depths'] == 12 and not tracker.counts['array_depth_unknown']
-    truth = {one.stamp_ns: one for one in scene.truth}
+    truth = {each.stamp_ns: each for each in scene.truth}
     near = [
-        np.abs(one.state[0, 0] - truth[stamp].depth.min()) < 0.3 for stamp, one in found.items()
+        np.abs(each.state[0, 0] - truth[stamp].depth.min()) < 0.3 for stamp, each in found.items()
     ]
     assert len(near) == 12 and np.mean(near) > 0.9
 
@@ -203,9 +203,9 @@ def test_a_dead_hydrophone_is_left_out_and_changes_little(spectra, dead):
 
 
 def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
-    one = np.ones((len(spectra), 8, 8), np.complex64)
+    each = np.ones((len(spectra), 8, 8), np.complex64)
     cases = {
-        'singular': ([changed(spectra, one)], {'loading': 0.0}),
+        'singular': ([changed(spectra, each)], {'loading': 0.0}),
         'wrong_hydrophones': ([changed(spectra, spectra.csdm[:, :7, :7])], {}),
         'bad_band': ([spectra], {'frequency_min': 5000.0, 'frequency_max': 6000.0}),
         'bad_frequency': (
@@ -223,7 +223,7 @@ def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
         tracker, found = run(items, **{**SMALL, **options})
         assert tracker.counts[reason] == 1, (reason, tracker.counts)
         assert not found
-    tracker, found = run([changed(spectra, one)], **SMALL)
+    tracker, found = run([changed(spectra, each)], **SMALL)
     assert tracker.counts['rank_deficient'] == 1
 
 

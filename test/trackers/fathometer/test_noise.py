@@ -102,8 +102,8 @@ def test_the_noise_of_a_trace_is_what_its_reflectors_leave():
     options = {'particles': 2000, 'polarity': 'both', **MIRROR}
     _, found = run(traces, **options)
     assert score_scene(found, scene, after=5).right >= 0.9
-    measured = np.mean([one.extras['sigma'][0] for one in found.values()])
-    whole = np.mean([_mad(one.amplitude) for one in traces])
+    measured = np.mean([each.extras['sigma'][0] for each in found.values()])
+    whole = np.mean([_mad(each.amplitude) for each in traces])
     assert measured == pytest.approx(1.0, abs=0.15)
     assert abs(measured - 1.0) < 0.7 * abs(whole - 1.0)
 
