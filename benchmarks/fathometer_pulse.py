@@ -43,8 +43,7 @@ from benchmarks.study import mean_of, Parts, rms, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence_and_power, echo_spectrum, steering
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import CrossSpectra
-from sonar_imm.trackers.fathometer.array_response import array_response
-from sonar_imm.trackers.fathometer.response import lattice_of_array, pulse_of
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array, pulse_of
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of

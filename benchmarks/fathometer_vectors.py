@@ -29,16 +29,16 @@ import numpy as np
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.estimation.set_filter import SetFilter
-from sonar_imm.estimation.set_model import gaussian_move, SetModel, Sets
+from sonar_imm.estimation.set_filter import SetFilter, Weighted
+from sonar_imm.estimation.set_model import gaussian_walk, SetModel, Sets
 from sonar_imm.measurements import Pressure
-from sonar_imm.trackers.fathometer.array_response import (
+from sonar_imm.trackers.fathometer.pressure import PressureStream
+from sonar_imm.trackers.fathometer.response import (
     array_coherence,
     array_response,
+    Lattice,
     processor_pulse,
 )
-from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 EXACT_LOG_EVIDENCE = 298.6663117
@@ -54,7 +54,7 @@ def exact_hmm_model() -> SetModel:
         separation=3,
         order_min=1,
         transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
-        move=gaussian_move(0.8),
+        walk=gaussian_walk(0.8),
         gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
         amplitude_std=3.0,
     )
@@ -65,11 +65,13 @@ def exact_hmm(folder: Path, seed: int) -> dict[str, float]:
     model = exact_hmm_model()
     with np.load(folder / 'fathometer' / 'exact_hmm.npz') as file:
         records, exact = file['B'], file['exP']
-    tracker, before, off, evidence = SetFilter(model, 20_000), None, [], 0.0
+    sets, before, off, evidence = SetFilter(model, 20_000), None, [], 0.0
     for name, b in enumerate(records):
-        step = tracker.step(before, b, (seed, name))
+        record = sets.record(b, (seed, name))
+        propagated = sets.propagate(before or sets.start(record), record)
+        step = sets.move(sets.resample(sets.weigh(propagated, record), record), record)
         before = step.after
-        off.append(0.5 * np.abs(tracker.summary(step)[0] - exact[name]).sum())
+        off.append(0.5 * np.abs(sets.summarise(step).pmf - exact[name]).sum())
         evidence += step.log_evidence
     return {
         'exact_hmm: PMF, total variation': float(np.mean(off)),
@@ -101,7 +103,7 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
             separation=1,
             order_min=int(order),
             transition=np.eye(1),
-            move=np.ones(1),
+            walk=np.ones(1),
             gram=pulse(float(v['depth_step']) * np.arange(n)),
             amplitude_std=float(v['amplitude_std_sigmas']),
             negative_probability=0.05,
@@ -118,9 +120,9 @@ def signed_likelihood(folder: Path) -> dict[str, float]:
     as they should."""
     worst, wrong = 0.0, 0
     for row in signed_sets(folder):
-        single, found = SetFilter(row.model, 1), np.zeros(1)
-        # The kernel that weighs sets, without moving them.
-        single._weigh(row.sets, row.response, found, single._amplitudes)
+        single = SetFilter(row.model, 1)
+        step = single.weigh(Weighted(row.sets, np.zeros(1)), single.record(row.response, (0, 0)))
+        found = step.after.log_weight
         wrong += np.isfinite(row.log_likelihood) != np.isfinite(found[0])
         if np.isfinite(row.log_likelihood):
             worst = max(worst, abs(found[0] - row.log_likelihood))

@@ -70,26 +70,26 @@ def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path)
         shutil.copytree(ROOT / room, root / room, ignore=ignore)
     code = """
 import numpy as np
-from sonar_imm.estimation import imm_particles_kernels as imm
+from sonar_imm.estimation import imm_particles as imm
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 out = np.empty(1)
 sines_of(np.zeros(1), 0, level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5), np.empty((2, 1)), out)
-mixed, c = np.empty((2, 1, 1)), np.empty(2)
-scratch = imm.MixScratch(np.empty((2, 1)), np.empty(1), np.empty(2, np.int64))
-imm.mix(np.array([[[3.0]], [[4.0]]]), np.ones((2, 1)), np.array([1.0, 1e-9]), np.eye(2),
-        np.zeros(2), scratch, mixed, c)
-hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.mix))
-print(out[0], mixed[1, 0, 0], hits)
+drawn, c = np.empty((1, 1, 2)), np.empty(1)
+scratch = imm.ResampleScratch(np.empty((1, 2)), np.empty(2), np.empty(3, np.int64))
+imm.resample(np.array([[[3.0, 4.0]]]), np.full((1, 2), 0.5), np.ones(1), np.eye(1),
+             np.full(1, 0.6), scratch, drawn, c)
+hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.resample))
+print(out[0], drawn[0, 0, 0], hits)
 """
-    assert run(code, root, cache) == ['0.5', '4.0', '0']
-    assert run(code, root, cache) == ['0.5', '4.0', '2']
+    assert run(code, root, cache) == ['0.5', '3.0', '0']
+    assert run(code, root, cache) == ['0.5', '3.0', '2']
     callee = root / 'sonar_imm/acoustics/likelihood_kernels.py'
     edit(callee, 'out[i] = ratio * cos_tilt', 'out[i] = 3.0 * ratio * cos_tilt')
-    constant = root / 'sonar_imm/estimation/imm_particles.py'
-    edit(constant, 'LEAST_CHANCE = 1e-290', 'LEAST_CHANCE = 1e-3')
-    assert run(code, root, cache) == ['1.5', '3.0', '0']
-    assert run(code, root, cache) == ['1.5', '3.0', '2']
+    constant = root / 'sonar_imm/estimation/elementary.py'
+    edit(constant, 'ROUND = 1.5 * 2.0**52', 'ROUND = 0.0')
+    assert run(code, root, cache) == ['1.5', '4.0', '0']
+    assert run(code, root, cache) == ['1.5', '4.0', '2']
 
 
 def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
@@ -169,7 +169,7 @@ def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypat
     code = """
 import numpy as np
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 geometry = level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5)
 try:
     sines_of(np.zeros(1), 0, geometry, np.empty((1, 2)), np.empty(1)[:0])

@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from msg_adapters.array_records import write_trace
 from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Rejection, Trace
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import SegyOptions

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from sonar_imm.acoustics.fathometer import PROCESSORS
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.parameters import parameter
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.truth import PRESENT
 
 from ..scenario import Scenario

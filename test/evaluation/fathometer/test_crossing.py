@@ -21,7 +21,7 @@ import pytest
 
 from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Trace
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.fathometer.crossing import common_shift, crossing_metrics, summary
 from sonar_imm_tools.offline.run_folder import RunFolder
