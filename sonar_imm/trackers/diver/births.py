@@ -27,8 +27,8 @@ from ...acoustics import multistatic
 from ...estimation.arrays import FloatArray, IndexArray
 from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
-from .model_set import heights_of
 from .sensing import locate, Positions, spread, systematic_variance, toa_variance
+from .state_space import heights_of
 
 
 class Birth(NamedTuple):

@@ -39,7 +39,7 @@ from ...estimation.association import gate_threshold, TrackStatus
 from ...measurements import Arrivals, Measurement, NOBODY
 from .births import Birth, births_from_ping
 from .config import DiverConfig
-from .pings import ping_numbers
+from .pings import ping_measurements
 from .scan import Scan
 from .sensing import Positions
 from .state import DiverState
@@ -69,7 +69,7 @@ def hear_named(scan: Scan, ping: Arrivals, config: DiverConfig, factor: float) -
     scan.x, scan.P = scan.layout.widened(scan.x, scan.P)
     whole = config.covariance_scale * factor
     rows = np.arange(len(ping))
-    numbers = ping_numbers(ping, rows, config, whole, scan.models, scan.layout)
+    numbers = ping_measurements(ping, rows, config, whole, scan.models, scan.layout)
     if numbers.pairs > 1:
         scan.accept(int(tracks[0]), numbers, whole)
     return []

@@ -36,12 +36,18 @@ from ...estimation.small_matrices import lift_all
 from ...estimation.student_t import DEGREES
 from ...measurements import Arrivals
 from .config import DiverConfig
-from .expectation_kernels import expect_numbers, expect_residuals, fit_numbers
-from .instruments import Layout
-from .model_set import heights_of, ModelSet
-from .ping_kernels import MOST_EXPLANATIONS, Numbers, subset_ping
-from .robust_kernels import student_t_maxima, student_t_ping
+from .ping_kernels import (
+    expect_measurements,
+    expect_residuals,
+    fit_measurements,
+    MOST_EXPLANATIONS,
+    PingMeasurements,
+    student_t_maxima,
+    student_t_ping,
+    subset_ping,
+)
 from .sensing import bearing_variance, MOST_NUMBERS, spread, toa_variance
+from .state_space import heights_of, Layout, ModelSet
 
 MOST_SUBSETS = 6
 """Most transmitter-receiver pairs heard whose subsets are all tried."""
@@ -70,7 +76,7 @@ class Ping(NamedTuple):
     """The `numbers` of a ping in the order of their content; row (C,): the row of the ping each
     stands in; passive: a tag's; pairs: transmitter-receiver pairs heard."""
 
-    numbers: Numbers
+    measured: PingMeasurements
     row: IntArray
     passive: bool
     pairs: int
@@ -79,14 +85,14 @@ class Ping(NamedTuple):
         """The numbers `keep` (C,), without those whose parent is not kept."""
         keep = self.kept(keep)
         place = np.cumsum(keep) - 1
-        left = Numbers(*(np.ascontiguousarray(column[keep]) for column in self.numbers))
+        left = PingMeasurements(*(np.ascontiguousarray(column[keep]) for column in self.measured))
         left = left._replace(parent=np.where(left.parent >= 0, place[left.parent], -1))
         pairs = len(np.unique(left.node[left.kind <= ONE_WAY]))
         return Ping(left, self.row[keep], self.passive, pairs)
 
     def kept(self, keep: BoolArray) -> BoolArray:
         """`keep` (C,) without those whose parent is not kept."""
-        parent = self.numbers.parent
+        parent = self.measured.parent
         orphaned = (parent >= 0) & ~keep[parent]
         return np.asarray(keep & ~orphaned)
 
@@ -99,12 +105,12 @@ class Ping(NamedTuple):
     @property
     def nodes(self) -> IntArray:
         """Numbers of the pairs heard."""
-        return np.unique(self.numbers.node[self.echo])
+        return np.unique(self.measured.node[self.echo])
 
     @property
     def echo(self) -> BoolArray:
         """(C,) True for path lengths, which are what tells that a diver is there."""
-        return np.asarray(self.numbers.kind <= ONE_WAY)
+        return np.asarray(self.measured.kind <= ONE_WAY)
 
 
 class PingUpdate(NamedTuple):
@@ -120,7 +126,7 @@ class PingUpdate(NamedTuple):
     repairs: int
 
 
-def ping_numbers(
+def ping_measurements(
     ping: Arrivals,
     rows: IntArray,
     config: DiverConfig,
@@ -168,7 +174,7 @@ def ping_numbers(
                 table.append((len(table) + 10**6, parent, *entry, row))
     columns = [np.array(column) for column in zip(*table)] if table else [np.empty(0)] * 7
     row = columns[6].astype(np.intp)
-    numbers = Numbers(
+    measured = PingMeasurements(
         node=columns[0].astype(np.int64),
         parent=columns[1].astype(np.int64),
         kind=columns[2].astype(np.int64),
@@ -179,7 +185,7 @@ def ping_numbers(
         rx=np.ascontiguousarray(ping.rx[row]),
         columns=layout.columns(models, ping.rx_id[row], ping.passive),
     )
-    return Ping(numbers, row, ping.passive, int(new.sum()))
+    return Ping(measured, row, ping.passive, int(new.sum()))
 
 
 def _depth_reports(ping: Arrivals, rows: IntArray) -> list[tuple[float, float, int]]:
@@ -208,28 +214,28 @@ def update_by_ping(
     are good where they fit what became of the diver.
     """
     if len(ping.row) > MOST_NUMBERS:
-        _, nis = fit_numbers(x, P, mu, config.target_z, ping.numbers)
+        _, nis = fit_measurements(x, P, mu, config.target_z, ping.measured)
         keep = np.zeros(len(nis), bool)
         keep[np.argsort(nis, kind='stable')[:MOST_NUMBERS]] = True
         keep = ping.kept(keep)
         after = update_by_ping(x, P, mu, ping.only(keep), config, layout)
         if after is None:
             return None
-        _, nis = fit_numbers(after.x, after.P, after.mu, config.target_z, ping.numbers)
+        _, nis = fit_measurements(after.x, after.P, after.mu, config.target_z, ping.measured)
         good = 1.0 / (1.0 + nis / GOOD_RESIDUAL**2)
         good[keep] = after.good
         return after._replace(good=good)
-    n, numbers, mask = x.shape[-1], ping.numbers, layout.mask
+    n, measured, mask = x.shape[-1], ping.measured, layout.mask
     if ping.passive:
         x, P, mask = _with_emission(x, P, mu, ping, mask, config.target_z)
     if ping.passive or ping.pairs > MOST_SUBSETS:
         starts = optima(ping, config)
-        after = student_t_ping(x, P, mask, config.target_z, numbers, starts, DEGREES)
+        after = student_t_ping(x, P, mask, config.target_z, measured, starts, DEGREES)
         squared = (DEGREES + 1.0) / np.maximum(after[3], 1e-300) - DEGREES
         good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
     else:
         eps = config.outlier_probability
-        after = subset_ping(x, P, mask, config.target_z, numbers, eps, MOST_EXPLANATIONS)
+        after = subset_ping(x, P, mask, config.target_z, measured, eps, MOST_EXPLANATIONS)
         good = after[3]
     with np.errstate(divide='ignore'):
         weight = np.log(mu) + after[2]
@@ -266,7 +272,7 @@ def begin_from_ping(
         uniform = np.full(len(x), 1.0 / len(x))
         x, P, mask = _with_emission(x, P, uniform, ping, mask, config.target_z)
     at, covariance, evidence, _ = student_t_ping(
-        x, P, mask, config.target_z, ping.numbers, position[None], DEGREES
+        x, P, mask, config.target_z, ping.measured, position[None], DEGREES
     )
     covariance = np.ascontiguousarray(covariance[:, :n, :n])
     lift_all(covariance)
@@ -280,25 +286,25 @@ def residuals(
     own variances, and how many of them are independent."""
     if ping.passive:
         x, P, _ = _with_emission(x, P, mu, ping, np.ones(x.shape[-1], bool), height)
-    residual, covariance = expect_numbers(x, P, mu, height, ping.numbers)
+    residual, covariance = expect_measurements(x, P, mu, height, ping.measured)
     return residual, covariance, len(residual) - int(ping.passive)
 
 
 def optima(ping: Ping, config: DiverConfig) -> FloatArray:
     """The best positions (k, 2) of the ping by itself, with heavy tails and no prior."""
-    echo = ping.only(ping.echo).numbers
+    echo = ping.only(ping.echo).measured
     columns = np.full_like(echo.columns, -1)
     columns[:, 0], columns[:, 1] = 0, 1
     if ping.passive:
         columns[:, EMISSION] = 2
-    numbers = echo._replace(columns=columns)
-    starts = _starts(numbers, ping.passive)
+    measured = echo._replace(columns=columns)
+    starts = _starts(measured, ping.passive)
     size = 3 if ping.passive else 2
     mean = np.zeros(size)
-    mean[:2] = numbers.rx[:, :2].mean(axis=0)
+    mean[:2] = measured.rx[:, :2].mean(axis=0)
     spread = np.diag([FAR**2, FAR**2, (10.0 * FAR) ** 2][:size])
     height = float(np.mean(heights_of(config)))
-    found, value = student_t_maxima(mean, spread, starts, numbers, height, DEGREES)
+    found, value = student_t_maxima(mean, spread, starts, measured, height, DEGREES)
     kept: list[FloatArray] = []
     for k in np.argsort(-value, kind='stable'):
         place = found[k, :2]
@@ -309,25 +315,25 @@ def optima(ping: Ping, config: DiverConfig) -> FloatArray:
     return np.array(kept)
 
 
-def _starts(numbers: Numbers, passive: bool) -> FloatArray:
+def _starts(measured: PingMeasurements, passive: bool) -> FloatArray:
     """Eleven positions (11, 2): round the earliest receivers, or round the ellipse of the shortest
     path."""
-    order = np.argsort(numbers.value, kind='stable')
+    order = np.argsort(measured.value, kind='stable')
     if passive:
-        near = numbers.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
+        near = measured.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
         centre = near.mean(axis=0)
         reach = 20.0 + 0.5 * np.hypot(*(near - centre).T).max()
         angle = 2.0 * np.pi * np.arange(7) / 7.0
         ring = centre + reach * np.column_stack([np.cos(angle), np.sin(angle)])
         return np.vstack([near, centre, ring])
     one = order[0]
-    baseline = numbers.tx[one, :2] - numbers.rx[one, :2]
+    baseline = measured.tx[one, :2] - measured.rx[one, :2]
     apart = float(np.hypot(*baseline))
-    path = max(float(numbers.value[one]), 1.0001 * apart + 1e-3)
+    path = max(float(measured.value[one]), 1.0001 * apart + 1e-3)
     major = baseline / apart if apart > 0.0 else np.array([1.0, 0.0])
     minor = np.array([-major[1], major[0]])
     angle = 2.0 * np.pi * np.arange(11) / 11.0
-    middle = 0.5 * (numbers.tx[one, :2] + numbers.rx[one, :2])
+    middle = 0.5 * (measured.tx[one, :2] + measured.rx[one, :2])
     along = 0.5 * path * np.cos(angle)[:, None] * major
     across = 0.5 * np.sqrt(path**2 - apart**2) * np.sin(angle)[:, None] * minor
     return middle + along + across
@@ -346,7 +352,7 @@ def _with_emission(
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P
-    residual, _ = expect_residuals(wide, mu, height, ping.numbers)
+    residual, _ = expect_residuals(wide, mu, height, ping.measured)
     wide[:, n] = np.median(residual[ping.echo]) if ping.echo.any() else 0.0
     covariance[:, n, n] = EMISSION_STD**2
     return wide, covariance, np.append(mask, True)

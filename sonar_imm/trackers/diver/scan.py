@@ -32,12 +32,12 @@ from ...estimation.small_matrices import lift_all
 from ...measurements import Arrivals, NOBODY
 from . import fix_kernels
 from .config import DiverConfig
-from .expectation_kernels import fit_numbers
 from .fix_consistency import FixConsistency, MEMORY
-from .model_set import ModelSet
-from .pings import Ping, ping_numbers, PingUpdate, residuals, update_by_ping
+from .ping_kernels import fit_measurements
+from .pings import Ping, ping_measurements, PingUpdate, residuals, update_by_ping
 from .sensing import Positions
 from .state import cross, DiverState
+from .state_space import ModelSet
 
 FIXES, ARRIVALS = 0, 1
 """Rows of the learnt scale."""
@@ -229,7 +229,7 @@ class Scan:
         self.layout = self.instruments.layout(self.config, self.models.n)
         self.x, self.P = self.layout.widened(self.x, self.P)
         rows, taken = np.arange(len(ping)), np.zeros(len(ping), bool)
-        numbers = ping_numbers(ping, rows, self.config, factor, self.models, self.layout)
+        numbers = ping_measurements(ping, rows, self.config, factor, self.models, self.layout)
         if len(self.x) and numbers.pairs > int(ping.passive):
             good = (self._take_tag if ping.passive else self._take_echoes)(numbers, factor)
             taken[numbers.row[good & numbers.echo]] = True
@@ -243,10 +243,12 @@ class Scan:
         ones: a ghost fits the echoes it was made of, but only those. One that ends up with fewer
         than half of the pairs is not what the ping shows; for it nothing happened.
         """
-        fits = [fit_numbers(*one, self.config.target_z, ping.numbers) for one in self._each()]
+        fits = [
+            fit_measurements(*one, self.config.target_z, ping.measured) for one in self._each()
+        ]
         fit, nis = (np.array(column) for column in zip(*fits))
         near = (nis < NEAR) & ping.echo
-        pairs = [np.flatnonzero((ping.numbers.node == one) & ping.echo) for one in ping.nodes]
+        pairs = [np.flatnonzero((ping.measured.node == one) & ping.echo) for one in ping.nodes]
         explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
         rank = 2 * (len(pairs) - explained) + self.tentative
         before = self._copies()
@@ -369,7 +371,7 @@ class Scan:
         if (good & ping.echo).sum() > int(ping.passive):
             own = ping.compared(good)
             residual, covariance, dof = residuals(*before, own, height)
-            S = covariance + np.diag(own.numbers.variance)
+            S = covariance + np.diag(own.measured.variance)
             self.nis[track] += float(residual @ np.linalg.solve(S, residual))
             self.nis_dof[track] += np.uint16(dof)
         self.x[track], self.P[track], self.mu[track] = after.x, after.P, after.mu
@@ -381,10 +383,10 @@ class Scan:
     def _learn_from_ping(self, track: int, ping: Ping, factor: float) -> None:
         """The scale of arrival times, from the arrivals a track took."""
         residual, covariance, dof = residuals(*self._one(track), ping, self.config.target_z)
-        stated = np.diag(ping.numbers.variance / factor)
+        stated = np.diag(ping.measured.variance / factor)
         if ping.passive and dof:
             # The emission is unknown: differences, whitened by what is stated.
-            projection = difference_projection(ping.numbers.variance / factor)
+            projection = difference_projection(ping.measured.variance / factor)
             residual, stated = projection @ residual, np.eye(dof)
             covariance = projection @ covariance @ projection.T
         if dof:

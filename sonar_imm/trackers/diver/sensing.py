@@ -26,7 +26,7 @@ from ...acoustics.localisation import Localisation, localise
 from ...estimation.arrays import FloatArray, IndexArray, IntArray
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, scan_of
 from .config import DiverConfig
-from .model_set import heights_of
+from .state_space import heights_of
 
 LEAST_VAR_TOA = 1e-13
 """Least variance of an arrival time, s^2: half a millimetre of path. Below it a joint covariance

@@ -29,8 +29,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
 from .fix_consistency import FixConsistency
-from .instruments import Instruments
-from .model_set import ModelSet, Motion
+from .state_space import Instruments, ModelSet, Motion
 
 SCALE_PRIOR = 20.0
 """Numbers measured that the stated covariances are worth when their scale is being learnt."""

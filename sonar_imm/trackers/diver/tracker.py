@@ -48,15 +48,15 @@ from .births import Birth, births_from_ping
 from .config import DiverConfig
 from .fix_consistency import FixConsistency
 from .fix_scans import each_name_once, shows_all, take_fixes
-from .instruments import Layout
+from .georeferencing import Georeferencer
 from .models import build_models
 from .names import hear_named, is_named, merged, names_said, pings_of, remembered
-from .pings import begin_from_ping, FAR, ping_numbers
-from .placing import Placer
+from .pings import begin_from_ping, FAR, ping_measurements
 from .scan import Scan
 from .sensing import position_groups
 from .starts import confirmed, make_room, no_room, starts_of
 from .state import DiverState
+from .state_space import Layout
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
@@ -64,7 +64,7 @@ __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 class DiverTracker:
     """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`."""
 
-    STATE = ('_stream', '_placer')
+    STATE = ('_stream', '_georeferencer')
 
     def __init__(self, config: DiverConfig):
         self.config = config
@@ -86,12 +86,12 @@ class DiverTracker:
             survivor=lambda state: self._nobody(state.life.none_left()),
         )
         self.counts = self._stream.counts
-        self._placer = Placer(self.config, self.counts)
+        self._georeferencer = Georeferencer(self.config, self.counts)
 
     @property
     def origin(self) -> Origin | None:
         """Where the frame of the tracks lies on Earth, None when that is not known."""
-        return self._placer.origin
+        return self._georeferencer.origin
 
     @property
     def frames(self) -> Frames:
@@ -99,7 +99,7 @@ class DiverTracker:
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
-        self.config = self._placer.config = config
+        self.config = self._georeferencer.config = config
 
     def warm(self) -> None:
         imm_kernels.warm()
@@ -145,7 +145,7 @@ class DiverTracker:
             'fixes_mean_nis': now.fixes.mean_nis,
             'fixes_lag_1': now.fixes.lag_1,
             'arrivals_mean_nis': now.arrivals.mean,
-            'waiting_for_vessel': len(self._placer),
+            'waiting_for_vessel': len(self._georeferencer),
             'scale_fixes': float(now.factor()[0]),
             'scale_arrivals': float(now.factor()[1]),
         }
@@ -155,7 +155,7 @@ class DiverTracker:
         state, advice = self._stream.state, 'check var_toa, var_bearing and toa_std'
         lasting = state.fixes.warnings(self.config.fix_bias_std > 0.0)
         heard = state.arrivals.warnings('arrivals', advice)
-        return [*self._placer.warnings(), *lasting, *heard, *no_room(state, self.config)]
+        return [*self._georeferencer.warnings(), *lasting, *heard, *no_room(state, self.config)]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -163,7 +163,7 @@ class DiverTracker:
     def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
         """The stamps and states that are new or changed, oldest first."""
         revised: dict[int, DiverState] = {}
-        for one in self._placer.place(measurement):
+        for one in self._georeferencer.georeference(measurement):
             revised.update(self._stream.revise(one))
         return [(stamp_ns, revised[stamp_ns]) for stamp_ns in sorted(revised)]
 
@@ -317,7 +317,7 @@ class DiverTracker:
         x, P, mu = self.models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
         x, P = layout.widened(x, P)
         factor = self.config.covariance_scale
-        ping = ping_numbers(birth.ping, birth.rows, self.config, factor, self.models, layout)
+        ping = ping_measurements(birth.ping, birth.rows, self.config, factor, self.models, layout)
         # All models of a copy begin alike: one of each is enough to ask.
         M = len(self.models.names)
         first = begin_from_ping(x[0, ::M], P[0, ::M], ping, birth.position, self.config, layout)

@@ -23,11 +23,10 @@ from sonar_imm.acoustics.arrivals_3d import observe
 from sonar_imm.estimation.student_t import student_t_maximum
 from sonar_imm.estimation.subset_update import subset_update
 from sonar_imm.measurements import Arrivals
-from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.ping_kernels import Numbers, subset_ping
-from sonar_imm.trackers.diver.pings import optima, ping_numbers, update_by_ping
-from sonar_imm.trackers.diver.robust_kernels import student_t_ping
+from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
+from sonar_imm.trackers.diver.pings import optima, ping_measurements, update_by_ping
+from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -49,7 +48,7 @@ def case(seed=0):
     value[2] += 9.0
     variance = np.where(kind < 2, 0.09, 1e-4)
     nobody = np.full(6, -1)
-    numbers = Numbers(
+    numbers = PingMeasurements(
         np.arange(6), nobody, kind, value, variance, np.full(6, 0.02), tx, rx, columns
     )
 
@@ -98,7 +97,7 @@ def test_numbers_of_a_node_exclude_each_other_and_angles_follow_their_echo():
     """Two echoes of a pair, the second of which is late, and the bearing of the first."""
     x, P, numbers, _ = case()
     two = np.array([0, 2, 4])
-    some = Numbers(*(np.ascontiguousarray(column[two]) for column in numbers))
+    some = PingMeasurements(*(np.ascontiguousarray(column[two]) for column in numbers))
     some = some._replace(node=np.array([0, 0, 1]), parent=np.array([-1, -1, 0]))
     _, _, _, good = subset_ping(x[None], P[None], np.ones(N, bool), 0.0, some, 0.05, 128)
     assert good[0, 0] + good[0, 1] <= 1.0 + 1e-12
@@ -177,7 +176,7 @@ def test_many_good_arrivals_outvote_any_prior():
     rng = np.random.default_rng(4)
     receivers = rng.uniform(-80.0, 80.0, (9, 3)) * [1.0, 1.0, 0.0]
     measurement = ping_of(np.array([20.0, 35.0, 0.0]), receivers, (np.nan,) * 3, rng=rng)
-    numbers = ping_numbers(measurement, np.arange(9), config, 1.0, models, layout)
+    numbers = ping_measurements(measurement, np.arange(9), config, 1.0, models, layout)
     x, P, mu = (
         one[0] for one in models.new_tracks(np.array([[-30.0, 10.0]]), 25.0 * np.eye(2)[None])
     )
@@ -192,7 +191,7 @@ def test_wild_echoes_only_leave_the_prediction():
     layout = Instruments().layout(config, models.n)
     measurement = ping_of(np.array([20.0, 35.0, 0.0]))
     measurement = evolve(measurement, toa=measurement.toa + [0.02, 0.03, 0.025, 0.022])
-    numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
+    numbers = ping_measurements(measurement, np.arange(4), config, 1.0, models, layout)
     x, P, mu = (
         one[0] for one in models.new_tracks(np.array([[20.0, 35.0]]), 0.25 * np.eye(2)[None])
     )
@@ -213,7 +212,7 @@ def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
     sigma = float(v['sigma'])
     measurement = ping_of(v['truth'], v['rx'], tuple(v['tx']), sigma / 1500.0)
     measurement = evolve(measurement, toa=v['path'] / 1500.0)
-    numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
+    numbers = ping_measurements(measurement, np.arange(4), config, 1.0, models, layout)
     x, P, mu = (
         one[0]
         for one in models.new_tracks(
@@ -238,14 +237,14 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
     place = np.array([20.0, 35.0, -11.0])
     beside = {'depth': np.full(4, 11.0), 'var_depth': np.full(4, 0.04)}
     beside |= {'elevation': np.full(4, -0.2), 'var_elevation': np.full(4, 1e-4)}
-    numbers = ping_numbers(
+    numbers = ping_measurements(
         ping_of(place, **beside), np.arange(4), config, 1.0, models, layout
-    ).numbers
+    ).measured
     assert numbers.kind.tolist() == [4, 0, 3, 0, 3, 0, 3, 0, 3]
     assert numbers.value[0] == -11.0
     flat = DiverConfig(max_tracks=1)
     models = build_models(flat)
-    numbers = ping_numbers(
+    numbers = ping_measurements(
         ping_of(place, **beside), np.arange(4), flat, 1.0, models, Instruments().layout(flat, 3)
-    ).numbers
+    ).measured
     assert numbers.kind.tolist() == [0, 0, 0, 0]

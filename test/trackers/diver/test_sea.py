@@ -22,8 +22,8 @@ import pytest
 
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 

@@ -96,7 +96,7 @@ class _Samples:
         return self.buffer.samples[int(np.abs(stamps - stamp_ns).argmin())]
 
 
-class Placer:
+class Georeferencer:
     """Gives what the tracker can use of each measurement; counts what it cannot in `counts`."""
 
     def __init__(self, config: DiverConfig, counts: Counter[str]):
@@ -130,7 +130,7 @@ class Placer:
             )
         return said
 
-    def place(self, measurement: Measurement) -> list[Measurement]:
+    def georeference(self, measurement: Measurement) -> list[Measurement]:
         """What of `measurement`, and of what waited for it, is ready now, oldest stamp first."""
         if isinstance(measurement, (Fix, Fixes, Arrivals)):
             return [measurement] if self._in_metres() else []
