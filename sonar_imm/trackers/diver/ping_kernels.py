@@ -175,7 +175,7 @@ def _place(
     where it is the worst itself."""
     slot = count
     if count == len(weights):
-        slot = np.argmin(weights)
+        slot = int(np.argmin(weights))
         if weights[slot] >= weight:
             return -1
     X[slot, :] = x

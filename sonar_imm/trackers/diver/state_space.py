@@ -80,10 +80,10 @@ class ModelSet:
 
     names: of the models; E: (M, q, n) outputs; chain: the law of switching; start: state
     components after the position for a new track, mean and variance, (n - 2,) each; initial: (M,)
-    model probabilities of a new track. What `with_depth` and
-    `with_fix_bias` add: outputs, names of the q outputs;
-    height and bias, places of z and of the bias of fixes in the state, -1 for none; heights (K,):
-    where K copies of the models begin in z, which do not switch between each other.
+    model probabilities of a new track. What `with_depth` and `with_fix_bias` add: outputs, names
+    of the q outputs; height and bias, places of z and of the bias of fixes in the state, -1 for
+    none; heights (K,): where K copies of the models begin in z, which do not switch between each
+    other.
     """
 
     names: tuple[str, ...]
@@ -259,11 +259,11 @@ class Instruments:
 
     known: tuple[tuple[int, bool], ...] = ()
 
-    def heard(self, ping: Arrivals, config: DiverConfig) -> Instruments:
+    def with_receivers(self, ping: Arrivals, config: DiverConfig) -> Instruments:
         """With the receivers of a ping; the same where nothing is to be known of them."""
         if not (config.receiver_position_std or config.receiver_clock_std):
             return self
-        ids = {one for one, _ in self.known}
+        ids = {receiver for receiver, _ in self.known}
         new = []
         for receiver in np.unique(ping.rx_id).tolist():
             if receiver not in ids:
@@ -272,8 +272,9 @@ class Instruments:
                 new.append((receiver, not apart <= AT_TRANSMITTER))
         return Instruments((*self.known, *new)) if new else self
 
-    def layout(self, config: DiverConfig, n: int) -> Layout:
-        """Where the errors stand behind n states of motion."""
+    def layout(self, config: DiverConfig, models: ModelSet) -> Layout:
+        """Where the errors stand behind the states of motion of `models`."""
+        n = models.n
         variances: list[float] = []
         estimated: list[bool] = []
         errors = config.systematic_errors
@@ -292,17 +293,25 @@ class Instruments:
                 clocks[receiver] = n + len(variances)
                 variances.append((config.receiver_clock_std * config.sound_speed) ** 2)
                 estimated.append(errors != 'consider')
-        return Layout(n, np.array(variances), np.array(estimated, bool), sound, offsets, clocks)
+        H = np.zeros((1, len(models.E), 2, n + len(variances)))
+        H[0, :, :, :n] = models.fix
+        mask = np.array([True] * n + estimated)
+        return Layout(n, np.array(variances), mask, H, sound, offsets, clocks)
 
 
 @frozen(eq=False)
 class Layout:
-    """n states of motion, then q constants with prior `variances` (q,), `estimated` (q,) or only
-    considered; sound, offsets, clocks: places in the whole state, -1 or absent for none."""
+    """n states of motion, then q constants with prior `variances` (q,).
+
+    mask (n + q,): True for what an update may move, False for what is only considered; H
+    (1, M, 2, n + q): what a fix measures of the whole state; sound, offsets, clocks: places in the
+    whole state, -1 or absent for none.
+    """
 
     n: int
     variances: FloatArray
-    estimated: BoolArray
+    mask: BoolArray
+    H: FloatArray
     sound: int
     offsets: dict[int, int]
     clocks: dict[int, int]
@@ -311,17 +320,12 @@ class Layout:
     def size(self) -> int:
         return self.n + len(self.variances)
 
-    @property
-    def mask(self) -> BoolArray:
-        """(n + q,) True for what an update may move."""
-        return np.concatenate([np.ones(self.n, bool), self.estimated])
-
-    def columns(self, models: ModelSet, receivers: IntArray, passive: bool) -> IntArray:
+    def columns(self, models: ModelSet, receivers: np.ndarray, passive: bool) -> IntArray:
         """(C, 7) for `acoustics.arrivals_3d.observe`; of a tag the emission stands last."""
         out = np.full((len(receivers), 7), -1)
         out[:, X], out[:, Y], out[:, Z], out[:, SOUND] = 0, 1, models.height, self.sound
-        out[:, OFFSET] = [self.offsets.get(one, -1) for one in receivers.tolist()]
-        out[:, CLOCK] = [self.clocks.get(one, -1) for one in receivers.tolist()]
+        out[:, OFFSET] = [self.offsets.get(receiver, -1) for receiver in receivers.tolist()]
+        out[:, CLOCK] = [self.clocks.get(receiver, -1) for receiver in receivers.tolist()]
         if passive:
             out[:, EMISSION] = self.size
         return out
