@@ -294,21 +294,19 @@ class DiverTracker:
         layout = self._layout(now.instruments)
         white, consistency = now.white, now.fixes
         if len(tracks):
-            predicted = now.x, now.P, now.mu, layout.H, fixes.z, fixes.R, tracks, detection
+            innovations = now.x, now.P, now.mu, layout.H, fixes.z, fixes.R, tracks, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
-            white, sums = fix_kernels.watch(*predicted, tentative, white, sums, MEMORY)
+            white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
             consistency = FixConsistency(*sums)
         now = now._replace(white=white, fixes=consistency, score=association.score)
         if association.weights is not None:
-            joint = association.weights, tracks
-            return jipda.update_jointly(now, fixes, *joint, h, layout.H, ~layout.mask)
+            weights, considered = association.weights, ~layout.mask
+            return jipda.update_jointly(now, fixes, weights, tracks, h, layout.H, considered)
         if not len(tracks):
             return now
         if layout.mask.all():
-            after = fix_kernels.update(
-                *(now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R),
-                *(tracks, detection, now.nis, now.nis_dof),
-            )
+            predicted = now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R, tracks, detection
+            after = fix_kernels.update(*predicted, now.nis, now.nis_dof)
         else:
             after = _considered_update(now, fixes, tracks, detection, h, layout)
         x, P, mu, nis, nis_dof, repairs = after

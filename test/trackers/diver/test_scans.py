@@ -28,7 +28,7 @@ from sonar_imm.trackers.diver import fix_kernels, jipda
 from sonar_imm.trackers.diver import tracker as tracker_module
 from sonar_imm.trackers.diver.scan import position_groups
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
-from sonar_imm.trackers.diver.state import FixConsistency, MEMORY, SCALE_MEMORY
+from sonar_imm.trackers.diver.state import FixConsistency, MEMORY, ROWS, SCALE_MEMORY
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -281,25 +281,42 @@ def test_the_learnt_scale_is_that_of_the_last_fixes():
     assert not tracker._stream.state.scale[1].any()  # of arrivals nothing is known
 
 
-def test_arrivals_are_judged_where_no_fix_says_the_same():
+def ping(second):
+    """The echoes of a diver at (20, 30, -2) at four receivers."""
     rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
     leg = np.linalg.norm(rx - [20.0, 30.0, -2.0], axis=1)
+    return Arrivals(
+        stamp_ns=second * SECOND,
+        tx_id=np.zeros(4),
+        rx_id=np.arange(4),
+        tx=np.tile(rx[0], (4, 1)),
+        rx=rx,
+        toa=(leg + leg[0]) / 1500.0,
+        var_toa=np.full(4, 1e-8),
+        bearing=np.full(4, np.nan),
+        var_bearing=np.full(4, np.nan),
+        frame_id='map',
+    )
+
+
+@pytest.mark.parametrize('association', ASSOCIATIONS)
+def test_a_scan_changes_nothing_of_the_state_before_it(association):
+    """States are values: those in the history are what a late measurement is replayed from."""
+    tracker = DiverTracker(
+        DiverConfig(association=association, estimate_covariance_scale=True, target_z=-2.0)
+    )
+    for second in range(1, 10):
+        before = tracker._stream.state
+        kept = {name: np.copy(getattr(before, name)) for name in (*ROWS, 'scale')}
+        seen = scan(second, (20.0, 30.0), (30.0, 5.0 + second), ids=[NOBODY, 7])
+        tracker.process(ping(second) if second % 3 == 0 else seen)
+        assert tracker._stream.state is not before
+        for name, value in kept.items():
+            np.testing.assert_array_equal(getattr(before, name), value, err_msg=name)
+
+
+def test_arrivals_are_judged_where_no_fix_says_the_same():
     tracker = DiverTracker(DiverConfig(target_z=-2.0))
-
-    def ping(second):
-        return Arrivals(
-            stamp_ns=second * SECOND,
-            tx_id=np.zeros(4),
-            rx_id=np.arange(4),
-            tx=np.tile(rx[0], (4, 1)),
-            rx=rx,
-            toa=(leg + leg[0]) / 1500.0,
-            var_toa=np.full(4, 1e-8),
-            bearing=np.full(4, np.nan),
-            var_bearing=np.full(4, np.nan),
-            frame_id='map',
-        )
-
     for second in range(1, 9):
         tracker.process(scan(second, (20.0, 30.0)))
         tracker.process(ping(second))
