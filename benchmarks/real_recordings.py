@@ -35,7 +35,7 @@ from msg_adapters.estimates import read_estimate
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Arrivals, Fix, Rejection
-from sonar_imm.trackers.diver.sensing import locate
+from sonar_imm.trackers.diver.births import locate
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.recordings.convert import convert_arrivals, convert_autoferry, convert_fixes

@@ -24,13 +24,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 import functools
+from itertools import chain
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.placing import Placer
+from sonar_imm.trackers.diver.georeferencing import Georeferencer
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ...recordings.sources import BagError
@@ -57,9 +58,10 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     run = folder.read_run()
     series = _series(folder.read_estimates(), folder.path)
     truth = _truth(run, options)
-    placer = Placer(DiverConfig.from_mapping(run['parameters'], ignore_unknown=True), Counter())
-    placed = (one for measurement in read_measurements(run) for one in placer.place(measurement))
-    fixes = [one for one in placed if isinstance(one, (Fix, Fixes))]
+    config = DiverConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    georeferencer = Georeferencer(config, Counter())
+    placed = chain.from_iterable(map(georeferencer.georeference, read_measurements(run)))
+    fixes = [item for item in placed if isinstance(item, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics = score(series, truth, fixes=raw, cutoff=cutoff)

@@ -12,7 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Soft association of a scan of fixes: every pairing is weighed (`estimation.jipda`).
+"""Joint integrated probabilistic data association of a group of fixes: every pairing is weighed
+(`estimation.jipda`).
 
 What the hits and misses of `estimation.association.Tracks` are to a hard choice, the probability
 of existence is here: it says when a track is confirmed, published and ended.
@@ -20,20 +21,18 @@ of existence is here: it says when a track is confirmed, published and ended.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...estimation import imm_kernels, jipda
-from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation import jipda as joint_association
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
 from .config import DiverConfig
-from .sensing import Positions
-
-if TYPE_CHECKING:
-    from .scan import Scan
-    from .state import DiverState
+from .scan import Positions
+from .state import DiverState
 
 CONFIRMS = 0.9
 """Existence above which a track may be confirmed."""
@@ -55,42 +54,79 @@ NEAR_CONFIRMED, SCANS_CONFIRMED = 0.3, 8
 """The same of a confirmed track and an older confirmed one: two tracks on one diver."""
 
 
-def take_softly(scan: Scan, group: Positions) -> FloatArray:
-    """Update the tracks of `scan` by all fixes they may have caused; gives the probability (D,)
-    that a fix is of a diver that is tracked already."""
-    config = scan.config
-    z, R = np.ascontiguousarray(group.z), np.ascontiguousarray(group.R)
-    H, h = scan.expected_fixes()
+StatusArray = NDArray[np.uint8]
+
+
+class JointWeights(NamedTuple):
+    """Which fixes belong to which tracks, by probability: beta (T, D) of each pair; missed (T,)
+    that a track has no fix; detected (T,) that it has one; existence (T,) now that this is
+    known; excluded (T,): tracks that take no part."""
+
+    beta: FloatArray
+    missed: FloatArray
+    detected: FloatArray
+    existence: FloatArray
+    excluded: BoolArray
+
+    def likeliest(self) -> tuple[IndexArray, IntArray]:
+        """The tracks (t,) for which a hit is likelier than a miss, and the likeliest fix (t,) of
+        each."""
+        hit = np.flatnonzero(self.detected > 0.5 * self.existence)
+        return hit, self.beta[hit].argmax(axis=1) if len(hit) else hit
+
+
+def joint_weights(
+    now: DiverState, fixes: Positions, h: FloatArray, H: FloatArray, excluded: BoolArray
+) -> JointWeights:
+    """Weigh all pairings of tracks and `fixes`; h (T, M, 2) expected by H (1, M, 2, n)."""
+    config = fixes.config
     threshold = gate_threshold(config.gate_probability, 2)
-    mixture, nis = jipda.likelihoods(h, H, scan.P, scan.mu, z, R, threshold)
-    nis[scan.named] = np.inf
-    seen = ~scan.named & (group.whole | (nis <= threshold).any(axis=1))
-    existence = known_existence(scan.existence, scan.before.life.status)
-    beta, missed, after = jipda.associate(
+    mixture, nis = joint_association.likelihoods(h, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+    nis[excluded] = np.inf
+    seen = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
+    beta, missed, existence = joint_association.associate(
         mixture / (config.clutter_density + config.birth_density),
         nis,
-        existence,
+        known_existence(now.existence, now.life.status),
         np.where(seen, config.detection_probability, 0.0),
         threshold,
     )
-    detected = beta.sum(axis=1)
-    hit = np.flatnonzero(detected > 0.5 * after)
-    if len(hit):
-        best = beta[hit].argmax(axis=1)
-        scan.watch(group, hit, best, H)
-        scan.nis[hit] += np.square(scan.white[hit]).sum(axis=1)
-        scan.nis_dof[hit] += np.uint16(2)
-    scan.x, scan.P, scan.mu, repairs = jipda.update(
-        scan.x, scan.P, scan.mu, h, H, z, R, beta, missed, ~scan.layout.mask
+    return JointWeights(beta, missed, beta.sum(axis=1), existence, excluded)
+
+
+def update_jointly(
+    now: DiverState,
+    fixes: Positions,
+    weights: JointWeights,
+    hit: IndexArray,
+    h: FloatArray,
+    H: FloatArray,
+    considered: BoolArray,
+) -> DiverState:
+    """Update the tracks by all fixes they may have caused; hit (t,): those whose whitened
+    innovation is new; considered (n,): what an update does not move."""
+    nis, nis_dof = now.nis.copy(), now.nis_dof.copy()
+    nis[hit] += np.square(now.white[hit]).sum(axis=1)
+    nis_dof[hit] += np.uint16(2)
+    x, P, mu, repairs = joint_association.update(
+        now.x, now.P, now.mu, h, H, fixes.z, fixes.R, weights.beta, weights.missed, considered
     )
-    scan.repairs += repairs
-    scan.existence = np.where(scan.named, scan.existence, after)
-    scan.evidence = scan.evidence + detected
-    scan.score = np.where(scan.named, scan.score, jipda.log_odds(after))
-    return np.asarray(beta.sum(axis=0))
+    # The life of a named track hangs on its own fixes.
+    named = now.target_id != NOBODY
+    return now._replace(
+        x=x,
+        P=P,
+        mu=mu,
+        nis=nis,
+        nis_dof=nis_dof,
+        repairs=now.repairs + repairs,
+        existence=np.where(named, now.existence, weights.existence),
+        evidence=now.evidence + weights.detected,
+        score=np.where(weights.excluded, now.score, joint_association.log_odds(weights.existence)),
+    )
 
 
-def known_existence(existence: FloatArray, status: IntArray) -> FloatArray:
+def known_existence(existence: FloatArray, status: StatusArray) -> FloatArray:
     """Existence (T,), where it is not known (a track that began otherwise) by the status."""
     guess = np.where(status == TENTATIVE, 0.5, CONFIRMS)
     return np.where(np.isnan(existence), guess, existence)
@@ -103,16 +139,11 @@ def birth_existence(config: DiverConfig, claimed: FloatArray) -> FloatArray:
     return np.asarray(new * (1.0 - claimed))
 
 
-def published(existence: FloatArray) -> BoolArray:
-    """Which tracks (T,) are published: those that probably exist, or are counted by hits."""
-    return np.asarray(~(existence <= PUBLISHES))
-
-
 class Judged(NamedTuple):
     """What becomes of tracks (T,) that live by their existence: status; alive; near_to and
     near_for as in `DiverState`."""
 
-    status: IntArray
+    status: StatusArray
     alive: BoolArray
     near_to: IntArray
     near_for: IntArray
@@ -132,10 +163,7 @@ def judge(now: DiverState, hit: BoolArray, looked: BoolArray, E: FloatArray) -> 
     status = np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
     if not looked.any():
         return Judged(status, alive, now.near_to, now.near_for)
-    n = E.shape[-1]
-    x, P = np.ascontiguousarray(now.x[..., :n]), np.ascontiguousarray(now.P[..., :n, :n])
-    mean, covariance = imm_kernels.combine(x, P, now.mu, np.ascontiguousarray(E))
-    near_to, near_for = coalescence(now, was, mean, covariance)
+    near_to, near_for = coalescence(now, was, *now.positions(E))
     patience = np.where(was, SCANS_CONFIRMED, SCANS_TENTATIVE)
     return Judged(status, alive & (near_for < patience), near_to, near_for)
 
@@ -148,7 +176,7 @@ def coalescence(
     mean (T, 2) and covariance (T, 2, 2) of the positions. Named tracks take no part.
     """
     ids, free = now.life.track_id.astype(np.int64), now.target_id == NOBODY
-    partner, distance = jipda.nearest_older(mean, covariance, ids, free, confirmed)
+    partner, distance = joint_association.nearest_older(mean, covariance, ids, free, confirmed)
     near = distance < np.where(confirmed, NEAR_CONFIRMED, NEAR_TENTATIVE)
     near_to = np.where(near, ids[partner], 0)
     near_for = np.where(near, np.where(near_to == now.near_to, now.near_for, 0) + 1, 0)

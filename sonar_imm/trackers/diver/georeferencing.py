@@ -18,14 +18,15 @@ Latitude and longitude become metres east and north of the origin. A relative fi
 vessel's pose is known around its stamp, from ``nav`` or from ``nav_fix`` and ``heading``, and is
 composed with it. Everything else goes through as it is.
 
-Without a stated origin the first position in latitude and longitude is it, once one is used. Then
-metres that others have measured are from somewhere else, and cannot be used beside it: what came
-first stays.
+Without a stated origin the first position in latitude and longitude is it, once such a position is
+used. Then metres that others have measured are from somewhere else, and cannot be used beside it:
+what came first stays.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -83,9 +84,9 @@ class _Samples:
         restarted = decision.verdict == 'restart'
         if restarted:
             self.buffer = NavigationBuffer()
-        for one in decision.released:
+        for released in decision.released:
             counts['poses'] += 1
-            self.buffer = self.buffer.inserted(one)
+            self.buffer = self.buffer.inserted(released)
         if self.buffer.stamps:
             self.buffer = self.buffer.since(self.buffer.stamps[-1] - self._kept_ns)
         return restarted
@@ -96,7 +97,7 @@ class _Samples:
         return self.buffer.samples[int(np.abs(stamps - stamp_ns).argmin())]
 
 
-class Placer:
+class Georeferencer:
     """Gives what the tracker can use of each measurement; counts what it cannot in `counts`."""
 
     def __init__(self, config: DiverConfig, counts: Counter[str]):
@@ -116,21 +117,21 @@ class Placer:
 
     def warnings(self) -> list[str]:
         """What the user has to do, in sentences."""
-        said = []
+        sentences = []
         if self._counts['no_origin']:
-            said.append(
+            sentences.append(
                 f'{self._counts["no_origin"]} positions cannot be used: those in metres and those '
                 'in latitude and longitude need origin_latitude and origin_longitude to stand '
                 'beside each other'
             )
-        if len(self._waiting) > 1 and not self._heard():
-            said.append(
+        if len(self._waiting) > 1 and not self._vessel_known():
+            sentences.append(
                 f'{len(self._waiting)} relative fixes wait for the pose of the vessel: nav, or '
                 'nav_fix and heading, or the parameter vessel: fixed'
             )
-        return said
+        return sentences
 
-    def place(self, measurement: Measurement) -> list[Measurement]:
+    def georeference(self, measurement: Measurement) -> list[Measurement]:
         """What of `measurement`, and of what waited for it, is ready now, oldest stamp first."""
         if isinstance(measurement, (Fix, Fixes, Arrivals)):
             return [measurement] if self._in_metres() else []
@@ -210,7 +211,7 @@ class Placer:
 
     # -- relative to the vessel ------------------------------------------------------------------
 
-    def _heard(self) -> bool:
+    def _vessel_known(self) -> bool:
         places, headings = self._places.buffer.stamps, self._headings.buffer.stamps
         return bool(self._poses.buffer.stamps or (places and headings))
 
@@ -240,7 +241,7 @@ class Placer:
                 except Rejection:  # poses that leap within nanoseconds lead beyond the Earth
                     self._counts['vessel_pose_gap'] += 1
         self._waiting = waiting
-        return sorted(done, key=lambda one: one.stamp_ns)
+        return sorted(done, key=attrgetter('stamp_ns'))
 
     def _readiness(self, stamp_ns: int) -> Readiness:
         """Whether the pose of the vessel at a stamp is known, will be, or never will be."""
@@ -251,8 +252,8 @@ class Placer:
             nanoseconds(self.config.vessel_max_extrapolation),
         )
         parts = (self._places, self._headings) if self._by_places() else (self._poses,)
-        said = [one.buffer.readiness(stamp_ns, stamp_ns, *limits) for one in parts]
-        return 'wait' if 'wait' in said else 'gap' if 'gap' in said else 'ready'
+        known = [part.buffer.readiness(stamp_ns, stamp_ns, *limits) for part in parts]
+        return 'wait' if 'wait' in known else 'gap' if 'gap' in known else 'ready'
 
     def _vessel(self, stamp_ns: int) -> _Vessel:
         config = self.config
