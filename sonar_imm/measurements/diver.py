@@ -248,3 +248,32 @@ class Arrivals:
     def passive(self) -> bool:
         """True when the target itself emits, at an unknown time."""
         return len(self) > 0 and bool(np.isnan(self.tx).all())
+
+
+@frozen(eq=False, kw_only=True)
+class Start:
+    """A target to begin a track at.
+
+    position: (3,) x, y, z in `frame_id`, the frame of the tracks, m; z is not used by a tracker of
+    two dimensions. covariance: (2, 2) of x and y, m^2; there is no start without one.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=floats(3))
+    covariance: FloatArray = field(converter=floats(2, 2))
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if not np.isfinite(self.position[:2]).all():
+            raise Rejection('nan', 'the start has a position that is not finite')
+        if np.abs(self.position[:2]).max() > FARTHEST_FIX:
+            raise Rejection(
+                'out_of_range',
+                f'the start lies at {self.position[:2]}, further than 100,000 km from the origin',
+            )
+        check_covariance(self.covariance, 'a start')
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('start', self.position, self.covariance)

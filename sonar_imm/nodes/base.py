@@ -51,11 +51,10 @@ from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, FrameTree, Rejection, RepeatGuard
+from ..measurements import Rejection
 from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
 from ..parameters import ConfigError
 from ..trackers import SYSTEMS
-from ..trackers.frames import FrameDoor
 from .answers import Answers
 from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Announcer, Meter, Reporter

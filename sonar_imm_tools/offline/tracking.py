@@ -34,10 +34,10 @@ import numpy as np
 
 from sonar_imm import __version__
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import FrameGuard, Rejection, RepeatGuard
+from sonar_imm.intake import Intake
+from sonar_imm.measurements import Rejection
 from sonar_imm.parameters import Config
 from sonar_imm.trackers import System
-from sonar_imm.trackers.frames import FrameDoor
 
 from .. import SECOND
 from ..recordings.measurements import measurements_of
@@ -150,8 +150,7 @@ class OfflineRun:
         self.messages = 0
         self.durations = array('d')
         self._window_ns = window_ns(config)
-        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
-        self._door = FrameDoor(self.tracker, FrameGuard(self.options.frame_id))
+        self._intake = Intake(self.tracker, self.options.frame_id)
 
     @property
     def total(self) -> int:
@@ -205,7 +204,6 @@ class OfflineRun:
         return made
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
-        door = self._door
         for heard in measurements_of(
             self.bag,
             self.system.name,
@@ -222,9 +220,7 @@ class OfflineRun:
             try:
                 if isinstance(heard.measurement, Rejection):
                     raise heard.measurement
-                measurement = door.admit(heard.measurement)
-                if measurement is not None:
-                    measurement = self._repeats.fresh(measurement)
+                measurement = self._intake.admit(heard.measurement)
             except Rejection as rejection:
                 self._refuse(heard.topic, rejection)
                 continue
@@ -261,8 +257,8 @@ class OfflineRun:
         for name in kept:
             if count := health.get(name):
                 counts[name] = int(count)
-        if self._repeats.rows:
-            counts['repeated_rows'] = self._repeats.rows
+        if self._intake.repeats.rows:
+            counts['repeated_rows'] = self._intake.repeats.rows
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
@@ -277,7 +273,7 @@ class OfflineRun:
 
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
-        return {'mounting': self._door.mounting} if self._door.mounting else {}
+        return {'mounting': self._intake.mounting} if self._intake.mounting else {}
 
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""

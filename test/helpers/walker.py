@@ -23,7 +23,7 @@ import numpy as np
 import msg_adapters.displays.bathymetry
 import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import FrameGuard, Frames
+from sonar_imm.intake import KnownFrames
 from sonar_imm.parameters import Config, parameter
 from sonar_imm.trackers import System, SYSTEMS
 
@@ -51,7 +51,7 @@ class WalkerConfig(Config):
 class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
 
-    STATE = ('counts', 'fixes')
+    STATE = ('counts', 'fixes', 'frames')
 
     def __init__(self, config):
         self.config = config
@@ -61,7 +61,7 @@ class WalkerTracker:
 
     def reset(self):
         self.fixes = {}
-        self.frames = Frames(FrameGuard(), ())
+        self.frames = KnownFrames()
 
     def reconfigure(self, config):
         self.config = config

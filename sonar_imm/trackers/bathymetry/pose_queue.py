@@ -28,8 +28,9 @@ import numpy as np
 
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
-from ...estimation.history import StampGate
-from ...measurements import Altitude, FrameGuard, nanoseconds, Navigation, Rejection, Snapshot
+from ...intake import KnownFrames
+from ...intake.stream import Stream, StreamRules
+from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 
@@ -56,8 +57,8 @@ class PoseQueue:
     def __init__(self, counts: Counter[str]):
         self.counts = counts
         self.heard = False
-        self.frames = FrameGuard()
-        self._gate: StampGate[Navigation] = StampGate(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
+        rules = StreamRules(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
+        self._stream = Stream((Navigation,), rules, counts)
         self._buffer = NavigationBuffer()
         self._altitudes: list[Altitude] = []
         self._waiting: list[Snapshot] = []
@@ -66,23 +67,20 @@ class PoseQueue:
         """How many pings wait."""
         return len(self._waiting)
 
+    @property
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
+
     def add_pose(self, sample: Navigation) -> None:
         """Take one pose in. A clock that was set back forgets all poses."""
-        try:
-            self.frames.check(sample)
-        except Rejection:
-            self.counts['other_frame'] += 1
-            return
-        decision = self._gate.decide(sample.stamp_ns, sample)
-        decision.count_in(self.counts)
-        if decision.verdict == 'restart':
+        admitted = self._stream.admit(sample)
+        if admitted.restarted:
             self.counts['navigation_gap'] += len(self._waiting)
             self._buffer, self._altitudes, self._waiting = NavigationBuffer(), [], []
-        for one in decision.released:
+        for pose in admitted.items:
             self.heard = True
-            self.frames.settle(one)
             self.counts['poses'] += 1
-            self._buffer = self._buffer.inserted(one)
+            self._buffer = self._buffer.inserted(pose)
         if self._buffer.stamps:
             self._buffer = self._buffer.since(self._buffer.stamps[-1] - KEPT_NS)
 
@@ -113,7 +111,7 @@ class PoseQueue:
             else:
                 poses = self._buffer.poses(stamps)
                 altitude = self._altitude(int(stamps[-1]))
-                done.append(PosedPing(snapshot, poses, self.frames.frame_id, altitude))
+                done.append(PosedPing(snapshot, poses, self._stream.frame_id, altitude))
         self._waiting = waiting
         return done
 

@@ -44,7 +44,8 @@ from attrs import evolve
 import numpy as np
 
 from ...estimates import Estimate
-from ...measurements import Altitude, Frames, Navigation, Snapshot
+from ...intake import KnownFrames
+from ...measurements import Altitude, Navigation, Snapshot
 from .config import BathymetryConfig
 from .consistency import noise_warnings
 from .coupling import Alone, Coupling, Favoured
@@ -79,8 +80,8 @@ class BathymetryTracker:
         self._residuals: deque[float] = deque(maxlen=PINGS_JUDGED)
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._queue.frames, (Navigation,))
+    def frames(self) -> KnownFrames:
+        return self._queue.frames
 
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config

@@ -21,7 +21,7 @@ probabilities of turning. A scan of the world goes through
     predict -> fixes: gate, associate, update; pings: explain -> learn -> prune -> spawn
 
 and the whole of what is known after it is one value, `DiverState`, so that a late measurement is
-put in its place by computing the scans after it again (`trackers.stream`).
+put in its place by computing the scans after it again (`intake.stream`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
@@ -40,9 +40,10 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
 from ...estimation.association import Tracks
 from ...estimation.association_kernels import TENTATIVE
-from ...measurements import Arrivals, Fix, Fixes, Frames, Measurement, NOBODY, Start
+from ...intake import KnownFrames
+from ...intake.stream import ReplayStream, StreamRules
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
-from ..stream import ReplayStream, StreamRules
 from . import fix_kernels, soft
 from .births import Birth, births_from_ping
 from .config import DiverConfig
@@ -94,8 +95,8 @@ class DiverTracker:
         return self._placer.origin
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)

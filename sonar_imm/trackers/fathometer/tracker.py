@@ -45,8 +45,9 @@ from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_members import find_members
 from ...estimation.set_model import banded_transition, gaussian_move, SetModel
-from ...measurements import ArrayDepth, CrossSpectra, Frames, Pressure, Rejection, Trace
-from ..stream import OnceStream, StreamRules
+from ...intake import KnownFrames
+from ...intake.stream import OnceStream, StreamRules
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
 from .array_response import array_response, rank_deficient
 from .config import FathometerConfig
@@ -146,8 +147,8 @@ class FathometerTracker:
             self._begin(self._lattice)
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)

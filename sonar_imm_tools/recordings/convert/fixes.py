@@ -24,7 +24,8 @@ import numpy as np
 
 from msg_adapters.fixes import check_size, write_fix
 from msg_adapters.scans import write_scan
-from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection, RepeatGuard
+from sonar_imm.intake import RepeatFilter
+from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..csv_table import CsvOptions, CsvTable, Row
@@ -58,7 +59,7 @@ def convert_fixes(
     `convert_truth`, for the same bag and the same origin.
 
     Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
-    the same diver again a moment later, see `RepeatGuard`) stay, and are counted: the tracker
+    the same diver again a moment later, see `RepeatFilter`) stay, and are counted: the tracker
     leaves them out.
     """
     table = CsvTable(path, options)
@@ -66,7 +67,7 @@ def convert_fixes(
     frame = LocalFrame(table, origin)
     report = ConversionReport(Path(out))
 
-    repeats: dict[str, RepeatGuard] = {}
+    repeats: dict[str, RepeatFilter] = {}
     repeated: list[int] = []
 
     def parse(row: Row) -> tuple[Fix, str]:
@@ -80,7 +81,7 @@ def convert_fixes(
         )
         check_size(fix)
         try:
-            repeats.setdefault(name, RepeatGuard(REPEAT_TIME)).fresh(fix)
+            repeats.setdefault(name, RepeatFilter(REPEAT_TIME)).fresh(fix)
         except Rejection:
             repeated.append(row.line)
         return fix, name

@@ -26,15 +26,22 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from .checks import nanoseconds, Rejection
-from .diver import Fix, Fixes, NOBODY
-from .positions import GeodeticFix, RelativeFix, VesselFix
+from ..measurements import (
+    Fix,
+    Fixes,
+    GeodeticFix,
+    nanoseconds,
+    NOBODY,
+    Rejection,
+    RelativeFix,
+    VesselFix,
+)
 
 MOST_KEPT = 10_000
 """Positions remembered; the oldest are forgotten for more."""
 
 
-class RepeatGuard:
+class RepeatFilter:
     """Lets new positions pass. rows: how many rows of scans were left out so far."""
 
     def __init__(self, limit: float):

@@ -17,8 +17,8 @@
 from attrs import frozen
 import pytest
 
+from sonar_imm.intake.stream import Admitted, OnceStream, ReplayStream, StreamRules
 from sonar_imm.trackers.shared_parameters import StampParameters, StreamParameters
-from sonar_imm.trackers.stream import Admitted, OnceStream, ReplayStream, StreamRules
 
 S = 10**9
 RULES = StreamRules(window_ns=10 * S, max_gap_ns=600 * S, restart_after=5)

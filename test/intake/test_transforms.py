@@ -19,13 +19,12 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.intake.frames import moved, TransformTree
 from sonar_imm.measurements import (
     Arrivals,
     Detections,
     Fix,
     Fixes,
-    FrameTree,
-    moved,
     Navigation,
     Rejection,
     Start,
@@ -51,7 +50,7 @@ def matrix(pose):
 def test_a_chain_of_transforms_is_the_product_of_its_matrices():
     rng = np.random.default_rng(3)
     a, b, c, d = (a_pose(rng) for _ in range(4))
-    tree = FrameTree()
+    tree = TransformTree()
     tree.add(StaticTransforms(poses={'base': ('map', a), 'arm': ('base', b)}))
     tree.add(StaticTransforms(poses={'sonar': ('arm', c), 'keel': ('base', d)}))
     A, B, C, D = (matrix(one) for one in (a, b, c, d))
@@ -67,7 +66,7 @@ def test_a_chain_of_transforms_is_the_product_of_its_matrices():
 
 
 def test_what_is_said_again_replaces_and_a_loop_ends():
-    tree = FrameTree()
+    tree = TransformTree()
     one, two = (Pose(np.array([x, 0.0, 0.0]), np.eye(3)) for x in (1.0, 2.0))
     tree.add(StaticTransforms(poses={'a': ('b', one), 'b': ('a', one)}))
     assert tree.pose('nowhere', 'a') is None
