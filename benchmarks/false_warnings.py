@@ -39,7 +39,7 @@ import yaml
 from benchmarks.image_tracks import detected
 from benchmarks.tables import write_json
 from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarImage, Trace
-from sonar_imm.nodes.health import Finding, Hysteresis, WARN
+from sonar_imm.nodes.diagnostics import Finding, Hysteresis, WARN
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.own_parameters import own_parameters

@@ -19,9 +19,10 @@ counted, none is raised:
 
     type accepted? -> frame the same as before? -> stamp in the stream? (`estimation.history`)
 
-What was held before a restart of the clock passes the first two once more. Two streams differ in what happens then. `OnceStream` hands each measurement out once and for good,
-in rising order of stamps. `ReplayStream` puts each in its place in time and computes the states
-after it again, so that the order of arrival changes nothing:
+What was held before a restart of the clock passes the first two once more. Two streams differ in
+what happens then. `OnceStream` hands each measurement out once and for good, in rising order of
+stamps. `ReplayStream` puts each in its place in time and computes the states after it again, so
+that the order of arrival changes nothing:
 
     def process(self, measurement):
         return [self._estimate(state) for _, state in self._stream.revise(measurement)]

@@ -50,8 +50,9 @@ from msg_adapters.soundings import write_soundings
 
 from ..estimates import Estimate
 from ..soundings import soundings_of
-from .base import run, TrackerNode
+from .base import TrackerNode
 from .messages import make
+from .running import run
 
 
 class BathymetryNode(TrackerNode):

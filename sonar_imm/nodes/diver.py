@@ -39,8 +39,9 @@ from msg_adapters.displays.tracks import confirmed_rows
 from msg_adapters.geodetic import write_geo
 
 from ..estimates import Estimate
-from .base import run, TrackerNode
+from .base import TrackerNode
 from .messages import make
+from .running import run
 
 
 class DiverNode(TrackerNode):

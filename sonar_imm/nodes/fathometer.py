@@ -38,8 +38,9 @@ from typing import Any
 from msg_adapters.array_records import write_response
 
 from ..estimates import Estimate
-from .base import run, TABLE, TrackerNode
+from .base import TABLE, TrackerNode
 from .messages import make
+from .running import run
 
 
 class FathometerNode(TrackerNode):

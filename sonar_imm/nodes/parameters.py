@@ -90,13 +90,21 @@ class NodeParameters:
         """Give the value of one of the further parameters."""
         return self._chosen[name]
 
+    def values(self) -> dict[str, Any]:
+        """The parameters of all classes by name; where two share one, the last one's."""
+        return {
+            name: value
+            for config in self._configs.values()
+            for name, value in config.as_dict().items()
+        }
+
     def on_change(self, apply: Callable[[], None]) -> None:
         """Call `apply` after a change made from outside has been taken over."""
 
         def take_over(changed: list[Parameter]) -> None:
             if ours := self._ours(changed):
                 values = _plain_values(ours)
-                self._configs = self._build(self._values() | values)
+                self._configs = self._build(self.values() | values)
                 apply()
                 told = ', '.join(f'{name} is {value} now' for name, value in values.items())
                 self._node.get_logger().info(f'parameters changed: {told}')
@@ -152,15 +160,8 @@ class NodeParameters:
             raise ConfigError(*problems)
         return built
 
-    def _values(self) -> dict[str, Any]:
-        return {
-            name: value
-            for config in self._configs.values()
-            for name, value in config.as_dict().items()
-        }
-
     def _declare(self, spec: ParameterSpec) -> None:
-        value, told = (self._values() | self._chosen)[spec.name], descriptor(spec)
+        value, told = (self.values() | self._chosen)[spec.name], descriptor(spec)
         if value != []:
             self._node.declare_parameter(spec.name, value, told, ignore_override=True)
             return
@@ -178,7 +179,7 @@ class NodeParameters:
     def _check(self, changed: list[Parameter]) -> SetParametersResult:
         """Judge a change of good type, which rclpy has checked by now."""
         try:
-            self._build(self._values() | _plain_values(self._ours(changed)))
+            self._build(self.values() | _plain_values(self._ours(changed)))
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

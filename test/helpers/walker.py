@@ -123,7 +123,8 @@ def register(set_item):
 
 
 def main():
-    from sonar_imm.nodes.base import run, TrackerNode
+    from sonar_imm.nodes.base import TrackerNode
+    from sonar_imm.nodes.running import run
 
     register(dict.__setitem__)
     return run(lambda: TrackerNode('walker'))
