@@ -71,10 +71,10 @@ class Fix:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key('fix' + self.sensor, self.position, self.covariance, _said(self))
+        return content_key('fix' + self.sensor, self.position, self.covariance, _target_ids(self))
 
 
-def _said(fix: Fix) -> NDArray | None:
+def _target_ids(fix: Fix) -> NDArray | None:
     """The name of a fix as an array, None when it has none."""
     return None if fix.target_id == NOBODY else np.array([fix.target_id], np.int32)
 
@@ -155,7 +155,7 @@ def usable_fixes(position: FloatArray, covariance: FloatArray | None) -> NDArray
         a, b, c, d = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
         scale = np.abs(covariance).max(axis=(1, 2), initial=0.0)
         # Relative to the largest entry, so that nothing overflows; as `check_covariance`.
-        a, b, c, d = (one / np.where(scale > 0.0, scale, 1.0) for one in (a, b, c, d))
+        a, b, c, d = (part / np.where(scale > 0.0, scale, 1.0) for part in (a, b, c, d))
         least = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
         known = np.isfinite(scale) & (scale > 0.0) & (np.abs(b - c) <= 1e-6) & (least > 1e-12)
         return np.asarray(usable & (known | np.isnan(covariance).all(axis=(1, 2))))
@@ -228,8 +228,8 @@ class Arrivals:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        one = self.in_order()
-        return content_key('arrivals', *(getattr(one, name) for name in ARRIVAL_COLUMNS))
+        ordered = self.in_order()
+        return content_key('arrivals', *(getattr(ordered, name) for name in ARRIVAL_COLUMNS))
 
     def in_order(self) -> Arrivals:
         """The same ping with its rows in the order of their content."""

@@ -138,12 +138,12 @@ class Hysteresis:
         """The findings that count now, the worst first. quiet: no message came, which says nothing
         for or against what messages show. One that is just not there keeps its last sentence until
         it is over."""
-        now = {(one.key, one.level): one for one in findings}
-        for name, one in now.items():
+        now = {(finding.key, finding.level): finding for finding in findings}
+        for name, finding in now.items():
             self._found[name] = self._found.get(name, 0) + 1
             self._missed.pop(name, None)
-            if one.at_once or self._found[name] >= self._rise or name in self._counting:
-                self._counting[name] = one
+            if finding.at_once or self._found[name] >= self._rise or name in self._counting:
+                self._counting[name] = finding
         for name in [name for name in self._found if name not in now]:
             known = self._counting.get(name)
             if quiet and not (known and (known.timed or known.passing)):
@@ -154,7 +154,7 @@ class Hysteresis:
             self._missed[name] = self._missed.get(name, 0) + 1
             if known.passing or self._missed[name] >= self._fall:
                 del self._counting[name], self._found[name], self._missed[name]
-        return sorted(self._counting.values(), key=lambda one: -_WORSE.index(one.level))
+        return sorted(self._counting.values(), key=lambda finding: -_WORSE.index(finding.level))
 
 
 def worst(levels: Iterable[bytes]) -> bytes:
@@ -162,18 +162,18 @@ def worst(levels: Iterable[bytes]) -> bytes:
     return max(levels, key=_WORSE.index, default=OK)
 
 
-def told(findings: list[Finding], otherwise: str) -> tuple[bytes, str]:
+def level_and_text(findings: list[Finding], otherwise: str) -> tuple[bytes, str]:
     """The level of a status and its text."""
-    text = '; '.join(dict.fromkeys(one.sentence for one in findings))
-    return worst(one.level for one in findings), text or otherwise
+    text = '; '.join(dict.fromkeys(finding.sentence for finding in findings))
+    return worst(finding.level for finding in findings), text or otherwise
 
 
 def summary(name: str, parts: Iterable[DiagnosticStatus]) -> DiagnosticStatus:
     """One status for a node: the worst level of its `parts`, and the sentences behind it."""
     parts = list(parts)
-    level = worst(one.level for one in parts)
-    text = '; '.join(dict.fromkeys(one.message for one in parts if one.level == level))
-    pairs = [(one.name.rpartition(': ')[2], one.message) for one in parts]
+    level = worst(part.level for part in parts)
+    text = '; '.join(dict.fromkeys(part.message for part in parts if part.level == level))
+    pairs = [(part.name.rpartition(': ')[2], part.message) for part in parts]
     return DiagnosticStatus(
         level=level,
         name=name,
@@ -300,10 +300,10 @@ class Reporter:
         """Sentences about what is needed and does not come."""
         sentences, last = [], self._meter.last
         for names in self._needed:
-            heard = [name for name in names if name in last]
-            silence = now - max((last[name] for name in heard), default=-np.inf)
-            where = ' or '.join(self._topics[name] for name in heard or names)
-            if not heard:
+            arrived = [name for name in names if name in last]
+            silence = now - max((last[name] for name in arrived), default=-np.inf)
+            where = ' or '.join(self._topics[name] for name in arrived or names)
+            if not arrived:
                 sentences.append(f'no message yet on {where}')
             elif silence > stale_after:
                 sentences.append(f'no message for {silence:.1f} s on {where}')
@@ -349,7 +349,8 @@ class Reporter:
             for topic, policy in sorted(incompatible.items())
         }
         found = [
-            Finding(one.split(' for ')[0], STALE, one, at_once=True, passing=True) for one in stale
+            Finding(silence.split(' for ')[0], STALE, silence, at_once=True, passing=True)
+            for silence in stale
         ]
         if refused and refused.total() >= fresh.total():
             sentence = f'every message is refused: {_most(refused)}'
@@ -365,9 +366,9 @@ class Reporter:
             found.append(Finding('incompatible', WARN, sentence, timed=True))
         if not stale:
             gone = self._gone(now, stale_after)
-            found += [Finding(f'gone {one}', WARN, text, timed=True) for one, text in gone]
+            found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]
         counting = self._of_input.settle(found, quiet=not fresh)
-        level, text = told(counting, 'receiving')
+        level, text = level_and_text(counting, 'receiving')
         if not enabled:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
@@ -387,7 +388,7 @@ class Reporter:
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
-        found = [Finding(_wording(one), WARN, one) for one in warnings]
+        found = [Finding(_wording(warning), WARN, warning) for warning in warnings]
         if stale and enabled:
             sentence = f'waiting for input: {stale[0]}'
             found.append(Finding('stale', STALE, sentence, at_once=True, passing=True))
@@ -404,7 +405,7 @@ class Reporter:
             sentence = 'an internal error was caught, see the log'
             found.append(Finding('internal_error', ERROR, sentence, at_once=True))
         counting = self._of_tracker.settle(found, quiet=quiet)
-        level, text = told(counting, 'tracking' if enabled else 'disabled')
+        level, text = level_and_text(counting, 'tracking' if enabled else 'disabled')
         return self._status('tracker', level, text, values)
 
     def _status(
@@ -431,12 +432,12 @@ class Announcer:
         self._name = name
         self.health = DiagnosticStatus(level=STALE, name=name, message='starting')
         self._all = endpoints.advertise(DiagnosticArray, '/diagnostics', output_qos())
-        self._one = endpoints.advertise(DiagnosticStatus, '~/health', latched_qos())
+        self._summary = endpoints.advertise(DiagnosticStatus, '~/health', latched_qos())
 
     def publish(self, message: DiagnosticArray) -> None:
         self._all.publish(message)
         self.health = summary(self._name, message.status)
-        self._one.publish(self.health)
+        self._summary.publish(self.health)
 
 
 def _share_lost(missing: Counter[str], fresh: Counter[str]) -> str:

@@ -106,8 +106,8 @@ class NodeParameters:
                 values = _plain_values(ours)
                 self._configs = self._build(self.values() | values)
                 apply()
-                told = ', '.join(f'{name} is {value} now' for name, value in values.items())
-                self._node.get_logger().info(f'parameters changed: {told}')
+                changes = ', '.join(f'{name} is {value} now' for name, value in values.items())
+                self._node.get_logger().info(f'parameters changed: {changes}')
 
         self._node.add_post_set_parameters_callback(take_over)
 
@@ -161,17 +161,17 @@ class NodeParameters:
         return built
 
     def _declare(self, spec: ParameterSpec) -> None:
-        value, told = (self.values() | self._chosen)[spec.name], descriptor(spec)
+        value, described = (self.values() | self._chosen)[spec.name], descriptor(spec)
         if value != []:
-            self._node.declare_parameter(spec.name, value, told, ignore_override=True)
+            self._node.declare_parameter(spec.name, value, described, ignore_override=True)
             return
         # rclpy takes an empty list for an array of bytes. A parameter that has only a type has no
         # value, and then `ros2 param dump` shows those of no parameter of the node.
         kind = _TYPES[spec.kind]
         self._node.declare_parameter(spec.name, kind, ignore_override=True)
         self._node.set_parameters([Parameter(spec.name, kind, [])])
-        told.name, told.type = spec.name, kind.value
-        self._node.set_descriptor(spec.name, told)
+        described.name, described.type = spec.name, kind.value
+        self._node.set_descriptor(spec.name, described)
 
     def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [p for p in parameters if p.name in self._specs]

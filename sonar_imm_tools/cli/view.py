@@ -163,7 +163,7 @@ def _show_live(topics: Sequence[str], host: str, port: int, layout_file: Path | 
             topics,
             appeared=lambda *channel: server.advertise([Channel(*channel)]),
             vanished=server.withdraw,
-            heard=lambda *message: server.publish(Shown(*message)),
+            received=lambda *message: server.publish(Shown(*message)),
             watched=server.watched,
         )
         relay.step(0.5)

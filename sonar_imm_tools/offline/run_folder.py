@@ -241,7 +241,7 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
     if not Path(run['bag']).exists():
         return
     with BagReader(run['bag']) as bag:
-        for heard in measurements_of(
+        for item in measurements_of(
             bag,
             run['system'],
             run['topics'],
@@ -249,8 +249,8 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
             settings=run.get('parameters'),
             detector=run.get('detector'),
         ):
-            if heard.measurement is not None and not isinstance(heard.measurement, Rejection):
-                yield heard.measurement
+            if item.measurement is not None and not isinstance(item.measurement, Rejection):
+                yield item.measurement
 
 
 def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimate]:

@@ -126,7 +126,7 @@ class ParquetTable:
         if not self._held:
             return
         columns = [
-            np.concatenate([one[name] for one in self._held]).astype(dtype, copy=False)
+            np.concatenate([rows[name] for rows in self._held]).astype(dtype, copy=False)
             for name, dtype in types.items()
         ]
         self._held, self._rows_held = [], 0

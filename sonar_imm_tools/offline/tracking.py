@@ -142,8 +142,10 @@ class OfflineRun:
         self.bag = bag
         self.system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
-        told = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
-        self.topics = {name: entry.name for name, entry in chosen.items() if entry.wanted(told)}
+        settings = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
+        self.topics = {
+            name: entry.name for name, entry in chosen.items() if entry.wanted(settings)
+        }
         build = system.build_smoother if self.options.smooth else system.build
         self.tracker = build(config.for_inputs(frozenset(self.topics.values())))
         self.refused: dict[str, Refused] = {}
@@ -162,7 +164,7 @@ class OfflineRun:
         revisions = Revisions(self._window_ns)
         self.tracker.warm()
         share = self.options.jobs > 1 and hasattr(self.tracker, 'tasks')
-        for made in self._shared_out(advance) if share else self._one_by_one(advance):
+        for made in self._shared_out(advance) if share else self._in_turn(advance):
             final = revisions.add(made)
             if not self.options.smooth:
                 yield from final
@@ -172,7 +174,7 @@ class OfflineRun:
         elif last:
             yield from self.tracker.smoothed()
 
-    def _one_by_one(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
+    def _in_turn(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
         """What the tracker makes of each measurement."""
         for measurement in self._measurements(advance):
             begin = time.perf_counter()
@@ -194,8 +196,8 @@ class OfflineRun:
                 while waiting:
                     yield self._taken(waiting.popleft())
             finally:
-                for one in waiting:
-                    one.cancel()
+                for future in waiting:
+                    future.cancel()
 
     def _taken(self, done: Future[tuple[Any, float]]) -> list[Estimate]:
         found, seconds = done.result()
@@ -204,7 +206,7 @@ class OfflineRun:
         return made
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
-        for heard in measurements_of(
+        for item in measurements_of(
             self.bag,
             self.system.name,
             self.topics,
@@ -215,14 +217,14 @@ class OfflineRun:
         ):
             self.messages += 1
             advance(1)
-            if heard.measurement is None:
+            if item.measurement is None:
                 continue
             try:
-                if isinstance(heard.measurement, Rejection):
-                    raise heard.measurement
-                measurement = self._intake.admit(heard.measurement)
+                if isinstance(item.measurement, Rejection):
+                    raise item.measurement
+                measurement = self._intake.admit(item.measurement)
             except Rejection as rejection:
-                self._refuse(heard.topic, rejection)
+                self._refuse(item.topic, rejection)
                 continue
             if measurement is not None:
                 yield measurement

@@ -70,13 +70,13 @@ class Chain:
     def connect(self, publishers: Iterable[Publisher], limit: float = MATCH_LIMIT) -> set[str]:
         """As `LockStep.connect`, for both nodes and for what one sends to the other."""
         publishers = list(publishers)
-        heard = self.first.connect([p for p in publishers if p.topic_name in self._fed], limit)
-        heard |= self.second.connect(
+        connected = self.first.connect([p for p in publishers if p.topic_name in self._fed], limit)
+        connected |= self.second.connect(
             [p for p in publishers if p.topic_name not in self._fed], limit
         )
         if not self.first.wait_for(lambda: self.first.listeners):
             raise LinkError('the second node does not hear what the first one makes')
-        return heard
+        return connected
 
     def step(self, publisher: Publisher, message: Any) -> None:
         """Publish `message` and wait for all answers. Raises `LinkError` without one."""

@@ -38,7 +38,7 @@ DEPTH = 50
 
 
 @frozen(eq=False)
-class HeardTable:
+class ReceivedTable:
     """One message of a table: its columns by name, (rows,) or (rows, count), or the sentence why
     it is none."""
 
@@ -55,7 +55,7 @@ class TableListener:
     def __init__(self, link: Link, topics: tuple[str, ...] = ()):
         self._link = link
         self._wanted = tuple(f'/{name.lstrip("/")}' for name in topics)
-        self._heard: deque[HeardTable] = deque()
+        self._received: deque[ReceivedTable] = deque()
         self._subscriptions: dict[str, object] = {}
 
     @property
@@ -63,7 +63,7 @@ class TableListener:
         """What is listened to."""
         return list(self._subscriptions)
 
-    def tables(self, timeout: float) -> Iterator[HeardTable | None]:
+    def tables(self, timeout: float) -> Iterator[ReceivedTable | None]:
         """Yield tables as they come, and None now and then while none does.
 
         Raises `LinkError` when none has come within `timeout` seconds from the start, and for a
@@ -73,13 +73,13 @@ class TableListener:
         silent = True
         while True:
             self._look()
-            if not self._link.wait_for(lambda: self._heard, LOOK_SECONDS):
+            if not self._link.wait_for(lambda: self._received, LOOK_SECONDS):
                 if silent and time.monotonic() > end:
-                    raise LinkError(self._nothing_heard(timeout))
+                    raise LinkError(self._silence(timeout))
                 yield None
-            while self._heard:
+            while self._received:
                 silent = False
-                yield self._heard.popleft()
+                yield self._received.popleft()
 
     def _look(self) -> None:
         """Subscribe to what is there now and was not."""
@@ -98,8 +98,8 @@ class TableListener:
     def _reader(self, name: str) -> object:
         def take(message: PointCloud2) -> None:
             try:
-                self._heard.append(
-                    HeardTable(
+                self._received.append(
+                    ReceivedTable(
                         topic=name,
                         stamp_ns=stamp_ns(message),
                         frame_id=str(message.header.frame_id),
@@ -107,11 +107,11 @@ class TableListener:
                     )
                 )
             except Rejection as rejection:
-                self._heard.append(HeardTable(topic=name, problem=rejection.sentence))
+                self._received.append(ReceivedTable(topic=name, problem=rejection.sentence))
 
         return take
 
-    def _nothing_heard(self, timeout: float) -> str:
+    def _silence(self, timeout: float) -> str:
         there = self._link.node.get_topic_names_and_types()
         waited = f'within {timeout:g} s'
         if silent := [name for name in self._subscriptions if self._publishers(name)]:

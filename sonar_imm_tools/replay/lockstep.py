@@ -120,7 +120,7 @@ class LockStep:
         self._counts: Counts | None = None
         self._start = Counts(0, 0, 0)
         self._sent = 0
-        self._told_estimates = 0
+        self._estimates_before = 0
         self.delays: list[float] = []
         link.node.create_subscription(
             PointCloud2, node_name + _ANSWERS, self._answered, latched_qos()
@@ -146,26 +146,26 @@ class LockStep:
                 'domain, and one of this package?'
             )
         topics = {p.topic_name for p in publishers}
-        heard: set[str] = set()
+        hearing: set[str] = set()
         last = time.monotonic()
 
         def connected() -> bool:
             nonlocal last
-            if fresh := self._heard(publishers) - heard:
-                heard.update(fresh)
+            if fresh := self._subscribed(publishers) - hearing:
+                hearing.update(fresh)
                 last = time.monotonic()
             return (
-                bool(heard)
-                and (heard == topics or time.monotonic() - last > _OTHER_INPUTS)
-                and all(p.get_subscription_count() for p in publishers if p.topic_name in heard)
+                bool(hearing)
+                and (hearing == topics or time.monotonic() - last > _OTHER_INPUTS)
+                and all(p.get_subscription_count() for p in publishers if p.topic_name in hearing)
                 and self._recorded()
             )
 
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
-            raise LinkError(self._silence(publishers, heard))
+            raise LinkError(self._silence(publishers, hearing))
         self._start = self._counts
-        self._told_estimates = self._counts.estimates
-        return heard
+        self._estimates_before = self._counts.estimates
+        return hearing
 
     def step(self, publisher: Publisher, message: Any) -> None:
         """Publish `message` and wait for its answer. Raises `LinkError` when there is none."""
@@ -183,9 +183,9 @@ class LockStep:
                 f"node '{self._name}' did not answer message {self._sent} on "
                 f'{topic} within {ANSWER_LIMIT:g} s'
             )
-        if self._counts.estimates > self._told_estimates:
+        if self._counts.estimates > self._estimates_before:
             self.delays.append(time.monotonic() - sent)
-        self._told_estimates = self._counts.estimates
+        self._estimates_before = self._counts.estimates
         if self.counts.messages > self._sent:
             raise LinkError(
                 f"something else publishes to the node '{self._name}': it took "
@@ -218,7 +218,7 @@ class LockStep:
             return f"node '{self._name}' has gone"
         return None
 
-    def _heard(self, publishers: list[Publisher]) -> set[str]:
+    def _subscribed(self, publishers: list[Publisher]) -> set[str]:
         """Topics among those of `publishers` that the node itself subscribes to."""
         return {
             p.topic_name
@@ -229,7 +229,7 @@ class LockStep:
             )
         }
 
-    def _silence(self, publishers: list[Publisher], heard: set[str]) -> str:
+    def _silence(self, publishers: list[Publisher], hearing: set[str]) -> str:
         """Say why no topic of the bag reaches the node."""
         for publisher in publishers:
             for info in self._link.node.get_subscriptions_info_by_topic(publisher.topic_name):
@@ -239,8 +239,8 @@ class LockStep:
                         f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
                         f'bag holds {offered}; change the type parameter of the node'
                     )
-        if heard:
-            return f"node '{self._name}' does not take what is published on {', '.join(heard)}"
+        if hearing:
+            return f"node '{self._name}' does not take what is published on {', '.join(hearing)}"
         names = ', '.join(p.topic_name for p in publishers) or 'no topics'
         return (
             f"node '{self._name}' listens to none of the topics of the bag ({names}); remap them"

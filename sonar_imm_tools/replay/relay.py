@@ -59,13 +59,13 @@ class Relay:
         *,
         appeared: Callable[[str, str, str], None],
         vanished: Callable[[str], None],
-        heard: Callable[[str, int, bytes], None],
+        received: Callable[[str, int, bytes], None],
         watched: Callable[[str], bool],
     ):
         self._link = link
         self._wanted = set(topics)
         self._appeared, self._vanished = appeared, vanished
-        self._heard, self._watched = heard, watched
+        self._received, self._watched = received, watched
         self._types: dict[str, str] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._next_look = 0.0
@@ -116,7 +116,7 @@ class Relay:
 
     def _subscribe(self, name: str) -> Subscription:
         def take(raw: bytes) -> None:
-            self._heard(name, time.time_ns(), bytes(raw))
+            self._received(name, time.time_ns(), bytes(raw))
 
         return self._link.node.create_subscription(
             message_class(self._types[name]), name, take, self._qos(name), raw=True
@@ -124,10 +124,10 @@ class Relay:
 
     def _qos(self, name: str) -> QoSProfile:
         """Reliable, and with what was sent before, where every publisher offers that."""
-        offered = [one.qos_profile for one in self._link.node.get_publishers_info_by_topic(name)]
+        offered = [info.qos_profile for info in self._link.node.get_publishers_info_by_topic(name)]
 
         def all_are(field: str, policy: Any) -> bool:
-            return bool(offered) and all(getattr(one, field) == policy for one in offered)
+            return bool(offered) and all(getattr(profile, field) == policy for profile in offered)
 
         if not all_are('reliability', ReliabilityPolicy.RELIABLE):
             return input_qos(_DEPTH)

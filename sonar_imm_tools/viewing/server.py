@@ -98,13 +98,15 @@ class ViewServer:
 
     def advertise(self, channels: Iterable[Channel]) -> None:
         """Offer topics; one that is offered already is left as it is."""
-        for one in channels:
-            if one.topic not in self._channels:
-                self._channels[one.topic] = foxglove.Channel(
-                    one.topic,
+        for channel in channels:
+            if channel.topic not in self._channels:
+                self._channels[channel.topic] = foxglove.Channel(
+                    channel.topic,
                     message_encoding='cdr',
                     schema=foxglove.Schema(
-                        name=one.type_name, encoding='ros2msg', data=one.definition.encode()
+                        name=channel.type_name,
+                        encoding='ros2msg',
+                        data=channel.definition.encode(),
                     ),
                     context=self._context,
                 )

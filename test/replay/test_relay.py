@@ -39,7 +39,7 @@ class Rig:
             topics,
             appeared=lambda name, kind, text: self.offered.update({name: (kind, text)}),
             vanished=self.gone.append,
-            heard=lambda *message: self.heard.append(message),
+            received=lambda *message: self.heard.append(message),
             watched=self.watching.__contains__,
         )
 
