@@ -84,12 +84,13 @@ def read_pressure(message: Any, *, world_frame: str = 'enu') -> Pressure:
     columns = decode_table(message, ('p', 'scale', 'sample_rate', *_DEPTHS), most_rows=MAX_SAMPLES)
     require_columns(columns, ('p', 'sample_rate'), 'pressure')
     samples = _two_dimensional(columns['p'])
-    scale: float | None = 0.0
+    scale = 0.0
     if samples.dtype.kind in 'iu':
         require_columns(columns, ('scale',), 'pressure in whole numbers')
-        scale = constant_column(columns, 'scale')
-        if scale is None:
+        stated = constant_column(columns, 'scale')
+        if stated is None:
             raise Rejection('bad_scale', 'the scale of the pressure is zero or not a number')
+        scale = stated
         samples = samples * np.float32(scale)
     rate = constant_column(columns, 'sample_rate')
     return Pressure(
@@ -176,7 +177,9 @@ def _matrices(values: NDArray) -> NDArray[np.complexfloating]:
     if values.dtype.kind != 'f':
         raise Rejection('bad_field', f'column csdm holds {values.dtype}, not floats')
     double = values.dtype == np.float64
-    paired = np.ascontiguousarray(values).view(np.complex128 if double else np.complex64)
+    paired: NDArray[np.complexfloating] = np.ascontiguousarray(values).view(
+        np.complex128 if double else np.complex64
+    )
     return paired.reshape(len(values), hydrophones, hydrophones)
 
 

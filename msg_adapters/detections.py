@@ -87,10 +87,10 @@ def read_pose_array(message: Any, *, bearing_positive: str = 'port', **_: Any) -
 
 def read_laser_scan(message: Any, *, bearing_positive: str = 'port', **_: Any) -> Detections:
     """Read a LaserScan: an echo for each range inside its limits; angles count to port."""
-    distance = np.array(message.ranges, np.float64)
+    distance: FloatArray = np.array(message.ranges, np.float64)
     with np.errstate(invalid='ignore'):  # a step that is not finite leaves no bearing
-        steps = float(message.angle_increment) * np.arange(len(distance))
-        bearing = float(message.angle_min) + steps
+        steps = np.arange(len(distance), dtype=np.float64)
+        bearing = float(message.angle_min) + float(message.angle_increment) * steps
     inside = (distance >= message.range_min) & (distance <= message.range_max)
     intensity = np.array(message.intensities, np.float64)
     if len(intensity) != len(distance):
@@ -226,10 +226,10 @@ def _variances(values: FloatArray) -> FloatArray:
 
 def _good(distance: FloatArray, flags: Any) -> FloatArray:
     """NaN for detections whose flag is not OK; without flags all are good."""
-    marks = [int(flag.flag) for flag in flags]
-    if not marks:
+    given = [int(flag.flag) for flag in flags]
+    if not given:
         return distance
-    marks = _one_each(marks, len(distance), 'flags')
+    marks = _one_each(given, len(distance), 'flags')
     return np.where(marks == 0, distance, np.nan)
 
 

@@ -52,11 +52,12 @@ def read_vessel_fix(message: Any, **_: Any) -> VesselFix:
 def write_geodetic(fix: GeodeticFix, make: Make) -> Any:
     """Write a NavSatFix."""
     known = fix.covariance is not None
+    covariance = np.zeros((3, 3)) if fix.covariance is None else fix.covariance
     return _navsat(
         fix.stamp_ns,
         fix.frame_id,
         np.array([fix.latitude, fix.longitude, fix.height]),
-        fix.covariance if known else np.zeros((3, 3)),
+        covariance,
         KNOWN if known else UNKNOWN,
         make,
     )

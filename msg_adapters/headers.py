@@ -24,14 +24,23 @@ other axes, as its paper does, turns them where measurements come in and estimat
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from typing import Any, cast, Protocol, TypeVar
 
 from attrs import evolve
 
 from sonar_imm.measurements import Rejection
 
 Make = Callable[..., Any]
-M = TypeVar('M')
+
+
+class InFrame(Protocol):
+    """A measurement that says in which frame it is."""
+
+    @property
+    def frame_id(self) -> str: ...
+
+
+M = TypeVar('M', bound=InFrame)
 
 WORLD_FRAMES = ('enu', 'ned')
 _NANO = 1_000_000_000
@@ -84,7 +93,8 @@ def to_enu(measurement: M, world_frame: str, turned: Callable[[M], M]) -> M:
     """
     if world_frame == 'ned':
         frame_id = measurement.frame_id.removesuffix('_ned')
-        return evolve(turned(measurement), frame_id=frame_id)
+        in_enu: Any = turned(measurement)
+        return cast(M, evolve(in_enu, frame_id=frame_id))
     if world_frame != 'enu':
         raise ValueError(
             f"world_frame must be one of {', '.join(WORLD_FRAMES)}, got '{world_frame}'"

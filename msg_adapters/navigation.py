@@ -217,10 +217,10 @@ def _covariance(values: Any) -> FloatArray | None:
             'bad_shape',
             f'a covariance of the navigation has {covariance.size} numbers, 36 are needed',
         )
-    covariance = covariance.reshape(6, 6)
-    diagonal = np.diag(covariance)
-    usable = np.isfinite(covariance).all() and covariance.any() and (diagonal >= 0.0).all()
-    return covariance if usable else None
+    matrix = covariance.reshape(6, 6)
+    diagonal = np.diag(matrix)
+    usable = np.isfinite(matrix).all() and matrix.any() and (diagonal >= 0.0).all()
+    return matrix if usable else None
 
 
 def _written(covariance: FloatArray | None) -> FloatArray:

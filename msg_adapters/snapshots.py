@@ -59,6 +59,9 @@ def read_snapshot(message: Any, *, world_frame: str = 'enu', side: str = '') -> 
     iq = _complex(columns['iq'])
     constants = {name: constant_column(columns, name) for name in CONSTANTS}
     ranges, time = _ranges(columns, constants['sound_speed'])
+    variances: dict[str, Any] = {
+        name: scalar_column(columns, name) for name in VARIANCES if name in columns
+    }
     return Snapshot(
         stamp_ns=stamp_ns(message),
         frame_id=str(message.header.frame_id),
@@ -66,7 +69,7 @@ def read_snapshot(message: Any, *, world_frame: str = 'enu', side: str = '') -> 
         iq=iq,
         two_way_time=time,
         side=side,
-        **{name: scalar_column(columns, name) for name in VARIANCES if name in columns},
+        **variances,
         **constants,
     )
 

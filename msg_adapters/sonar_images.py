@@ -192,7 +192,8 @@ def _raw_ranges(message: Any, sound_speed: float) -> FloatArray:
     check_cells(count, 1)
     stated = float(message.ping_info.sound_speed)
     speed = stated if SOUND_SPEEDS[0] <= stated <= SOUND_SPEEDS[1] else sound_speed
-    return (int(message.sample0) + np.arange(count)) * speed / (2.0 * rate)
+    samples = np.arange(count, dtype=np.float64)
+    return (int(message.sample0) + samples) * speed / (2.0 * rate)
 
 
 def image_samples(image: Any, ranges: int, beams: int, order: str) -> FloatArray:

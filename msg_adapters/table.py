@@ -26,7 +26,7 @@ from collections.abc import Collection, Mapping
 from functools import lru_cache
 from itertools import chain
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +80,7 @@ def decode_table(
         raise Rejection('bad_layout', f'point_step is 0 for {rows} points')
     if rows * sum(dtype.itemsize * count for _, _, dtype, count in fields) > MAX_BYTES:
         raise Rejection('too_large', f'the table of {rows} rows exceeds {MAX_BYTES >> 20} MiB')
-    order = '>' if message.is_bigendian else '<'
+    order: Literal['>', '<'] = '>' if message.is_bigendian else '<'
     columns = {}
     for name, offset, dtype, count in fields:
         shape = (rows,) if count == 1 else (rows, count)
@@ -167,11 +167,12 @@ def layout_of(
             )
         kinds.append((name, kind.newbyteorder('<'), shape))
     packed = np.dtype(kinds)
+    places: Mapping[str, Any] = packed.fields or {}
     fields = tuple(
         make(
             'sensor_msgs/msg/PointField',
             name=name,
-            offset=packed.fields[name][1],
+            offset=places[name][1],
             datatype=_CODES[kind.str[1:]],
             count=math.prod(shape),
         )

@@ -78,7 +78,9 @@ def soundings_of(estimate: Estimate) -> Soundings | None:
     columns = {**dict(zip('xyz', estimate.xyz.T)), **exact, **estimate.extras}
     kept = np.asarray(estimate.extras['valid'], bool)
     with np.errstate(over='ignore'):
-        table = {name: np.asarray(columns[name]).astype(kind) for name, kind in COLUMNS.items()}
+        table: dict[str, np.ndarray] = {
+            name: np.asarray(columns[name]).astype(kind) for name, kind in COLUMNS.items()
+        }
     for column in table.values():
         kept = kept & np.isfinite(column)
     return Soundings(

@@ -135,7 +135,7 @@ class TrueReflectors:
     def tables(self, frame_id: str) -> Iterator[TruthTable]:
         """Give one row per reflector, or none: ``x y z depth amplitude track_id``."""
         zero = np.zeros(len(self.depth), np.float32)
-        columns = {
+        columns: dict[str, np.ndarray] = {
             'x': zero,
             'y': zero,
             'z': (-self.depth).astype(np.float32),

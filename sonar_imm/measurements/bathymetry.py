@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..acoustics.variances import usable_bins
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, complexes, floats, positives, Rejection
+from .checks import check_stamp, column, complexes, positives, Rejection
 
 MAX_BINS, MAX_STAVES = 131_072, 64
 FARTHEST_BIN = 20_000.0
@@ -57,7 +57,7 @@ class Snapshot:
     FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
-    range: FloatArray = field(converter=floats(None))
+    range: FloatArray = field(converter=column)
     iq: NDArray[np.complexfloating] = field(converter=_snapshots)
     frame_id: str = ''
     noise_variance: FloatArray | None = field(default=None, converter=positives)

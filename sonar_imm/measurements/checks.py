@@ -35,19 +35,35 @@ class Rejection(ValueError):
         super().__init__(self.sentence)
 
 
-def floats(*shape: int | None) -> Any:
-    """Converter to a read-only float64 array; a None in `shape` matches any length."""
+def floats(value: Any, *shape: int | None) -> FloatArray:
+    """Read-only float64 array of that `shape`, in which None matches any length."""
+    array = np.array(value, dtype=np.float64)
+    if len(shape) != array.ndim or any(
+        want not in (None, got) for want, got in zip(shape, array.shape)
+    ):
+        raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
+    array.flags.writeable = False
+    return array
 
-    def convert(value: Any) -> FloatArray:
-        array = np.array(value, dtype=np.float64)
-        if len(shape) != array.ndim or any(
-            want not in (None, got) for want, got in zip(shape, array.shape)
-        ):
-            raise Rejection('bad_shape', f'an array of shape {shape} is needed, got {array.shape}')
-        array.flags.writeable = False
-        return array
 
-    return convert
+def column(value: Any) -> FloatArray:
+    """Read-only (n,)."""
+    return floats(value, None)
+
+
+def point(value: Any) -> FloatArray:
+    """Read-only (3,)."""
+    return floats(value, 3)
+
+
+def points(value: Any) -> FloatArray:
+    """Read-only (n, 3)."""
+    return floats(value, None, 3)
+
+
+def quaternion(value: Any) -> FloatArray:
+    """Read-only (4,): x, y, z, w."""
+    return floats(value, 4)
 
 
 def nanoseconds(seconds: float) -> int:
@@ -84,7 +100,7 @@ def complexes(value: Any) -> NDArray[np.complexfloating]:
     return array
 
 
-def content_key(kind: str, *parts: FloatArray | NDArray | None) -> bytes:
+def content_key(kind: str, *parts: NDArray | np.generic | None) -> bytes:
     """The content of a measurement as bytes: it orders those of one stamp and tells duplicates."""
     return kind.encode() + b''.join(part.tobytes() for part in parts if part is not None)
 

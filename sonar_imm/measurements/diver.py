@@ -23,7 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
-from .checks import check_covariance, check_stamp, content_key, floats, Rejection
+from .checks import (
+    check_covariance,
+    check_stamp,
+    column,
+    content_key,
+    floats,
+    point,
+    points,
+    Rejection,
+)
 
 
 def _ids(value: Any) -> NDArray[np.uint16]:
@@ -47,7 +56,7 @@ class Fix:
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=floats(3))
+    position: FloatArray = field(converter=point)
     covariance: FloatArray | None = None
     target_id: int = NOBODY
     sensor: str = ''
@@ -63,7 +72,7 @@ class Fix:
                 f'the fix lies at {self.position[:2]}, further than 100,000 km from the origin',
             )
         if self.covariance is not None:
-            covariance = floats(2, 2)(self.covariance)
+            covariance = floats(self.covariance, 2, 2)
             check_covariance(covariance, 'a fix')
             covariance = 0.5 * covariance + 0.5 * covariance.T
             covariance.flags.writeable = False
@@ -98,7 +107,7 @@ class Fixes:
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=floats(None, 3))
+    position: FloatArray = field(converter=points)
     covariance: FloatArray | None = None
     target_id: NDArray[np.int32] | None = field(default=None, converter=_names)
     sensor: str = ''
@@ -112,7 +121,7 @@ class Fixes:
                 'bad_shape', f'fixes: {len(self.target_id)} identities for {n} positions'
             )
         if self.covariance is not None:
-            covariance = floats(n, 2, 2)(self.covariance)
+            covariance = floats(self.covariance, n, 2, 2)
             object.__setattr__(self, 'covariance', covariance)
         if not usable_fixes(self.position, self.covariance).all():
             raise Rejection(
@@ -195,16 +204,16 @@ class Arrivals:
     stamp_ns: int
     tx_id: NDArray[np.uint16] = field(converter=_ids)
     rx_id: NDArray[np.uint16] = field(converter=_ids)
-    tx: FloatArray = field(converter=floats(None, 3))
-    rx: FloatArray = field(converter=floats(None, 3))
-    toa: FloatArray = field(converter=floats(None))
-    var_toa: FloatArray = field(converter=floats(None))
-    bearing: FloatArray = field(converter=floats(None))
-    var_bearing: FloatArray = field(converter=floats(None))
-    elevation: FloatArray = field(default=(), converter=floats(None))
-    var_elevation: FloatArray = field(default=(), converter=floats(None))
-    depth: FloatArray = field(default=(), converter=floats(None))
-    var_depth: FloatArray = field(default=(), converter=floats(None))
+    tx: FloatArray = field(converter=points)
+    rx: FloatArray = field(converter=points)
+    toa: FloatArray = field(converter=column)
+    var_toa: FloatArray = field(converter=column)
+    bearing: FloatArray = field(converter=column)
+    var_bearing: FloatArray = field(converter=column)
+    elevation: FloatArray = field(default=(), converter=column)
+    var_elevation: FloatArray = field(default=(), converter=column)
+    depth: FloatArray = field(default=(), converter=column)
+    var_depth: FloatArray = field(default=(), converter=column)
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:
@@ -212,7 +221,7 @@ class Arrivals:
         n = len(self.toa)
         for name in OPTIONAL_ARRIVALS:
             if n and not len(getattr(self, name)):
-                object.__setattr__(self, name, floats(None)(np.full(n, np.nan)))
+                object.__setattr__(self, name, column(np.full(n, np.nan)))
         columns = ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing')
         for name in (*columns, *OPTIONAL_ARRIVALS):
             if len(getattr(self, name)) != n:
@@ -250,17 +259,22 @@ class Arrivals:
         return len(self) > 0 and bool(np.isnan(self.tx).all())
 
 
+def plane_covariance(value: Any) -> FloatArray:
+    """Read-only (2, 2)."""
+    return floats(value, 2, 2)
+
+
 @frozen(eq=False, kw_only=True)
 class Start:
-    """A target to begin a track at.
+    """Where somebody says that a diver is: not measured, but from a person or another program.
 
     position: (3,) x, y, z in `frame_id`, the frame of the tracks, m; z is not used by a tracker of
     two dimensions. covariance: (2, 2) of x and y, m^2; there is no start without one.
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=floats(3))
-    covariance: FloatArray = field(converter=floats(2, 2))
+    position: FloatArray = field(converter=point)
+    covariance: FloatArray = field(converter=plane_covariance)
     frame_id: str = ''
 
     def __attrs_post_init__(self) -> None:

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, complexes, floats, positives, Rejection
+from .checks import check_stamp, column, complexes, positives, Rejection
 
 MAX_SAMPLES, MAX_HYDROPHONES, MAX_FREQUENCIES = 1_000_000, 256, 131_072
 LEAST_HYDROPHONES = 3
@@ -87,8 +87,8 @@ class Trace:
     """
 
     stamp_ns: int
-    depth: FloatArray = field(converter=floats(None))
-    amplitude: FloatArray = field(converter=floats(None))
+    depth: FloatArray = field(converter=column)
+    amplitude: FloatArray = field(converter=column)
     frame_id: str = ''
     sigma: FloatArray | None = field(default=None, converter=positives)
     reference_depth: float | None = field(default=None, converter=_depth)
@@ -144,7 +144,7 @@ class CrossSpectra:
     """
 
     stamp_ns: int
-    frequency: FloatArray = field(converter=floats(None))
+    frequency: FloatArray = field(converter=column)
     csdm: NDArray[np.complexfloating] = field(converter=complexes)
     frame_id: str = ''
     snapshots: int = 0

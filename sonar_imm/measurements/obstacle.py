@@ -22,7 +22,7 @@ from attrs import field, frozen
 import numpy as np
 
 from ..estimation.arrays import FloatArray
-from .checks import check_stamp, content_key, floats, Rejection
+from .checks import check_stamp, column, content_key, floats, point, quaternion, Rejection
 
 BEAM_AXES = ('marine', 'rep103', 'auto')
 """What the axes of beam vectors may be: z forward and y to starboard; x forward and y to port; by
@@ -51,8 +51,8 @@ class Detections:
     FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
-    range: FloatArray = field(converter=floats(None))
-    bearing: FloatArray = field(converter=floats(None))
+    range: FloatArray = field(converter=column)
+    bearing: FloatArray = field(converter=column)
     var_range: FloatArray | None = None
     var_bearing: FloatArray | None = None
     intensity: FloatArray | None = None
@@ -65,7 +65,7 @@ class Detections:
         for name in OPTIONAL_COLUMNS:
             given = getattr(self, name)
             column = np.full(len(self.range), np.nan) if given is None else given
-            object.__setattr__(self, name, floats(None)(column))
+            object.__setattr__(self, name, floats(column, None))
         for name in ('bearing', *OPTIONAL_COLUMNS):
             rows = len(getattr(self, name))
             if rows != len(self):
@@ -96,8 +96,8 @@ class SonarImage:
     FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
-    range: FloatArray = field(converter=floats(None))
-    bearing: FloatArray = field(converter=floats(None))
+    range: FloatArray = field(converter=column)
+    bearing: FloatArray = field(converter=column)
     amplitude: FloatArray
     frame_id: str = ''
     scanning: bool = False
@@ -124,10 +124,10 @@ class Navigation:
     """
 
     stamp_ns: int
-    position: FloatArray = field(converter=floats(3))
-    orientation: FloatArray = field(converter=floats(4))
-    velocity: FloatArray = field(converter=floats(3), factory=lambda: np.full(3, np.nan))
-    turn_rate: FloatArray = field(converter=floats(3), factory=lambda: np.full(3, np.nan))
+    position: FloatArray = field(converter=point)
+    orientation: FloatArray = field(converter=quaternion)
+    velocity: FloatArray = field(converter=point, factory=lambda: np.full(3, np.nan))
+    turn_rate: FloatArray = field(converter=point, factory=lambda: np.full(3, np.nan))
     pose_covariance: FloatArray | None = None
     twist_covariance: FloatArray | None = None
     frame_id: str = ''
@@ -149,7 +149,7 @@ class Navigation:
             )
         for name in ('pose_covariance', 'twist_covariance'):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, floats(6, 6)(getattr(self, name)))
+                object.__setattr__(self, name, floats(getattr(self, name), 6, 6))
 
     def key(self) -> bytes:
         """See `content_key`; velocities are not used."""

@@ -25,7 +25,15 @@ import numpy as np
 
 from ..acoustics.geometry import Pose
 from ..estimation.arrays import FloatArray
-from .checks import check_covariance, check_stamp, content_key, floats, Rejection
+from .checks import (
+    check_covariance,
+    check_stamp,
+    content_key,
+    floats,
+    point,
+    quaternion,
+    Rejection,
+)
 from .diver import NOBODY
 from .obstacle import Navigation
 
@@ -39,7 +47,7 @@ def _symmetric(covariance: FloatArray | None, what: str) -> FloatArray | None:
     """A read-only covariance (3, 3). Raises `Rejection` for one that is none."""
     if covariance is None:
         return None
-    given = floats(3, 3)(covariance)
+    given = floats(covariance, 3, 3)
     if np.isfinite(given).all() and np.abs(given).max() > MOST_VARIANCE:
         raise Rejection(
             'out_of_range', f'the covariance of {what} reaches {np.abs(given).max():g}'
@@ -111,7 +119,7 @@ class VesselHeading:
     FRAME: ClassVar[str] = 'none'
 
     stamp_ns: int
-    orientation: FloatArray = field(converter=floats(4))
+    orientation: FloatArray = field(converter=quaternion)
     covariance: FloatArray | None = None
     frame_id: str = ''
 
@@ -144,7 +152,7 @@ class RelativeFix:
     FRAME: ClassVar[str] = 'own'
 
     stamp_ns: int
-    offset: FloatArray = field(converter=floats(3))
+    offset: FloatArray = field(converter=point)
     covariance: FloatArray | None = None
     levelled: bool = False
     target_id: int = NOBODY
