@@ -208,6 +208,10 @@ class UnusedShare:
         return f'{share:.0f} % of the messages of the last {now - then:.0f} s not used: {reasons}'
 
 
+_Totals = tuple[float | None, Counter[str], Counter[str], int, Counter[str]]
+"""Steady seconds of a report, and received, refused, dropped and lost messages until then."""
+
+
 class Reporter:
     """Turns a `Meter` and the tracker's own numbers into a DiagnosticArray, once a period."""
 
@@ -231,7 +235,7 @@ class Reporter:
         self._topics = dict(topics)
         self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
-        self._before = (None, Counter(), Counter(), 0, Counter())
+        self._before: _Totals = None, Counter(), Counter(), 0, Counter()
         self._of_input, self._of_tracker = Hysteresis(rise, fall), Hysteresis(rise, fall)
         self._unused = UnusedShare()
 

@@ -150,7 +150,8 @@ class NodeParameters:
 
     def _build(self, values: Mapping[str, Any]) -> dict[type[Config], Any]:
         """Build one config a class, with the mistakes of all classes in one `ConfigError`."""
-        built, problems = {}, []
+        built: dict[type[Config], Any] = {}
+        problems: list[str] = []
         for config_type in self._types:
             try:
                 built[config_type] = config_type.from_mapping(values, ignore_unknown=True)

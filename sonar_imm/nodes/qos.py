@@ -27,7 +27,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import time
-from typing import Any
+from typing import Any, cast
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
@@ -191,12 +191,12 @@ class Endpoints:
                 topic, event, 'cannot be heard', 'subscription'
             ),
             message_lost=lambda event: self._lost(topic, event),
-            matched=lambda event: event.current_count_change < 0 and gaps.publisher_left(),
+            matched=lambda event: self._matched(topic, event),
         )
         subscription = self._node.create_subscription(
             message_type,
             topic,
-            receive,
+            cast(Any, receive),  # rclpy's types know callbacks without the info only
             qos,
             event_callbacks=events,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
@@ -236,6 +236,10 @@ class Endpoints:
                 f'change it there, or here with -p qos_overrides.{name}.{side}.{policy.lower()}'
             )
         self.incompatible[topic] = policy
+
+    def _matched(self, topic: str, event: Any) -> None:
+        if event.current_count_change < 0:
+            self._gaps[topic].publisher_left()
 
     def _lost(self, topic: str, event: Any) -> None:
         self._reported_lost[topic] = event.total_count

@@ -153,7 +153,7 @@ def _show_recorded(
 
 def _show_live(topics: Sequence[str], host: str, port: int, layout_file: Path | None) -> None:
     from ..replay.link import Link
-    from ..replay.relay import Relay
+    from ..replay.listening import Relay
     from ..viewing.material import Channel, Shown
     from ..viewing.server import ViewServer
 

@@ -147,7 +147,7 @@ class OfflineRun:
             name: entry.name for name, entry in chosen.items() if entry.wanted(settings)
         }
         build = system.build_smoother if self.options.smooth else system.build
-        self.tracker = build(config.for_inputs(frozenset(self.topics.values())))
+        self.tracker: Any = build(config.for_inputs(frozenset(self.topics.values())))
         self.refused: dict[str, Refused] = {}
         self.messages = 0
         self.durations = array('d')

@@ -163,8 +163,8 @@ class LockStep:
 
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
             raise LinkError(self._silence(publishers, hearing))
-        self._start = self._counts
-        self._estimates_before = self._counts.estimates
+        self._start = self._counts or self._start
+        self._estimates_before = 0
         return hearing
 
     def step(self, publisher: Publisher, message: Any) -> None:
@@ -183,9 +183,10 @@ class LockStep:
                 f"node '{self._name}' did not answer message {self._sent} on "
                 f'{topic} within {ANSWER_LIMIT:g} s'
             )
-        if self._counts.estimates > self._estimates_before:
+        estimates = self.counts.estimates
+        if estimates > self._estimates_before:
             self.delays.append(time.monotonic() - sent)
-        self._estimates_before = self._counts.estimates
+        self._estimates_before = estimates
         if self.counts.messages > self._sent:
             raise LinkError(
                 f"something else publishes to the node '{self._name}': it took "
@@ -247,10 +248,72 @@ class LockStep:
         )
 
 
+class FirstStep(LockStep):
+    """Keeps step with a node whose output another one hears, as that of a detector of images.
+    listeners: how many do."""
+
+    listeners = 0
+
+    def _answered(self, message: Any) -> None:
+        super()._answered(message)
+        self.listeners = int(decode_table(message)['listeners'][0])
+
+
+class Chain:
+    """Keeps step with two nodes; takes the place of a `LockStep` in the player. A message for the
+    first node is answered there; for each message that this one published since, the second has to
+    answer too.
+
+    fed: names of the published topics that the first node hears.
+    """
+
+    def __init__(self, first: FirstStep, second: LockStep, fed: Iterable[str]):
+        self.first, self.second = first, second
+        self._fed = frozenset(fed)
+
+    @property
+    def counts(self) -> Counts:
+        """Messages taken by either node, but for those that the first sent to the second; what
+        both refused; estimates of the second."""
+        first, second = self.first.counts, self.second.counts
+        return Counts(
+            first.messages + second.messages - first.estimates,
+            first.refused + second.refused,
+            second.estimates,
+        )
+
+    @property
+    def delays(self) -> list[float]:
+        return self.second.delays
+
+    def connect(self, publishers: Iterable[Publisher], limit: float = MATCH_LIMIT) -> set[str]:
+        """As `LockStep.connect`, for both nodes and for what one sends to the other."""
+        publishers = list(publishers)
+        connected = self.first.connect([p for p in publishers if p.topic_name in self._fed], limit)
+        connected |= self.second.connect(
+            [p for p in publishers if p.topic_name not in self._fed], limit
+        )
+        if not self.first.wait_for(lambda: self.first.listeners):
+            raise LinkError('the second node does not hear what the first one makes')
+        return connected
+
+    def step(self, publisher: Publisher, message: Any) -> None:
+        """Publish `message` and wait for all answers. Raises `LinkError` without one."""
+        if publisher.topic_name not in self._fed:
+            self.second.step(publisher, message)
+            return
+        sent, made = time.monotonic(), self.first.counts.estimates
+        self.first.step(publisher, message)
+        fresh = self.first.counts.estimates - made
+        if fresh:
+            self.second.follow(fresh, publisher.topic_name, sent)
+
+
 def _full_name(info: Any) -> str:
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def _type_name(publisher: Publisher) -> str:
-    package, _, name = publisher.msg_type.__module__.partition('.')
-    return f'{package}/msg/{publisher.msg_type.__name__}'
+    message_type: Any = publisher.msg_type
+    package, _, name = message_type.__module__.partition('.')
+    return f'{package}/msg/{message_type.__name__}'

@@ -31,6 +31,7 @@ from foxglove.websocket import (
     PlaybackControlRequest,
     PlaybackState,
     PlaybackStatus,
+    ServerListener,
 )
 
 from .material import Channel, Shown
@@ -132,7 +133,7 @@ class ViewServer:
         self._server.broadcast_playback_state(_playback_state(state, None))
 
 
-class _Listener:
+class _Listener(ServerListener):
     """What viewers ask for; called from the threads of the server."""
 
     def __init__(self, playback: Playback | None, autostart: bool):

@@ -23,7 +23,7 @@ from sonar_imm_tools.recordings.messages import message_definition
 from sonar_imm_tools.replay import relay as relay_module
 from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link
-from sonar_imm_tools.replay.relay import Relay
+from sonar_imm_tools.replay.listening import Relay
 
 LIMIT = 300  # steps of 50 ms
 
