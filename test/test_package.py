@@ -88,6 +88,7 @@ HEADER = """\
 """
 # Path below the root: why it may exceed 400 lines.
 LONG_FILES: dict[str, str] = {
+    'sonar_imm/nodes/diagnostics.py': 'from what is found in a period to the levels of a node',
     'test/acoustics/test_localisation.py': 'every doubt of one function, to be read together',
     'test/estimation/test_imm.py': 'every closed form of one filter, to be read together',
     'test/estimation/test_smoothing.py': 'holds its oracle, the enumeration of all mode sequences',

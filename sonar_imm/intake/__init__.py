@@ -31,15 +31,30 @@ from attrs import evolve
 import numpy as np
 
 from ..acoustics import geometry
-from ..measurements import Detections, Rejection, Snapshot, StaticTransforms, VesselPose
+from ..measurements import (
+    Detections,
+    Fix,
+    Fixes,
+    GeodeticFix,
+    nanoseconds,
+    NOBODY,
+    Rejection,
+    RelativeFix,
+    Snapshot,
+    StaticTransforms,
+    VesselFix,
+    VesselPose,
+)
 from ..parameters import Config
-from .frames import frame_role, KnownFrames, moved, TransformTree
-from .repeats import RepeatFilter
+from .stream import frame_key, KnownFrames, TRACKS
+from .transforms import moved, TransformTree
 
 __all__ = ['Intake', 'KnownFrames', 'RepeatFilter', 'TransformTree']
 
 SEEN_FROM_THE_SONAR = (Detections, Snapshot)
 """What cannot be used before the place of the sonar is known."""
+MOST_KEPT = 10_000
+"""Positions remembered; the oldest are forgotten for more."""
 
 
 class Intake:
@@ -75,7 +90,9 @@ class Intake:
         if self._sonar_frames and not self.mounting:
             self._require_mounting(measurement)
         frames = self.tracker.frames
-        measurement = self._in_frame(measurement, self.frame_id or frames.frame_id)
+        target = self.frame_id or frames.frame_id
+        if target and measurement.frame_id not in ('', target):
+            measurement = self._in_frame(measurement, target)
         frames.check(measurement, self.frame_id)
         if not isinstance(measurement, frames.kinds):
             frames.settle(measurement)
@@ -96,13 +113,11 @@ class Intake:
         self._mount()
 
     def _in_frame(self, measurement: Any, target: str) -> Any:
-        """The measurement in the frame `target`, where a transform says how."""
-        source = measurement.frame_id
-        if source in ('', target) or not target:
+        """The measurement in the frame `target`, where it has a place in the world and a transform
+        says how."""
+        if frame_key(measurement) != TRACKS and not isinstance(measurement, VesselPose):
             return measurement
-        if frame_role(measurement) != 'world' and not isinstance(measurement, VesselPose):
-            return measurement
-        pose = self.transforms.pose(target, source)
+        pose = self.transforms.pose(target, measurement.frame_id)
         return measurement if pose is None else moved(measurement, target, pose)
 
     def _require_mounting(self, measurement: Any) -> None:
@@ -124,3 +139,78 @@ class Intake:
             'sonar_mount_rpy_deg': tuple(np.degrees(geometry.euler_angles(pose.R)).tolist()),
         }
         self.tracker.remount(evolve(self.tracker.config, **self.mounting))
+
+
+class RepeatFilter:
+    """Leaves out repeated polls: the same numbers once more, when a driver asks more often than it
+    is answered.
+
+    Noise makes no two measurements alike to the last bit, so that a fix whose numbers came before,
+    for the same diver and a moment ago, is the old one with a new stamp. It says nothing, and its
+    stamp is wrong. After `limit` the same numbers count again: a diver that rests on a coarse grid
+    is there.
+
+    rows: how many rows of scans were left out so far.
+    """
+
+    def __init__(self, limit: float):
+        """Leave out what is repeated within `limit` seconds; 0: nothing."""
+        self._limit_ns = nanoseconds(limit)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what came."""
+        self.rows = 0
+        self._first: dict[bytes, int] = {}
+
+    def fresh(self, measurement: Any) -> Any:
+        """The measurement, of a scan of named positions the rows that are new.
+
+        Raises `Rejection` for one that holds nothing new.
+        """
+        if not self._limit_ns or isinstance(measurement, VesselFix):
+            return measurement
+        if isinstance(measurement, Fixes):
+            return self._rows(measurement)
+        if isinstance(measurement, (Fix, GeodeticFix, RelativeFix)):
+            source = f'{measurement.frame_id}\0{measurement.sensor}\0'.encode()
+            if self._came(source + measurement.key(), measurement.stamp_ns):
+                raise Rejection('repeated', 'the same position came before with another stamp')
+        return measurement
+
+    def _rows(self, scan: Fixes) -> Fixes:
+        if not len(scan):
+            return scan
+        if scan.target_id is None or (scan.target_id == NOBODY).any():
+            if self._came(scan.frame_id.encode() + scan.key(), scan.stamp_ns):
+                raise Rejection('repeated', 'the same scan came before with another stamp')
+            return scan
+        new = np.array(
+            [
+                not self._came(
+                    f'{scan.frame_id}\0{name}'.encode() + place.tobytes(), scan.stamp_ns
+                )
+                for name, place in zip(scan.target_id.tolist(), scan.position)
+            ]
+        )
+        if new.all():
+            return scan
+        if not new.any():
+            raise Rejection('repeated', 'the same positions came before with another stamp')
+        self.rows += int((~new).sum())
+        return evolve(
+            scan,
+            position=scan.position[new],
+            covariance=None if scan.covariance is None else scan.covariance[new],
+            target_id=scan.target_id[new],
+        )
+
+    def _came(self, content: bytes, stamp_ns: int) -> bool:
+        """Whether that content came with another stamp, not long ago; remembers it."""
+        first = self._first.get(content)
+        if first is not None and 0 < abs(stamp_ns - first) <= self._limit_ns:
+            return True
+        if first is None and len(self._first) >= MOST_KEPT:
+            self._first.pop(next(iter(self._first)))
+        self._first[content] = stamp_ns
+        return False

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The stream of measurements, as every tracker has it: what is taken, in which order, how often.
+"""The stream of measurements, as every tracker has it: in which frame, in which order, how often.
 
 A measurement passes three gates before a tracker's own mathematics sees it. Each refusal is
 counted, none is raised:
@@ -35,15 +35,68 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from attrs import frozen
 
 from ..estimation.history import MAX_LATE_NS, ReplayHistory, StampGate, Step
 from ..measurements import nanoseconds, Rejection
-from .frames import KnownFrames
 
 State = TypeVar('State')
+TRACKS = 'tracks'
+
+
+def frame_key(measurement: Any) -> Any:
+    """What has the frame of `measurement`: `TRACKS`; a sensor on board (its kind of measurement,
+    and side); or None, when it is the same in any frame. The class says so by `FRAME`: ``'own'``,
+    ``'none'``, or nothing."""
+    role = getattr(type(measurement), 'FRAME', 'world')
+    if role == 'own':
+        return type(measurement), getattr(measurement, 'side', '')
+    return TRACKS if role == 'world' else None
+
+
+class KnownFrames:
+    """The frame of the tracks, and that of each sensor on board: each is that of the first
+    measurement that was used.
+
+    A measurement that is not used must not decide: `check` only compares, `settle` decides.
+    kinds: the classes of which the tracker decides what is used, since it can refuse them for
+    their stamps; what is of another class is used whenever it comes.
+    """
+
+    def __init__(self, kinds: tuple[type, ...] = ()):
+        self.kinds = kinds
+        self._frames: dict[Any, str] = {TRACKS: ''}
+
+    @property
+    def frame_id(self) -> str:
+        """The frame of the tracks, empty until one is known."""
+        return self._frames[TRACKS]
+
+    def check(self, measurement: Any, required: str = '') -> None:
+        """Raise `Rejection` when `measurement` is in another frame, or, where it is in that of the
+        tracks, not in `required`. One without a frame passes only until a frame is known."""
+        key = frame_key(measurement)
+        for expected in (required if key == TRACKS else '', self._frames.get(key, '')):
+            if expected and measurement.frame_id != expected:
+                whose = 'the tracks' if key == TRACKS else 'earlier ones'
+                raise Rejection(
+                    'frame',
+                    f"the frame '{measurement.frame_id}' is not the frame '{expected}' of {whose}",
+                )
+
+    def settle(self, measurement: Any) -> None:
+        """Expect the frame of `measurement`, which passed `check` and is used, from now on."""
+        key = frame_key(measurement)
+        if key is not None:
+            self._frames[key] = measurement.frame_id
+
+    def admit(self, measurement: Any) -> None:
+        """`check` and `settle`, for what is used whatever its stamp. Raises `Rejection`."""
+        self.check(measurement)
+        self.settle(measurement)
 
 
 @frozen
@@ -178,13 +231,10 @@ class ReplayStream(Stream, Generic[State]):
             self._history = ReplayHistory(self._survivor(self.state), self._rules.window_ns)
         revised: dict[int, State] = {}
         for item in admitted.items:
-            revised.update(self._insert(item))
-        return [(stamp_ns, revised[stamp_ns]) for stamp_ns in sorted(revised)]
-
-    def _insert(self, item: Any) -> list[tuple[int, State]]:
-        newest_ns = self._history.newest_ns
-        inserted = self._history.insert(item.stamp_ns, item.key(), item, self._step)
-        self.counts[inserted.verdict] += 1
-        if inserted.revised and newest_ns is not None and item.stamp_ns < newest_ns:
-            self.counts['late'] += 1
-        return inserted.revised
+            newest_ns = self._history.newest_ns
+            inserted = self._history.insert(item.stamp_ns, item.key(), item, self._step)
+            self.counts[inserted.verdict] += 1
+            if inserted.revised and newest_ns is not None and item.stamp_ns < newest_ns:
+                self.counts['late'] += 1
+            revised.update(inserted.revised)
+        return sorted(revised.items(), key=itemgetter(0))

@@ -78,6 +78,7 @@ class BaseNode(Node):
         super().__init__(name, **options)
         self._settings = NodeParameters(self, config_types, type_specs(name))
         self._config_type, self._node_config_type = config_types
+        self._node_config: Any = self._settings[self._node_config_type]
         self._name = name
         self._full_name = self.get_fully_qualified_name().lstrip('/')
         self._inputs: dict[str, tuple[InputTopic, Callable[[Any], Any]]] = {}
@@ -109,6 +110,7 @@ class BaseNode(Node):
             self._report,
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
+        self._settings.on_change(self._reconfigure)
         self._settings.warn_of_unknown()
         self._acknowledge(None)
         self.get_logger().info(f'ready, hears {", ".join(resolved.values())}')
@@ -151,6 +153,9 @@ class BaseNode(Node):
         """Forget what came so far, after an internal error."""
         raise NotImplementedError
 
+    def reconfigure(self) -> None:
+        """Take over parameters that were changed while running."""
+
     def work_report(self) -> dict[str, Any]:
         """`enabled`, `counts`, `health` and `warnings` for `Reporter.report`."""
         raise NotImplementedError
@@ -173,10 +178,6 @@ class BaseNode(Node):
 
     # -- the same for all ----------------------------------------------------------------------
 
-    @property
-    def _node_config(self) -> Any:
-        return self._settings[self._node_config_type]
-
     def _listen(self, topic: InputTopic, name: str, settings: Mapping[str, Any]) -> str:
         """Subscribe to one input on the topic `name`, and give the resolved name of that."""
         spec = type_spec(topic)
@@ -192,6 +193,10 @@ class BaseNode(Node):
         )
         resolved: str = subscription.topic_name
         return resolved
+
+    def _reconfigure(self) -> None:
+        self._node_config = self._settings[self._node_config_type]
+        self.reconfigure()
 
     def _waited_too_long(self, name: str, info: Mapping[str, Any]) -> bool:
         """Whether a message lay in the queue for more than `max_wait`; counts it."""
@@ -268,7 +273,6 @@ class TrackerNode(BaseNode):
             post_callback=self._on_clock_back,
         )
         self._saved_state.save_periodically(lambda: self._config)
-        self._settings.on_change(lambda: self._intake.reconfigure(self._config))
         self.begin()
 
     def destroy_node(self) -> None:
@@ -283,13 +287,9 @@ class TrackerNode(BaseNode):
     def advertise_more(self) -> None:
         """Offer what a system's own node publishes besides the displays."""
 
-    def show(self, newest: Estimate) -> None:
-        """Publish the newest state for displays."""
-        self._displays.publish(newest)
-
-    def show_all(self, estimates: list[Estimate]) -> None:
-        """Publish what each of the estimates of one message is to be shown as."""
-        self.show(estimates[-1])
+    def show(self, estimates: list[Estimate]) -> None:
+        """Publish for displays what the estimates of one message are to be shown as."""
+        self._displays.publish(estimates[-1])
 
     def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Read, admit, process, publish."""
@@ -316,6 +316,10 @@ class TrackerNode(BaseNode):
         """Forget all measurements and take away what is drawn."""
         self._intake.reset()
         self._displays.clear()
+
+    def reconfigure(self) -> None:
+        """Hand the parameters on to the tracker."""
+        self._intake.reconfigure(self._config)
 
     def work_report(self) -> dict[str, Any]:
         """What the tracker says of itself."""
@@ -369,7 +373,7 @@ class TrackerNode(BaseNode):
         for estimate in estimates[-wanted:]:
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1
-        self.show_all(estimates)
+        self.show(estimates)
 
     def _doubt(self, name: str, reason: str) -> None:
         if reason not in self._meter.doubted:

@@ -64,9 +64,9 @@ class BathymetryNode(TrackerNode):
     def advertise_more(self) -> None:
         self._soundings = self.advertise('sensor_msgs/msg/PointCloud2', '~/soundings')
 
-    def show_all(self, estimates: list[Estimate]) -> None:
+    def show(self, estimates: list[Estimate]) -> None:
         for estimate in estimates:
-            self.show(estimate)
+            super().show([estimate])
             soundings = soundings_of(estimate)
             if soundings is not None and self._soundings.get_subscription_count():
                 self._soundings.publish(write_soundings(soundings, make))

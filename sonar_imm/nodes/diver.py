@@ -53,9 +53,9 @@ class DiverNode(TrackerNode):
     def advertise_more(self) -> None:
         self._geo = self.advertise('sensor_msgs/msg/NavSatFix', '~/geo')
 
-    def show(self, newest: Estimate) -> None:
-        super().show(newest)
-        origin = self.tracker.origin
+    def show(self, estimates: list[Estimate]) -> None:
+        super().show(estimates)
+        newest, origin = estimates[-1], self.tracker.origin
         if origin is not None and self._geo.get_subscription_count():
             for row in confirmed_rows(newest):
                 self._geo.publish(write_geo(newest, row, origin, make))

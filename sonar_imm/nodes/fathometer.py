@@ -52,8 +52,8 @@ class FathometerNode(TrackerNode):
     def advertise_more(self) -> None:
         self._response = self.advertise(TABLE, '~/response')
 
-    def show(self, newest: Estimate) -> None:
-        super().show(newest)
+    def show(self, estimates: list[Estimate]) -> None:
+        super().show(estimates)
         if self._response.get_subscription_count() and self.tracker.response is not None:
             self._response.publish(write_response(self.tracker.response, make))
 

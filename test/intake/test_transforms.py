@@ -19,7 +19,7 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.intake.frames import moved, TransformTree
+from sonar_imm.intake.transforms import moved, TransformTree
 from sonar_imm.measurements import (
     Arrivals,
     Detections,

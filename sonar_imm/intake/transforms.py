@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Frames: every measurement of a tracker in one, and what is measured in another turned into it.
+"""What is measured in a frame that is fixed to that of the tracks, turned into that.
 
 Only transforms that do not change are used: a measurement is then turned by the same numbers
 whenever it comes, live and from a recording. What moves against the frame of the tracks is a
@@ -43,65 +43,6 @@ from ..measurements import (
 
 UPRIGHT = 1.0 - 1e-6
 """Least cosine between two verticals that are the same."""
-_TRACKS = 'tracks'
-
-
-def frame_role(measurement: Any) -> str:
-    """Whose frame a measurement is in, as its class says by `FRAME`: ``'world'``, that of the
-    tracks, where it says nothing; ``'own'``, that of its sensor on the vehicle; ``'none'``, when
-    it is the same in any frame."""
-    role: str = getattr(type(measurement), 'FRAME', 'world')
-    return role
-
-
-class KnownFrames:
-    """The frame of the tracks, and that of each sensor (kind of measurement, and side) that has
-    its own: each is that of the first measurement that was used.
-
-    A measurement that is not used must not decide: `check` only compares, `settle` decides.
-    kinds: the classes of which the tracker decides what is used, since it can refuse them for
-    their stamps; what is of another class is used whenever it comes.
-    """
-
-    def __init__(self, kinds: tuple[type, ...] = ()):
-        self.kinds = kinds
-        self._frames: dict[Any, str] = {}
-
-    @property
-    def frame_id(self) -> str:
-        """The frame of the tracks, empty until one is known."""
-        return self._frames.get(_TRACKS, '')
-
-    def check(self, measurement: Any, required: str = '') -> None:
-        """Raise `Rejection` when `measurement` is in another frame, or, where it is in that of the
-        tracks, not in `required`. One without a frame passes only until a frame is known."""
-        key = _key(measurement)
-        for expected in (required if key == _TRACKS else '', self._frames.get(key, '')):
-            if expected and measurement.frame_id != expected:
-                whose = 'the tracks' if key == _TRACKS else 'earlier ones'
-                raise Rejection(
-                    'frame',
-                    f"the frame '{measurement.frame_id}' is not the frame '{expected}' of {whose}",
-                )
-
-    def settle(self, measurement: Any) -> None:
-        """Expect the frame of `measurement`, which passed `check` and is used, from now on."""
-        key = _key(measurement)
-        if key is not None:
-            self._frames[key] = measurement.frame_id
-
-    def admit(self, measurement: Any) -> None:
-        """`check` and `settle`, for what is used whatever its stamp. Raises `Rejection`."""
-        self.check(measurement)
-        self.settle(measurement)
-
-
-def _key(measurement: Any) -> Any:
-    """What shares one frame: all that is in the frame of the tracks, or one sensor; or None."""
-    role = frame_role(measurement)
-    if role == 'own':
-        return type(measurement), getattr(measurement, 'side', '')
-    return _TRACKS if role == 'world' else None
 
 
 class TransformTree:
