@@ -15,10 +15,11 @@
 """The bathymetry node: ``ros2 run sonar_imm bathymetry_node``, or
 ``python -m sonar_imm.nodes.bathymetry``.
 
-Hears ``snapshot``, one message a ping, and publishes one ``~/estimate`` a ping, one row a range
-bin. The points are the floor in the frame of the sonar; the column ``label`` is the number of the
-most probable terrain model, by which RViz2 and Foxglove colour them (config/bathymetry.rviz,
-config/foxglove_bathymetry.json), ``label_probability`` how probable it is.
+Hears ``snapshot``, one message per ping, and publishes one ``~/estimate`` per ping, one row per
+range bin. The points are the floor in the frame of the sonar; the column ``label`` is the number
+of the most probable terrain model, by which RViz2 and Foxglove colour them
+(config/bathymetry.rviz, config/foxglove_bathymetry.json), ``label_probability`` how probable it
+is.
 
 Also published, for each ping: ``~/model_probabilities``, the share of the bins that each terrain
 model holds, and with navigation on ``nav`` ``~/soundings``, what goes into a chart: a row for each

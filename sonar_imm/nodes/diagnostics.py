@@ -14,7 +14,7 @@
 
 """What /diagnostics says of a node, in the shape of diagnostic_updater.
 
-Two entries a node: ``<node>: input`` (rates, silence, refused and lost messages) and
+Two entries per node: ``<node>: input`` (rates, silence, refused and lost messages) and
 ``<node>: tracker`` (what the tracker says of itself, and how long it takes). Everything here is
 measured with the steady clock of the machine: under simulated time, paused or looped, silence
 still shows. Nothing here knows of subscriptions and clocks; the node tells what happened and when.

@@ -17,8 +17,8 @@
 Hears ``fix``, ``fixes``, ``relative``, ``arrivals``, and for ``relative`` the vessel's ``nav`` or
 ``nav_fix`` and ``heading``. Besides ``~/estimate`` it publishes, for the newest state only:
 
-- ``~/odometry``: one message a confirmed diver (coasting ones too), told apart by
-  ``child_frame_id`` = ``diver_<track_id>``;
+- ``~/odometry``: one message per confirmed diver (coasting ones too), whose ``child_frame_id`` is
+  ``diver_<track_id>``;
 - ``~/geo``: the same as NavSatFix, when it is known where the frame of the tracks lies on Earth;
 - ``~/model_probabilities``: those of the diver that has been tracked longest.
 """

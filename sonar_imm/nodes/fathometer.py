@@ -15,7 +15,7 @@
 """The fathometer node: ``ros2 run sonar_imm fathometer_node``, or
 ``python -m sonar_imm.nodes.fathometer``.
 
-Hears ``csdm``, ``pressure`` or ``trace``, and ``array_depth`` beside them. One ``~/estimate`` a
+Hears ``csdm``, ``pressure`` or ``trace``, and ``array_depth`` beside them. One ``~/estimate`` per
 record; with `preview_seconds` also one at each sliding update between records, marked `preview`.
 Besides, for the newest record or preview:
 

@@ -149,7 +149,7 @@ class NodeParameters:
         return values
 
     def _build(self, values: Mapping[str, Any]) -> dict[type[Config], Any]:
-        """Build one config a class, with the mistakes of all classes in one `ConfigError`."""
+        """Build a config of each class, with the mistakes of all classes in one `ConfigError`."""
         built: dict[type[Config], Any] = {}
         problems: list[str] = []
         for config_type in self._types:

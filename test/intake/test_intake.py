@@ -37,7 +37,7 @@ from sonar_imm_tools.simulation.obstacle import simulator as obstacle
 LEVER, RPY = (1.5, -0.3, 0.4), (2.0, -15.0, 8.0)
 MOUNT = Pose(np.array(LEVER), geometry.rotation(*np.radians(RPY)))
 FRAMES = {'vehicle_frame': 'base_link', 'sonar_frame': 'sonar'}
-SAID = StaticTransforms(
+TRANSFORMS = StaticTransforms(
     poses={
         'sonar': ('bracket', Pose(np.zeros(3), MOUNT.R)),
         'bracket': ('base_link', Pose(MOUNT.position, np.eye(3))),
@@ -53,15 +53,15 @@ def scene_of(system):
     return scene, swath.simulate(scene, 1).measurements
 
 
-def run(system, said=None, **told):
+def run(system, transforms=None, **parameters):
     """The last estimate, the reasons of refusals, and the tracker."""
     scene, received = scene_of(system)
-    config = SYSTEMS[system].config_type()(**{**scene.told(), **told})
+    config = SYSTEMS[system].config_type()(**{**scene.told(), **parameters})
     tracker = SYSTEMS[system].build(config)
     intake, made, refused = Intake(tracker), [], []
-    for one in [*([said] if said else []), *(item.measurement for item in received)]:
+    for item in [*([transforms] if transforms else []), *(item.measurement for item in received)]:
         try:
-            measurement = intake.admit(one)
+            measurement = intake.admit(item)
         except Rejection as rejection:
             refused.append(rejection)
             continue
@@ -74,20 +74,20 @@ def run(system, said=None, **told):
 def test_a_mounting_that_transforms_say_is_that_of_the_parameters(system):
     by_hand, _, _ = run(system, sonar_lever=LEVER, sonar_mount_rpy_deg=RPY)
     plain, _, _ = run(system)
-    told, refused, tracker = run(system, SAID, **FRAMES)
+    mounted, refused, tracker = run(system, TRANSFORMS, **FRAMES)
     assert not refused and tracker.config.sonar_lever == LEVER
     assert tracker.config.sonar_mount_rpy_deg == pytest.approx(RPY)
-    assert told.state == pytest.approx(by_hand.state, rel=1e-9, abs=1e-9, nan_ok=True)
-    assert told.xyz == pytest.approx(by_hand.xyz, rel=1e-5, abs=1e-5, nan_ok=True)
-    assert plain.state.shape != told.state.shape or not np.allclose(
-        plain.state, told.state, equal_nan=True
+    assert mounted.state == pytest.approx(by_hand.state, rel=1e-9, abs=1e-9, nan_ok=True)
+    assert mounted.xyz == pytest.approx(by_hand.xyz, rel=1e-5, abs=1e-5, nan_ok=True)
+    assert plain.state.shape != mounted.state.shape or not np.allclose(
+        plain.state, mounted.state, equal_nan=True
     )
 
 
 @pytest.mark.parametrize('system', ['obstacle', 'bathymetry'])
 def test_pings_before_the_mounting_is_known_are_refused_by_name(system):
     last, refused, _ = run(system, **FRAMES)
-    assert last is None and {one.reason for one in refused} == {'no_mounting'}
+    assert last is None and {item.reason for item in refused} == {'no_mounting'}
     assert "'sonar' is on 'base_link'" in refused[0].sentence
 
 
@@ -95,7 +95,7 @@ def test_a_change_of_parameters_keeps_the_mounting():
     config = SYSTEMS['obstacle'].config_type()(**FRAMES)
     tracker = SYSTEMS['obstacle'].build(config)
     intake = Intake(tracker)
-    intake.admit(SAID)
+    intake.admit(TRANSFORMS)
     intake.reconfigure(evolve(config, detection_probability=0.5))
     assert tracker.config.detection_probability == 0.5 and tracker.config.sonar_lever == LEVER
 
@@ -128,8 +128,8 @@ def test_a_late_altitude_does_not_shut_out_the_later_ones():
     intake = Intake(tracker)
 
     def take(second, frame_id):
-        said = Altitude(stamp_ns=second * 10**9, altitude=9.0, frame_id=frame_id)
-        tracker.process(intake.admit(said))
+        altitude = Altitude(stamp_ns=second * 10**9, altitude=9.0, frame_id=frame_id)
+        tracker.process(intake.admit(altitude))
 
     for second in range(5000, 5005):
         pose = Navigation(
@@ -164,7 +164,9 @@ def test_a_required_frame_survives_a_reset_and_a_first_one_does_not():
 
 def test_an_array_keeps_to_its_first_frame():
     scene, received = scene_of('bathymetry')
-    snapshot = next(one.measurement for one in received if isinstance(one.measurement, Snapshot))
+    snapshot = next(
+        item.measurement for item in received if isinstance(item.measurement, Snapshot)
+    )
     config = SYSTEMS['bathymetry'].config_type()(**scene.told())
     intake = Intake(SYSTEMS['bathymetry'].build(config))
     first = evolve(snapshot, frame_id='array')

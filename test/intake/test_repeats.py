@@ -55,8 +55,8 @@ def passes(repeats, measurement):
 
 def test_the_same_position_a_moment_later_is_a_repeat_until_the_time_is_over():
     repeats = RepeatFilter(5.0)
-    said = [passes(repeats, fix(second)) for second in (1, 2, 3, 6, 6.5, 7, 12)]
-    assert said == [True, False, False, False, True, False, True]
+    passed = [passes(repeats, fix(second)) for second in (1, 2, 3, 6, 6.5, 7, 12)]
+    assert passed == [True, False, False, False, True, False, True]
 
 
 def test_a_late_repeat_is_one_too_and_the_same_stamp_is_left_to_others():
@@ -74,7 +74,7 @@ def test_other_numbers_names_sensors_and_frames_are_no_repeats():
         fix(2, frame_id='odom'),
         fix(2, covariance=np.eye(2)),
     ]
-    assert all(passes(repeats, one) for one in others)
+    assert all(passes(repeats, other) for other in others)
 
 
 @pytest.mark.parametrize(
