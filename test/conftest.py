@@ -34,7 +34,8 @@ os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
 os.environ.pop('ROS_LOCALHOST_ONLY', None)
 
 # Without ROS the rest of the package is still tested, e.g. on the oldest numpy.
-collect_ignore = [] if importlib.util.find_spec('rclpy') else ['nodes', 'replay', 'system']
+without_ros = ['conformance/nodes', 'nodes', 'replay', 'system']
+collect_ignore = [] if importlib.util.find_spec('rclpy') else without_ros
 
 
 def pytest_report_header():

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from attrs import field, frozen
 import numpy as np
@@ -37,6 +37,11 @@ OPTIONAL_COLUMNS = ('var_range', 'var_bearing', 'intensity', 'extent_range', 'ex
 """What a detection may say besides range and bearing."""
 
 
+def _unknown() -> Any:
+    """A column that is left out: NaN in each row, whose number is known after the others."""
+    return None
+
+
 @frozen(eq=False, kw_only=True)
 class Detections:
     """What a forward-looking sonar saw in one ping, one row an echo; none is a ping too.
@@ -53,19 +58,19 @@ class Detections:
     stamp_ns: int
     range: FloatArray = field(converter=column)
     bearing: FloatArray = field(converter=column)
-    var_range: FloatArray | None = None
-    var_bearing: FloatArray | None = None
-    intensity: FloatArray | None = None
+    var_range: FloatArray = field(factory=_unknown)
+    var_bearing: FloatArray = field(factory=_unknown)
+    intensity: FloatArray = field(factory=_unknown)
     frame_id: str = ''
-    extent_range: FloatArray | None = None
-    extent_bearing: FloatArray | None = None
+    extent_range: FloatArray = field(factory=_unknown)
+    extent_bearing: FloatArray = field(factory=_unknown)
 
     def __attrs_post_init__(self) -> None:
         check_stamp(self.stamp_ns)
         for name in OPTIONAL_COLUMNS:
             given = getattr(self, name)
-            column = np.full(len(self.range), np.nan) if given is None else given
-            object.__setattr__(self, name, floats(column, None))
+            values = np.full(len(self.range), np.nan) if given is None else given
+            object.__setattr__(self, name, column(values))
         for name in ('bearing', *OPTIONAL_COLUMNS):
             rows = len(getattr(self, name))
             if rows != len(self):

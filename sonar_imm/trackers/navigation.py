@@ -90,8 +90,8 @@ class NavigationBuffer:
     def pose(self, stamp_ns: int) -> Pose:
         """The vehicle at `stamp_ns`, in the navigation's own axes."""
         if len(self.stamps) == 1:
-            one = self.samples[0]
-            return Pose(one.position, geometry.rotation_of_quaternion(one.orientation))
+            sample = self.samples[0]
+            return Pose(sample.position, geometry.rotation_of_quaternion(sample.orientation))
         after = min(max(bisect_left(self.stamps, stamp_ns), 1), len(self.stamps) - 1)
         older, newer = self.samples[after - 1], self.samples[after]
         fraction = (stamp_ns - older.stamp_ns) / (newer.stamp_ns - older.stamp_ns)
@@ -104,8 +104,8 @@ class NavigationBuffer:
         begin = max(0, min(bisect_right(self.stamps, stamps_ns[0]) - 1, len(self.stamps) - 2))
         end = max(begin + 2, bisect_left(self.stamps, stamps_ns[-1]) + 1)
         stamps, samples = np.array(self.stamps[begin:end]), self.samples[begin:end]
-        position = np.array([one.position for one in samples])
-        q = np.array([one.orientation for one in samples])
+        position = np.array([sample.position for sample in samples])
+        q = np.array([sample.orientation for sample in samples])
         if len(stamps) == 1:
             stamps = np.append(stamps, stamps + 1)
             position, q = np.repeat(position, 2, axis=0), np.repeat(q, 2, axis=0)

@@ -54,7 +54,9 @@ def course(buffer: NavigationBuffer, stamp_ns: int, window: float) -> FloatArray
     if len(stamps) < 2 or (stamps[-1] - stamps[0]) * 1e-9 < _SHORTEST:
         return np.full(3, np.nan)
     t = (np.array(stamps) - stamp_ns) * 1e-9
-    positions = np.concatenate([one.position for one in buffer.samples[first:last]]).reshape(-1, 3)
+    positions = np.concatenate([sample.position for sample in buffer.samples[first:last]]).reshape(
+        -1, 3
+    )
     return slope(t, positions)
 
 

@@ -68,7 +68,8 @@ class BehaviourSlices(DepthSlices):
         self.slices, self.M = config.components, len(switching)
         names = switching * self.slices + ['seabed'] * ('seabed' in self.behaviours)
         self.K = len(names)
-        self._is = {name: np.array([one == name for one in names]) for name in BEHAVIOURS}
+        behaviour = np.array(names)
+        self._is = {name: behaviour == name for name in BEHAVIOURS}
         self._of = np.stack([self._is[name] for name in self.behaviours], axis=-1).astype(float)
         self.moves = self._is['moving']
         self._swaying, self._moving = (self._is[name] * 1.0 for name in ('swaying', 'moving'))

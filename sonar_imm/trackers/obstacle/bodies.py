@@ -52,10 +52,10 @@ MEMORY = 30.0
 
 
 class Bodies(NamedTuple):
-    """Of T tracks: count (T,) of echoes with an extent, and their mean standard deviation (T, 2),
+    """Of T tracks: number (T,) of echoes with an extent, and their mean standard deviation (T, 2),
     m, in range and across it; zeros as long as there was none."""
 
-    count: FloatArray
+    number: FloatArray
     std: FloatArray
 
     @staticmethod
@@ -63,7 +63,7 @@ class Bodies(NamedTuple):
         return Bodies(np.zeros(T), np.zeros((T, 2)))
 
     def rows(self, which: np.ndarray) -> Bodies:
-        return Bodies(self.count[which], self.std[which])
+        return Bodies(self.number[which], self.std[which])
 
     def joined(self, other: Bodies) -> Bodies:
         return Bodies(*(np.concatenate(both) for both in zip(self, other)))
@@ -83,12 +83,12 @@ class Bodies(NamedTuple):
         metres = np.column_stack([np.ones(len(z)), z[:, 0]])
         stated = np.sqrt(np.diagonal(R, axis1=-2, axis2=-1)) * metres
         # The first echo of a track is averaged with what is believed beforehand.
-        before = np.where(self.count[:, None] > 0.0, self.std, np.sqrt(own) * metres)
-        weight = 1.0 / (np.minimum(self.count, MEMORY) + 2.0)
+        before = np.where(self.number[:, None] > 0.0, self.std, np.sqrt(own) * metres)
+        weight = 1.0 / (np.minimum(self.number, MEMORY) + 2.0)
         mean = before + weight[:, None] * (stated - before)
-        told = extended[:, None]
-        after = Bodies(self.count + extended, np.where(told, mean, self.std))
-        used = np.square(np.where(told, mean, stated) / metres)
+        stated_now = extended[:, None]
+        after = Bodies(self.number + extended, np.where(stated_now, mean, self.std))
+        used = np.square(np.where(stated_now, mean, stated) / metres)
         return after, used[:, :, None] * np.eye(2)
 
 

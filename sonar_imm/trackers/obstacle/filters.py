@@ -198,11 +198,23 @@ class DepthSlices:
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
-        *words, place, velocity, both, mean, covariance = ping_kernels.describe(
-            *mixture, self.moves, *sonar.pose, self.cone, 0.5 * (1.0 - BAND)
+        tail = 0.5 * (1.0 - BAND)
+        state, own, low, high, above, place, velocity, both, *near = ping_kernels.describe(
+            *mixture, self.moves, *sonar.pose, self.cone, tail
         )
-        behaviour, near = self.behaviour(mixture.mu), (mean, covariance)
-        return View(*words, place, both[:, :3, :3], behaviour, velocity, both[:, 3:, 3:], near)
+        return View(
+            state,
+            own,
+            low,
+            high,
+            above,
+            place,
+            both[:, :3, :3],
+            self.behaviour(mixture.mu),
+            velocity,
+            both[:, 3:, 3:],
+            (near[0], near[1]),
+        )
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
         """Probability of each behaviour, (T, B)."""
@@ -384,7 +396,7 @@ def _two_way(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArra
     """Range and azimuth (..., 2) of points seen at `out` (..., 3) when the ping left."""
     d_out = np.linalg.norm(out, axis=-1)
     fraction = np.clip(2.0 * d_out / config.sound_speed / sonar.late_by, 0.0, 1.0)
-    late = geometry.predict(out, sonar.pose, sonar.late)
+    late = out if sonar.late is None else geometry.predict(out, sonar.pose, sonar.late)
     back = out + fraction[..., None] * (late - out)
     d_back, azimuth = geometry.project(back, config.azimuth_model)
     return np.stack([0.5 * (d_out + d_back), azimuth], axis=-1)

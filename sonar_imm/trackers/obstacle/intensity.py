@@ -122,12 +122,12 @@ def weighed(
     strengths were valid; width rad; weight: power to which the likelihood is raised.
     """
     variance = strengths.variance + DRIFT_DB**2 * dt
-    heard = np.isfinite(level)[:, None] & np.isfinite(elevation)
+    has_level = np.isfinite(level)[:, None] & np.isfinite(elevation)
     innovation = level[:, None] - strengths.mean - pattern_db(elevation, width)
-    innovation = np.where(heard, innovation, 0.0)
+    innovation = np.where(has_level, innovation, 0.0)
     S = variance + fading_db**2
-    gain = np.where(heard, variance / S, 0.0)
-    log_likelihood = np.where(heard, -0.5 * (np.square(innovation) / S + np.log(S)), 0.0)
+    gain = np.where(has_level, variance / S, 0.0)
+    log_likelihood = np.where(has_level, -0.5 * (np.square(innovation) / S + np.log(S)), 0.0)
     log_likelihood -= np.max(np.where(mu > 0.0, log_likelihood, -np.inf), axis=1, keepdims=True)
     new = mu * np.exp(weight * np.minimum(log_likelihood, 0.0))
     new /= new.sum(axis=1, keepdims=True)

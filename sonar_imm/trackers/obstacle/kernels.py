@@ -16,10 +16,10 @@
 
 A target is K components of four states (d, delta, z, s): range m, azimuth rad positive to
 starboard, depth m of the obstacle, scale of the navigation's horizontal distances. A kernel takes
-x (T, K, 4) and P (T, K, 4, 4) of all targets at once; `cone` says which azimuth is meant. What a
-point and a projection are is told in `acoustics.geometry`; here they are written out again for
-speed, and where no point exists, as can happen at a sigma point, the nearest existing one is
-taken. Sigma points (`sigma_kernels`) are on the columns of the Cholesky root with kappa = 1, so
+x (T, K, 4) and P (T, K, 4, 4) of all targets at once; `cone` says which azimuth is meant.
+`acoustics.geometry` describes points and projections; here they are written out again for speed,
+and where no point exists, as can happen at a sigma point, the nearest existing one is taken. Sigma
+points (`sigma_kernels`) are on the columns of the Cholesky root with kappa = 1, so
 that no weight is negative and the centre of four states weighs 1/5.
 """
 

@@ -92,18 +92,18 @@ def echoes(
 
 
 @kernel
-def finite(x: FloatArray, P: FloatArray) -> BoolArray:
+def is_finite(x: FloatArray, P: FloatArray) -> BoolArray:
     """Which of the mixtures x (T, K, n), P (T, K, n, n) have finite numbers throughout, (T,)."""
     T = len(x)
-    sound = np.empty(T, dtype=np.bool_)
+    usable = np.empty(T, dtype=np.bool_)
     for t in range(T):
         flaws = 0
         for value in x[t].reshape(-1):
             flaws += not math.isfinite(value)
         for value in P[t].reshape(-1):
             flaws += not math.isfinite(value)
-        sound[t] = flaws == 0
-    return sound
+        usable[t] = flaws == 0
+    return usable
 
 
 @kernel

@@ -211,16 +211,16 @@ def weighted(image: FloatArray, centre: FloatArray, weight: FloatArray, mean: Fl
 
 @kernel
 def product(
-    one: FloatArray, other: FloatArray, centre: FloatArray, weight: FloatArray, out: FloatArray
+    first: FloatArray, other: FloatArray, centre: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
     """The covariance (lanes,) of two images without their means: see `weighted`."""
     lanes = len(out)
     for k in range(lanes):
-        out[k] = centre[k] * one[0, k] * other[0, k]
+        out[k] = centre[k] * first[0, k] * other[0, k]
     for column in range(len(weight)):
         for number in range(ahead(column), ahead(column) + 2):
             for k in range(lanes):
-                out[k] += weight[column, k] * one[number, k] * other[number, k]
+                out[k] += weight[column, k] * first[number, k] * other[number, k]
 
 
 @kernel

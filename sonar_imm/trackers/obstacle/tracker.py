@@ -226,8 +226,9 @@ class ObstacleTracker:
         reference = float(pose.position[2] + vehicle.position[2])  # depth plus height
         straight = geometry.flip_world(course(buffer, ping.stamp_ns, self.config.course_window))
         oldest_ns = ping.stamp_ns - nanoseconds(self.config.max_altitude_age)
-        known = altitude is not None and altitude.stamp_ns >= oldest_ns
-        height = altitude.altitude if known else np.nan
+        height = np.nan
+        if altitude is not None and altitude.stamp_ns >= oldest_ns:
+            height = altitude.altitude
         late_ns = self._late_ns()
         if not late_ns:
             return Sonar(pose, height, reference=reference, course=straight)
@@ -244,11 +245,11 @@ class ObstacleTracker:
         now = self._update(now, chosen, expected, z, R, extended)
         if self.config.vertical_beam_width_deg and before:
             dt = (now.stamp_ns - before.stamp_ns) * 1e-9
-            heard = np.append(level_db(intensity), np.nan)[chosen]
-            told = by_intensity(
-                *now.mixture, now.strengths, now.sonar.pose, heard, dt, self.config
+            level = np.append(level_db(intensity), np.nan)[chosen]
+            mu, strengths = by_intensity(
+                *now.mixture, now.strengths, now.sonar.pose, level, dt, self.config
             )
-            now = now._replace(mixture=now.mixture._replace(mu=told[0]), strengths=told[1])
+            now = now._replace(mixture=now.mixture._replace(mu=mu), strengths=strengths)
         hit = chosen >= 0
         now = self._prune(now, hit)
         if np.count_nonzero(hit) < len(z):
@@ -268,11 +269,11 @@ class ObstacleTracker:
             mixture=mixture,
             repairs=before.repairs + repairs,
         )
-        sound = ping_kernels.finite(mixture.x, mixture.P)
-        return now.only(sound), len(sound) - int(np.count_nonzero(sound))
+        is_finite = ping_kernels.is_finite(mixture.x, mixture.P)
+        return now.only(is_finite), len(is_finite) - int(np.count_nonzero(is_finite))
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
-        """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is told (D,), of the rows
+        """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is stated (D,), of the rows
         that are echoes, azimuth positive to starboard. A row that is as uncertain as it is far
         says nothing and is left out."""
         *echoes, real = ping_kernels.echoes(
@@ -366,7 +367,7 @@ class ObstacleTracker:
         view = self.filter.view(ping.mixture, ping.sonar)
         view = considered(view, ping.sonar, ping.bodies, self.config.range_scale_std)
         place, place_covariance = self.mount.to_enu(view.place, view.place_covariance)
-        extras = {
+        extras: dict[str, np.ndarray] = {
             **behaviour_columns(view, self.filter.behaviours),
             **closest_approach(*view.near, ping.mixture.mu, ping.sonar.course, self.config),
             'track_id': ping.life.track_id,

@@ -55,7 +55,7 @@ def test_detections_without_extent_are_as_uncertain_as_they_say():
     assert after is bodies and used is R
     after, used = bodies.seen(np.array([False, True]), np.repeat(Z, 2, axis=0), R, OWN)
     assert_allclose(used[0], R[0])
-    assert after.count.tolist() == [0.0, 1.0] and not after.std[0].any()
+    assert after.number.tolist() == [0.0, 1.0] and not after.std[0].any()
 
 
 def test_the_size_is_kept_in_metres_while_the_range_closes():
@@ -127,7 +127,7 @@ def test_a_track_that_was_missed_keeps_its_size():
                 extent_bearing=[0.003] * n,
             )
         )
-        assert tracker._stream.state.last.bodies.count[0] == 1.0 + k // 2
+        assert tracker._stream.state.last.bodies.number[0] == 1.0 + k // 2
 
 
 def image_run(setting, seed):

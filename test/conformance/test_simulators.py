@@ -1,0 +1,88 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What every simulator promises, checked alike for the scenes of all systems."""
+
+import importlib
+import pickle
+
+from helpers.scenes import small_scene
+import numpy as np
+import pytest
+
+from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers import SYSTEMS
+
+
+@pytest.fixture(params=SYSTEMS)
+def system(request):
+    return SYSTEMS[request.param]
+
+
+@pytest.fixture
+def scenes(system):
+    return importlib.import_module(system.scenes)
+
+
+def test_a_seed_decides_on_every_byte(system):
+    first, again, other = (
+        [pickle.dumps(item.measurement) for item in small_scene(system, seed)[1].measurements]
+        for seed in (3, 3, 4)
+    )
+    assert first == again != other
+
+
+def test_the_random_state_of_the_process_is_left_alone(system, scenes):
+    np.random.seed(1)
+    before = np.random.get_state()[1].tobytes()
+    small_scene(system, 3)
+    assert np.random.get_state()[1].tobytes() == before
+
+
+def test_measurements_are_received_in_order_and_after_their_stamp(system, scenes):
+    received = small_scene(system, 3)[1].measurements
+    times = [item.received_ns for item in received]
+    assert times == sorted(times) and len(times) > 1
+    assert all(item.received_ns >= item.measurement.stamp_ns for item in received)
+
+
+def test_the_truth_is_a_table_a_stamp_that_draws(system, scenes):
+    scene = small_scene(system, 3)[1]
+    tables = [table for truth in scene.truth for table in truth.tables(scene.frame_id)]
+    assert tables
+    for table in tables:
+        assert list(table.columns)[:3] == ['x', 'y', 'z'] and table.frame_id
+        assert {len(column) for column in table.columns.values()} == {len(table.columns['x'])}
+        assert all(table.columns[name].dtype == np.float32 for name in 'xyz')
+
+
+def test_the_tracker_takes_what_the_scene_tells_of_its_instruments(system, scenes):
+    config, scene = small_scene(system, 3)
+    tracker = system.build(system.config_type()(**config.told()))
+    for item in scene.measurements:
+        tracker.process(item.measurement)
+    assert tracker.counts['used'] > 0 and not tracker.counts['unknown_type']
+
+
+def test_every_scenario_has_a_description_and_can_be_configured(scenes):
+    for name, (description, _) in scenes.SCENARIOS.items():
+        assert len(description.split()) > 2
+        assert scenes.scenario(name, {}) == scenes.scenario(name, None)
+
+
+def test_a_name_that_nobody_knows_is_answered_with_those_that_exist(scenes):
+    known = next(iter(scenes.SCENARIOS))
+    with pytest.raises(ConfigError, match=f"unknown scenario '{known}x'.*did you mean.*{known}"):
+        scenes.scenario(known + 'x', {})
+    with pytest.raises(ConfigError, match='no_such_parameter'):
+        scenes.scenario(known, {'no_such_parameter': 1})

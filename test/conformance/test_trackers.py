@@ -1,0 +1,231 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What every tracker promises, checked alike on recordings of all systems."""
+
+from copy import deepcopy
+import pickle
+
+import attrs
+from helpers.tracked import as_bytes, published, RUNS, tracked
+import numpy as np
+import pytest
+
+from sonar_imm.measurements import Rejection
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.state_file import read_state, tracker_from, write_state
+from sonar_imm.trackers.state_values import freeze
+from sonar_imm_tools.offline.tracking import final_estimates
+
+SECOND = 10**9
+WITH_HISTORY = [name for name in RUNS if name.startswith(('diver', 'obstacle'))]
+
+
+@pytest.fixture(params=RUNS)
+def run(request):
+    return tracked(request.param)
+
+
+@attrs.frozen
+class Stranger:
+    """A measurement that no tracker knows."""
+
+    stamp_ns: int = 5 * SECOND
+    frame_id: str = 'map'
+
+
+def test_there_is_a_recording_of_every_system():
+    assert {name.split('_')[0] for name in RUNS} == set(SYSTEMS)
+    for name in RUNS:
+        assert sum(map(len, tracked(name).whole)) > 5, 'too few estimates to compare'
+
+
+def test_the_same_input_gives_the_same_bytes(run):
+    tracker = run.build()
+    tracker.warm()
+    assert [published(tracker, m) for m in run.input] == run.whole
+    assert tracker.counts == run.counts
+
+
+def test_reset_equals_a_fresh_tracker(run):
+    tracker = run.until(40)
+    tracker.reset()
+    assert not +tracker.counts
+    assert [published(tracker, m) for m in run.input] == run.whole
+    assert tracker.counts == run.counts
+
+
+@pytest.mark.parametrize('name', WITH_HISTORY)
+def test_shuffled_input_gives_the_bytes_of_sorted_input(name):
+    """What is late by less than the window gets its place in time."""
+    run = tracked(name)
+    measurements = sorted(run.input, key=lambda m: m.stamp_ns)
+    rng = np.random.default_rng(3)
+    arrival = [
+        m.stamp_ns + rng.uniform(0.0, 0.3 * run.config.history * SECOND) for m in measurements
+    ]
+    shuffled = [measurements[k] for k in np.argsort(arrival, kind='stable')]
+    assert shuffled != measurements
+    made = []
+    for order in (measurements, shuffled):
+        tracker = run.build()
+        estimates = [estimate for m in order for estimate in tracker.process(m)]
+        made.append([as_bytes(one) for one in final_estimates(estimates, run.config)])
+        assert not tracker.counts['too_late']
+    assert made[0] == made[1] and tracker.counts['late'] > 3
+
+
+@pytest.mark.parametrize('name', [n for n in RUNS if not n.startswith('bathymetry')])
+def test_what_is_too_late_is_counted_and_changes_nothing(name):
+    """The bathymetry tracker has no such thing: each ping stands alone."""
+    run = tracked(name)
+    cut = len(run.input) * 3 // 4
+    tracker = run.until(cut)
+    late = attrs.evolve(run.input[cut - 1], stamp_ns=run.input[0].stamp_ns - 60 * SECOND)
+    assert tracker.process(late) == []
+    assert tracker.counts['too_late'] == 1
+    assert [published(tracker, m) for m in run.input[cut:]] == run.whole[cut:]
+
+
+def test_a_clock_that_was_set_back_by_a_day_is_followed(run):
+    """A bag that starts over: after a few measurements the tracker believes the new clock."""
+    tracker = run.until(len(run.input))
+    back = [attrs.evolve(m, stamp_ns=m.stamp_ns - 86400 * SECOND) for m in run.input]
+    made = [estimate for m in back for estimate in tracker.process(m)]
+    stamps = {m.stamp_ns for m in back}
+    assert len(made) > 0.5 * sum(map(len, run.whole))
+    assert made[-1].stamp_ns in stamps
+
+
+def test_an_unknown_type_is_counted_and_changes_nothing(run):
+    tracker = run.until(50)
+    for stranger in (Stranger(), 'a word', None):
+        assert tracker.process(stranger) == []
+    assert tracker.counts['unknown_type'] == 3
+    assert [published(tracker, m) for m in run.input[50:]] == run.whole[50:]
+
+
+def test_the_measurements_of_other_systems_are_strangers():
+    kinds = {name.split('_')[0]: tracked(name).input[-1] for name in RUNS}
+    for name, system in SYSTEMS.items():
+        tracker = system.build(system.config_type()())
+        for other, measurement in kinds.items():
+            if other != name and type(measurement).__name__ != 'Navigation':
+                assert tracker.process(measurement) == []
+        assert tracker.counts['unknown_type'] >= 2
+
+
+def test_numbers_that_are_not_finite_harm_nobody(run):
+    """Every array and number of a measurement in turn is NaN, or infinite: either the measurement
+    refuses it, or the tracker lives with it and publishes finite numbers."""
+    refused = taken = 0
+    for bad in (np.nan, np.inf):
+        tracker, rng = run.until(30), np.random.default_rng(1)
+        for measurement in run.input[30:45]:
+            for field in attrs.fields(type(measurement)):
+                value = getattr(measurement, field.name)
+                if isinstance(value, np.ndarray) and value.size and value.dtype.kind in 'fc':
+                    hurt = np.array(value)
+                    hurt.flat[rng.integers(value.size)] = bad
+                elif isinstance(value, float):
+                    hurt = bad
+                else:
+                    continue
+                try:
+                    wrong = attrs.evolve(measurement, **{field.name: hurt})
+                except (Rejection, ValueError):
+                    refused += 1
+                    continue
+                taken += 1
+                for estimate in tracker.process(wrong):
+                    there = estimate.existing if hasattr(estimate, 'existing') else slice(None)
+                    assert not np.isinf(estimate.state[there]).any(), field.name
+            tracker.process(measurement)
+    assert refused + taken > 20
+
+
+def test_process_is_pure(run):
+    """No input is changed, no published estimate changes later, no global random state moves."""
+    tracker = run.build()
+    before = pickle.dumps(run.input[:60])
+    np.random.seed(1)  # the state of the process, which nobody may touch
+    state = np.random.get_state()[1].tobytes()
+    estimates = [estimate for m in run.input[:60] for estimate in tracker.process(m)]
+    copies = [as_bytes(one) for one in deepcopy(estimates)]
+    for measurement in run.input[60:]:
+        tracker.process(measurement)
+    assert pickle.dumps(run.input[:60]) == before
+    assert [as_bytes(one) for one in estimates] == copies
+    assert np.random.get_state()[1].tobytes() == state
+
+
+def test_the_parameters_of_now_change_nothing(run):
+    tracker = run.until(50)
+    tracker.reconfigure(run.config)
+    assert [published(tracker, m) for m in run.input[50:]] == run.whole[50:]
+
+
+def test_health_and_counts_are_numbers(run):
+    tracker = run.until(60)
+    assert all(isinstance(count, int) and count >= 0 for count in tracker.counts.values())
+    health = tracker.health()
+    assert health and all(isinstance(float(value), float) for value in health.values())
+
+
+def test_what_follows_a_restart_is_bit_for_bit_the_same(run, tmp_path):
+    rng = np.random.default_rng(len(run.system.name))
+    for cut in [0, 1, *rng.integers(2, len(run.input), 3)]:
+        stopped = run.until(cut)
+        write_state(tmp_path / 'state', run.saved(stopped))
+        for measurement in run.input[cut : cut + 3]:
+            stopped.process(measurement)  # what it does after it was saved changes nothing
+        again = tracker_from(read_state(tmp_path / 'state'), run.system, run.config)
+        assert [published(again, m) for m in run.input[cut:]] == run.whole[cut:]
+        assert again.counts == run.counts
+
+
+@pytest.mark.parametrize('name', WITH_HISTORY)
+def test_a_window_that_is_sent_again_changes_nothing(name, tmp_path):
+    run = tracked(name)
+    cut = 60
+    write_state(tmp_path / 'state', run.saved(run.until(cut)))
+    again = tracker_from(read_state(tmp_path / 'state'), run.system, run.config)
+    assert not any(again.process(m) for m in run.input[cut - 5 : cut])
+    assert again.counts['duplicate'] == 5
+    assert [published(again, m) for m in run.input[cut:]] == run.whole[cut:]
+
+
+def test_every_attribute_that_changes_is_state(run):
+    """Whatever a run changes in a tracker is named in STATE, or follows from what is."""
+    fresh, ran = run.build(), run.until(60)
+    for attribute in set(vars(ran)) - set(ran.STATE) - {'config', 'counts', '_filter', '_heard'}:
+        before, after = (freeze(getattr(tracker, attribute)) for tracker in (fresh, ran))
+        assert _same(before, after), attribute
+
+
+def _same(value, other):
+    if hasattr(value, 'attributes'):
+        names = (value.attributes.keys() | other.attributes.keys()) - {'_cache'}
+        return all(_same(value.attributes.get(n), other.attributes.get(n)) for n in names)
+    if attrs.has(type(value)):
+        names = {field.name for field in attrs.fields(type(value))} - {'_cache'}
+        return all(_same(getattr(value, n), getattr(other, n)) for n in names)
+    if isinstance(value, dict):
+        return value.keys() == other.keys() and all(_same(value[n], other[n]) for n in value)
+    if isinstance(value, (list, tuple)):
+        return len(value) == len(other) and all(map(_same, value, other))
+    if isinstance(value, np.ndarray):
+        return np.array_equal(value, other, equal_nan=value.dtype.kind == 'f')
+    if hasattr(value, '__dict__') and not callable(value):
+        return _same(freeze(value), freeze(other))
+    return callable(value) or value == other

@@ -1,0 +1,94 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Recordings of every system as measurements, with what an uninterrupted run makes of them."""
+
+import functools
+from pathlib import Path
+
+from msg_adapters.estimates import write_estimate
+from sonar_imm.measurements import Rejection
+from sonar_imm.trackers import SYSTEMS
+from sonar_imm.trackers.state_file import json_parameters, Saved
+from sonar_imm.trackers.state_values import frozen_state
+from sonar_imm_tools.cli.common import load_config
+from sonar_imm_tools.recordings.measurements import measurements_of
+from sonar_imm_tools.recordings.messages import ros_message
+from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.reader import BagReader
+
+BAGS = Path(__file__).resolve().parents[2] / 'bags'
+RUNS = {
+    'diver_table1': {},
+    'diver_multistatic': {},
+    'obstacle_tethers': {},
+    'bathymetry_ship': {'engine': 'grid', 'smoothing': 'states', 'ping_coupling': '1.0'},
+    'fathometer_drift': {'smoothing_lag': '2', 'particles': '300'},
+    'fathometer_pressure': {
+        'preview_seconds': '5.0',
+        'processor': 'mvdr',
+        'pulse': 'processor',
+        'particles': '300',
+    },
+}
+"""Recording: parameters that make its tracker quick, and use what else would not be used."""
+
+
+class Tracked:
+    """A shipped recording, the parameters for it, and what an uninterrupted run makes of it."""
+
+    def __init__(self, name, most=120):
+        self.system = SYSTEMS[name.split('_')[0]]
+        bag = BAGS / name
+        self.config = load_config(self.system, own_parameters(bag), RUNS[name])[0]
+        with BagReader(bag) as reader:
+            read = measurements_of(reader, self.system.name, settings=self.config.as_dict())
+            found = [item.measurement for item in read]
+        self.input = [m for m in found if m is not None and not isinstance(m, Rejection)][:most]
+        tracker = self.build()
+        self.whole = [published(tracker, m) for m in self.input]
+        self.counts = tracker.counts
+
+    def build(self):
+        return self.system.build(self.config)
+
+    def until(self, cut):
+        """A tracker that has processed the first `cut` measurements."""
+        tracker = self.build()
+        for measurement in self.input[:cut]:
+            tracker.process(measurement)
+        return tracker
+
+    def saved(self, tracker, **changes):
+        fields = {
+            'system': self.system.name,
+            'parameters': json_parameters(self.config),
+            'saved_ns': 5,
+            'newest_ns': 7,
+            'state': frozen_state(tracker),
+            'extras': {},
+        }
+        return Saved(**(fields | changes))
+
+
+def published(tracker, measurement):
+    """What a tracker publishes of a measurement, as bytes."""
+    return [as_bytes(estimate) for estimate in tracker.process(measurement)]
+
+
+def as_bytes(estimate):
+    message = write_estimate(estimate, ros_message)
+    return message.header.stamp.sec, message.header.stamp.nanosec, bytes(message.data)
+
+
+tracked = functools.cache(Tracked)
