@@ -65,7 +65,7 @@ EXTRAS = {
         'stonesoup',
         'websockets>=15',
     ],
-    'lint': ['mypy', 'ruff'],
+    'lint': ['mypy', 'pre-commit', 'ruff'],
     'rerun': ['rerun-sdk>=0.24'],
     'segy': ['segyio>=1.9'],
     'view': ['foxglove-sdk>=0.20'],
