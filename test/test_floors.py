@@ -126,12 +126,12 @@ for system in SYSTEMS.values():
 def test_the_floor_check_sees_relative_and_inner_imports(tmp_path: Path) -> None:
     file = ROOT / 'sonar_imm' / 'estimation' / 'imagined.py'
     source = (
-        'from ..nodes import diver\nfrom .. import cli\nfrom . import kalman\n'
+        'from ..nodes import diver\nfrom .. import trackers\nfrom . import kalman\n'
         'def f():\n    import rclpy.node\n'
     )
     assert set(imported_names(source, file)) >= {
         'sonar_imm.nodes.diver',
-        'sonar_imm.cli',
+        'sonar_imm.trackers',
         'sonar_imm.estimation.kalman',
         'rclpy.node',
     }

@@ -87,24 +87,6 @@ class Tracker(Protocol):
         ...
 
 
-class SharingTracker(Tracker, Protocol):
-    """A tracker whose work falls into tasks that need nothing of each other, so that processes can
-    share a recording; ``process(m)`` is ``take(work(task))`` for all ``tasks(m)``."""
-
-    def tasks(self, measurement: Any) -> list[Any]:
-        """What is to be done now that `measurement` is known, in order; can be pickled."""
-        ...
-
-    @staticmethod
-    def work(task: Any) -> Any:
-        """Do a task, in any process and order."""
-        ...
-
-    def take(self, found: Any) -> list[Estimate]:
-        """The estimates that follow from what `work` found, in the order of the tasks."""
-        ...
-
-
 class SmoothingTracker(Tracker, Protocol):
     """A tracker that remembers a whole recording."""
 

@@ -183,7 +183,9 @@ class OfflineRun:
             yield made
 
     def _shared_out(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
-        """The same from a `SharingTracker`, whose tasks `jobs` processes do."""
+        """The same from a tracker whose work falls into tasks that need nothing of each other, so
+        that `jobs` processes can do them: ``process(m)`` is ``take(work(task))`` for all of
+        ``tasks(m)``, in order. A task can be pickled, and ``work`` needs no tracker."""
         ahead = AHEAD * self.options.jobs
         waiting: deque[Future[tuple[Any, float]]] = deque()
         with processes(self.options.jobs) as pool:

@@ -34,7 +34,7 @@ from ...acoustics.geometry import Pose
 from ...acoustics.rays import profile_of
 from ...estimates import Estimate, places
 from ...estimation.arrays import BoolArray, FloatArray
-from ...estimation.mode_smoothing import smooth_modes
+from ...estimation.smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig

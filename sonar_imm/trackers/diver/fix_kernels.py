@@ -25,7 +25,7 @@ import math
 import numpy as np
 
 from ...estimation import imm_kernels
-from ...estimation.adaptation_kernels import row_sum
+from ...estimation.adaptation import row_sum
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.consistency import FARTHEST
 from ...estimation.jit import kernel

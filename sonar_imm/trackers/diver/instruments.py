@@ -30,7 +30,7 @@ from __future__ import annotations
 from attrs import frozen
 import numpy as np
 
-from ...acoustics.arrivals_3d import CLOCK, EMISSION, OFFSET, SOUND, X, Y, Z
+from ...acoustics.arrivals_3d import CLOCK, EMISSION, OFFSET, SOUND_SPEED_ERROR, X, Y, Z
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...measurements import Arrivals
 from .config import DiverConfig
@@ -110,7 +110,12 @@ class Layout:
     def columns(self, models: ModelSet, receivers: IntArray, passive: bool) -> IntArray:
         """(C, 7) for `acoustics.arrivals_3d.observe`; of a tag the emission stands last."""
         out = np.full((len(receivers), 7), -1)
-        out[:, X], out[:, Y], out[:, Z], out[:, SOUND] = 0, 1, models.height, self.sound
+        out[:, X], out[:, Y], out[:, Z], out[:, SOUND_SPEED_ERROR] = (
+            0,
+            1,
+            models.height,
+            self.sound,
+        )
         out[:, OFFSET] = [self.offsets.get(one, -1) for one in receivers.tolist()]
         out[:, CLOCK] = [self.clocks.get(one, -1) for one in receivers.tolist()]
         if passive:

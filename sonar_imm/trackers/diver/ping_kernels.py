@@ -31,7 +31,9 @@ from ...acoustics.arrivals_3d import BEARING, observe
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.consider import consider_scalar
 from ...estimation.jit import kernel
-from ...estimation.subset_update import PRUNE
+
+PRUNE = 14.0
+"""An explanation whose log-probability is this much below the best one's is dropped."""
 
 MOST_EXPLANATIONS = 128
 """Explanations of a model at once; beyond, the worst give way."""

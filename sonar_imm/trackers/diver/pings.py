@@ -32,15 +32,14 @@ import numpy as np
 
 from ...acoustics.arrivals_3d import BEARING, ELEVATION, EMISSION, HEIGHT, ONE_WAY, PATH
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.small_matrices import lift_all
-from ...estimation.student_t import DEGREES
+from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals
 from .config import DiverConfig
 from .expectation_kernels import expect_numbers, expect_residuals, fit_numbers
 from .instruments import Layout
 from .model_set import heights_of, ModelSet
 from .ping_kernels import MOST_EXPLANATIONS, Numbers, subset_ping
-from .robust_kernels import student_t_maxima, student_t_ping
+from .robust_kernels import DEGREES, student_t_maxima, student_t_ping
 from .sensing import bearing_variance, MOST_NUMBERS, spread, toa_variance
 
 MOST_SUBSETS = 6
@@ -239,7 +238,7 @@ def update_by_ping(
     share = np.exp(weight - best)
     updated = share / share.sum()
     P = np.ascontiguousarray(after[1][:, :n, :n])
-    repairs = lift_all(P)
+    repairs = add_jitter_all(P)
     return PingUpdate(
         np.ascontiguousarray(after[0][:, :n]),
         P,
@@ -269,7 +268,7 @@ def begin_from_ping(
         x, P, mask, config.target_z, ping.numbers, position[None], DEGREES
     )
     covariance = np.ascontiguousarray(covariance[:, :n, :n])
-    lift_all(covariance)
+    add_jitter_all(covariance)
     return at[:, :n], covariance, evidence
 
 

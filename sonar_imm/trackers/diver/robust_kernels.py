@@ -29,9 +29,13 @@ from ...acoustics.arrivals_3d import BEARING, EMISSION, observe, ONE_WAY, X, Y
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.consider import consider_scalar
 from ...estimation.jit import kernel
-from ...estimation.small_matrices import cholesky, cholesky_lifted, whitened_square
-from ...estimation.student_t import MOST_ITERATIONS
+from ...estimation.small_matrices import cholesky, cholesky_with_jitter, whitened_square
 from .ping_kernels import Numbers
+
+DEGREES = 4.0
+"""Degrees of freedom of the Student-t density of a residual."""
+
+MOST_ITERATIONS = 60
 
 SMALLEST_GAIN = 1e-7
 """Gain in log-density that ends a search: far below what a model probability could show."""
@@ -209,7 +213,7 @@ def student_t_ping(
             if value > best + SMALLEST_GAIN:
                 at, best = other, value
         _weighted(at, x[j], P[j], every, numbers, height, degrees, 1.0, state, P1[j], weights[j])
-        if not cholesky_lifted(P1[j], Lc):
+        if not cholesky_with_jitter(P1[j], Lc):
             P1[j, :, :] = P[j]
             continue
         evidence[j] = best

@@ -25,10 +25,15 @@ from ...acoustics.multistatic import difference_projection
 from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from ...estimation.association import assign, assign_fits, association_cost, gate_threshold
-from ...estimation.association_kernels import TENTATIVE
+from ...estimation.association import (
+    assign,
+    assign_fits,
+    association_cost,
+    gate_threshold,
+    TENTATIVE,
+)
 from ...estimation.consider import consider_models
-from ...estimation.small_matrices import lift_all
+from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
 from . import fix_kernels
 from .config import DiverConfig
@@ -44,7 +49,7 @@ FIXES, ARRIVALS = 0, 1
 
 NEAR = 28.0
 """NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
-`estimation.subset_update`."""
+`ping_kernels`."""
 
 TAKEN = 0.5
 """Probability of being good from which a number counts as a track's."""
@@ -191,7 +196,7 @@ class Scan:
                 R[detection],
                 mask,
             )
-            self.repairs += sum(lift_all(one) for one in P)
+            self.repairs += sum(add_jitter_all(one) for one in P)
             self.x[tracks], self.P[tracks], self.mu[tracks] = x, P, mu
             self.nis[tracks] += np.where(ok, nis, 0.0)
             self.nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)

@@ -24,10 +24,9 @@ from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
-from ...estimation import imm_kernels, jipda_kernels
+from ...estimation import imm_kernels, jipda
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.association import gate_threshold
-from ...estimation.association_kernels import COASTING, CONFIRMED, TENTATIVE
+from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import NOBODY
 from .config import DiverConfig
 from .sensing import Positions
@@ -63,11 +62,11 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
     z, R = np.ascontiguousarray(group.z), np.ascontiguousarray(group.R)
     H, h = scan.expected_fixes()
     threshold = gate_threshold(config.gate_probability, 2)
-    mixture, nis = jipda_kernels.likelihoods(h, H, scan.P, scan.mu, z, R, threshold)
+    mixture, nis = jipda.likelihoods(h, H, scan.P, scan.mu, z, R, threshold)
     nis[scan.named] = np.inf
     seen = ~scan.named & (group.whole | (nis <= threshold).any(axis=1))
     existence = known_existence(scan.existence, scan.before.life.status)
-    beta, missed, after = jipda_kernels.associate(
+    beta, missed, after = jipda.associate(
         mixture / (config.clutter_density + config.birth_density),
         nis,
         existence,
@@ -81,13 +80,13 @@ def take_softly(scan: Scan, group: Positions) -> FloatArray:
         scan.watch(group, hit, best, H)
         scan.nis[hit] += np.square(scan.white[hit]).sum(axis=1)
         scan.nis_dof[hit] += np.uint16(2)
-    scan.x, scan.P, scan.mu, repairs = jipda_kernels.update(
+    scan.x, scan.P, scan.mu, repairs = jipda.update(
         scan.x, scan.P, scan.mu, h, H, z, R, beta, missed, ~scan.layout.mask
     )
     scan.repairs += repairs
     scan.existence = np.where(scan.named, scan.existence, after)
     scan.evidence = scan.evidence + detected
-    scan.score = np.where(scan.named, scan.score, jipda_kernels.log_odds(after))
+    scan.score = np.where(scan.named, scan.score, jipda.log_odds(after))
     return np.asarray(beta.sum(axis=0))
 
 
@@ -149,7 +148,7 @@ def coalescence(
     mean (T, 2) and covariance (T, 2, 2) of the positions. Named tracks take no part.
     """
     ids, free = now.life.track_id.astype(np.int64), now.target_id == NOBODY
-    partner, distance = jipda_kernels.nearest_older(mean, covariance, ids, free, confirmed)
+    partner, distance = jipda.nearest_older(mean, covariance, ids, free, confirmed)
     near = distance < np.where(confirmed, NEAR_CONFIRMED, NEAR_TENTATIVE)
     near_to = np.where(near, ids[partner], 0)
     near_for = np.where(near, np.where(near_to == now.near_to, now.near_for, 0) + 1, 0)

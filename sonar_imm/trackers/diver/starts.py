@@ -27,8 +27,7 @@ import numpy as np
 
 from ...estimation import imm_kernels
 from ...estimation.arrays import BoolArray
-from ...estimation.association import gate_threshold
-from ...estimation.association_kernels import CONFIRMED, TENTATIVE
+from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE
 from ...measurements import Measurement, NOBODY, Start
 from .config import DiverConfig
 from .state import DiverState

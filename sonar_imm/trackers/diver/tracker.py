@@ -35,11 +35,10 @@ import numpy as np
 
 from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
-from ...estimation import adaptation_kernels, association_kernels, imm_kernels, jipda_kernels
+from ...estimation import adaptation, association, imm_kernels, jipda
 from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import FloatArray
-from ...estimation.association import Tracks
-from ...estimation.association_kernels import TENTATIVE
+from ...estimation.association import TENTATIVE, Tracks
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
@@ -104,9 +103,9 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
-        jipda_kernels.warm()
-        adaptation_kernels.warm()
-        association_kernels.warm()
+        jipda.warm()
+        adaptation.warm()
+        association.warm()
         fix_kernels.warm()
         # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))

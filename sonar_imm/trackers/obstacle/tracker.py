@@ -39,8 +39,7 @@ from ...acoustics import geometry
 from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign_fits, gate_threshold, Tracks
-from ...estimation.association_kernels import TENTATIVE
+from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation

@@ -17,11 +17,11 @@
 from attrs import evolve
 from helpers.sea_vectors import vectors
 import numpy as np
+from oracles.student_t import student_t_maximum
+from oracles.subset_update import subset_update
 import pytest
 
 from sonar_imm.acoustics.arrivals_3d import observe
-from sonar_imm.estimation.student_t import student_t_maximum
-from sonar_imm.estimation.subset_update import subset_update
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models

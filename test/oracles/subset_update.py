@@ -36,8 +36,8 @@ import math
 from attrs import frozen
 import numpy as np
 
-from .arrays import BoolArray, FloatArray
-from .consider import consider_update
+from sonar_imm.estimation.arrays import BoolArray, FloatArray
+from sonar_imm.estimation.consider import consider_update
 
 PRUNE = 14.0
 """An explanation whose log-probability is this much below the best one's is dropped."""
@@ -79,7 +79,7 @@ def subset_update(
     estimated: BoolArray | None = None,
     prune: float = PRUNE,
 ) -> SubsetUpdate:
-    """Oracle for tests: update x (n,), P (n, n) with numbers each of which may be wild.
+    """Update x (n,), P (n, n) with numbers each of which may be wild.
 
     A number is linearised where the explanation so far stands. outlier_density is per unit of the
     numbers; estimated (n,): see `consider.consider_update`, None for all.
@@ -90,31 +90,31 @@ def subset_update(
     left = [Explanation((), np.array(x, np.float64), np.array(P, np.float64), 0.0)]
     for measure, value, variance in observations:
         grown = []
-        for one in left:
-            expected, gradient = measure(one.x)
-            S = float(gradient @ one.P @ gradient) + variance
+        for old in left:
+            expected, gradient = measure(old.x)
+            S = float(gradient @ old.P @ gradient) + variance
             innovation = value - expected
             fit = -0.5 * (innovation**2 / S + math.log(2.0 * math.pi * S))
             row, noise = gradient[None], np.array([[variance]])
-            x_b, P_b = consider_update(one.x, one.P, row, noise, np.array([innovation]), mask)
-            grown.append(Explanation((*one.good, False), one.x, one.P, one.log_weight + log_bad))
-            grown.append(Explanation((*one.good, True), x_b, P_b, one.log_weight + log_good + fit))
-        best = max(one.log_weight for one in grown)
-        left = [one for one in grown if one.log_weight >= best - prune]
+            x_b, P_b = consider_update(old.x, old.P, row, noise, np.array([innovation]), mask)
+            grown.append(Explanation((*old.good, False), old.x, old.P, old.log_weight + log_bad))
+            grown.append(Explanation((*old.good, True), x_b, P_b, old.log_weight + log_good + fit))
+        best = max(new.log_weight for new in grown)
+        left = [new for new in grown if new.log_weight >= best - prune]
     return _together(left, len(observations))
 
 
 def _together(left: Sequence[Explanation], count: int) -> SubsetUpdate:
-    weight = np.array([one.log_weight for one in left])
+    weight = np.array([each.log_weight for each in left])
     best = float(weight.max())
     share = np.exp(weight - best)
     probability = share / share.sum()
-    states = np.stack([one.x for one in left])
+    states = np.stack([each.x for each in left])
     x = probability @ states
     spread = states - x
-    P = np.einsum('b,bij->ij', probability, np.stack([one.P for one in left]))
+    P = np.einsum('b,bij->ij', probability, np.stack([each.P for each in left]))
     P = P + np.einsum('b,bi,bj->ij', probability, spread, spread)
-    good = np.array([one.good for one in left], np.float64).reshape(len(left), count)
+    good = np.array([each.good for each in left], np.float64).reshape(len(left), count)
     return SubsetUpdate(
         left, probability, x, P, best + math.log(float(share.sum())), probability @ good
     )

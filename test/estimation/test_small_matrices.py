@@ -19,7 +19,13 @@ from numpy.testing import assert_allclose
 import pytest
 
 from sonar_imm.estimation import small_matrices
-from sonar_imm.estimation.lanes import lanes_for, MOST_LANES, roots, turn_of, unsound
+from sonar_imm.estimation.small_matrices import (
+    lanes_for,
+    MOST_LANES,
+    not_psd,
+    semidefinite_roots,
+    turn_of,
+)
 
 
 def covariances(rng, n, lanes):
@@ -46,18 +52,18 @@ def test_roots_and_soundness_are_those_of_single_matrices(n):
         np.empty(lanes),
     )
     bad = np.empty(lanes, np.int64)
-    roots(S, L, scratch)
+    semidefinite_roots(S, L, scratch)
     for k in range(lanes):
-        one = np.zeros((n, n))
-        small_matrices.semidefinite_root(P[k], one)
+        root = np.zeros((n, n))
+        small_matrices.semidefinite_root(P[k], root)
         mine = np.tril(L[:, :, k])
-        assert_allclose(mine, one, rtol=1e-6, atol=1e-300, err_msg=str(k))
+        assert_allclose(mine, root, rtol=1e-6, atol=1e-300, err_msg=str(k))
         size = np.sqrt(np.abs(np.diag(P[k])))
-        close = np.abs(mine @ mine.T - one @ one.T) <= 1e-13 * np.outer(size, size)
+        close = np.abs(mine @ mine.T - root @ root.T) <= 1e-13 * np.outer(size, size)
         assert close.all() or not np.isfinite(P[k]).all(), k
-    unsound(S, L, scratch, bad)
+    not_psd(S, L, scratch, bad)
     alone = [not small_matrices.is_psd(P[k], np.zeros((n, n))) for k in range(lanes)]
-    assert bad.tolist() == [int(one) for one in alone]
+    assert bad.tolist() == [int(each) for each in alone]
     assert {0, 1} == set(bad.tolist())
 
 

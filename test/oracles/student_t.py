@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Many measurements with heavy tails: the most probable state under a Student-t law.
+"""Many measurements with heavy tails: the most probable state with Student-t errors.
 
 With more than a handful of numbers there are too many inlier/outlier subsets (`subset_update`),
 and enough numbers to outvote the wild ones. Each residual r (in standard deviations) then has the
@@ -25,9 +25,9 @@ The maximum is not the only one. Whoever calls gives the starts, among them thos
 suggest, so that many good numbers outvote any prior.
 
 The information of the weighted update overstates what is known: residuals near the middle are
-weighted by more than one. `student_t_update` therefore widens the variances by
+weighted by more than one. `robust_kernels` therefore widens the variances by
 ``(nu+3)/(nu+1)``, the ratio of the curvature of the Gaussian to the Fisher information of the t
-law, for the covariance, not for the mean.
+density, for the covariance, not for the mean.
 
 Source: K. L. Lange, R. J. A. Little, J. M. G. Taylor, "Robust statistical modeling using the t
 distribution", JASA 84, 1989.
@@ -41,9 +41,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import FloatArray
-from .consider import consider_update
-from .subset_update import Observation
+from oracles.subset_update import Observation
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.consider import consider_update
 
 DEGREES = 4.0
 MOST_ITERATIONS = 60
@@ -69,7 +69,7 @@ def student_t_maximum(
     starts: Sequence[FloatArray],
     degrees: float = DEGREES,
 ) -> Maximum:
-    """Oracle for tests: the best maximum reached from `starts` (n,) each, for a prior `mean` (n,),
+    """The best maximum reached from `starts` (n,) each, for a prior `mean` (n,),
     P (n, n)."""
     best: tuple[float, FloatArray] | None = None
     for start in starts:
