@@ -37,7 +37,7 @@ import yaml
 from benchmarks.image_tracks import detected
 from benchmarks.study import known, Parts, study
 from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarImage, Trace
-from sonar_imm.nodes.health import Finding, Hysteresis, WARN
+from sonar_imm.nodes.diagnostics import Finding, Hysteresis, WARN
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.own_files import own_parameters

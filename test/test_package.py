@@ -65,7 +65,7 @@ IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
 # Libraries that some commands need, each with an extra of its own.
 PEERS = {
     'sonar_imm_tools.offline.jobs': {'distributed'},
-    'sonar_imm_tools.offline.tables': {'pyarrow'},
+    'sonar_imm_tools.offline.run_folder': {'pyarrow'},
     'sonar_imm_tools.viewing.rerun_file': {'rerun'},
     'sonar_imm_tools.viewing.server': {'foxglove'},
     'sonar_imm_tools.evaluation.sweep': {'distributed'},

@@ -41,7 +41,7 @@ from typing import Any, Protocol
 from attrs import frozen
 
 from ..estimates import Estimate
-from ..measurements import Frames
+from ..intake import KnownFrames
 from ..parameters import Config, ConfigError
 
 
@@ -59,7 +59,7 @@ class Tracker(Protocol):
     counts: Counter[str]
 
     @property
-    def frames(self) -> Frames:
+    def frames(self) -> KnownFrames:
         """The frames of what was used so far."""
         ...
 

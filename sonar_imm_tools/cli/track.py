@@ -116,7 +116,7 @@ def command(
     if scheduler is not None and jobs > 1:
         raise click.UsageError('--jobs and --scheduler exclude each other')
     if parquet:
-        from ..offline.tables import require_parquet
+        from ..offline.run_folder import require_parquet
 
         require_parquet()
     plan = Plan(parquet=parquet, **options)

@@ -23,7 +23,7 @@ import numpy as np
 import msg_adapters.displays.bathymetry
 import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import FrameGuard, Frames
+from sonar_imm.intake import KnownFrames
 from sonar_imm.parameters import Config, live, parameter
 from sonar_imm.trackers import System, SYSTEMS
 
@@ -49,7 +49,7 @@ class WalkerConfig(Config):
 class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
 
-    STATE = ('counts', 'fixes')
+    STATE = ('counts', 'fixes', 'frames')
 
     def __init__(self, config):
         self.config = config
@@ -59,7 +59,7 @@ class WalkerTracker:
 
     def reset(self):
         self.fixes = {}
-        self.frames = Frames(FrameGuard(), ())
+        self.frames = KnownFrames()
 
     def reconfigure(self, config):
         self.config = config
@@ -121,7 +121,8 @@ def register(set_item):
 
 
 def main():
-    from sonar_imm.nodes.base import run, TrackerNode
+    from sonar_imm.nodes.base import TrackerNode
+    from sonar_imm.nodes.running import run
 
     register(dict.__setitem__)
     return run(lambda: TrackerNode('walker'))

@@ -59,16 +59,9 @@ import numpy as np
 
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.history import StampGate
-from ...measurements import (
-    Altitude,
-    FrameGuard,
-    Frames,
-    nanoseconds,
-    Navigation,
-    Rejection,
-    Snapshot,
-)
+from ...intake import KnownFrames
+from ...intake.stream import Stream, StreamRules
+from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
 from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 from .kernels import Track
@@ -124,8 +117,8 @@ class BathymetryTracker:
         self._residuals: deque[float] = deque(maxlen=PINGS_JUDGED)
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._queue.frames, (Navigation,))
+    def frames(self) -> KnownFrames:
+        return self._queue.frames
 
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config
@@ -286,8 +279,8 @@ class PoseQueue:
     def __init__(self, counts: Counter[str]):
         self.counts = counts
         self.has_poses = False
-        self.frames = FrameGuard()
-        self._gate: StampGate[Navigation] = StampGate(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
+        rules = StreamRules(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
+        self._stream = Stream((Navigation,), rules, counts)
         self._buffer = NavigationBuffer()
         self._altitudes: list[Altitude] = []
         self._waiting: list[Snapshot] = []
@@ -296,21 +289,18 @@ class PoseQueue:
         """How many pings wait."""
         return len(self._waiting)
 
+    @property
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
+
     def add_pose(self, sample: Navigation) -> None:
         """Take one pose in. A clock that was set back forgets all poses."""
-        try:
-            self.frames.check(sample)
-        except Rejection:
-            self.counts['other_frame'] += 1
-            return
-        decision = self._gate.decide(sample.stamp_ns, sample)
-        decision.count_in(self.counts)
-        if decision.verdict == 'restart':
+        admitted = self._stream.admit(sample)
+        if admitted.restarted:
             self.counts['navigation_gap'] += len(self._waiting)
             self._buffer, self._altitudes, self._waiting = NavigationBuffer(), [], []
-        for pose in decision.released:
+        for pose in admitted.items:
             self.has_poses = True
-            self.frames.settle(pose)
             self.counts['poses'] += 1
             self._buffer = self._buffer.inserted(pose)
         if self._buffer.stamps:
@@ -343,7 +333,7 @@ class PoseQueue:
             else:
                 poses = self._buffer.poses(stamps)
                 altitude = self._altitude(int(stamps[-1]))
-                done.append(PosedPing(snapshot, poses, self.frames.frame_id, altitude))
+                done.append(PosedPing(snapshot, poses, self._stream.frame_id, altitude))
         self._waiting = waiting
         return done
 

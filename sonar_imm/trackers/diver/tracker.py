@@ -21,7 +21,7 @@ probabilities of turning. The measurements of a stamp, a `Scan`, go through
     predict -> associate -> update -> prune -> spawn
 
 and the whole of what is known after it is one value, `DiverState`, so that a late measurement is
-put in its place by computing the scans after it again (`trackers.stream`). Positions that are not
+put in its place by computing the scans after it again (`intake.stream`). Positions that are not
 metres in the frame of the tracks are brought into it first (`georeferencing`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
@@ -48,9 +48,10 @@ from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tr
 from ...estimation.consider import consider_models
 from ...estimation.consistency import NisMemory
 from ...estimation.small_matrices import add_jitter_all
-from ...measurements import Arrivals, Fix, Fixes, Frames, Measurement, NOBODY, Start
+from ...intake import KnownFrames
+from ...intake.stream import ReplayStream, StreamRules
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
-from ..stream import ReplayStream, StreamRules
 from . import births, fix_kernels, jipda, names, pings
 from .births import Birth
 from .config import DiverConfig
@@ -128,8 +129,8 @@ class DiverTracker:
         return self._georeferencer.origin
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)

@@ -54,8 +54,9 @@ from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
 from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
 from ...estimation.set_model import banded_transition, gaussian_walk, SetModel
-from ...measurements import ArrayDepth, CrossSpectra, Frames, Pressure, Rejection, Trace
-from ..stream import OnceStream, StreamRules
+from ...intake import KnownFrames
+from ...intake.stream import OnceStream, StreamRules
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from .config import FathometerConfig
 from .pressure import Collected, CompanionDepths, MOST_HEAVE, PressureStream
 from .reflectors import (
@@ -157,8 +158,8 @@ class FathometerTracker:
             self._begin(self._lattice)
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)

@@ -25,7 +25,8 @@ import numpy as np
 
 from msg_adapters.fixes import check_size, write_fix
 from msg_adapters.scans import write_scan
-from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection, RepeatGuard
+from sonar_imm.intake import RepeatFilter
+from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
 from ..convert_options import FixesOptions
@@ -49,7 +50,7 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
     `convert_truth`, for the same bag and the same origin.
 
     Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
-    the same diver again a moment later, see `RepeatGuard`) stay, and are counted: the tracker
+    the same diver again a moment later, see `RepeatFilter`) stay, and are counted: the tracker
     leaves them out.
     """
     how = FixesOptions(**values)
@@ -58,7 +59,7 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
     frame = LocalFrame(table, how.origin)
     report = ConversionReport(Path(out))
 
-    repeats: dict[str, RepeatGuard] = {}
+    repeats: dict[str, RepeatFilter] = {}
     repeated: list[int] = []
 
     def parse(row: Row) -> tuple[Fix, str]:
@@ -72,7 +73,7 @@ def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> Conversio
         )
         check_size(fix)
         try:
-            repeats.setdefault(name, RepeatGuard(REPEAT_TIME)).fresh(fix)
+            repeats.setdefault(name, RepeatFilter(REPEAT_TIME)).fresh(fix)
         except Rejection:
             repeated.append(row.line)
         return fix, name

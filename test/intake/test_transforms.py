@@ -19,13 +19,12 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.intake.transforms import moved, TransformTree
 from sonar_imm.measurements import (
     Arrivals,
     Detections,
     Fix,
     Fixes,
-    FrameTree,
-    moved,
     Navigation,
     Rejection,
     Start,
@@ -51,10 +50,10 @@ def matrix(pose):
 def test_a_chain_of_transforms_is_the_product_of_its_matrices():
     rng = np.random.default_rng(3)
     a, b, c, d = (a_pose(rng) for _ in range(4))
-    tree = FrameTree()
+    tree = TransformTree()
     tree.add(StaticTransforms(poses={'base': ('map', a), 'arm': ('base', b)}))
     tree.add(StaticTransforms(poses={'sonar': ('arm', c), 'keel': ('base', d)}))
-    A, B, C, D = (matrix(one) for one in (a, b, c, d))
+    A, B, C, D = (matrix(pose) for pose in (a, b, c, d))
     for target, source, expected in (
         ('map', 'sonar', A @ B @ C),
         ('sonar', 'map', np.linalg.inv(A @ B @ C)),
@@ -67,11 +66,11 @@ def test_a_chain_of_transforms_is_the_product_of_its_matrices():
 
 
 def test_what_is_said_again_replaces_and_a_loop_ends():
-    tree = FrameTree()
-    one, two = (Pose(np.array([x, 0.0, 0.0]), np.eye(3)) for x in (1.0, 2.0))
-    tree.add(StaticTransforms(poses={'a': ('b', one), 'b': ('a', one)}))
+    tree = TransformTree()
+    near, far = (Pose(np.array([x, 0.0, 0.0]), np.eye(3)) for x in (1.0, 2.0))
+    tree.add(StaticTransforms(poses={'a': ('b', near), 'b': ('a', near)}))
     assert tree.pose('nowhere', 'a') is None
-    tree.add(StaticTransforms(poses={'a': ('c', two), 'b': ('c', one)}))
+    tree.add(StaticTransforms(poses={'a': ('c', far), 'b': ('c', near)}))
     assert tree.pose('c', 'a').position.tolist() == [2.0, 0.0, 0.0]
 
 
@@ -86,10 +85,10 @@ def check_turned(before, after, variance_before, variance_after):
 def test_positions_are_turned_with_their_covariances():
     covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
     for kind in (Fix, Start):
-        one = kind(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='a')
-        made = moved(one, 'map', TURNED)
+        place = kind(stamp_ns=STAMP, position=[1.0, 2.0, 3.0], covariance=covariance, frame_id='a')
+        made = moved(place, 'map', TURNED)
         assert made.frame_id == 'map' and made.stamp_ns == STAMP
-        check_turned(one.position, made.position, covariance, made.covariance)
+        check_turned(place.position, made.position, covariance, made.covariance)
     assert moved(Fix(stamp_ns=1, position=[0.0, 0.0, 0.0]), 'map', TURNED).covariance is None
     unknown = np.full((2, 2), np.nan)
     scan = Fixes(

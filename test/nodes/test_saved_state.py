@@ -60,10 +60,10 @@ def test_a_node_that_is_started_again_goes_on(start, tmp_path):
 
 def test_states_are_saved_while_running_and_only_when_something_was_heard(start, tmp_path):
     rig = start('state_interval:=0.1')
-    rig.bench.spin_until(lambda: rig.node._keeper._heard == 0)
+    rig.bench.spin_until(lambda: rig.node._saved_state._taken == 0)
     rig.send(a_fix(1.0))
     rig.bench.spin_until((tmp_path / 'state').exists)
-    rig.node._keeper._thread.join()
+    rig.node._saved_state._thread.join()
     written = (tmp_path / 'state').stat().st_mtime_ns
     ticks = []
     rig.node.create_timer(0.3, lambda: ticks.append(1))
@@ -120,7 +120,7 @@ def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(sta
     end(rig)
     again = start()
     again.send(a_fix(5000.0), a_fix(1001.0, 1.0, 1.0))
-    assert again.node._keeper._loaded_ns is None
+    assert again.node._saved_state._loaded_ns is None
     assert again.means()[-1][0] == 5000.0 and len(again.node.tracker.fixes) == 3
     capfd.readouterr()
     other = start()
@@ -142,16 +142,16 @@ def test_a_disk_that_is_full_is_said(start, monkeypatch, capfd):
 
     def save(seconds):
         rig.send(a_fix(seconds))
-        rig.node._keeper.save(rig.node.tracker, rig.node.tracker.config, wait=True)
+        rig.node._saved_state.save(rig.node.tracker.config, wait=True)
 
     with monkeypatch.context() as disk:
-        disk.setattr('sonar_imm.nodes.keeping.write_state', full)
+        disk.setattr('sonar_imm.nodes.saved_state.write_state', full)
         save(1.0)
         save(2.0)
-        assert 'No space left on device' in rig.node._keeper.trouble
+        assert 'No space left on device' in rig.node._saved_state.trouble
         assert capfd.readouterr().err.count('the state cannot be saved') == 1
     save(3.0)  # somebody made room
-    assert rig.node._keeper.trouble == ''
+    assert rig.node._saved_state.trouble == ''
 
 
 def test_a_folder_that_is_not_there_ends_the_node(make_bench):

@@ -17,13 +17,13 @@
 import numpy as np
 import pytest
 
+from sonar_imm.intake import RepeatFilter
 from sonar_imm.measurements import (
     Fix,
     Fixes,
     GeodeticFix,
     Rejection,
     RelativeFix,
-    RepeatGuard,
     VesselFix,
 )
 
@@ -44,9 +44,9 @@ def scan(second, *places, **values):
     )
 
 
-def passes(guard, measurement):
+def passes(repeats, measurement):
     try:
-        guard.fresh(measurement)
+        repeats.fresh(measurement)
     except Rejection as rejection:
         assert rejection.reason == 'repeated'
         return False
@@ -54,18 +54,18 @@ def passes(guard, measurement):
 
 
 def test_the_same_position_a_moment_later_is_a_repeat_until_the_time_is_over():
-    guard = RepeatGuard(5.0)
-    said = [passes(guard, fix(second)) for second in (1, 2, 3, 6, 6.5, 7, 12)]
-    assert said == [True, False, False, False, True, False, True]
+    repeats = RepeatFilter(5.0)
+    passed = [passes(repeats, fix(second)) for second in (1, 2, 3, 6, 6.5, 7, 12)]
+    assert passed == [True, False, False, False, True, False, True]
 
 
 def test_a_late_repeat_is_one_too_and_the_same_stamp_is_left_to_others():
-    guard = RepeatGuard(5.0)
-    assert passes(guard, fix(10)) and passes(guard, fix(10)) and not passes(guard, fix(8))
+    repeats = RepeatFilter(5.0)
+    assert passes(repeats, fix(10)) and passes(repeats, fix(10)) and not passes(repeats, fix(8))
 
 
 def test_other_numbers_names_sensors_and_frames_are_no_repeats():
-    guard = RepeatGuard(5.0)
+    repeats = RepeatFilter(5.0)
     others = [
         fix(1),
         fix(2, x=1.0000001),
@@ -74,7 +74,7 @@ def test_other_numbers_names_sensors_and_frames_are_no_repeats():
         fix(2, frame_id='odom'),
         fix(2, covariance=np.eye(2)),
     ]
-    assert all(passes(guard, one) for one in others)
+    assert all(passes(repeats, other) for other in others)
 
 
 @pytest.mark.parametrize(
@@ -86,32 +86,32 @@ def test_other_numbers_names_sensors_and_frames_are_no_repeats():
     ],
 )
 def test_all_kinds_of_positions(make):
-    guard = RepeatGuard(5.0)
-    assert passes(guard, make(1)) and not passes(guard, make(2))
+    repeats = RepeatFilter(5.0)
+    assert passes(repeats, make(1)) and not passes(repeats, make(2))
 
 
 def test_an_empty_scan_and_a_vessel_at_rest_are_no_repeats():
-    guard = RepeatGuard(5.0)
+    repeats = RepeatFilter(5.0)
     for k in range(1, 4):
-        assert passes(guard, scan(k))
-        assert passes(guard, VesselFix(stamp_ns=k * SECOND, latitude=59.0, longitude=10.0))
+        assert passes(repeats, scan(k))
+        assert passes(repeats, VesselFix(stamp_ns=k * SECOND, latitude=59.0, longitude=10.0))
 
 
 def test_of_named_positions_the_new_ones_stay():
-    guard = RepeatGuard(5.0)
-    guard.fresh(scan(1, 1.0, 2.0, target_id=[4, 5]))
-    left = guard.fresh(scan(2, 1.0, 2.5, target_id=[4, 5]))
+    repeats = RepeatFilter(5.0)
+    repeats.fresh(scan(1, 1.0, 2.0, target_id=[4, 5]))
+    left = repeats.fresh(scan(2, 1.0, 2.5, target_id=[4, 5]))
     assert left.target_id.tolist() == [5] and left.position[:, 0].tolist() == [2.5]
-    assert guard.rows == 1
-    assert not passes(guard, scan(3, 1.0, 2.5, target_id=[4, 5]))
-    guard.reset()
-    assert passes(guard, scan(3, 1.0, 2.5, target_id=[4, 5]))
+    assert repeats.rows == 1
+    assert not passes(repeats, scan(3, 1.0, 2.5, target_id=[4, 5]))
+    repeats.reset()
+    assert passes(repeats, scan(3, 1.0, 2.5, target_id=[4, 5]))
 
 
 def test_zero_lets_everything_pass_and_memory_is_bounded():
-    guard = RepeatGuard(0.0)
-    assert all(passes(guard, fix(k)) for k in range(1, 5))
-    guard = RepeatGuard(5.0)
+    repeats = RepeatFilter(0.0)
+    assert all(passes(repeats, fix(k)) for k in range(1, 5))
+    repeats = RepeatFilter(5.0)
     for k in range(10_500):
-        guard.fresh(fix(1, x=float(k)))
-    assert len(guard._first) == 10_000
+        repeats.fresh(fix(1, x=float(k)))
+    assert len(repeats._first) == 10_000

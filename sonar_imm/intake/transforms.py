@@ -12,50 +12,40 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Transforms between frames that do not change, and what is measured in one of them, in another.
+"""What is measured in a frame that is fixed to that of the tracks, turned into that.
 
-Only static ones are used: a measurement is then turned by the same numbers whenever it comes, live
-and from a recording. What moves against the frame of the tracks is a vehicle, and has navigation.
+Only transforms that do not change are used: a measurement is then turned by the same numbers
+whenever it comes, live and from a recording. What moves against the frame of the tracks is a
+vehicle, and has navigation.
 """
 
 from __future__ import annotations
 
 from functools import singledispatch
-from typing import Any, ClassVar
+from typing import Any
 
-from attrs import evolve, frozen
+from attrs import evolve
 import numpy as np
 
 from ..acoustics import geometry
 from ..acoustics.geometry import Pose
 from ..estimation.angles import wrap_angle
 from ..estimation.arrays import FloatArray
-from .checks import Rejection
-from .diver import Arrivals, Fix, Fixes
-from .obstacle import Navigation
-from .starts import Start
+from ..measurements import (
+    Arrivals,
+    Fix,
+    Fixes,
+    Navigation,
+    Rejection,
+    Start,
+    StaticTransforms,
+)
 
 UPRIGHT = 1.0 - 1e-6
 """Least cosine between two verticals that are the same."""
 
 
-@frozen(eq=False, kw_only=True)
-class StaticTransforms:
-    """What one message says of frames that are fixed to each other: of each child frame its parent
-    and its pose in that, FLU or ENU axes."""
-
-    FRAME: ClassVar[str] = 'none'
-
-    poses: dict[str, tuple[str, Pose]]
-    stamp_ns: int = 0
-    frame_id: str = ''
-
-    def key(self) -> bytes:
-        """No tracker takes it into its history."""
-        return b'transforms'
-
-
-class FrameTree:
+class TransformTree:
     """All that was said of frames that are fixed to each other; what is said again replaces."""
 
     def __init__(self) -> None:

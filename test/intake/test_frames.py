@@ -16,12 +16,12 @@
 
 import pytest
 
+from sonar_imm.intake import KnownFrames
 from sonar_imm.measurements import (
     Altitude,
     ArrayDepth,
     Detections,
     Fix,
-    FrameGuard,
     Navigation,
     Rejection,
 )
@@ -31,58 +31,52 @@ def fix(frame_id):
     return Fix(stamp_ns=1, position=(0.0, 0.0, 0.0), frame_id=frame_id)
 
 
-def refused(guard, frame_id):
+def refused(frames, frame_id):
     with pytest.raises(Rejection) as caught:
-        guard.admit(fix(frame_id))
+        frames.admit(fix(frame_id))
     return caught.value
 
 
 def test_the_first_named_frame_stays():
-    guard = FrameGuard()
-    guard.admit(fix(''))
-    guard.admit(fix('map'))
-    guard.admit(fix('map'))
-    rejection = refused(guard, 'odom')
+    frames = KnownFrames()
+    frames.admit(fix(''))
+    frames.admit(fix('map'))
+    frames.admit(fix('map'))
+    rejection = refused(frames, 'odom')
     assert rejection.reason == 'frame'
     assert rejection.sentence == "the frame 'odom' is not the frame 'map' of the tracks"
-    refused(guard, '')
+    refused(frames, '')
 
 
-def test_reset_lets_the_next_one_decide():
-    guard = FrameGuard()
-    guard.admit(fix('map'))
-    guard.reset()
-    guard.admit(fix('odom'))
-    refused(guard, 'map')
-
-
-def test_a_told_frame_holds_from_the_start_and_survives_reset():
-    guard = FrameGuard('harbour')
-    refused(guard, 'map')
-    guard.reset()
-    refused(guard, '')
-    guard.admit(fix('harbour'))
+def test_a_required_frame_holds_before_any_is_known():
+    frames = KnownFrames()
+    with pytest.raises(Rejection, match="'map' is not the frame 'harbour' of the tracks"):
+        frames.check(fix('map'), 'harbour')
+    with pytest.raises(Rejection, match="'' is not the frame 'harbour' of the tracks"):
+        frames.check(fix(''), 'harbour')
+    frames.check(fix('harbour'), 'harbour')
+    frames.check(Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter'), 'harbour')
+    assert frames.frame_id == ''
 
 
 def test_what_sensors_on_board_say_is_in_frames_of_their_own():
-    guard = FrameGuard('odom')
+    frames = KnownFrames()
     echo = Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar')
     height = Altitude(stamp_ns=1, altitude=3.0, frame_id='altimeter')
     place = Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='odom')
     for measurement in (echo, height, place, echo, height, place):
-        guard.admit(measurement)
+        frames.admit(measurement)
     for other in (
         Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'),
         Navigation(stamp_ns=1, position=[0, 0, 0], orientation=[0, 0, 0, 1], frame_id='map'),
     ):
         with pytest.raises(Rejection) as caught:
-            guard.admit(other)
+            frames.admit(other)
         assert caught.value.reason == 'frame'
-    guard.reset()
-    guard.admit(Detections(stamp_ns=1, range=[], bearing=[], frame_id='sonar_2'))
 
 
 def test_a_depth_is_a_depth_in_any_frame():
-    guard = FrameGuard('map')
-    guard.admit(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
-    assert guard.frame_id == 'map'
+    frames = KnownFrames()
+    frames.admit(fix('map'))
+    frames.admit(ArrayDepth(stamp_ns=1, depth=30.0, frame_id='buoy'))
+    assert frames.frame_id == 'map'

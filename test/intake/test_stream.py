@@ -17,8 +17,8 @@
 from attrs import frozen
 import pytest
 
+from sonar_imm.intake.stream import Admitted, OnceStream, ReplayStream, StreamRules
 from sonar_imm.trackers.shared_parameters import StampParameters, StreamParameters
-from sonar_imm.trackers.stream import Admitted, OnceStream, ReplayStream, StreamRules
 
 S = 10**9
 RULES = StreamRules(window_ns=10 * S, max_gap_ns=600 * S, restart_after=5)
@@ -66,8 +66,8 @@ def test_strangers_and_other_frames_are_counted(make, take):
 
 def test_what_is_late_revises_what_comes_after():
     stream = replay()
-    for one in (Number(S, 1), Number(3 * S, 4), Number(5 * S, 16)):
-        stream.revise(one)
+    for number in (Number(S, 1), Number(3 * S, 4), Number(5 * S, 16)):
+        stream.revise(number)
     assert stream.revise(Number(2 * S, 2)) == [(2 * S, 3), (3 * S, 7), (5 * S, 23)]
     assert stream.revise(Number(2 * S, 2)) == []
     assert stream.revise(Number(5 * S, 32)) == [(5 * S, 55)]
@@ -77,9 +77,9 @@ def test_what_is_late_revises_what_comes_after():
 
 def test_a_restart_keeps_what_survives_and_hands_everything_out():
     stream = replay()
-    for one in at(*range(5000, 5020), value=1):
-        stream.revise(one)
-    held = [stream.revise(one) for one in at(*range(1, 6), value=1)]
+    for number in at(*range(5000, 5020), value=1):
+        stream.revise(number)
+    held = [stream.revise(number) for number in at(*range(1, 6), value=1)]
     assert held[:4] == [[]] * 4
     assert held[4] == [(second * S, -1000 + second) for second in range(1, 6)]
     assert stream.counts['restarts'] == 1 and stream.counts['too_late'] == 0
@@ -95,9 +95,9 @@ def test_a_stream_without_history_takes_each_stamp_once_and_in_order():
 
 def test_a_restart_without_history_is_in_order_too():
     stream = once(window_ns=S)
-    for one in at(5000, 5001):
-        stream.admit(one)
-    admitted = [stream.admit(one) for one in at(10, 9.5, 9.5, 11)]
+    for number in at(5000, 5001):
+        stream.admit(number)
+    admitted = [stream.admit(number) for number in at(10, 9.5, 9.5, 11)]
     assert admitted[:3] == [Admitted()] * 3
     assert admitted[3] == Admitted(tuple(at(9.5, 10, 11)), restarted=True)
     assert stream.counts['duplicate'] == 1
@@ -134,10 +134,10 @@ def test_only_what_is_used_decides_on_the_frame_of_a_sensor(make, take):
 def test_what_was_held_is_in_one_frame_after_a_restart():
     stream = once()
     stream.accepts = (Number, Echo)
-    for one in at(5000, 5001):
-        stream.admit(one)
+    for number in at(5000, 5001):
+        stream.admit(number)
     for second, frame in ((10, 'bow'), (11, 'stern')):
         stream.admit(Echo(second * S, frame_id=frame))
     admitted = stream.admit(Echo(12 * S, frame_id='bow'))
-    assert [one.stamp_ns for one in admitted.items] == [10 * S, 12 * S]
+    assert [number.stamp_ns for number in admitted.items] == [10 * S, 12 * S]
     assert stream.counts['other_frame'] == 1

@@ -25,34 +25,34 @@ from collections.abc import Callable
 from pathlib import Path
 import threading
 import time
-from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from ..intake import Intake
 from ..node_config import NodeConfig
 from ..parameters import Config, ConfigError
-from ..trackers import SYSTEMS, Tracker
+from ..trackers import SYSTEMS
 from ..trackers.state_file import json_parameters, read_state, Saved, tracker_from, write_state
-from ..trackers.state_values import freeze, frozen_state, put, StateError
+from ..trackers.state_values import frozen_state, restore, StateError
 
 _ENOUGH = 3
 """First measurements that have to be far from a state before it is given up; one may be wrong."""
 
 
-class StateKeeper:
-    """Loads and saves the state of one tracker and of the `guards` before it: what is known of
-    frames, and of what was heard.
+class SavedState:
+    """Loads and saves the state of one tracker and of the `Intake` before it.
 
     trouble: why states are not saved, in a sentence; empty while they are.
     """
 
-    def __init__(self, node: Node, system: str, settings: NodeConfig, guards: tuple[Any, ...]):
+    def __init__(self, node: Node, system: str, settings: NodeConfig):
         """Raises `ConfigError` when the folder of the file is not there."""
         self.trouble = ''
-        self._node, self._system, self._guards = node, SYSTEMS[system], guards
+        self._node, self._system = node, SYSTEMS[system]
+        self._frame_id = settings.frame_id
         self._max_age = settings.state_max_age
-        self._told = {
+        self._conventions = {
             'frame_id': settings.frame_id,
             'world_frame_convention': settings.world_frame_convention,
         }
@@ -61,16 +61,22 @@ class StateKeeper:
         self._refused = False
         self._loaded_ns: int | None = None
         self._newest_ns: int | None = None
-        self._heard = self._saved = self._far = 0
+        self._taken = self._saved = self._far = 0
         self._thread: threading.Thread | None = None
         if self._path and not self._path.parent.is_dir():
             raise ConfigError(f"state_file: there is no folder '{self._path.parent}'")
 
-    def begin(self, config: Config) -> Tracker:
-        """A tracker that goes on from the file, or a new one."""
+    def load(self, config: Config) -> Intake:
+        """The intake of a tracker that goes on from the file, or of a new one."""
+        self._intake = self._from_file(config) or Intake(
+            self._system.build(config), self._frame_id
+        )
+        return self._intake
+
+    def _from_file(self, config: Config) -> Intake | None:
         if self._path:
             try:
-                return self._load(self._path, config)
+                return self._read(self._path, config)
             except FileNotFoundError:
                 pass
             except StateError as error:
@@ -79,20 +85,20 @@ class StateKeeper:
                     f"the state in '{self._path}' is not used: {error}; it is kept as "
                     f"'{_refused(self._path).name}' when the next one is saved"
                 )
-        return self._system.build(config)
+        return None
 
-    def save_every_now_and_then(self, state: Callable[[], tuple[Tracker, Config]]) -> None:
-        """`save` what `state()` gives, each time something new was heard."""
+    def save_periodically(self, given: Callable[[], Config]) -> None:
+        """`save` with the parameters `given()`, each time something new came."""
         if self._path:
             self._node.create_timer(
                 self._period,
-                lambda: self.save(*state()),
+                lambda: self.save(given()),
                 clock=Clock(clock_type=ClockType.STEADY_TIME),
             )
 
-    def goes_on(self, stamp_ns: int) -> bool:
+    def still_fits(self, stamp_ns: int) -> bool:
         """Note a measurement; False when it shows that the loaded state is of another time."""
-        self._heard += 1
+        self._taken += 1
         self._newest_ns = stamp_ns
         loaded = self._loaded_ns
         if loaded is None:
@@ -108,22 +114,22 @@ class StateKeeper:
             )
         return not self._far
 
-    def save(self, tracker: Tracker, given: Config, *, wait: bool = False) -> None:
+    def save(self, given: Config, *, wait: bool = False) -> None:
         """Write the state of now, if there is something new; `wait` until it is on the disk.
         given: the parameters of the tracker without what /tf_static says."""
         if self._thread is not None and (wait or not self._thread.is_alive()):
             self._thread.join()
             self._thread = None
-        if self._path is None or self._heard == self._saved or self._thread is not None:
+        if self._path is None or self._taken == self._saved or self._thread is not None:
             return
-        self._saved = self._heard
+        self._saved = self._taken
         saved = Saved(
             system=self._system.name,
             parameters=json_parameters(given),
             saved_ns=time.time_ns(),
             newest_ns=self._newest_ns,
-            state=frozen_state(tracker),
-            extras={'told': self._told, 'guards': [freeze(one) for one in self._guards]},
+            state=frozen_state(self._intake.tracker),
+            extras={'conventions': self._conventions, 'intake': frozen_state(self._intake)},
         )
         if wait:
             self._write(self._path, saved)
@@ -131,22 +137,19 @@ class StateKeeper:
         self._thread = threading.Thread(target=self._write, args=(self._path, saved), daemon=True)
         self._thread.start()
 
-    def _load(self, path: Path, config: Config) -> Tracker:
+    def _read(self, path: Path, config: Config) -> Intake:
         saved = read_state(path)
         age = 1e-9 * (time.time_ns() - saved.saved_ns)
         if abs(age) > self._max_age:
             when = f'{age:.0f} s ago' if age > 0 else f'{-age:.0f} s ahead of the clock'
             raise StateError(f'it was saved {when}, state_max_age is {self._max_age:g} s')
-        tracker = tracker_from(saved, self._system, config)
-        if saved.extras['told'] != self._told:
+        intake = Intake(tracker_from(saved, self._system, config), self._frame_id)
+        if saved.extras['conventions'] != self._conventions:
             raise StateError('it was saved with another frame_id or world_frame_convention')
-        if len(saved.extras['guards']) != len(self._guards):
-            raise StateError('it does not fit this version (guards)')
-        for guard, state in zip(self._guards, saved.extras['guards']):
-            put(guard, state)
+        restore(intake, saved.extras['intake'])
         self._loaded_ns = self._newest_ns = saved.newest_ns
         self._node.get_logger().info(f"goes on from the state in '{path}', {age:.1f} s old")
-        return tracker
+        return intake
 
     def _write(self, path: Path, saved: Saved) -> None:
         try:
