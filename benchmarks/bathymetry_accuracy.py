@@ -24,29 +24,33 @@ deviations, and, in brackets, what an independent prototype found before.
 
 from __future__ import annotations
 
-import argparse
-import json
+from collections.abc import Mapping
 import math
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.study import cell, Parts, Row, study, truths
 from sonar_imm.acoustics import array, spatial
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from sonar_imm.truth import Scene, TrueProfile
+from sonar_imm_tools.simulation.bathymetry.simulator import BathymetryScenario, scenario, simulate
 
 PAPER_CHAIN = (0.98, 0.02, 0.02, 0.98)
-SLOPES_ONLY = {'transition_matrix': (1.0, 0.0, 0.0, 1.0), 'initial_probabilities': (0.0, 1.0)}
-SLOPE_SET = {'model_set': 'height_rw_ncs', 'sigmas': (1.0, 1.0)}
-TWO = {'sigmas': (0.01, 1.0)}
-QUICK = {'sigmas': (0.01, 0.7)}
-GRID = {'engine': 'grid'}
+SLOPES_ONLY: dict[str, Any] = {
+    'transition_matrix': (1.0, 0.0, 0.0, 1.0),
+    'initial_probabilities': (0.0, 1.0),
+}
+KEYS = ('smooth', 'patch', 'all', 'angle_deg', 'iou')
+SLOPE_SET: dict[str, Any] = {'model_set': 'height_rw_ncs', 'sigmas': (1.0, 1.0)}
+TWO: dict[str, Any] = {'sigmas': (0.01, 1.0)}
+QUICK: dict[str, Any] = {'sigmas': (0.01, 0.7)}
+GRID: dict[str, Any] = {'engine': 'grid'}
 
 # Name: parameters that differ from `COMMON`, and smooth, patch, all (m), angle (deg), overlap as
 # found before by an independent prototype; None where it was not measured.
-COMMON = {'shadow_gate': False, 'initial_std': 1.0}
-TRACKERS = {
+COMMON: dict[str, Any] = {'shadow_gate': False, 'initial_std': 1.0}
+TRACKERS: dict[str, tuple[dict[str, Any], tuple[float | None, ...]]] = {
     'random walk only': (
         {'model_set': 'height_bank', 'sigmas': (1.0,), 'engine': 'particles'},
         (0.401, 0.331, 0.391, 0.41, None),
@@ -90,7 +94,7 @@ TRACKERS = {
     ),
     'defaults': ({'shadow_gate': True, 'initial_std': 0.0}, (None,) * 5),
 }
-CLASSICAL = {
+CLASSICAL: dict[str, tuple[float | None, ...]] = {
     'phase difference of one pair': (1.71, 0.98, 1.61, 1.51, None),
     'music': (0.186, 0.527, 0.274, 0.34, None),
     'capon': (0.258, 0.529, 0.320, 0.37, None),
@@ -107,7 +111,7 @@ class Answer(NamedTuple):
     inside: np.ndarray | None
 
 
-def classical(name: str, scene, config) -> Answer:
+def classical(name: str, scene: Scene, config: BathymetryScenario) -> Answer:
     """Directions from windows of +-5 bins, without a tracker."""
     heights, angles = [], []
     tilt, spacing = math.radians(config.tilt_deg), config.spacing_wavelengths
@@ -126,13 +130,13 @@ def classical(name: str, scene, config) -> Answer:
     return Answer(np.array(heights), np.array(angles), None, None)
 
 
-def tracked(values: dict, scene) -> Answer:
+def tracked(values: Mapping[str, Any], scene: Scene) -> Answer:
     config = BathymetryConfig(**{**COMMON, **values})
     tracker = BathymetryTracker(config)
     tables = [tracker.process(item.measurement)[0].columns() for item in scene.measurements]
     height = np.array([table['height'] for table in tables])
     angle = np.array([table['angle'] for table in tables])
-    truth = np.array([profile.height for profile in scene.truth])
+    truth = np.array([profile.height for profile in truths(scene, TrueProfile)])
     inside = rough = None
     if 'cov_height_height' in tables[0]:
         sd = np.sqrt([table['cov_height_height'] for table in tables])
@@ -144,10 +148,11 @@ def tracked(values: dict, scene) -> Answer:
     return Answer(height, angle, rough, inside)
 
 
-def score(answer: Answer, scene) -> dict[str, float | None]:
-    patch = np.array([profile.patch for profile in scene.truth])
-    square = np.square(answer.height - [profile.height for profile in scene.truth])
-    angular = np.square(answer.angle - [profile.angle for profile in scene.truth])
+def score(answer: Answer, scene: Scene, prototype: tuple[float | None, ...]) -> dict[str, Any]:
+    truth = truths(scene, TrueProfile)
+    patch = np.array([profile.patch for profile in truth])
+    square = np.square(answer.height - np.array([profile.height for profile in truth]))
+    angular = np.square(answer.angle - np.array([profile.angle for profile in truth]))
     rough, inside = answer.rough, answer.inside
     return {
         'smooth': math.sqrt(square[~patch].mean()),
@@ -157,43 +162,31 @@ def score(answer: Answer, scene) -> dict[str, float | None]:
         'iou': None if rough is None else float((rough & patch).sum() / (rough | patch).sum()),
         'inside_smooth': None if inside is None else float(inside[~patch].mean()),
         'inside_patch': None if inside is None else float(inside[patch].mean()),
+        'prototype': dict(zip(KEYS, prototype)),
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--pings', type=int, default=120)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
-    options = parser.parse_args()
-    config = scenario('paper', {'pings': options.pings})
-    scene = simulate(config, options.seed)
-    keys = ('smooth', 'patch', 'all', 'angle_deg', 'iou')
-    print(f'{options.pings} pings, seed {options.seed}; in brackets: prototype')
-    print(f'{"":42}' + ''.join(f'{key:>15}' for key in keys) + '  within 2 sd')
-    results = {}
-    for name, (values, sheet) in {
-        **{name: (None, sheet) for name, sheet in CLASSICAL.items()},
-        **TRACKERS,
-    }.items():
-        answer = classical(name, scene, config) if values is None else tracked(values, scene)
-        results[name] = {**score(answer, scene), 'prototype': dict(zip(keys, sheet))}
-        print(row(name, results[name], keys), flush=True)
-    if options.out:
-        run = {'pings': options.pings, 'seed': options.seed, 'methods': results}
-        options.out.write_text(json.dumps(run, indent=2) + '\n')
+def main(pings: int = 120, seed: int = 1) -> Parts:
+    config = scenario('paper', {'pings': pings})
+    scene = simulate(config, seed)
+    yield {'pings': pings, 'seed': seed}
+    for name, prototype in CLASSICAL.items():
+        yield {'methods': {name: score(classical(name, scene, config), scene, prototype)}}
+    for name, (values, prototype) in TRACKERS.items():
+        yield {'methods': {name: score(tracked(values, scene), scene, prototype)}}
 
 
-def row(name: str, result: dict, keys: tuple[str, ...]) -> str:
-    cells = []
-    for key in keys:
-        value, before = result[key], result['prototype'][key]
-        shown = '-' if value is None else f'{value:.3f}'
-        cells.append(f'{shown + ("" if before is None else f" ({before:g})"):>15}')
-    smooth, patch = result['inside_smooth'], result['inside_patch']
-    inside = '' if smooth is None else f'  {smooth:.3f} {patch:.3f}'
-    return f'{name:42}' + ''.join(cells) + inside
+def shown(result: Row) -> dict[str, str]:
+    """The errors, and in brackets those of the prototype."""
+    before = result['prototype']
+    cells = {
+        key: cell(result[key]) + ('' if before[key] is None else f' ({before[key]:g})')
+        for key in KEYS
+    }
+    return cells | {
+        'within 2 sd': f'{cell(result["inside_smooth"])} {cell(result["inside_patch"])}'
+    }
 
 
 if __name__ == '__main__':
-    main()
+    study(main, shown=shown)

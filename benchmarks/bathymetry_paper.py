@@ -25,22 +25,15 @@ the bins labelled rough.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from benchmarks.tables import markdown, write_json
-from msg_adapters.estimates import read_estimate
-from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
-from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
-from sonar_imm_tools.evaluation.bathymetry.scoring import score
-from sonar_imm_tools.recordings.truth import records_of
-from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+from benchmarks.bathymetry_scenes import judged
+from benchmarks.study import Parts, study
 
 SIGMAS = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 PAPER = {'variant': 'paper'}
-SETS = {
+SETS: dict[str, Callable[[float], dict[str, Any]]] = {
     'height_rw_ncs': lambda sigma: {'model_set': 'height_rw_ncs', 'sigmas': (sigma, 1.0)},
     'height_two_rw': lambda sigma: {'model_set': 'height_two_rw', 'sigmas': (0.01, sigma)},
 }
@@ -67,12 +60,7 @@ CASES: dict[str, tuple[str, Mapping[str, Any], Mapping[str, Any]]] = {
 
 def run(name: str, pings: int, seed: int) -> dict[str, float]:
     """Scores of one case."""
-    scene_name, changes, values = CASES[name]
-    scene = simulate(scenario(scene_name, {'pings': pings, **changes}), seed)
-    tracker = BathymetryTracker(BathymetryConfig(**values))
-    estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
-    records = [record for true in scene.truth for record in records_of(true, '')]
-    metrics = score(profiles_of(estimates, [read_estimate(message) for *_, message in records]))
+    metrics = judged(*CASES[name], pings, seed)
     return {
         **{f'{k}_m': metrics['height'][k]['rmse_m'] for k in ('smooth', 'patch', 'all')},
         'within': metrics['inside_band']['all'],
@@ -80,20 +68,12 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--pings', type=int, default=40)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--only', default='', help='cases whose name begins so')
-    parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
-    options = parser.parse_args()
-    names = [name for name in CASES if name.startswith(options.only)]
-    rows = {name: run(name, options.pings, options.seed) for name in names}
-    print(f'{options.pings} pings, seed {options.seed}')
-    print(markdown(rows))
-    run_of = {'pings': options.pings, 'seed': options.seed}
-    write_json(options.out, {**run_of, 'cases': rows})
+def main(pings: int = 40, seed: int = 1, only: str = '') -> Parts:
+    yield {'pings': pings, 'seed': seed}
+    for name in CASES:
+        if name.startswith(only):
+            yield {'cases': {name: run(name, pings, seed)}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, only={'help': 'cases whose name begins so'})

@@ -23,19 +23,21 @@ deviations. The first two rows are the errata of the paper at work.
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
 from benchmarks.bathymetry_accuracy import PAPER_CHAIN, SLOPE_SET, SLOPES_ONLY
+from benchmarks.study import Parts, Row, study
 from msg_adapters.estimates import read_estimate
+from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm.truth import Scene
 from sonar_imm_tools.evaluation.bathymetry.profiles import profiles_of
 from sonar_imm_tools.evaluation.bathymetry.scoring import score
 from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
-BANK = {
+BANK: dict[str, Any] = {
     'model_set': 'height_bank',
     'sigmas': (0.01, 0.05, 0.3, 1.5),
     'rough_sigma': 0.3,
@@ -43,12 +45,12 @@ BANK = {
     'stay_probability': 0.995,
 }
 """The coarse bank; for the default one see `bathymetry_sea`."""
-OPEN = {'shadow_gate': False}
-SLOPE = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
-FLAT = {'patch_std': 0.0, 'slope': 0.1}
+OPEN: dict[str, Any] = {'shadow_gate': False}
+SLOPE: dict[str, Any] = {**OPEN, **SLOPE_SET, **SLOPES_ONLY}
+FLAT: dict[str, Any] = {'patch_std': 0.0, 'slope': 0.1}
 
 # Name: scenario, what it changes, parameters.
-CASES = {
+CASES: dict[str, tuple[str, Mapping[str, Any], Mapping[str, Any]]] = {
     'slope .1, constant slope only, paper': ('slope', FLAT, {**SLOPE, 'variant': 'paper'}),
     'slope .1, constant slope only, corrected': ('slope', FLAT, SLOPE),
     'slope .1 and patch, height_rw_ncs, paper': (
@@ -80,36 +82,34 @@ CASES = {
 }
 
 
-def run(name: str, pings: int, seed: int) -> dict:
-    """Scores of one case."""
-    scene_name, changes, values = CASES[name]
+def judged(
+    scene_name: str, changes: Mapping[str, Any], values: Mapping[str, Any], pings: int, seed: int
+) -> dict[str, Any]:
+    """Scores of a tracker with `values` on a scene with `changes`."""
     scene = simulate(scenario(scene_name, {'pings': pings, **changes}), seed)
     tracker = BathymetryTracker(BathymetryConfig(**values))
     estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
+    return score(profiles_of(estimates, truth_of(scene)))
+
+
+def truth_of(scene: Scene) -> list[Estimate]:
+    """The true floor of each ping, as a recording has it."""
     records = [record for true in scene.truth for record in records_of(true, '')]
-    truth = [read_estimate(message) for _, _, message in records]
-    return score(profiles_of(estimates, truth))
+    return [read_estimate(message) for *_, message in records]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--pings', type=int, default=60)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
-    options = parser.parse_args()
-    print(f'{options.pings} pings, seed {options.seed}')
-    print(f'{"":46}{"smooth":>8}{"patch":>8}{"all":>8}{"iou":>8}  within 2 sd')
-    results = {}
-    for name in CASES:
-        results[name] = metrics = run(name, options.pings, options.seed)
-        errors = [metrics['height'][place]['rmse_m'] for place in ('smooth', 'patch', 'all')]
-        iou = metrics.get('segmentation', {}).get('iou', float('nan'))
-        cells = ''.join(f'{value:8.3f}' for value in (*errors, iou))
-        print(f'{name:46}{cells}  {metrics["inside_band"]["all"]:.3f}', flush=True)
-    if options.out:
-        run_of = {'pings': options.pings, 'seed': options.seed, 'cases': results}
-        options.out.write_text(json.dumps(run_of, indent=2) + '\n')
+def main(pings: int = 60, seed: int = 1) -> Parts:
+    yield {'pings': pings, 'seed': seed}
+    for name, case in CASES.items():
+        yield {'cases': {name: judged(*case, pings, seed)}}
+
+
+def shown(metrics: Row) -> dict[str, float]:
+    """What is printed of the scores."""
+    errors = {place: metrics['height'][place]['rmse_m'] for place in ('smooth', 'patch', 'all')}
+    iou = metrics.get('segmentation', {}).get('iou', float('nan'))
+    return errors | {'iou': iou, 'within 2 sd': metrics['inside_band']['all']}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, shown=shown)

@@ -24,25 +24,23 @@ common to a ping, so that closer pings would judge one error many times.
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from msg_adapters.estimates import read_estimate
+from benchmarks.bathymetry_scenes import truth_of
+from benchmarks.study import known, Parts, study
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 from sonar_imm_tools.evaluation.bathymetry.profiles import Profile, profiles_of
 from sonar_imm_tools.evaluation.bathymetry.scoring import score
-from sonar_imm_tools.recordings.truth import records_of
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 
-APART = {'ping_rate': 0.3, 'patch_along': []}
-GRID = {'engine': 'grid'}
-ANGLES = {'model_set': 'angle_two_rw'}
-BANK = {'model_set': 'height_bank'}
-NADIR = {'first_range': 15.1}
+APART: dict[str, Any] = {'ping_rate': 0.3, 'patch_along': []}
+GRID: dict[str, Any] = {'engine': 'grid'}
+ANGLES: dict[str, Any] = {'model_set': 'angle_two_rw'}
+BANK: dict[str, Any] = {'model_set': 'height_bank'}
+NADIR: dict[str, Any] = {'first_range': 15.1}
 LOST = 1.0
 """Metres of RMSE from which a ping is lost."""
 
@@ -52,13 +50,13 @@ def unknown(height: float) -> dict[str, Any]:
     return {**APART, 'sonar_height': height, 'first_range': 5.0}
 
 
-EXACT = {**GRID, 'smoothing': 'states', 'sigmas': [0.01, 0.7]}
+EXACT: dict[str, Any] = {**GRID, 'smoothing': 'states', 'sigmas': [0.01, 0.7]}
 LOUD = {'snr_far_db': 30.0}
 EXACT_NAVIGATION = {
     f'nav_{what}': 0.0
     for what in ('attitude_error_deg', 'heading_error_deg', 'heave_error', 'position_error')
 }
-TOLD = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
+TOLD: dict[str, Any] = {'sonar_height': 15.0, 'sonar_height_std': 5.0}
 
 # Name: scenario, what it changes, parameters beside those of the instruments.
 CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
@@ -125,13 +123,13 @@ CASES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
         for strength in (0.0, 0.15, 0.35, 0.7)
     },
     **{
-        f'staves 2, {spacing:g} wavelengths, {share:.0%} differ, told {told:.0%}': (
+        f'staves 2, {spacing:g} wavelengths, {share:.0%} differ, told {stated:.0%}': (
             'paper',
             {'staves': 2, 'spacing_wavelengths': spacing, 'decorrelation': share},
-            {**GRID, 'decorrelation': told},
+            {**GRID, 'decorrelation': stated},
         )
         for spacing in (0.5, 3.66)
-        for share, told in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.05), (0.2, 0.0), (0.2, 0.2))
+        for share, stated in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.05), (0.2, 0.0), (0.2, 0.2))
     },
 }
 
@@ -141,21 +139,20 @@ def run(name: str, pings: int, seed: int) -> dict[str, float]:
     scene_name, changes, values = CASES[name]
     config = scenario(scene_name, {'pings': pings, **changes})
     scene = simulate(config, seed)
-    heard = frozenset({'snapshot', 'nav'} if config.moving else {'snapshot'})
-    told = BathymetryConfig.from_mapping({**config.told(), **values}).for_inputs(heard)
-    if told.navigation == 'ignored' and told.sound_speed_profile:
+    inputs = frozenset({'snapshot', 'nav'} if config.moving else {'snapshot'})
+    settings = BathymetryConfig.from_mapping({**config.instruments(), **values}).for_inputs(inputs)
+    if settings.navigation == 'ignored' and settings.sound_speed_profile:
         raise ValueError('a profile needs navigation')
-    tracker = BathymetryTracker(told)
+    tracker = BathymetryTracker(settings)
     estimates = [
         estimate for item in scene.measurements for estimate in tracker.process(item.measurement)
     ]
     estimates += tracker.finish()
-    records = [record for true in scene.truth for record in records_of(true, '')]
-    truth = [read_estimate(message) for _, _, message in records]
-    swath = profiles_of(estimates, truth)
-    if config.moving and told.navigation == 'ignored':
+    swath = profiles_of(estimates, truth_of(scene))
+    if config.moving and settings.navigation == 'ignored':
         level = config.water_level - config.sonar_depth - config.sonar_height
         for profile in swath.profiles:
+            assert profile.truth is not None
             profile.truth.height[:] -= level  # a sonar at rest counts from its reference floor
     metrics = score(swath)
     return {
@@ -174,34 +171,22 @@ def _rmse(profile: Profile) -> float:
     return float(np.sqrt(np.nanmean(np.square(error))))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--pings', type=int, default=24)
-    parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--only', default='', help='cases whose name begins so')
-    parser.add_argument('--out', type=Path, help='write the numbers here, as JSON')
-    parser.add_argument('--keep', action='store_true', help='keep what is in --out beside them')
-    options = parser.parse_args()
-    print(f'{options.pings} pings, seed {options.seed}')
-    print(f'{"":42}{"all":>8}{"patch":>8}{"within":>8}{"iou":>8}{"lost":>6}')
-    results = {}
+def main(
+    pings: int = 24, seed: int = 1, only: str = '', keep: bool = False, out: Path | None = None
+) -> Parts:
+    settings = {'pings': pings, 'seed': seed}
+    before = known(out) if keep else {}
+    if before and {name: before[name] for name in settings} != settings:
+        raise SystemExit('the file is of another run')
+    yield {**settings, 'cases': before.get('cases', {})}
     for name in CASES:
-        if not name.startswith(options.only):
-            continue
-        results[name] = row = run(name, options.pings, options.seed)
-        names = ('rmse_m', 'patch_rmse_m', 'inside_two_sd', 'iou')
-        cells = ''.join(f'{row[column]:8.3f}' for column in names)
-        print(f'{name:42}{cells}{row["lost_pings"]:6d}', flush=True)
-    if options.out and options.keep:
-        before = json.loads(options.out.read_text())
-        if (before['pings'], before['seed']) != (options.pings, options.seed):
-            parser.error('the file is of another run')
-        results = {**before['cases'], **results}
-        results = {name: results[name] for name in CASES if name in results}
-    if options.out:
-        run_of = {'pings': options.pings, 'seed': options.seed, 'cases': results}
-        options.out.write_text(json.dumps(run_of, indent=2) + '\n')
+        if name.startswith(only):
+            yield {'cases': {name: run(name, pings, seed)}}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        only={'help': 'cases whose name begins so'},
+        keep={'help': 'keep what is in --out beside them'},
+    )

@@ -25,20 +25,14 @@ the peak memory of the process grew.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterator
-import contextlib
-import json
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 import resource
-import subprocess
-import sys
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import in_fresh_process, Parts, study
 from msg_adapters.arrivals import MAX_PAIRS
 from msg_adapters.detections import MAX_DETECTIONS
 from msg_adapters.inputs import inputs_of
@@ -172,10 +166,10 @@ def cost(name: str) -> dict[str, float]:
     settings = {'association': 'jipda'} if name == 'fixes_softly' else {}
     tracker = SYSTEMS[system].build(SYSTEMS[system].config_type()(**settings))
     tracker.warm()
-    entry = next(one for one in inputs_of(system) if one.name == topic)
+    entry = next(entry for entry in inputs_of(system) if entry.name == topic)
     read = entry.reader(TABLE, 'enu', tracker.config.as_dict())
     prepared = list(messages(name))
-    size = max(len(typestore().serialize_cdr(one, TABLE)) for one in prepared)
+    size = max(len(typestore().serialize_cdr(message, TABLE)) for message in prepared)
     before, slowest, outcome = _peak_mb(), 0.0, 'used'
     for second, message in enumerate(prepared, start=1):
         start = time.process_time()
@@ -187,9 +181,9 @@ def cost(name: str) -> dict[str, float]:
             outcome = rejection.reason
         slowest = max(slowest, time.process_time() - start)
     grown = _peak_mb() - before
-    told = {'size_mb': size / 1e6, 'cpu_s': slowest, 'memory_mb': grown}
+    measured = {'size_mb': size / 1e6, 'cpu_s': slowest, 'memory_mb': grown}
     per_mb = {'cpu_s_per_mb': slowest / (size / 1e6), 'memory_per_byte': grown * 1e6 / size}
-    return told | per_mb | {'refused': float(outcome != 'used')}
+    return measured | per_mb | {'refused': float(outcome != 'used')}
 
 
 def _companions(system: str, second: int) -> Iterator[Any]:
@@ -210,29 +204,13 @@ def _peak_mb() -> float:
 
 def measured(name: str) -> dict[str, float]:
     """`cost` in a fresh process."""
-    command = [sys.executable, '-m', 'benchmarks.bounds', '--here', name]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[1]
-    )
-    result: dict[str, float] = json.loads(done.stdout)
-    return result
+    return in_fresh_process(cost, name)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--only', choices=CASES, action='append')
-    parser.add_argument('--here', choices=CASES, help=argparse.SUPPRESS)
-    parser.add_argument('--out', type=Path)
-    arguments = parser.parse_args()
-    if arguments.here:
-        with contextlib.redirect_stdout(sys.stderr):
-            result = cost(arguments.here)
-        print(json.dumps(result))
-        return
-    table = {name: measured(name) for name in arguments.only or CASES}
-    print(markdown(table, 2))
-    write_json(arguments.out, table)
+def main(only: Sequence[str] | None = None) -> Parts:
+    for name in only or CASES:
+        yield {name: measured(name)}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, digits=2, only={'action': 'append', 'choices': list(CASES)})

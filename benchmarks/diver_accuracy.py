@@ -24,18 +24,19 @@ their own (other seeds). RMSE is over all stamps from the first fix on.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.estimation import imm_kernels
 from sonar_imm.estimation.adaptation import AdaptiveChain
 from sonar_imm.estimation.consistency import average_bounds, nees
 from sonar_imm.estimation.smoothing import imm_smooth
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
+from sonar_imm.truth import TrueTrack
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 COLUMNS = {
@@ -43,18 +44,22 @@ COLUMNS = {
     'five scenes': ['legs_slow', 'straight', 'circle', 'zigzag', 'stop_and_go'],
     'random heading': ['random_heading'],
 }
-NOISES = {
+NOISES: dict[str, list[tuple[float, ...]]] = {
     'cv': [(q,) for q in (0.1, 0.15, 0.2, 0.25, 0.3, 0.4)],
     'cv_cv': [(a, b) for a in (0.01, 0.03, 0.06, 0.1) for b in (0.45, 0.6, 0.8, 1.0)],
     'cv_ct': [(a, b, b) for a in (0.05, 0.1, 0.2) for b in (0.2, 0.3, 0.5)],
 }
-STAYS = {'cv': (1.0,), 'cv_cv': (0.7, 0.8, 0.85, 0.9, 0.95), 'cv_ct': (0.8, 0.9)}
+STAYS: dict[str, tuple[float, ...]] = {
+    'cv': (1.0,),
+    'cv_cv': (0.7, 0.8, 0.85, 0.9, 0.95),
+    'cv_ct': (0.8, 0.9),
+}
 BASELINES = {
     'cv': 'CV Kalman, tuned',
     'cv_cv': 'IMM CV+CV, tuned',
     'cv_ct': 'IMM CV+CT+-, tuned',
 }
-TRACKERS = {
+TRACKERS: dict[str, dict[str, Any]] = {
     'world_headings, 1 m/s given': {
         'model_set': 'world_headings',
         'stay_probability': 0.88,
@@ -76,25 +81,27 @@ def load(names: list[str], seeds: range) -> tuple[np.ndarray, np.ndarray, np.nda
     truth, z, R = [], [], []
     for seed in seeds:
         scene = simulate(scenario(names[seed % len(names)]), seed)
-        track = scene.truth[0]
+        track = truths(scene, TrueTrack)[0]
         truth.append(np.column_stack([track.position[:, :2], track.velocity]))
-        z.append([one.measurement.position[:2] for one in scene.measurements])
-        R.append([one.measurement.covariance for one in scene.measurements])
+        z.append([item.measurement.position[:2] for item in scene.measurements])
+        R.append([item.measurement.covariance for item in scene.measurements])
     return np.array(truth), np.array(z), np.array(R)
 
 
-def forward(config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarray | None = None):
+def forward(
+    config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarray | None = None
+) -> Iterator[tuple[Any, ...]]:
     """Filter N runs of K fixes at once: yields mean, covariance and the arrays of each step."""
     models = build_models(config)
     chain = AdaptiveChain(
         models.chain,
-        config.adaptation,
+        config.adaptation,  # type: ignore[arg-type]
         weight=config.adaptation_prior,
         guard=config.adaptation_guard,
     )
     if matrix is not None:
         models.chain.matrix = matrix
-        models.chain.transition = lambda dt: matrix
+        models.chain.transition = lambda dt: matrix  # type: ignore[method-assign]
     x, P, mu = models.new_tracks(z[:, 0], R[:, 0])
     H, motion = np.ascontiguousarray(models.E[:, :2]), models.motion(1.0)
     learnt = chain.fresh(len(z))
@@ -118,10 +125,12 @@ def forward(config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarra
         yield mean, covariance, x, P, mu, transition, motion, models
 
 
-def track(config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarray | None = None):
+def track(
+    config: DiverConfig, z: np.ndarray, R: np.ndarray, matrix: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Estimates (N, K, 4) and covariances (N, K, 4, 4)."""
-    steps = [(step[0], step[1]) for step in forward(config, z, R, matrix)]
-    return tuple(np.stack(part, axis=1) for part in zip(*steps))
+    mean, covariance, *_ = zip(*forward(config, z, R, matrix))
+    return np.stack(mean, axis=1), np.stack(covariance, axis=1)
 
 
 def rmse(estimate: np.ndarray, truth: np.ndarray, columns: slice = slice(0, 2)) -> float:
@@ -216,8 +225,8 @@ def smoothing(runs: int) -> dict[str, dict[str, float]]:
     """Filter beside smoother."""
     truth, z, R = load(['table1'], range(runs))
     table = {}
-    for label, values in {'CV RTS': {'model_set': 'cv'}, 'heading_speed': {}}.items():
-        steps = list(forward(DiverConfig(**values), z, R))
+    for label, model_set in (('CV RTS', 'cv'), ('heading_speed', 'heading_speed')):
+        steps = list(forward(DiverConfig(model_set=model_set), z, R))
         E, motion, K = steps[0][7].E, steps[0][6], len(steps)
         F, Q, B = (np.broadcast_to(part, (K, *part.shape)) for part in motion)
         smooth = np.empty((runs, K, 4))
@@ -239,11 +248,10 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
         squared, absent, names, total = [], 0, [], 0
         for seed in range(runs):
             scene = simulate(scenario(name), seed)
-            tracker = DiverTracker(DiverConfig(max_tracks=1))
-            final = {}
-            for one in scene.measurements:
-                final.update((each.stamp_ns, each) for each in tracker.process(one.measurement))
-            at = {int(stamp): k for k, stamp in enumerate(scene.truth[0].stamp_ns)}
+            measurements = [item.measurement for item in scene.measurements]
+            final = final_estimates(DiverTracker(DiverConfig(max_tracks=1)), measurements)
+            path = truths(scene, TrueTrack)[0]
+            at = {int(stamp): k for k, stamp in enumerate(path.stamp_ns)}
             ids = set()
             for stamp, estimate in final.items():
                 rows = np.flatnonzero(estimate.extras['track_state'] > 0)
@@ -251,7 +259,7 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
                 absent += not len(rows)
                 for row in rows[:1]:
                     ids.add(int(estimate.extras['track_id'][row]))
-                    error = estimate.state[row, :2] - scene.truth[0].position[at[stamp], :2]
+                    error = estimate.state[row, :2] - path.position[at[stamp], :2]
                     squared.append(error @ error)
             names.append(len(ids))
         table[name] = {
@@ -262,24 +270,14 @@ def whole_tracker(runs: int) -> dict[str, dict[str, float]]:
     return table
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=500)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    tables = {
-        'RMSE of position, m': main_table(options.runs),
-        'where it loses': losses(min(options.runs, 200)),
-        'consistency of the default': consistency(min(options.runs, 200)),
-        'smoothing, Table 1 legs, RMSE m': smoothing(min(options.runs, 60)),
-        'the whole tracker': whole_tracker(min(options.runs, 60)),
-    }
-    for title, table in tables.items():
-        print(f'\n{title} ({options.runs} runs at most)\n\n{markdown(table)}', flush=True)
-    write_json(options.out, {'runs': options.runs, **tables})
+def main(runs: int = 500) -> Parts:
+    yield {'runs': runs}
+    yield {'RMSE of position, m': main_table(runs)}
+    yield {'where it loses': losses(min(runs, 200))}
+    yield {'consistency of the default': consistency(min(runs, 200))}
+    yield {'smoothing, Table 1 legs, RMSE m': smoothing(min(runs, 60))}
+    yield {'the whole tracker': whole_tracker(min(runs, 60))}
 
 
 if __name__ == '__main__':
-    main()
+    study(main)

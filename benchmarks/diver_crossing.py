@@ -25,14 +25,12 @@ the same track in scans 90 to 97 as in scans 32 to 39.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, rms, study
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene
@@ -62,7 +60,7 @@ def track(scene: Scene, config: DiverConfig) -> tuple[Series, float]:
     """The estimates, and the CPU seconds they took."""
     tracker = DiverTracker(config)
     begin = time.process_time()
-    made = [tracker.process(one.measurement)[-1] for one in scene.measurements]
+    made = [tracker.process(item.measurement)[-1] for item in scene.measurements]
     return series_of(made), time.process_time() - begin
 
 
@@ -70,7 +68,7 @@ def identities_kept(series: Series, truth: Truth) -> list[bool]:
     """For each pair whether both divers have the same track before and after they crossed."""
     followed = match(series.confirmed(), truth, cutoff=CUTOFF).followed_by
     before, after = ([_usual(row[when]) for row in followed] for when in (BEFORE, AFTER))
-    same = [one == other and one >= 0 for one, other in zip(before, after)]
+    same = [first == last and first >= 0 for first, last in zip(before, after)]
     return [same[k] and same[k + 1] for k in range(0, len(same), 2)]
 
 
@@ -112,37 +110,29 @@ def case(probability: float, clutter: float, association: str, runs: int) -> dic
     def mean(*names: str) -> float:
         values: list[Any] = scored
         for name in names:
-            values = [one[name] for one in values]
+            values = [each[name] for each in values]
         return float(np.mean(values))
 
     return {
-        'GOSPA, rms': float(np.sqrt(np.mean([one['gospa']['rms_m'] ** 2 for one in scored]))),
+        'GOSPA, rms': rms([each['gospa']['rms_m'] for each in scored]),
         'with switches': mean('gospa', 'with_switches_m'),
         'GOSPA, mean': mean('gospa', 'mean_m'),
-        'RMSE': float(np.sqrt(np.mean([one['position']['rmse_m'] ** 2 for one in scored]))),
+        'RMSE': rms([each['position']['rmse_m'] for each in scored]),
         'NEES': mean('consistency', 'nees_position', 'mean'),
         'identities kept': float(np.mean(kept)),
-        'false tracks/h': sum(one['tracks']['false_tracks'] for one in scored) / scans * HOUR,
+        'false tracks/h': sum(each['tracks']['false_tracks'] for each in scored) / scans * HOUR,
         'scans to confirm': float(np.mean(confirmed)),
         'ms a scan': 1e3 * seconds / scans,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--runs', type=int, default=16)
-    parser.add_argument('--out', type=Path)
-    told = parser.parse_args()
-    table = {
-        f'P_D {probability}, {clutter:g} false, {association}': case(
-            probability, clutter, association, told.runs
-        )
-        for probability, clutter in CASES
-        for association in ASSOCIATIONS
-    }
-    print(markdown(table))
-    write_json(told.out, {'runs': told.runs, 'table': table})
+def main(runs: int = 16) -> Parts:
+    yield {'runs': runs}
+    for probability, clutter in CASES:
+        for association in ASSOCIATIONS:
+            name = f'P_D {probability}, {clutter:g} false, {association}'
+            yield {'table': {name: case(probability, clutter, association, runs)}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main)

@@ -27,14 +27,13 @@ before two tracks are one follow from P_D (`names.patience`).
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from benchmarks.diver_crossing import true_paths
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import mean_of, Parts, rms, study, truths
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm.truth import Scene, TrueTrack
@@ -49,9 +48,14 @@ HEARD_FROM, EVERY = 20, 4
 
 def truth_of(scene: str, seed: int) -> tuple[TrueTrack, ...]:
     """The paths of the two divers."""
-    told = {'duration': 120.0, 'speed': 0.75, 'start': [-20.0, 0.0], 'turn_deg': 60.0}
-    told |= {'divers': 2, 'spacing': 30.0} if scene == 'apart' else {}
-    made = simulate(scenario('table1', told), seed).truth
+    values: dict[str, Any] = {
+        'duration': 120.0,
+        'speed': 0.75,
+        'start': [-20.0, 0.0],
+        'turn_deg': 60.0,
+    }
+    values |= {'divers': 2, 'spacing': 30.0} if scene == 'apart' else {}
+    made = truths(simulate(scenario('table1', values), seed), TrueTrack)
     first = made[0]
     if scene == 'apart':
         return made
@@ -64,7 +68,7 @@ def measured(scene: str, truth: tuple[TrueTrack, ...], seed: int) -> list[Fix | 
     rng = np.random.default_rng([seed, 7])
     measurements: list[Fix | Fixes] = []
     for k, stamp in enumerate(truth[0].stamp_ns.tolist()):
-        there = np.array([one.position[k, :2] for one in truth])
+        there = np.array([path.position[k, :2] for path in truth])
         there = there[rng.uniform(size=len(there)) < P_DETECTION]
         seen = there + rng.normal(scale=SCAN_STD, size=there.shape)
         false = rng.uniform(-HALF, HALF, (rng.poisson(FALSE), 2))
@@ -103,8 +107,8 @@ def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
         clutter_density=FALSE / (2.0 * HALF) ** 2,
     )
     tracker = DiverTracker(config)
-    made = [tracker.process(one)[-1] for one in measured(scene, truth, seed)]
-    paths = {one.track_id: one for one in truth}
+    made = [tracker.process(item)[-1] for item in measured(scene, truth, seed)]
+    paths = {path.track_id: path for path in truth}
     error = []
     for estimate in made[-120:]:
         for row in np.flatnonzero(estimate.extras['target_id'] >= 0):
@@ -120,35 +124,18 @@ def run(scene: str, association: str, mode: str, seed: int) -> dict[str, float]:
     return {
         'gospa_m': found['gospa']['rms_m'],
         'rmse_m': found['position']['rmse_m'],
-        'named_rmse_m': float(np.sqrt(np.mean(np.square(error)))),
+        'named_rmse_m': rms(error),
         'tracks': float(found['tracks_confirmed']),
         'switches_per_hour': found['tracks']['identity_switches'] / hours,
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--runs', type=int, default=8)
-    parser.add_argument('--out', type=Path)
-    options = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    for scene in SCENES:
-        for association in ('gnn', 'jipda'):
-            for mode in ('alone', 'share'):
-                runs = [run(scene, association, mode, seed) for seed in range(options.runs)]
-                mean = {name: float(np.mean([one[name] for one in runs])) for name in runs[0]}
-                rows.append({'scene': scene, 'association': association, 'named': mode} | mean)
-                print(rows[-1], flush=True)
-    table = {
-        f'{row["scene"]}, {row["association"]}, {row["named"]}': {
-            name: value for name, value in row.items() if isinstance(value, float)
-        }
-        for row in rows
-    }
-    print(markdown(table, 2))
-    if options.out:
-        write_json(options.out, {'runs': options.runs, 'rows': rows})
+def main(runs: int = 8) -> Parts:
+    yield {'runs': runs}
+    for scene, association, mode in product(SCENES, ('gnn', 'jipda'), ('alone', 'share')):
+        scores = mean_of([run(scene, association, mode, seed) for seed in range(runs)])
+        yield {'rows': [{'scene': scene, 'association': association, 'named': mode} | scores]}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, digits=2)

@@ -23,33 +23,30 @@ the horizontal position (2 is due), for depth also of all three coordinates (3 i
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
-from pathlib import Path
-import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import write_json
+from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
-from sonar_imm.truth import Scene
+from sonar_imm.truth import Scene, TrueTrack
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
 SETTLED = 10.0
 """Seconds from the start that are not scored."""
 
 Values = Mapping[str, Any]
+Cells = list[tuple[str, str, str, Values, Values]]
+"""Row, column, scenario, what it changes, parameters."""
 
 
 def score(scene: Scene, config: DiverConfig) -> np.ndarray:
     """Rows (k, 4) of squared horizontal error, horizontal NEES, squared depth error, whole NEES;
     the last two NaN where depth is no state. A stamp without a track gives NaN."""
-    tracker, final = DiverTracker(config), {}
-    for one in scene.measurements:
-        final.update((e.stamp_ns, e) for e in tracker.process(one.measurement))
-    track = scene.truth[0]
-    rows = []
+    final = final_estimates(DiverTracker(config), (i.measurement for i in scene.measurements))
+    track = truths(scene, TrueTrack)[0]
+    rows: list[list[Any]] = []
     for k, stamp in enumerate(track.stamp_ns.tolist()):
         if (stamp - track.stamp_ns[0]) * 1e-9 < SETTLED or stamp not in final:
             continue
@@ -69,7 +66,7 @@ def score(scene: Scene, config: DiverConfig) -> np.ndarray:
     return np.array(rows)
 
 
-def study(scene: Values, config: Values, runs: int, name: str = 'multistatic') -> dict[str, Any]:
+def errors(scene: Values, config: Values, runs: int, name: str) -> dict[str, Any]:
     """RMSE and NEES over `runs` scenes. `scene` and `config` may hold functions of the run."""
     rows: list[np.ndarray] = []
     for seed in range(1000, 1000 + runs):
@@ -84,14 +81,14 @@ def study(scene: Values, config: Values, runs: int, name: str = 'multistatic') -
         'nees': float(mean[1]),
         'rmse_depth': float(np.sqrt(mean[2])),
         'nees_3d': float(mean[3]),
-        'rmse_depth_of_runs': np.sqrt([np.nanmean(one[:, 2]) for one in rows]).round(3).tolist()
+        'rmse_depth_of_runs': np.sqrt([np.nanmean(each[:, 2]) for each in rows]).round(3).tolist()
         if np.isfinite(mean[2])
         else [],
         'without_track': float(1.0 - seen.mean()),
     }
 
 
-def cell(found: Mapping[str, Any]) -> str:
+def text_of(found: Mapping[str, Any]) -> str:
     text = f'{found["rmse"]:.2f}'
     if np.isfinite(found['rmse_depth']):
         text += f' / {found["rmse_depth"]:.2f}'
@@ -107,11 +104,10 @@ def cell(found: Mapping[str, Any]) -> str:
 
 
 def middle_depth(scene: Scene) -> float:
-    return float(scene.truth[0].position[:, 2].mean())
+    return float(truths(scene, TrueTrack)[0].position[:, 2].mean())
 
 
-def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
-    """(row, column, scenario, scene, config)."""
+def depth_cells() -> Cells:
     rows = {
         '2, 5, 8, 12 m': (2.0, 5.0, 8.0, 12.0),
         '5 m': (5.0,) * 4,
@@ -127,7 +123,7 @@ def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
         'pressure, .2 m': ({'depth_std': 0.2}, {'dimensions': 3}),
         'depth bank': ({}, {'dimensions': 3}),
     }
-    cells = [
+    cells: Cells = [
         (f'{row}, diver {diver}', column, 'multistatic', {'receiver_depths': at, **swims, **more},
          config)
         for row, at in rows.items()
@@ -149,28 +145,28 @@ def depth_cells() -> list[tuple[str, str, str, Values, Values]]:
     return cells
 
 
-def systematic_cells() -> list[tuple[str, str, str, Values, Values]]:
+def systematic_cells() -> Cells:
     off: dict[str, Values] = {
         'receivers': {'receiver_position_std': 1.0},
         'clocks': {'receiver_clock_std': 5e-4},
         'sound': {'sound_speed_std': 5.0},
     }
-    every: Values = {key: value for one in off.values() for key, value in one.items()}
-    cells = []
+    every: Values = {key: value for error in off.values() for key, value in error.items()}
+    cells: Cells = []
     for row, scene in {'nothing, told all three': {}, **off, 'all': every}.items():
-        told = scene or every
+        stated = scene or every
         for column, config in {
             'ignore': {},
-            'consider': {**told, 'systematic_errors': 'consider'},
-            'mixed': {**told, 'systematic_errors': 'mixed'},
-            'estimate': {**told, 'systematic_errors': 'estimate'},
+            'consider': {**stated, 'systematic_errors': 'consider'},
+            'mixed': {**stated, 'systematic_errors': 'mixed'},
+            'estimate': {**stated, 'systematic_errors': 'estimate'},
         }.items():
             cells.append((row, column, 'multistatic', scene, config))
     return cells
 
 
-def lasting_cells() -> list[tuple[str, str, str, Values, Values]]:
-    cells = []
+def lasting_cells() -> Cells:
+    cells: Cells = []
     for std, tau, white in ((1.0, 60.0, 0.5), (2.0, 60.0, 0.05), (2.0, 600.0, 0.05),
                             (1.0, 10.0, 0.5)):  # fmt: skip
         scene = {'fix_bias_std': std, 'fix_bias_time': tau, 'fix_std': white}
@@ -192,33 +188,18 @@ def lasting_cells() -> list[tuple[str, str, str, Values, Values]]:
 TABLES = {'depth': depth_cells, 'systematic': systematic_cells, 'lasting': lasting_cells}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
-    parser.add_argument('--runs', type=int, default=30)
-    parser.add_argument('--table', choices=[*TABLES], action='append')
-    parser.add_argument('--only', help='columns or rows whose name holds this')
-    parser.add_argument('--out', type=Path)
-    options = parser.parse_args()
-    results: dict[str, dict[str, dict[str, dict[str, Any]]]] = {}
-    for name in options.table or TABLES:
-        table = results.setdefault(name, {})
+def main(runs: int = 30, table: Sequence[str] | None = None, only: str = '') -> Parts:
+    yield {'runs': runs}
+    for name in table or TABLES:
         for row, column, scene_name, scene, config in TABLES[name]():
-            if options.only and options.only not in row + column:
-                continue
-            began = time.process_time()
-            found = study(scene, config, options.runs, scene_name)
-            table.setdefault(row, {})[column] = found
-            spent = time.process_time() - began
-            print(f'{name}: {row} | {column} | {cell(found)} | {spent:.0f} s', flush=True)
-        columns = list(dict.fromkeys(column for one in table.values() for column in one))
-        print(f'\n| | {" | ".join(columns)} |\n{"|---" * (len(columns) + 1)}|')
-        for row, found_row in table.items():
-            texts = [cell(found_row[c]) if c in found_row else '' for c in columns]
-            print(f'| {row} | {" | ".join(texts)} |')
-        print()
-    if options.out:
-        write_json(options.out, {'runs': options.runs, **results})
+            if only in row + column:
+                yield {name: {row: {column: errors(scene, config, runs, scene_name)}}}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        shown=lambda row: {column: text_of(found) for column, found in row.items()},
+        table={'action': 'append', 'choices': list(TABLES)},
+        only={'help': 'columns or rows whose name holds this'},
+    )

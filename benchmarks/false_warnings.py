@@ -26,10 +26,8 @@ one. Rows that are in the file already are not made again.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
-import json
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +35,12 @@ from attrs import evolve
 import yaml
 
 from benchmarks.image_tracks import detected
-from benchmarks.tables import write_json
+from benchmarks.study import known, Parts, study
 from sonar_imm.measurements import Arrivals, Detections, Fix, Snapshot, SonarImage, Trace
-from sonar_imm.nodes.health import Finding, Hysteresis, WARN
+from sonar_imm.nodes.diagnostics import Finding, Hysteresis, WARN
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli.common import load_config
-from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.own_files import own_parameters
 
 FIRST_SEED = 70_000
 """Bounds were looked for with seeds from 1000 on: these are others."""
@@ -86,11 +84,11 @@ def scene_of(bag: Path) -> tuple[str, str, dict[str, Any]]:
     text = (bag / 'metadata.yaml').read_text(encoding='utf-8')
     notes = yaml.safe_load(text)['rosbag2_bagfile_information']['custom_data']
     system, name = notes['source'].removeprefix('simulated: ').split()
-    told = {k[4:]: yaml.safe_load(f'[{v}]') for k, v in notes.items() if k.startswith('set ')}
+    changes = {k[4:]: yaml.safe_load(f'[{v}]') for k, v in notes.items() if k.startswith('set ')}
     scenes = import_module(SYSTEMS[system].scenes)
     specs = {spec.name: spec.kind for spec in type(scenes.scenario(name, {})).specs()}
     lists = {key for key, kind in specs.items() if kind.endswith('[]')}
-    return system, name, {k: tuple(v) if k in lists else v[0] for k, v in told.items()}
+    return system, name, {k: tuple(v) if k in lists else v[0] for k, v in changes.items()}
 
 
 def runs(bag: Path, factor: float, seeds: range) -> Iterator[tuple[float, int]]:
@@ -102,21 +100,20 @@ def runs(bag: Path, factor: float, seeds: range) -> Iterator[tuple[float, int]]:
     stated = {name: factor * getattr(config, name) for name in STATED.get(system, ())}
     tracker = SYSTEMS[system].build(evolve(config, **stated))
     for seed in seeds:
-        items = sorted(
-            scenes.simulate(setting, seed).measurements, key=lambda one: one.received_ns
-        )
-        measurements = [one.measurement for one in items]
-        if any(isinstance(one, SonarImage) for one in measurements):
+        items = scenes.simulate(setting, seed).measurements
+        measurements = [i.measurement for i in sorted(items, key=lambda i: i.received_ns)]
+        if any(isinstance(item, SonarImage) for item in measurements):
             measurements = detected(setting, measurements)
         tracker.reset()
-        hysteresis, raised, active = Hysteresis(), 0, set()
-        for one in measurements:
-            tracker.process(misstated(one, factor))
-            said = getattr(tracker, 'warnings', list)()
-            found = hysteresis.settle([Finding(text[:20], WARN, text) for text in said])
-            raised += len({one.key for one in found} - active)
-            active = {one.key for one in found}
-        stamps = [one.stamp_ns for one in measurements]
+        hysteresis, raised = Hysteresis(), 0
+        active: set[str] = set()
+        for measurement in measurements:
+            tracker.process(misstated(measurement, factor))
+            texts: list[str] = getattr(tracker, 'warnings', list)()
+            found = hysteresis.settle([Finding(text[:20], WARN, text) for text in texts])
+            raised += len({finding.key for finding in found} - active)
+            active = {finding.key for finding in found}
+        stamps = [measurement.stamp_ns for measurement in measurements]
         yield (max(stamps) - min(stamps)) / 3.6e12, raised
 
 
@@ -129,38 +126,25 @@ def row(bag: Path, factor: float, seeds: range) -> dict[str, float]:
         'runs': len(found),
         'minutes': 60.0 * hours,
         'warnings': raised,
-        'share': sum(one > 0 for _, one in found) / len(found),
+        'share': sum(count > 0 for _, count in found) / len(found),
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--runs', type=int, help='for each recording, instead of its usual number')
-    parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
-    parser.add_argument('--bags', nargs='*', default=[])
-    parser.add_argument('--out', type=Path)
-    told = parser.parse_args()
-    print('| scene of | stated / true std | runs | minutes | warnings | runs with one |')
-    print('|---|---|---|---|---|---|')
-    known = told.out is not None and told.out.is_file()
-    rows = json.loads(told.out.read_text(encoding='utf-8')) if known else {}
+def main(
+    runs: int | None = None,
+    first_seed: int = FIRST_SEED,
+    bags: Sequence[str] = (),
+    out: Path | None = None,
+) -> Parts:
+    yield (rows := known(out))
     for bag in sorted(Path('bags').iterdir()):
-        if not bag.is_dir() or (told.bags and bag.name not in told.bags):
+        if not bag.is_dir() or (bags and bag.name not in bags):
             continue
-        count = told.runs or RUNS.get(bag.name, USUAL_RUNS)
+        seeds = range(first_seed, first_seed + (runs or RUNS.get(bag.name, USUAL_RUNS)))
         for factor in (1.0,) if bag.name in MEASURED else FACTORS:
-            name = f'{bag.name} {factor:g}'
-            if name not in rows:
-                seeds = range(told.first_seed, told.first_seed + count)
-                rows[name] = row(bag, factor, seeds)
-                write_json(told.out, rows)
-            one = rows[name]
-            print(
-                f'| `{bag.name}` | {factor:g} | {one["runs"]} | {one["minutes"]:.1f} '
-                f'| {one["warnings"]} | {one["share"]:.0%} |',
-                flush=True,
-            )
+            if (name := f'{bag.name} {factor:g}') not in rows:
+                yield {name: row(bag, factor, seeds)}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, runs={'type': int, 'help': 'for each recording, instead of its usual number'})

@@ -24,27 +24,26 @@ does not go through the command: `fathometer_vectors` has it.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import io
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
 from benchmarks import fathometer_vectors
-from benchmarks.tables import write_json
+from benchmarks.fathometer_paper import reflectors
+from benchmarks.fathometer_paper import score as score_of
+from benchmarks.study import Parts, rms, study
 from msg_adapters.array_records import write_trace
 from sonar_imm.estimates import Estimate
-from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import Trace
-from sonar_imm.truth import PRESENT
 from sonar_imm_tools.cli import main as command
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.simulation.fathometer.scenario import PRESENT
 
 FOLDER = Path(__file__).parents[1] / 'test' / 'vectors'
 Truth = Mapping[str, np.ndarray]
@@ -83,17 +82,16 @@ def depths_at(truth: Truth, estimate: Estimate) -> tuple[np.ndarray, np.ndarray]
 
 def sets(found: Sequence[Estimate], truth: Truth, after: int) -> dict[str, float]:
     """P, OSPA and wrong signs of the records later than `after`."""
-    right, distance, wrong = [], [], 0
+    scores, wrong = [], 0
     for estimate in found:
         if estimate.stamp_ns <= after * SECOND:
             continue
         depth, sign = depths_at(truth, estimate)
-        z = estimate.state[np.isfinite(estimate.state[:, 0])]
-        order = int(estimate.model_names[int(estimate.probabilities[0].argmax())].split('_')[1])
-        right.append(order == len(depth))
-        distance.append(ospa(z[:, :1], depth[:, None], cutoff=2.0, order=2.0))
+        z = reflectors(estimate)
+        scores.append(score_of(estimate, depth))
         near = np.abs(z[:, :1] - depth) < 0.3
         wrong += int((near & (np.sign(z[:, 1:2]) != sign)).sum())
+    right, distance = np.array(scores).T
     return {
         'P': float(np.mean(right)),
         'OSPA, m': float(np.mean(distance)),
@@ -112,13 +110,14 @@ def heave(found: Sequence[Estimate], truth: Truth) -> dict[str, float]:
     values = sets(found, truth, 20)
     del values['wrong signs']
     return values | {
-        'common, m': float(np.sqrt(np.mean(np.square(common)))),
-        'relative, m': float(np.sqrt(np.mean(np.square(relative)))),
+        'common, m': rms(common),
+        'relative, m': rms(relative),
     }
 
 
 def multiples(found: Sequence[Estimate], truth: Truth) -> dict[str, float]:
-    is_multiple, flags = truth['is_multiple'].astype(bool), ([], [])
+    is_multiple = truth['is_multiple'].astype(bool)
+    flags: tuple[list[bool], list[bool]] = ([], [])
     for estimate in found:
         if estimate.stamp_ns > 10 * SECOND:
             depth, _ = depths_at(truth, estimate)
@@ -165,52 +164,45 @@ CASES: dict[str, tuple[str, tuple[str, ...], Score, dict[str, float]]] = {
 """Name: vectors, parameters, score, limits: at least so much, or at most where negative."""
 
 
-def entry(
-    table: dict[str, Any], name: str, values: Sequence[float], bound: float, most: bool
-) -> None:
+def tracked(
+    file: str, settings: Sequence[str], score: Score, runs: int, particles: int
+) -> list[dict[str, float]]:
+    """The scores of the command on one set of vectors, of each seed."""
+    with np.load(FOLDER / file) as kept:
+        truth = {key: kept[key] for key in kept}
+    found = []
+    with TemporaryDirectory() as folder:
+        write_bag(truth, Path(folder) / 'bag')
+        for seed in range(runs):
+            out = Path(folder) / f'out_{seed}'
+            given = (*settings, f'seed={seed}', f'particles={particles}')
+            words = [word for each in given for word in ('--set', each)]
+            with contextlib.redirect_stdout(io.StringIO()):
+                if command(['track', f'{folder}/bag', str(out), *words]):
+                    raise SystemExit(f'track failed on {file}')
+            found.append(score(RunFolder(out).read_estimates(), truth))
+    return found
+
+
+def entry(values: Sequence[float], bound: float, most: bool) -> dict[str, float]:
     """A row of the table; most: the bound is the greatest that is allowed, not the least."""
     worst = max(values) if most else min(values)
     mean, side = float(np.mean(values)), 'at most' if most else 'at least'
     good = mean <= bound if most else mean >= bound
-    table[name] = {'mean': mean, 'worst': float(worst), side: bound, 'good': bool(good)}
-    print(
-        f'{"ok  " if good else "MISS"} {name} {mean:.3g}, worst {worst:.3g}, {side} {bound:g}',
-        flush=True,
-    )
+    return {'mean': mean, 'worst': float(worst), side: bound, 'good': bool(good)}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=4, help='seeds')
-    parser.add_argument('--particles', type=int, default=20_000)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    table: dict[str, Any] = {}
-    print(f'{options.runs} seeds, {options.particles} particles')
+def main(runs: int = 4, particles: int = 20_000) -> Parts:
+    yield {'runs': runs, 'particles': particles}
     for name, (file, settings, score, limits) in CASES.items():
-        with np.load(FOLDER / file) as kept:
-            truth = {key: kept[key] for key in kept}
-        runs = []
-        with TemporaryDirectory() as folder:
-            write_bag(truth, Path(folder) / 'bag')
-            for seed in range(options.runs):
-                out = Path(folder) / f'out_{seed}'
-                given = (*settings, f'seed={seed}', f'particles={options.particles}')
-                words = [word for each in given for word in ('--set', each)]
-                with contextlib.redirect_stdout(io.StringIO()):
-                    if command(['track', f'{folder}/bag', str(out), *words]):
-                        raise SystemExit(f'track failed on {name}')
-                runs.append(score(RunFolder(out).read_estimates(), truth))
+        found = tracked(file, settings, score, runs, particles)
         for key, limit in limits.items():
-            values = [one[key] for one in runs]
-            most = key != 'P' and key != 'flagged' or limit < 0.0
-            entry(table, f'{name}: {key}', values, abs(limit), most)
-    for name, values in fathometer_vectors.rows(FOLDER, options.runs).items():
-        entry(table, name, values, fathometer_vectors.LIMITS[name], True)
-    write_json(options.out, {**vars(options), 'out': None, 'table': table})
+            most = key not in ('P', 'flagged') or limit < 0.0
+            row = entry([scores[key] for scores in found], abs(limit), most)
+            yield {'table': {f'{name}: {key}': row}}
+    for name, values in fathometer_vectors.rows(FOLDER, runs).items():
+        yield {'table': {name: entry(values, fathometer_vectors.LIMITS[name], True)}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, digits=4, runs={'help': 'seeds'})

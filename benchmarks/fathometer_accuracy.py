@@ -25,15 +25,15 @@ takes about 15 minutes a run, so they can be kept (`--cache`).
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks import fathometer_paper
+from benchmarks.fathometer_paper import ORDERS, reflectors
+from benchmarks.study import final_estimates, mean_of, Parts, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, noise_sigma, steering
-from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import CrossSpectra, Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.scenario import drift_of
@@ -41,24 +41,18 @@ from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, Fatho
 
 DEPTHS = (122.0, 1 / 32, 1600)
 NEAR = 0.4
-PAPER_ORDERS: dict[str, Any] = {
-    'order_min': 7,
-    'order_max': 9,
-    'order_transition_matrix': (0.6, 0.2, 0.2, 0.2, 0.6, 0.2, 0.2, 0.2, 0.6),
-}
 CONVENTIONAL: dict[str, Any] = {'frequency_min': 200.0}
-FINED: dict[str, Any] = {**PAPER_ORDERS, 'amplitude_prior': 'paper'}
 OWN_PULSE: dict[str, Any] = {'pulse': 'envelope'}
 """The envelope of a response has another pulse than its real part."""
 CONFIGURATIONS: dict[str, tuple[str, dict[str, Any]]] = {
     'MVDR as the paper (envelope, bootstrap), N^-m': (
         'envelope',
-        {**FINED, **OWN_PULSE, 'proposal': 'prior'},
+        {**ORDERS, **OWN_PULSE, 'proposal': 'prior'},
     ),
-    '+ data-driven proposals': ('envelope', {**FINED, **OWN_PULSE}),
-    '  with the pulse of the real part': ('envelope', FINED),
-    'MVDR real part, N^-m': ('mvdr', FINED),
-    'MVDR real part, N^(-m/2), 7-9': ('mvdr', {**PAPER_ORDERS, 'amplitude_prior': 'bic_half'}),
+    '+ data-driven proposals': ('envelope', {**ORDERS, **OWN_PULSE}),
+    '  with the pulse of the real part': ('envelope', ORDERS),
+    'MVDR real part, N^-m': ('mvdr', ORDERS),
+    'MVDR real part, N^(-m/2), 7-9': ('mvdr', {**ORDERS, 'amplitude_prior': 'bic_half'}),
     'MVDR real part, marginal, 1-12 (default)': ('mvdr', {}),
     '  smoothed, lag 2': ('mvdr', {'smoothing_lag': 2}),
     '  2,000 particles': ('mvdr', {'particles': 2000}),
@@ -69,14 +63,19 @@ CONFIGURATIONS: dict[str, tuple[str, dict[str, Any]]] = {
     },
     'conventional envelope, pulse of the real part, N^-m': (
         'conventional_envelope',
-        {**FINED, **CONVENTIONAL},
+        {**ORDERS, **CONVENTIONAL},
     ),
-    'conventional real part, N^-m': ('conventional', {**FINED, **CONVENTIONAL}),
+    'conventional real part, N^-m': ('conventional', {**ORDERS, **CONVENTIONAL}),
     'conventional real part, amplitude memory 0.98, 1-12': (
         'conventional',
         {'amplitude_memory': 0.98, **CONVENTIONAL},
     ),
 }
+
+
+Truth = list[tuple[np.ndarray, np.ndarray]]
+"""The ids and the depths of the reflectors of each record."""
+Drift = tuple[dict[str, list[Trace]], Truth]
 
 
 def responses(spectra: CrossSpectra) -> dict[str, Trace]:
@@ -108,7 +107,7 @@ def responses(spectra: CrossSpectra) -> dict[str, Trace]:
     return made
 
 
-def drift(seed: int, records: int, cache: Path | None) -> tuple[dict[str, list[Trace]], list]:
+def drift(seed: int, records: int, cache: Path | None) -> Drift:
     """Traces of one run by processor, and the true depths and ids of each record."""
     file = cache / f'drift_{seed}_{records}.npz' if cache else None
     if file is None or not file.exists():
@@ -124,7 +123,7 @@ def drift(seed: int, records: int, cache: Path | None) -> tuple[dict[str, list[T
         rng = np.random.default_rng(seed)
         floor = drift_of(config, rng)
         for record in range(records):
-            spectra = cross_spectra(config, floor, record, floor.array_depth_told[record], rng)
+            spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
             for name, trace in responses(spectra).items():
                 traces.setdefault(name, []).append(trace)
             here = floor.present[record]
@@ -136,19 +135,30 @@ def drift(seed: int, records: int, cache: Path | None) -> tuple[dict[str, list[T
     return _load(file)
 
 
-def _save(file: Path, traces: dict[str, list[Trace]], truth: list) -> None:
+def _save(file: Path, traces: dict[str, list[Trace]], truth: Truth) -> None:
+    amplitudes: dict[str, Any] = {
+        name: np.array([trace.amplitude for trace in each]) for name, each in traces.items()
+    }
+    sigmas: dict[str, Any] = {
+        f'{name}_sigma': [_noise(trace) for trace in each] for name, each in traces.items()
+    }
     np.savez_compressed(
         file,
         count=np.array([len(ids) for ids, _ in truth]),
         ids=np.concatenate([ids for ids, _ in truth]),
         true_depth=np.concatenate([depth for _, depth in truth]),
-        reference=np.array([one.reference_depth for one in traces['mvdr']]),
-        **{name: np.array([one.amplitude for one in each]) for name, each in traces.items()},
-        **{f'{name}_sigma': [one.sigma[0] for one in each] for name, each in traces.items()},
+        reference=np.array([trace.reference_depth for trace in traces['mvdr']]),
+        **amplitudes,
+        **sigmas,
     )
 
 
-def _load(file: Path) -> tuple[dict[str, list[Trace]], list]:
+def _noise(trace: Trace) -> float:
+    assert trace.sigma is not None
+    return float(trace.sigma[0])
+
+
+def _load(file: Path) -> Drift:
     with np.load(file) as kept:
         ends = np.cumsum(kept['count'])[:-1]
         truth = list(zip(np.split(kept['ids'], ends), np.split(kept['true_depth'], ends)))
@@ -169,28 +179,25 @@ def _load(file: Path) -> tuple[dict[str, list[Trace]], list]:
     return traces, truth
 
 
-def score(config: FathometerConfig, traces: list[Trace], truth: list) -> dict[str, float]:
-    tracker, found = FathometerTracker(config), {}
-    for trace in traces:
-        found.update((one.stamp_ns, one) for one in tracker.process(trace))
+def score(config: FathometerConfig, traces: list[Trace], truth: Truth) -> dict[str, float]:
+    found = final_estimates(FathometerTracker(config), traces)
     rows: dict[str, list[float]] = {}
     seen_by_id: dict[int, list[tuple[int, bool]]] = {}
     for k, (trace, (ids, depth)) in enumerate(zip(traces, truth)):
         estimate = found[trace.stamp_ns]
-        z = estimate.state[np.isfinite(estimate.state[:, 0]), 0]
-        order = config.order_min + int(estimate.probabilities[0].argmax())
-        distance = np.abs(z[:, None] - depth)
+        right, apart = fathometer_paper.score(estimate, depth)
+        distance = np.abs(reflectors(estimate)[:, :1] - depth)
         hit = (distance < NEAR).any(axis=0)
         values = {
-            'P(order right)': float(order == len(depth)),
-            'OSPA': ospa(z[:, None], depth[:, None], cutoff=2.0, order=2.0),
+            'P(order right)': right,
+            'OSPA': apart,
             'false': float(np.count_nonzero(~(distance < NEAR).any(axis=1))),
             'missed': float(np.count_nonzero(~hit)),
         }
         for name, value in values.items():
             rows.setdefault(name, []).append(value)
-        for one, there in zip(ids, hit):
-            seen_by_id.setdefault(int(one), []).append((k, bool(there)))
+        for number, there in zip(ids, hit):
+            seen_by_id.setdefault(int(number), []).append((k, bool(there)))
     result = {name: float(np.mean(values)) for name, values in rows.items()}
     born = [history for history in seen_by_id.values() if history[0][0] > 5]
     result['birth delay'] = float(np.mean([_delay(history) for history in born])) if born else 0.0
@@ -206,36 +213,25 @@ def _delay(history: list[tuple[int, bool]]) -> int:
     return len(there)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=3)
-    parser.add_argument('--records', type=int, default=300)
-    parser.add_argument('--particles', type=int, default=20_000)
-    parser.add_argument('--cache', type=Path, help='folder to keep traces in')
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
+def main(
+    runs: int = 3, records: int = 300, particles: int = 20_000, cache: Path | None = None
+) -> Parts:
     scores: dict[str, list[dict[str, float]]] = {}
-    for seed in range(options.runs):
-        traces, truth = drift(seed, options.records, options.cache)
+    for seed in range(runs):
+        traces, truth = drift(seed, records, cache)
         for label, (processor, values) in CONFIGURATIONS.items():
-            given = {'particles': options.particles, **values}
-            config = FathometerConfig(**given, seed=seed)
+            config = FathometerConfig(**{'particles': particles, **values}, seed=seed)
             scores.setdefault(label, []).append(score(config, traces[processor], truth))
     table = {
-        label: {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+        label: mean_of(each)
         | {
-            f'{name}, s.e.': float(
-                np.std([one[name] for one in each]) / max(1, len(each) - 1) ** 0.5
-            )
+            f'{name}, s.e.': standard_error([row[name] for row in each])
             for name in ('P(order right)', 'OSPA')
         }
         for label, each in scores.items()
     }
-    print(f'{options.runs} runs of {options.records} records\n\n{markdown(table)}')
-    write_json(options.out, {'runs': options.runs, 'records': options.records, 'table': table})
+    yield {'runs': runs, 'records': records, 'table': table}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, cache={'type': Path, 'help': 'folder to keep traces in'})

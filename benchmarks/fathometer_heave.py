@@ -29,16 +29,14 @@ depth, whose sum alone is seen: rms over the same records.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any
 import warnings
 
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.fathometer_paper import reflectors, score
+from benchmarks.study import Parts, rms, study
 from sonar_imm.acoustics.pulse import band_pulse
-from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 
@@ -100,29 +98,25 @@ def run(kind: str, options: dict[str, Any], seed: int, particles: int) -> dict[s
     tracker = FathometerTracker(
         FathometerConfig(**{'particles': particles, 'seed': seed, **options})
     )
-    right, distance, common, relative, scaled = [], [], [], [], []
+    scores, common, relative, scaled = [], [], [], []
     for k, trace in enumerate(traces):
         (estimate,) = tracker.process(trace)
         if k < UNSCORED:
             continue
-        z = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
-        order = 1 + int(estimate.probabilities[0].argmax())
-        right.append(order == len(LAYERS))
-        distance.append(ospa(z, truth[k][:, None], cutoff=2.0, order=2.0))
+        scores.append(score(estimate, truth[k]))
+        z = reflectors(estimate)[:, 0]
         if len(z) == len(LAYERS):
-            error = z[:, 0] - truth[k]
+            error = z - truth[k]
             common.append(error.mean())
             relative += list(error - error.mean())
             if 'heave' in options:
                 scaled.append(error.mean() / estimate.extras['heave_std'][0])
-    rms = [
-        float(np.sqrt(np.mean(np.square(one)))) if one else np.nan for one in (common, relative)
-    ]
+    right, distance = np.array(scores).T
     return {
         'P': float(np.mean(right)),
         'OSPA': float(np.mean(distance)),
-        'common, m': rms[0],
-        'relative, m': rms[1],
+        'common, m': rms(common) if common else np.nan,
+        'relative, m': rms(relative) if relative else np.nan,
         'common within 2 heave_std': float(np.mean(np.abs(scaled) <= 2.0)) if scaled else np.nan,
         'NEES': float(np.mean(np.square(scaled))) if scaled else np.nan,
     }
@@ -144,30 +138,21 @@ def bound(depth_std: float, memory: float) -> float:
     return float(np.sqrt(np.mean(variance[UNSCORED:])))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=40)
-    parser.add_argument('--particles', type=int, default=3000)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    table = {}
-    for label, (kind, values) in ROWS.items():
-        runs = [run(kind, values, seed, options.particles) for seed in range(options.runs)]
-        with warnings.catch_warnings():
-            # A row without a state has no NEES in any run.
-            warnings.simplefilter('ignore', RuntimeWarning)
-            table[label] = {k: float(np.nanmean([one[k] for one in runs])) for k in runs[0]}
-    print(f'{options.runs} runs of {RECORDS} records, {options.particles} particles')
+def main(runs: int = 40, particles: int = 3000) -> Parts:
     bounds = {
         f'{kind}, depth_std {std}': {'bound, m': bound(std, memory)}
         for kind, memory in (('independent', 0.0), ('memory 0.9', 0.9))
         for std in (0.1, 0.05, WALK)
     }
-    print(f'{markdown(bounds)}\n\n{markdown(table)}')
-    write_json(options.out, {'runs': options.runs, 'bounds': bounds, 'table': table})
+    yield {'runs': runs, 'bounds': bounds}
+    for label, (kind, values) in ROWS.items():
+        found = [run(kind, values, seed, particles) for seed in range(runs)]
+        with warnings.catch_warnings():
+            # A row without a state has no NEES in any run.
+            warnings.simplefilter('ignore', RuntimeWarning)
+            mean = {k: float(np.nanmean([row[k] for row in found])) for k in found[0]}
+        yield {'table': {label: mean}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main)

@@ -26,13 +26,10 @@ a half.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
-from sonar_imm.trackers.fathometer.multiples import Multiples, Seen, ways_above
+from benchmarks.study import Parts, study
+from sonar_imm.trackers.fathometer.reflectors import Multiples, Seen, ways_above
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 PRIMARIES, DEEPEST, ERROR, RECORDS = 4, 45.0, 0.03, (1, 5, 20, 60)
@@ -83,28 +80,18 @@ def run(rng: np.random.Generator, walk: float, polarity: str) -> dict[int, np.nd
     return kept
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=200)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    table: dict[str, dict[str, float]] = {}
+def main(runs: int = 200) -> Parts:
     for name, walk in FLOORS.items():
         for label, polarity in (('no sign', 'positive'), ('sign', 'both')):
             rng = np.random.default_rng(1)
-            runs = [run(rng, walk, polarity) for _ in range(options.runs)]
-            row: dict[str, float] = {'runs': float(options.runs)}
+            found = [run(rng, walk, polarity) for _ in range(runs)]
+            row: dict[str, float] = {'runs': float(runs)}
             for k in RECORDS:
-                marked = np.array([one[k] for one in runs])
+                marked = np.array([each[k] for each in found])
                 row[f'{k}: found'] = float(marked[:, PRIMARIES:].mean())
                 row[f'{k}: falsely'] = float(marked[:, :PRIMARIES].mean())
-            table[f'{name}, {label}'] = row
-            print(name, label, row, flush=True)
-    print(f'\n{markdown(table)}')
-    write_json(options.out, {'table': table})
+            yield {'table': {f'{name}, {label}': row}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main)

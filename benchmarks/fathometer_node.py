@@ -30,7 +30,6 @@ and `depths apart` compare what the node made of both, record by record.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -38,7 +37,7 @@ from typing import Any
 from attrs import evolve
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, standard_error, study
 from msg_adapters.array_records import read_pressure
 from sonar_imm.acoustics.spectra import effective_snapshots
 from sonar_imm.measurements import CrossSpectra, Pressure
@@ -46,14 +45,14 @@ from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTr
 from sonar_imm.truth import Received, Scene
 from sonar_imm_tools.cli.checking import check_recording, CheckedRecording
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.own_parameters import unusual
+from sonar_imm_tools.recordings.own_files import unusual
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.recordings.scenes import write_scene
 from sonar_imm_tools.simulation.fathometer.scenario import drift_of, FathometerScenario
 from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario, simulate
 
 KINDS = ('pressure', 'its cross-spectra', 'cross-spectra drawn')
-MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+MIRROR: dict[str, Any] = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
 """Automatic snapshots of pressure use this noise window by themselves."""
 
 
@@ -71,7 +70,7 @@ def spectra_of(
     # Snapshots follow each other across records, so that records are whole hops long.
     count = round(config.record_seconds * rate / hop)
     size = count * hop
-    pressure = np.concatenate([one.pressure for one in blocks]).astype(np.float64)
+    pressure = np.concatenate([block.pressure for block in blocks]).astype(np.float64)
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
     rows = np.arange(
         np.ceil(config.frequency_min * length / rate),
@@ -108,7 +107,7 @@ def drawn(config: FathometerScenario, seed: int, length: int) -> list[CrossSpect
     )
     rng = np.random.default_rng([seed, 1])
     return [
-        cross_spectra(as_spectra, floor, k, float(floor.array_depth_told[k]), rng)
+        cross_spectra(as_spectra, floor, k, float(floor.array_depth_stated[k]), rng)
         for k in range(config.records)
     ]
 
@@ -116,8 +115,8 @@ def drawn(config: FathometerScenario, seed: int, length: int) -> list[CrossSpect
 def responses(measurements: list[Any], config: FathometerConfig) -> list[np.ndarray]:
     """Depth responses in units of their noise."""
     tracker, found = FathometerTracker(evolve(config, particles=2)), []
-    for one in measurements:
-        if tracker.process(one):
+    for measurement in measurements:
+        if tracker.process(measurement):
             assert tracker.response is not None
             found.append(tracker.response.amplitude / tracker.response.sigma)
     return found
@@ -125,11 +124,11 @@ def responses(measurements: list[Any], config: FathometerConfig) -> list[np.ndar
 
 def run(seed: int, folder: Path) -> dict[str, dict[str, float]]:
     config = scenario('pressure')
-    told = {**config.told(), 'pulse': 'band'}
+    stated = {**config.instruments(), 'pulse': 'band'}
     scene = simulate(config, seed)
     bags = [folder / kind.replace(' ', '_') for kind in KINDS]
-    settings = FathometerConfig.from_mapping(told)
-    write_scene(scene, bags[0], provenance={}, parameters=parameters(told))
+    settings = FathometerConfig.from_mapping(stated)
+    write_scene(scene, bags[0], provenance={}, parameters=parameters(stated))
     blocks = read_back(bags[0])
     tracker = FathometerTracker(evolve(settings, particles=2))
     for block in blocks:
@@ -139,17 +138,17 @@ def run(seed: int, folder: Path) -> dict[str, dict[str, float]]:
     length = round(tracker.response.snapshot_seconds * config.sample_rate)
     computed = spectra_of(blocks, config, length)
     for bag, records in zip(bags[1:], (computed, drawn(config, seed, length))):
-        received = tuple(Received(one.stamp_ns, one) for one in records)
+        received = tuple(Received(record.stamp_ns, record) for record in records)
         other = Scene(received, scene.truth, frame_id=scene.frame_id)
-        write_scene(other, bag, provenance={}, parameters=parameters({**told, **MIRROR}))
+        write_scene(other, bag, provenance={}, parameters=parameters({**stated, **MIRROR}))
     checked = {
         kind: check_recording(bag, 'fathometer', folder / f'{bag.name}_run', quiet=True)
         for kind, bag in zip(KINDS, bags)
     }
-    rows = {kind: scores(one) for kind, one in checked.items()}
-    heard = responses(blocks, settings), responses(computed, evolve(settings, **MIRROR))
+    rows = {kind: scores(recording) for kind, recording in checked.items()}
+    both = responses(blocks, settings), responses(computed, evolve(settings, **MIRROR))
     rows[KINDS[1]]['response apart'] = float(
-        max(np.abs(a - b).max() for a, b in zip(*heard, strict=True))
+        max(np.abs(a - b).max() for a, b in zip(*both, strict=True))
     )
     live = [RunFolder(checked[kind].folder / 'live').read_estimates() for kind in KINDS[:2]]
     same, apart = [], []
@@ -161,8 +160,8 @@ def run(seed: int, folder: Path) -> dict[str, dict[str, float]]:
     return rows
 
 
-def parameters(told: dict[str, Any]) -> dict[str, Any]:
-    return {'fathometer': unusual(told, FathometerConfig)}
+def parameters(stated: dict[str, Any]) -> dict[str, Any]:
+    return {'fathometer': unusual(stated, FathometerConfig)}
 
 
 def scores(checked: CheckedRecording) -> dict[str, float]:
@@ -180,38 +179,25 @@ def summary(runs: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, floa
     for kind in KINDS:
         row = {'runs': float(len(runs))}
         for key in runs[0][kind]:
-            values = np.array([one[kind][key] for one in runs])
+            values = np.array([row[kind][key] for row in runs])
             if key in ('P', 'OSPA'):
-                row |= {key: values.mean(), f'{key}, s.e.': error_of(values)}
-                off = values - [one['pressure'][key] for one in runs]
-                row |= {f'{key} - pressure': off.mean(), f'{key} off, s.e.': error_of(off)}
+                row |= {key: values.mean(), f'{key}, s.e.': standard_error(values)}
+                off = values - [row['pressure'][key] for row in runs]
+                row |= {f'{key} - pressure': off.mean(), f'{key} off, s.e.': standard_error(off)}
             else:
                 row[key] = values.max() if 'apart' in key else values.mean()
         table[kind] = {key: float(value) for key, value in row.items()}
     return table
 
 
-def error_of(values: np.ndarray) -> float:
-    return float(values.std() / max(1, len(values) - 1) ** 0.5)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=8)
-    parser.add_argument('--seed', type=int, default=100, help='of the first run')
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    runs = []
-    for seed in range(options.seed, options.seed + options.runs):
+def main(runs: int = 8, seed: int = 100) -> Parts:
+    found = []
+    for number in range(seed, seed + runs):
         with TemporaryDirectory() as folder:
-            runs.append(run(seed, Path(folder)))
-        print(seed, runs[-1], flush=True)
-    table = summary(runs)
-    print(f'\n{markdown(table)}')
-    write_json(options.out, {'seed': options.seed, 'table': table})
+            found.append(run(number, Path(folder)))
+        print(number, found[-1], flush=True)
+    yield {'seed': seed, 'table': summary(found)}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, seed={'help': 'of the first run'})

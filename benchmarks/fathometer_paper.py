@@ -26,7 +26,6 @@ P is the share of records whose number of reflectors is right; OSPA of second or
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -34,12 +33,12 @@ from typing import Any
 import numpy as np
 from scipy.signal import hilbert
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, study
+from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import ospa
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
-from sonar_imm.truth import PRESENT
-from sonar_imm_tools.simulation.fathometer.scenario import drift_of
+from sonar_imm_tools.simulation.fathometer.scenario import drift_of, PRESENT
 from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, FathometerScenario
 
 VECTORS = Path(__file__).parents[1] / 'test' / 'vectors' / 'fathometer' / 'mvdr_traces.npz'
@@ -77,9 +76,16 @@ OF_ARRAY: dict[str, dict[str, Any]] = {
 }
 
 
-def score(estimate: Any, depth: np.ndarray) -> tuple[float, float]:
-    z = estimate.state[np.isfinite(estimate.state[:, 0]), :1]
+def reflectors(estimate: Estimate) -> np.ndarray:
+    """The states (k, 2), depth and amplitude, of the reflectors that are there."""
+    return estimate.state[np.isfinite(estimate.state[:, 0])]
+
+
+def score(estimate: Estimate, depth: np.ndarray) -> tuple[float, float]:
+    """Whether the number of reflectors is right, and OSPA, m. depth: the true ones (n,)."""
+    assert estimate.probabilities is not None
     order = int(estimate.model_names[int(estimate.probabilities[0].argmax())].split('_')[1])
+    z = reflectors(estimate)[:, :1]
     return float(order == len(depth)), ospa(z, depth[:, None], cutoff=2.0, order=2.0)
 
 
@@ -116,7 +122,6 @@ def of_vectors(particles: int) -> dict[str, dict[str, float]]:
             )
             scores.append(score(tracker.process(trace)[-1], kept['reflector_depth'][k, there[k]]))
         table[label] = summary(scores)
-        print(label, table[label], flush=True)
     return table
 
 
@@ -130,7 +135,7 @@ def of_array(runs: int, records: int, particles: int) -> dict[str, dict[str, flo
         )
         rng = np.random.default_rng(seed)
         floor = drift_of(config, rng)
-        told: dict[str, Any] = {
+        settings: dict[str, Any] = {
             'window': 'rectangular',
             'overlap': 0.0,
             'depth_min': config.depth_min,
@@ -141,11 +146,11 @@ def of_array(runs: int, records: int, particles: int) -> dict[str, dict[str, flo
             'seed': seed,
         }
         trackers = {
-            label: FathometerTracker(FathometerConfig(**{**told, **options}))
+            label: FathometerTracker(FathometerConfig(**{**settings, **options}))
             for label, options in OF_ARRAY.items()
         }
         for record in range(records):
-            depth = float(floor.array_depth_told[record])
+            depth = float(floor.array_depth_stated[record])
             spectra = cross_spectra(config, floor, record, depth, rng)
             true = floor.depth[record, floor.present[record]]
             for label, tracker in trackers.items():
@@ -153,25 +158,20 @@ def of_array(runs: int, records: int, particles: int) -> dict[str, dict[str, flo
     return {label: summary(each) for label, each in scores.items()}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=2, help='drifts of the array')
-    parser.add_argument('--records', type=int, default=60, help='of each of them')
-    parser.add_argument('--particles', type=int, default=20_000)
-    parser.add_argument('--only', choices=('vectors', 'array'))
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    tables = {}
-    if options.only != 'array':
-        tables['vectors'] = of_vectors(options.particles)
-    if options.only != 'vectors':
-        tables['array'] = of_array(options.runs, options.records, options.particles)
-    for name, table in tables.items():
-        print(f'\n{name}\n\n{markdown(table)}')
-    write_json(options.out, {'particles': options.particles, **tables})
+def main(
+    runs: int = 2, records: int = 60, particles: int = 20_000, only: str | None = None
+) -> Parts:
+    yield {'particles': particles}
+    if only != 'array':
+        yield {'vectors': of_vectors(particles)}
+    if only != 'vectors':
+        yield {'array': of_array(runs, records, particles)}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        runs={'help': 'drifts of the array'},
+        records={'help': 'of each of them'},
+        only={'choices': ('vectors', 'array')},
+    )

@@ -40,8 +40,6 @@ here begin at 11. 5,000 particles throughout.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 from pathlib import Path
 import tempfile
@@ -49,14 +47,14 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.study import mean_of, Parts, study
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.cli import main as command
 from sonar_imm_tools.evaluation.fathometer.crossing import crossing_metrics, summary
 from sonar_imm_tools.evaluation.fathometer.records import records_of
 from sonar_imm_tools.evaluation.fathometer.scoring import pair
 from sonar_imm_tools.offline.run_folder import RunFolder
-from sonar_imm_tools.recordings.convert.profiler import arrival_edges, first_arrivals
-from sonar_imm_tools.recordings.convert.segy import read_segy
+from sonar_imm_tools.recordings.convert.segy import arrival_edges, first_arrivals, read_segy
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data')) / 'sbp_chiapas'
@@ -78,45 +76,26 @@ ROWS = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--out', default='docs/results/fathometer_profilers.json')
-    parser.add_argument('--runs', type=int, default=6, help='seeds of the scene')
-    options = parser.parse_args()
-    result: dict[str, Any] = {'scene': scene_rows(options.runs)}
-    if DATA.exists():
-        with tempfile.TemporaryDirectory() as folder:
-            result |= real_lines(Path(folder))
-    else:
-        print(f'no real lines in {DATA}')
-    Path(options.out).write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
-
-
-def real_lines(folder: Path) -> dict[str, Any]:
+def real_lines(folder: Path) -> Parts:
     """Every line under every row, and the crossings of the default row."""
-    lines: dict[str, Any] = {}
     for line, name in FILES.items():
         convert(line, folder / f'{line}.bag', FIRST)
-        lines[line] = {}
         for row, extra in ROWS.items():
             out = folder / (line if not extra else 'other')
             call('track', folder / f'{line}.bag', out, '--overwrite', *FEW, *extra)
-            lines[line][row] = followed(DATA / name, RunFolder(out))
-            print(line, row, lines[line][row], flush=True)
-    crossings = {}
-    for pair_of in (('L1', 'L9'), ('L2', 'L9'), ('L3', 'L9')):
-        a, b = (RunFolder(folder / line) for line in pair_of)
-        crossings[' x '.join(pair_of)] = crossing_metrics(a, b, 3.0)
-        print(pair_of, crossings[' x '.join(pair_of)], flush=True)
+            yield {'lines': {line: {row: followed(DATA / name, RunFolder(out))}}}
     for line in ('L3', 'L9'):
         convert(line, folder / f'{line}_uncut.bag', UNCUT)
         call('track', folder / f'{line}_uncut.bag', folder / f'{line}_uncut', *FEW)
-    a, b = (RunFolder(folder / f'{line}_uncut') for line in ('L3', 'L9'))
-    crossings['L3 x L9, uncut'] = crossing_metrics(a, b, 3.0)
-    horizons = [h for one in crossings.values() for at in one['crossings'] for h in at['horizons']]
+    crossings = {}
+    for a, b, cut in (('L1', 'L9', ''), ('L2', 'L9', ''), ('L3', 'L9', ''), ('L3', 'L9', 'uncut')):
+        first, other = (RunFolder(folder / (f'{c}_{cut}' if cut else c)) for c in (a, b))
+        name = f'{a} x {b}, {cut}' if cut else f'{a} x {b}'
+        crossings[name] = crossing_metrics(first, other, 3.0)
+        print(name, crossings[name], flush=True)
+    horizons = [h for c in crossings.values() for at in c['crossings'] for h in at['horizons']]
     between = summary([h for h in horizons if h['judged']])
-    print(crossings['L3 x L9, uncut'], between, flush=True)
-    return {'lines': lines, 'crossings': crossings, 'between_lines': between}
+    yield {'crossings': crossings, 'between_lines': between}
 
 
 def convert(line: str, bag: Path, first: int) -> None:
@@ -127,7 +106,7 @@ def convert(line: str, bag: Path, first: int) -> None:
 
 
 def call(*arguments: Any) -> None:
-    if command([str(one) for one in arguments]):
+    if command([str(argument) for argument in arguments]):
         raise SystemExit('the command failed')
 
 
@@ -195,19 +174,17 @@ def scene_rows(runs: int) -> dict[str, Any]:
     for seed in range(11, 11 + runs):
         config = scenario('diffuse', {'records': 100})
         scene = simulate(config, seed)
-        for row, values in rows.items():
-            told = {**config.told(), 'particles': PARTICLES}
+        for row, scores in rows.items():
+            values = {**config.instruments(), 'particles': PARTICLES}
             if row == 'without':
-                told['scatter_decay'] = ()
-            tracker = FathometerTracker(FathometerConfig.from_mapping(told))
-            estimates = [tracker.process(one.measurement)[0] for one in scene.measurements]
-            values.append(_score(estimates, scene.truth))
-    result = {
-        row: {name: round(float(np.mean([v[name] for v in values])), 3) for name in values[0]}
-        for row, values in rows.items()
+                values['scatter_decay'] = ()
+            tracker = FathometerTracker(FathometerConfig.from_mapping(values))
+            estimates = [tracker.process(item.measurement)[0] for item in scene.measurements]
+            scores.append(_score(estimates, scene.truth))
+    return {
+        row: {name: round(mean, 3) for name, mean in mean_of(scores).items()}
+        for row, scores in rows.items()
     }
-    print(result, flush=True)
-    return {'runs': runs, **result}
 
 
 def _score(estimates: Any, truth: Any) -> dict[str, float]:
@@ -233,5 +210,18 @@ def _score(estimates: Any, truth: Any) -> dict[str, float]:
     }
 
 
+def main(runs: int = 6) -> Parts:
+    yield {'scene': {'runs': runs, **scene_rows(runs)}}
+    if DATA.exists():
+        with tempfile.TemporaryDirectory() as folder:
+            yield from real_lines(Path(folder))
+    else:
+        print(f'no real lines in {DATA}')
+
+
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        runs={'help': 'seeds of the scene'},
+        out={'default': Path('docs/results/fathometer_profilers.json')},
+    )

@@ -33,20 +33,17 @@ of it there is in each octave, against W.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from attrs import evolve
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks import fathometer_paper
+from benchmarks.study import mean_of, Parts, rms, standard_error, study
 from sonar_imm.acoustics.fathometer import coherence_and_power, echo_spectrum, steering
-from sonar_imm.estimation.consistency import ospa
+from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import CrossSpectra
-from sonar_imm.trackers.fathometer.array_response import array_response
-from sonar_imm.trackers.fathometer.response import lattice_of_array, pulse_of
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array, pulse_of
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, drift_of
@@ -67,9 +64,9 @@ def records_of(
 ) -> Iterator[tuple[CrossSpectra, np.ndarray, np.ndarray]]:
     """Cross-spectra, true depths and true amplitudes of each record."""
     for record in range(config.records):
-        told = float(floor.array_depth_told[record])
+        depth = float(floor.array_depth_stated[record])
         here = floor.present[record]
-        spectra = cross_spectra(config, floor, record, told, rng)
+        spectra = cross_spectra(config, floor, record, depth, rng)
         yield spectra, floor.depth[record, here], floor.amplitude[record, here]
 
 
@@ -93,9 +90,9 @@ def layers(
     rng = np.random.default_rng(seed)
     depth = DEPTHS + np.cumsum(0.05 * rng.standard_normal((records, 6)), axis=0)
     array = config.array_depth + rng.uniform(-0.5, 0.5, records)
-    told = array + config.array_depth_std * rng.standard_normal(records)
+    stated = array + config.array_depth_std * rng.standard_normal(records)
     amplitude = np.tile(signs * STRENGTHS, (records, 1))
-    return config, Drift(depth, amplitude, amplitude != 0.0, array, told), rng
+    return config, Drift(depth, amplitude, amplitude != 0.0, array, stated), rng
 
 
 def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[str, float]]:
@@ -104,14 +101,14 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
         config, floor, rng = drift(seed, records)
     else:
         config, floor, rng = layers(seed, records, SIGNS[name])
-    told = dict(config.told())
-    told |= {'window': 'rectangular', 'overlap': 0.0, 'particles': particles, 'seed': seed}
-    told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
+    settings = dict(config.instruments())
+    settings |= {'window': 'rectangular', 'overlap': 0.0, 'particles': particles, 'seed': seed}
+    settings |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
     if name != 'drift':
-        told |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
+        settings |= {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
     trackers = {
         f'{name}, {pulse}, {polarity}': FathometerTracker(
-            FathometerConfig(**told, pulse=pulse, polarity=polarity)
+            FathometerConfig(**settings, pulse=pulse, polarity=polarity)
         )
         for pulse in ('band', 'processor')
         for polarity in ('positive', 'both')
@@ -135,7 +132,7 @@ def run(name: str, seed: int, records: int, particles: int) -> dict[str, dict[st
     }
 
 
-def ghosts() -> dict[str, list[dict[str, float]]]:
+def peaks_beside() -> dict[str, list[dict[str, float]]]:
     """The largest peaks beside the layers of ``strong``, by pulse."""
     config, floor, rng = layers(0, 1, SIGNS['strong'])
     floor = evolve(floor, depth=DEPTHS[None], array_depth=np.array([config.array_depth]))
@@ -145,9 +142,9 @@ def ghosts() -> dict[str, list[dict[str, float]]]:
     exact = CrossSpectra(
         stamp_ns=1, frequency=frequency, csdm=expected_csdm(config, floor, 0, frequency)
     )
-    told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
+    settings = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
     tracked = FathometerConfig(
-        **{**told, 'depth_min': config.depth_min, 'depth_max': config.depth_max},
+        **{**settings, 'depth_min': config.depth_min, 'depth_max': config.depth_max},
         pulse='processor',
         noise_depth_min=0.0,
         noise_depth_max=0.0,
@@ -190,9 +187,9 @@ def echoes() -> dict[str, dict[str, dict[str, float]]]:
     """The echo of one layer, without noise, and the pulses that are taken for it."""
     tables = {}
     for name, (config, height) in ARRAYS.items():
-        one = np.array([[config.array_depth + height]])
+        layer = np.array([[config.array_depth + height]])
         where = np.array([config.array_depth])
-        floor = Drift(one, np.full((1, 1), 0.35), one > 0.0, where, where)
+        floor = Drift(layer, np.full((1, 1), 0.35), layer > 0.0, where, where)
         rows = np.arange(
             np.ceil(config.frequency_min * config.snapshot_seconds),
             np.floor(config.frequency_max * config.snapshot_seconds) + 1.0,
@@ -226,58 +223,39 @@ def echoes() -> dict[str, dict[str, dict[str, float]]]:
     return tables
 
 
-def _score(found: Any, depth: np.ndarray, amplitude: np.ndarray) -> list[float]:
-    z = found.state[np.isfinite(found.state[:, 0])]
-    order = int(found.model_names[int(found.probabilities[0].argmax())].split('_')[1])
+def _score(found: Estimate, depth: np.ndarray, amplitude: np.ndarray) -> list[float]:
+    z = fathometer_paper.reflectors(found)
     away = z[:, :1] - depth
     near = np.abs(away) < 0.4
     wrong = near & (np.sign(z[:, 1:2]) != np.sign(amplitude))
     return [
-        float(order == len(depth)),
-        ospa(z[:, :1], depth[:, None], cutoff=2.0, order=2.0),
-        float(np.sqrt(np.mean(np.square(away[near])))) if near.any() else np.nan,
+        *fathometer_paper.score(found, depth),
+        rms(away[near]) if near.any() else np.nan,
         float(wrong.sum()),
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=2)
-    parser.add_argument('--records', type=int, default=300)
-    parser.add_argument('--particles', type=int, default=5000)
-    parser.add_argument('--scenes', nargs='*', default=['strong', 'signed', 'drift'])
-    parser.add_argument('--ghosts', action='store_true', help='only these, and echoes')
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    if options.ghosts:
-        for name, rows in ghosts().items():
-            print(f'\n{markdown({f"{name} {k + 1}": row for k, row in enumerate(rows)}, 2)}')
-        for name, table in echoes().items():
-            print(f'\n{name}\n\n{markdown(table, 2)}')
+def main(
+    runs: int = 2,
+    records: int = 300,
+    particles: int = 5000,
+    scenes: Sequence[str] = ('strong', 'signed', 'drift'),
+    ghosts: bool = False,
+) -> Parts:
+    if ghosts:
+        yield {'ghosts': peaks_beside(), 'echoes': echoes()}
         return
-    made: dict[str, list[dict[str, float]]] = {}
-    for name in options.scenes:
-        records = options.records if name == 'drift' else max(10, options.records // 10)
+    yield {'records': records}
+    for name in scenes:
+        length = records if name == 'drift' else max(10, records // 10)
         # What costs little is repeated more often.
-        for seed in range(options.runs if name == 'drift' else 5 * options.runs):
-            for label, one in run(name, seed, records, options.particles).items():
-                made.setdefault(label, []).append(one)
-            print(
-                name, seed, {k: v[-1] for k, v in made.items() if k.startswith(name)}, flush=True
-            )
-    summary = {
-        label: {
-            'runs': float(len(each)),
-            **{key: float(np.mean([one[key] for one in each])) for key in each[0]},
-            'P, s.e.': float(np.std([one['P'] for one in each]) / max(1, len(each) - 1) ** 0.5),
-        }
-        for label, each in made.items()
-    }
-    print(f'\n{markdown(summary)}')
-    write_json(options.out, {'records': options.records, 'table': summary})
+        seeds = range(runs if name == 'drift' else 5 * runs)
+        found = [run(name, seed, length, particles) for seed in seeds]
+        for label in found[0]:
+            each = [scores[label] for scores in found]
+            error = {'P, s.e.': standard_error([row['P'] for row in each])}
+            yield {'table': {label: {'runs': float(len(each))} | mean_of(each) | error}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, ghosts={'help': 'only these, and echoes'})

@@ -30,16 +30,15 @@ median amplitude of each layer in units of the noise.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.fathometer_paper import reflectors, score
+from benchmarks.study import Parts, standard_error, study
 from sonar_imm.acoustics.spectra import effective_snapshots
-from sonar_imm.estimation.consistency import ospa
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, FathometerScenario
@@ -85,9 +84,9 @@ def floor_of(config: FathometerScenario, seed: int) -> Drift:
     T = config.records
     depth = LAYERS + np.cumsum(0.05 * rng.standard_normal((T, 3)), axis=0)
     array = config.array_depth + rng.uniform(-0.5, 0.5, T)
-    told = array + config.array_depth_std * rng.standard_normal(T)
+    stated = array + config.array_depth_std * rng.standard_normal(T)
     amplitude = np.tile(AMPLITUDES, (T, 1))
-    return Drift(depth, amplitude, amplitude > 0.0, array, told)
+    return Drift(depth, amplitude, amplitude > 0.0, array, stated)
 
 
 def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -95,10 +94,10 @@ def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -
     kind = level.split()[0]
     config = scenario('pressure', {'level': kind, 'steps_per_sigma': 0.0, **scene})
     floor, rng = floor_of(config, seed), np.random.default_rng([seed, 1])
-    told = {k: v for k, v in config.told().items() if k not in ('window', 'overlap')}
-    told |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
-    told.pop('snapshot_seconds', None)
-    settings = FathometerConfig(**{**told, **options}, seed=seed)
+    stated = {k: v for k, v in config.instruments().items() if k not in ('window', 'overlap')}
+    stated |= {'depth_min': config.depth_min, 'depth_max': config.depth_max}
+    stated.pop('snapshot_seconds', None)
+    settings = FathometerConfig(**{**stated, **options}, seed=seed)
     if kind == 'csdm':
         seconds = automatic_snapshot(
             settings, config.phones, config.depth_max - config.array_depth
@@ -111,31 +110,29 @@ def run(level: str, scene: dict[str, Any], options: dict[str, Any], seed: int) -
         # Drawn frequency by frequency, their noise does not fade.
         settings = evolve(settings, window='rectangular', overlap=0.0)
     tracker = FathometerTracker(settings)
-    right, distance, snr = [], [], []
+    scores, snr = [], []
     for record in range(config.records):
-        depth = float(floor.array_depth_told[record])
+        depth = float(floor.array_depth_stated[record])
         if kind == 'csdm':
             measured: list[Any] = [cross_spectra(config, floor, record, depth, rng)]
         else:
             measured = pressure_blocks(config, floor, record, depth, rng)
-        found = [one for each in measured for one in tracker.process(each)]
-        for estimate in found:
-            z = estimate.state[np.isfinite(estimate.state[:, 0])]
-            order = settings.order_min + int(estimate.probabilities[0].argmax())
-            right.append(float(order == len(LAYERS)))
-            distance.append(ospa(z[:, :1], floor.depth[record][:, None], cutoff=2.0, order=2.0))
+        for estimate in (found for each in measured for found in tracker.process(each)):
+            z = reflectors(estimate)
+            scores.append(score(estimate, floor.depth[record]))
             near = np.abs(z[:, :1] - floor.depth[record]) < 0.4
             sigma = float(estimate.extras['sigma'][0])
             snr.append(
                 [z[near[:, k], 1].max() / sigma if near[:, k].any() else np.nan for k in range(3)]
             )
-    return {'right': right, 'ospa': distance, 'snr': snr, 'counts': dict(tracker.counts)}
+    right, distance = zip(*scores)
+    return {'right': right, 'ospa': distance, 'snr': snr}
 
 
 def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
     def mean(name: str, first: int) -> tuple[float, float]:
-        each = [float(np.mean(one[name][first:])) for one in runs]
-        return float(np.mean(each)), float(np.std(each) / max(1, len(each) - 1) ** 0.5)
+        each = [float(np.mean(found[name][first:])) for found in runs]
+        return float(np.mean(each)), standard_error(each)
 
     row: dict[str, float] = {}
     for first, label in ((0, ''), (SETTLED, f' from record {SETTLED}')):
@@ -143,31 +140,24 @@ def row_of(runs: list[dict[str, Any]]) -> dict[str, float]:
             value, error = mean(name, first)
             row[f'{title}{label}'] = value
             row[f'{title}{label}, s.e.'] = error
-    snr = np.nanmedian(np.concatenate([one['snr'] for one in runs]), axis=0)
+    snr = np.nanmedian(np.concatenate([found['snr'] for found in runs]), axis=0)
     return row | {f'SNR {k + 1}': float(value) for k, value in enumerate(snr)}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=8, help='of 8 s; of 20 s half as many')
-    parser.add_argument('--particles', type=int, default=4000)
-    parser.add_argument('--rows', nargs='*', help='only rows with one of these words in the name')
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    table, made = {}, {}
+def main(runs: int = 8, particles: int = 4000, rows: Sequence[str] = ()) -> Parts:
+    yield {'particles': particles}
     for name, (level, scene, changes) in ROWS.items():
-        if options.rows and not any(word in name for word in options.rows):
+        if rows and not any(word in name for word in rows):
             continue
-        count = options.runs if name.startswith('8 s') else max(1, options.runs // 2)
-        given = {'particles': options.particles, **changes}
-        runs = [run(level, scene, given, seed) for seed in range(count)]
-        table[name], made[name] = {'runs': count, **row_of(runs)}, count
-        print(f'{name}: {table[name]}', flush=True)
-    print(f'\n{markdown(table)}')
-    write_json(options.out, {'particles': options.particles, 'table': table})
+        count = runs if name.startswith('8 s') else max(1, runs // 2)
+        given = {'particles': particles, **changes}
+        found = [run(level, scene, given, seed) for seed in range(count)]
+        yield {'table': {name: {'runs': count, **row_of(found)}}}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        runs={'help': 'of 8 s; of 20 s half as many'},
+        rows={'help': 'only rows with one of these words in the name'},
+    )

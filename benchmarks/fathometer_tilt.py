@@ -27,14 +27,11 @@ and how much too deep it lies.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 from scipy.special import j0
 
 from benchmarks.fathometer_pulse import ARRAYS
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, study
 from sonar_imm.acoustics.fathometer import coherence, depth_response, steering
 from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift, FathometerScenario
@@ -88,18 +85,12 @@ def echo_of(
     return float(b[top]), float(STEP * top - NEAR)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    table: dict[str, dict[str, float]] = {}
+def main() -> Parts:
     for name, (config, height) in ARRAYS.items():
         # Every fourth frequency of a snapshot: the echo comes back within a quarter of it.
         rows = np.arange(config.frequency_min, config.frequency_max + 1.0, 10.0)
-        one = np.array([[height]])
-        floor = Drift(one, np.full((1, 1), AMPLITUDE), one > 0.0, np.zeros(1), np.zeros(1))
+        layer = np.array([[height]])
+        floor = Drift(layer, np.full((1, 1), AMPLITUDE), layer > 0.0, np.zeros(1), np.zeros(1))
         red = ((rows / 1000.0) ** (0.0 if config.whitened else -1.6))[:, None, None]
         exact = expected_csdm(config, floor, 0, rows) / red
         upright = tilted_csdm(config, height, rows, 0.0)
@@ -110,13 +101,9 @@ def main() -> None:
             for tilt in TILTS[1:]:
                 R = tilted_csdm(config, height, rows, np.radians(tilt))
                 peak, deeper = echo_of(config, R, rows, processor, height)
-                table[f'{name}, {processor}, {tilt:g} deg'] = {
-                    'peak against upright': peak / whole[0],
-                    'too deep, m': deeper - whole[1],
-                }
-    print(markdown(table, 3))
-    write_json(options.out, {'table': table})
+                row = {'peak against upright': peak / whole[0], 'too deep, m': deeper - whole[1]}
+                yield {'table': {f'{name}, {processor}, {tilt:g} deg': row}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main)

@@ -22,23 +22,23 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.estimation.arrays import FloatArray
-from sonar_imm.estimation.set_filter import SetFilter
-from sonar_imm.estimation.set_model import gaussian_move, SetModel, Sets
+from sonar_imm.estimation.set_filter import SetFilter, Weighted
+from sonar_imm.estimation.set_model import gaussian_walk, SetModel, Sets
 from sonar_imm.measurements import Pressure
-from sonar_imm.trackers.fathometer.array_response import (
+from sonar_imm.trackers.fathometer.pressure import PressureStream
+from sonar_imm.trackers.fathometer.response import (
     array_coherence,
     array_response,
+    Lattice,
     processor_pulse,
 )
-from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 
 EXACT_LOG_EVIDENCE = 298.6663117
@@ -54,7 +54,7 @@ def exact_hmm_model() -> SetModel:
         separation=3,
         order_min=1,
         transition=np.full((3, 3), 0.2) + 0.4 * np.eye(3),
-        move=gaussian_move(0.8),
+        walk=gaussian_walk(0.8),
         gram=np.sinc(lag / 2.2) * np.exp(-((lag / 12.0) ** 2)),
         amplitude_std=3.0,
     )
@@ -65,11 +65,13 @@ def exact_hmm(folder: Path, seed: int) -> dict[str, float]:
     model = exact_hmm_model()
     with np.load(folder / 'fathometer' / 'exact_hmm.npz') as file:
         records, exact = file['B'], file['exP']
-    tracker, before, off, evidence = SetFilter(model, 20_000), None, [], 0.0
+    sets, before, off, evidence = SetFilter(model, 20_000), None, [], 0.0
     for name, b in enumerate(records):
-        step = tracker.step(before, b, (seed, name))
+        record = sets.record(b, (seed, name))
+        propagated = sets.propagate(before or sets.start(record), record)
+        step = sets.move(sets.resample(sets.weigh(propagated, record), record), record)
         before = step.after
-        off.append(0.5 * np.abs(tracker.summary(step)[0] - exact[name]).sum())
+        off.append(0.5 * np.abs(sets.summarise(step).pmf - exact[name]).sum())
         evidence += step.log_evidence
     return {
         'exact_hmm: PMF, total variation': float(np.mean(off)),
@@ -101,7 +103,7 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
             separation=1,
             order_min=int(order),
             transition=np.eye(1),
-            move=np.ones(1),
+            walk=np.ones(1),
             gram=pulse(float(v['depth_step']) * np.arange(n)),
             amplitude_std=float(v['amplitude_std_sigmas']),
             negative_probability=0.05,
@@ -109,21 +111,21 @@ def signed_sets(folder: Path) -> Iterator[SignedSet]:
         sets = Sets.empty(model, 1)
         sets.order[0], sets.cell[0] = order, v['cell'][k, :order]
         sets.sign[0] = v['sign'][k, :order]
-        told = float(v['log_likelihood'][k]), v['amplitude_mean'][k, :order]
-        yield SignedSet(model, sets, v['response'][k], *told)
+        log_likelihood, amplitude = float(v['log_likelihood'][k]), v['amplitude_mean'][k, :order]
+        yield SignedSet(model, sets, v['response'][k], log_likelihood, amplitude)
 
 
 def signed_likelihood(folder: Path) -> dict[str, float]:
     """Largest error of the finite ones; how many of all are rejected as they should not be, or not
     as they should."""
     worst, wrong = 0.0, 0
-    for one in signed_sets(folder):
-        single, found = SetFilter(one.model, 1), np.zeros(1)
-        # The kernel that weighs sets, without moving them.
-        single._weigh(one.sets, one.response, found, single._amplitudes)
-        wrong += np.isfinite(one.log_likelihood) != np.isfinite(found[0])
-        if np.isfinite(one.log_likelihood):
-            worst = max(worst, abs(found[0] - one.log_likelihood))
+    for row in signed_sets(folder):
+        single = SetFilter(row.model, 1)
+        step = single.weigh(Weighted(row.sets, np.zeros(1)), single.record(row.response, (0, 0)))
+        found = step.after.log_weight
+        wrong += np.isfinite(row.log_likelihood) != np.isfinite(found[0])
+        if np.isfinite(row.log_likelihood):
+            worst = max(worst, abs(found[0] - row.log_likelihood))
     return {
         'signed_likelihood: error': float(worst),
         'signed_likelihood: wrongly rejected or not': float(wrong),
@@ -144,12 +146,13 @@ def pressure(folder: Path) -> dict[str, float]:
     with np.load(folder / 'fathometer_sea' / 'pressure.npz') as file:
         v = {name: file[name] for name in file}
     names = ('snapshot_seconds', 'record_seconds', 'frequency_min', 'frequency_max')
+    settings: dict[str, Any] = {name: float(v[name]) for name in names}
     config = FathometerConfig(
         phones=16,
         element_spacing=float(v['element_spacing']),
         noise_depth_min=0.0,
         noise_depth_max=0.0,
-        **{name: float(v[name]) for name in names},
+        **settings,
     )
     depth = v['depth']
     lattice = Lattice(float(depth[0]), float(depth[1] - depth[0]), len(depth))
@@ -159,17 +162,17 @@ def pressure(folder: Path) -> dict[str, float]:
             stamp_ns=1, pressure=v['p'][k] * v['scale'][k], sample_rate=float(v['sample_rate'])
         )
         (collected,), _ = PressureStream(config, Counter()).push(block, 40.0)
-        heard = array_coherence(collected.spectra, config)
+        coherent = array_coherence(collected.spectra, config)
         found = array_response(collected.spectra, lattice, config, float(v['array_depth'][k]))
-        pulse = processor_pulse(heard, Lattice(40.0, lattice.step, 320), config.sound_speed)
+        pulse = processor_pulse(coherent, Lattice(40.0, lattice.step, 320), config.sound_speed)
         rows = np.searchsorted(collected.spectra.frequency, v['csdm_frequency'] - 0.1)
         pairs: Mapping[str, tuple[np.ndarray, np.ndarray]] = {
             'R': (levelled(collected.spectra.csdm[rows]), levelled(v['csdm'][k])),
-            'gamma': (heard.gamma, v['gamma_mvdr'][k]),
-            'W': (levelled(heard.weight), levelled(v['weight'][k])),
+            'gamma': (coherent.gamma, v['gamma_mvdr'][k]),
+            'W': (levelled(coherent.weight), levelled(v['weight'][k])),
             'b': (found.amplitude, v['response'][k]),
             'mirror sigma': (found.sigma[:1], v['sigma_mirror'][k : k + 1]),
-            'pulse': (pulse(lattice.step * np.arange(320)), v['pulse_processor'][k]),
+            'pulse': (pulse(np.asarray(lattice.step * np.arange(320))), v['pulse_processor'][k]),
         }
         for name, (ours, theirs) in pairs.items():
             error = float(np.abs(ours - theirs).max() / np.abs(theirs).max())
@@ -195,8 +198,8 @@ LIMITS = {
 def rows(folder: Path, seeds: int) -> dict[str, list[float]]:
     """Errors by name, of each seed where there are some."""
     found: dict[str, list[float]] = {}
-    for one in [exact_hmm(folder, seed) for seed in range(seeds)]:
-        for name, value in one.items():
+    for seed in range(seeds):
+        for name, value in exact_hmm(folder, seed).items():
             found.setdefault(name, []).append(value)
     for name, value in (signed_likelihood(folder) | sediment(folder) | pressure(folder)).items():
         found[name] = [value]

@@ -25,16 +25,13 @@ that the margin can be chosen on images it is not scored on.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
-import json
-from pathlib import Path
+from collections.abc import Callable, Sequence
 import time
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import write_json
+from benchmarks.study import Parts, study
 from sonar_imm.acoustics.cfar import quiet_level, tail_factor
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Detections, SonarImage
@@ -72,6 +69,15 @@ STUDY_CENTROID = {
 }
 """Degrees and metres by SNR, dB."""
 NEAR = 2.0
+PARTS = (
+    'several targets',
+    'speed',
+    'margins',
+    'false detections per image',
+    'threshold above Rayleigh, dB',
+    'centroids',
+    'found',
+)
 
 
 def image(sonar: ImageSonar, places: list[np.ndarray]) -> SonarImage:
@@ -167,6 +173,7 @@ def centroids(runs: int) -> list[dict[str, float]]:
             for i in np.flatnonzero(near(ping, r, b))[:1]:
                 error = np.array([ping.range[i] - r, ping.bearing[i] - b])
                 errors.append(error)
+                assert ping.var_range is not None and ping.var_bearing is not None
                 nees.append(np.square(error) / [ping.var_range[i], ping.var_bearing[i]])
         rms = np.sqrt(np.mean(np.square(errors), axis=0))
         rows.append(
@@ -208,10 +215,10 @@ def several_targets(scenes: int) -> dict[str, Any]:
             target = kind.split()[0]
             values = {'target': target, 'target_snr_db': level, 'target_size': sizes[target]}
             config = scene(**values)
-            one = ImageSonar(config, rng)
-            one.heading = (0.5 * np.pi if kind.endswith('across') else 0.0) - b
+            sonar = ImageSonar(config, rng)
+            sonar.heading = (0.5 * np.pi if kind.endswith('across') else 0.0) - b
             mean = base.mean_power(LEVEL)
-            echo = one.echo(LEVEL, place(r, b), 1.0, mean)
+            echo = sonar.echo(LEVEL, place(r, b), 1.0, mean)
             if target != 'point':  # as in the study, the level is that of the loudest glint
                 around = mean[np.argmin(np.abs(base.range - r))].mean()
                 echo = echo * np.sqrt(10.0 ** (0.1 * level) * around) / np.abs(echo).max()
@@ -230,8 +237,8 @@ def several_targets(scenes: int) -> dict[str, Any]:
         false += int((~hit).sum())
     return {
         'scenes': scenes,
-        'found': {name: float(np.mean(np.array(one) > 0)) for name, one in counts.items()},
-        'detections': {name: float(np.mean(one)) for name, one in counts.items()},
+        'found': {name: float(np.mean(np.array(each) > 0)) for name, each in counts.items()},
+        'detections': {name: float(np.mean(each)) for name, each in counts.items()},
         'false per image': false / scenes,
     }
 
@@ -250,41 +257,37 @@ def speed(rounds: int) -> dict[str, float]:
     return {'p50_ms': float(np.median(spent)), 'p90_ms': float(np.percentile(spent, 90))}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=120, help='images for each SNR')
-    parser.add_argument('--images', type=int, default=24, help='images for false alarms')
-    parser.add_argument('--scenes', type=int, default=20, help='scenes of several targets')
-    margins = {f'{one:g} dB': DetectorConfig(threshold_margin_db=one) for one in MARGINS}
-    parts: dict[str, Callable[[argparse.Namespace], Any]] = {
-        'several targets': lambda given: several_targets(given.scenes),
-        'speed': lambda given: speed(60),
-        'margins': lambda given: false_alarms(given.images, margins, CHOSEN_ON),
-        'false detections per image': lambda given: false_alarms(
-            given.images, DETECTORS, SCORED_ON
-        ),
-        'threshold above Rayleigh, dB': lambda given: price(6),
-        'centroids': lambda given: centroids(given.runs),
-        'found': lambda given: found(given.runs),
-    }
-    parser.add_argument('--parts', nargs='*', choices=list(parts), default=list(parts))
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON here')
-    given = parser.parse_args()
-    result: dict[str, Any] = {
-        'images': given.images,
-        'runs': given.runs,
+def main(
+    runs: int = 120, images: int = 24, scenes: int = 20, parts: Sequence[str] = PARTS
+) -> Parts:
+    yield {
+        'images': images,
+        'runs': runs,
         'snr_db': LEVELS,
         'study, false': STUDY_FALSE,
         'study, found': STUDY_FOUND,
         'study, centroids': STUDY_CENTROID,
     }
-    for name in given.parts:
-        result[name] = parts[name](given)
-        print(json.dumps({name: result[name]}, indent=2), flush=True)
-        write_json(given.out, result)
+    margins = {f'{margin:g} dB': DetectorConfig(threshold_margin_db=margin) for margin in MARGINS}
+    made: tuple[Callable[[], Any], ...] = (
+        lambda: several_targets(scenes),
+        lambda: speed(60),
+        lambda: false_alarms(images, margins, CHOSEN_ON),
+        lambda: false_alarms(images, DETECTORS, SCORED_ON),
+        lambda: price(6),
+        lambda: centroids(runs),
+        lambda: found(runs),
+    )
+    for name, make in zip(PARTS, made):
+        if name in parts:
+            yield {name: make()}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        runs={'help': 'images for each SNR'},
+        images={'help': 'images for false alarms'},
+        scenes={'help': 'scenes of several targets'},
+        parts={'choices': PARTS},
+    )

@@ -27,15 +27,14 @@ below; `over the beam` draws it over what the first images can show.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 
-from benchmarks.obstacle_sea import told
-from benchmarks.tables import markdown, write_json
+from benchmarks.obstacle_sea import truth_tables
+from benchmarks.study import final_estimates, Parts, study, truths
 from sonar_imm.measurements import Measurement, SonarImage
 from sonar_imm.trackers.obstacle import bodies
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
@@ -45,7 +44,12 @@ from sonar_imm.truth import Scene
 from sonar_imm_tools.evaluation.obstacle.motion import motion_metrics
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, truth_of
-from sonar_imm_tools.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
+from sonar_imm_tools.simulation.obstacle.simulator import (
+    ObstacleScenario,
+    scenario,
+    simulate,
+    TrueObstacle,
+)
 
 CASES: dict[str, dict[str, Any]] = {
     'float, 3 m below': {},
@@ -63,14 +67,14 @@ NUMBERS = ('range', 'bearing', 'offset')
 
 def detected(setting: ObstacleScenario, given: list[Measurement]) -> list[Measurement]:
     """The measurements of a scene with detections in place of its images."""
-    feeder = setting.told_feeder()
+    feeder = setting.feeder_instruments()
     detector = ImageDetector(
         DetectorConfig(
             beam_width_deg=feeder['beam_width_deg'], range_resolution=feeder['range_resolution']
         )
     )
-    found = [detector.process(one) if isinstance(one, SonarImage) else one for one in given]
-    return [one for one in found if one is not None]
+    found = [detector.process(item) if isinstance(item, SonarImage) else item for item in given]
+    return [item for item in found if item is not None]
 
 
 def tracked(
@@ -78,10 +82,10 @@ def tracked(
 ) -> dict[str, float]:
     """The scores of one run."""
     config = evolve(ObstacleConfig(), max_range=setting.max_range)
-    tracker, final = ObstacleTracker(config), {}
-    for one in measurements:
-        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(one))
-    truth = truth_of([table for one in scene.truth for table in told(one)])
+    final = final_estimates(ObstacleTracker(config), measurements)
+    truth = truth_of(
+        [table for true in truths(scene, TrueObstacle) for table in truth_tables(true)]
+    )
     metrics, found = score(series_of(final.values()), truth, cutoff=5.0, gap=60.0)
     tracks, near = metrics['tracks'], metrics['vertical_offset_near']
     row = {
@@ -120,34 +124,32 @@ def summary(rows: list[dict[str, float]]) -> dict[str, float]:
     return table
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=62)
-    parser.add_argument('--first', type=int, default=1, help='first seed')
-    parser.add_argument('--cases', nargs='*', default=[''], help='parts of names of cases')
-    parser.add_argument('--centre', type=float, nargs='*', default=[bodies.CENTRE])
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    tables: dict[str, dict[str, float]] = {}
+def main(
+    runs: int = 62,
+    first: int = 1,
+    cases: Sequence[str] = ('',),
+    centre: Sequence[float] = (bodies.CENTRE,),
+) -> Parts:
+    yield {'first seed': first}
     for name, changes in CASES.items():
-        if not any(part in name for part in options.cases):
+        if not any(part in name for part in cases):
             continue
         setting = scenario('images', changes)
-        rows: dict[float, list[dict[str, float]]] = {share: [] for share in options.centre}
-        for seed in range(options.first, options.first + options.runs):
+        rows: dict[float, list[dict[str, float]]] = {share: [] for share in centre}
+        for seed in range(first, first + runs):
             scene = simulate(setting, seed)
-            measurements = detected(setting, [one.measurement for one in scene.measurements])
+            measurements = detected(setting, [item.measurement for item in scene.measurements])
             for share, each in rows.items():
                 bodies.CENTRE = share
                 each.append(tracked(setting, scene, measurements))
         for share, each in rows.items():
-            label = name if len(rows) == 1 else f'{name}, centre {share:g}'
-            tables[label] = summary(each)
-            print(f'\n{markdown({label: tables[label]}, 2)}', flush=True)
-        write_json(options.out, {'first seed': options.first, **tables})
+            yield {name if len(rows) == 1 else f'{name}, centre {share:g}': summary(each)}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        digits=2,
+        first={'help': 'first seed'},
+        cases={'help': 'parts of names of cases'},
+    )

@@ -28,9 +28,9 @@ The second table is where the node's own time goes, measured in this process.
 
 from __future__ import annotations
 
-import argparse
 import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 import os
 import signal
 import subprocess
@@ -45,6 +45,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 
+from benchmarks.study import Parts, study
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import inputs_of
 from sonar_imm.nodes.messages import make
@@ -77,16 +78,16 @@ def case_of(system: str, count: int) -> Case:
     else:
         # Pings until the range is down to `last_range`: slow enough for as many as are wanted.
         speed = 80.0 / (0.1 * count)
-        told = {'ping_rate': 10.0, 'obstacles': 2, 'speed': speed}
-        scene = obstacle.scenario('rolling', told)
+        changes = {'ping_rate': 10.0, 'obstacles': 2, 'speed': speed}
+        scene = obstacle.scenario('rolling', changes)
         simulated, timed = obstacle.simulate(scene, 0), 'detections'
-    entries = {one.measurement: one for one in inputs_of(system)}
+    entries = {entry.measurement: entry for entry in inputs_of(system)}
     messages = [
-        (entry.name, entry.write(one.measurement, make))
-        for one in simulated.measurements
-        for entry in [entries[type(one.measurement)]]
+        (entry.name, entry.write(item.measurement, make))
+        for item in simulated.measurements
+        for entry in [entries[type(item.measurement)]]
     ]
-    return Case(system, scene.told(), timed, messages)
+    return Case(system, scene.instruments(), timed, messages)
 
 
 class Echo(Node):
@@ -107,7 +108,7 @@ class Peer:
 
     def __init__(self, link: Link, name: str, topics: dict[str, tuple[str, type]]):
         self.link, self.name = link, name
-        self.heard = 0.0
+        self.answered = 0.0
         self.last = b''
         self.out = {
             key: link.node.create_publisher(kind, topic, lockstep_qos())
@@ -118,24 +119,26 @@ class Peer:
         )
 
     def _take(self, raw: bytes) -> None:
-        self.heard, self.last = time.perf_counter(), raw
+        self.answered, self.last = time.perf_counter(), raw
 
     def ready(self) -> bool:
         there = self.link.node.count_publishers(f'/{self.name}/estimate')
-        return bool(there and all(one.get_subscription_count() for one in self.out.values()))
+        return bool(there and all(out.get_subscription_count() for out in self.out.values()))
 
     def ask(self, key: str, message: Any) -> float:
         """Milliseconds from sending to the answer."""
-        self.heard, begin = 0.0, time.perf_counter()
+        self.answered, begin = 0.0, time.perf_counter()
         self.out[key].publish(message)
-        if not self.link.wait_for(lambda: self.heard, LIMIT):
+        if not self.link.wait_for(lambda: self.answered, LIMIT):
             raise LinkError(f'/{self.name} did not answer')
-        return 1e3 * (self.heard - begin)
+        return 1e3 * (self.answered - begin)
 
 
 def latencies(case: Case, rate: float) -> np.ndarray:
     """(K, 2) milliseconds of the node and of the echo, `rate` pairs a second."""
-    words = [word for name, value in case.options.items() for word in ('-p', _told(name, value))]
+    words = [
+        word for name, value in case.options.items() for word in ('-p', _assigned(name, value))
+    ]
     kinds = {key: type(message) for key, message in case.messages}
     with reserved_domain_id() as domain:
         environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
@@ -169,7 +172,7 @@ def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
             node.out[key].publish(message)
             continue
         due = max(due + 1.0 / rate, time.perf_counter()) if rate else 0.0
-        node.link.wait_for(lambda due=due: time.perf_counter() >= due, LIMIT)
+        node.link.wait_for(partial(_passed, due), LIMIT)
         frame_id = message.header.frame_id
         pair = [0.0, 0.0]
         for which in (0, 1) if len(spent) % 2 else (1, 0):
@@ -180,13 +183,17 @@ def _asked(case: Case, node: Peer, other: Peer, rate: float) -> np.ndarray:
     return np.array(spent[SETTLED:])
 
 
-def _told(name: str, value: Any) -> str:
+def _passed(due: float) -> bool:
+    return time.perf_counter() >= due
+
+
+def _assigned(name: str, value: Any) -> str:
     return f'{name}:={list(value) if isinstance(value, tuple) else value}'
 
 
 def parts(case: Case) -> dict[str, float]:
     """Median milliseconds of each step of the node, without the middleware."""
-    entries = {one.name: one for one in inputs_of(case.system)}
+    entries = {entry.name: entry for entry in inputs_of(case.system)}
     system = SYSTEMS[case.system]
     tracker = system.build(system.config_type()(**case.options))
     tracker.warm()
@@ -217,32 +224,35 @@ def parts(case: Case) -> dict[str, float]:
     return {name: float(np.median(values)) for name, values in spent.items()}
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--messages', type=int, default=600)
-    parser.add_argument('--rate', type=float, default=10.0, help='messages a second; 0: no pause')
-    parser.add_argument('--system', choices=('diver', 'obstacle'), help='only that node')
-    parser.add_argument('--echo', action='store_true', help='be the node that only answers')
-    told = parser.parse_args(args)
-    if told.echo:
+def main(
+    messages: int = 600, rate: float = 10.0, system: str | None = None, echo: bool = False
+) -> Parts:
+    if echo:
         rclpy.init()
         try:
             rclpy.spin(Echo())
         except (KeyboardInterrupt, ExternalShutdownException):
             return
-    for system in [told.system] if told.system else ['diver', 'obstacle']:
-        case = case_of(system, told.messages)
-        spent = latencies(case, told.rate)
-        p50, p99 = np.percentile(spent, (50, 99), axis=0)
-        print('| ms from message to estimate | p50 | p99 |\n|---|---|---|')
-        for k, name in enumerate((f'{system}_node', 'a node that only answers')):
-            print(f'| {name} | {p50[k]:.2f} | {p99[k]:.2f} |')
-        print(f'| ratio, of {len(spent)} | {p50[0] / p50[1]:.2f} | {p99[0] / p99[1]:.2f} |\n')
-        print(f'| step of {system}_node, in one process | median ms |\n|---|---|')
-        for name, value in parts(case_of(system, min(told.messages, 200))).items():
-            print(f'| {name} | {value:.2f} |')
-        print(flush=True)
+    for name in [system] if system else ['diver', 'obstacle']:
+        spent = latencies(case_of(name, messages), rate)
+        rows = np.percentile(spent, (50, 99), axis=0).T.tolist()
+        rows.append([node / other for node, other in zip(*rows)])
+        labels = (f'{name}_node', 'a node that only answers', f'ratio, of {len(spent)}')
+        table = {label: dict(zip(('p50', 'p99'), row)) for label, row in zip(labels, rows)}
+        steps = parts(case_of(name, min(messages, 200)))
+        yield {
+            f'{name}: ms from message to estimate': table,
+            f'{name}: steps of the node, in one process': {
+                step: {'median ms': value} for step, value in steps.items()
+            },
+        }
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        digits=2,
+        rate={'help': 'messages a second; 0: no pause'},
+        system={'choices': ('diver', 'obstacle'), 'help': 'only that node'},
+        echo={'help': 'be the node that only answers'},
+    )

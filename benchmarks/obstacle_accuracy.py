@@ -27,14 +27,13 @@ freed, 12 m to both sides. Every method holds obstacles for fixed (`behaviours: 
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Detections, Navigation
@@ -77,11 +76,9 @@ def config_of(scene: ObstacleScenario, **values: object) -> ObstacleConfig:
 
 
 def track(scene: Scene, config: ObstacleConfig) -> dict[int, Estimate]:
-    """The last word on every ping, by stamp."""
-    tracker, final = ObstacleTracker(config), {}
-    for one in scene.measurements:
-        final.update((each.stamp_ns, each) for each in tracker.process(one.measurement))
-    return final
+    """The last estimate of every ping, by stamp."""
+    measurements = [item.measurement for item in scene.measurements]
+    return final_estimates(ObstacleTracker(config), measurements)
 
 
 def level(estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
@@ -97,18 +94,25 @@ def true_level(truth: TrueObstacle, ping: int) -> np.ndarray:
     return np.array([r * np.cos(b), r * np.sin(b)])
 
 
+def nearest(truth: TrueObstacle, estimate: Estimate, ping: int) -> int | None:
+    """The row of the confirmed track nearest to an obstacle at a ping; None when it is not
+    followed."""
+    points, confirmed = level(estimate)
+    distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
+    distance[~confirmed] = np.inf
+    if not len(distance) or distance.min() > NEAR:
+        return None
+    return int(np.argmin(distance))
+
+
 def offset_at(truth: TrueObstacle, final: dict[int, Estimate], at: float) -> list[float] | None:
     """Error, NEES and band coverage when the range falls to `at`; None when not followed."""
     for ping in np.flatnonzero(truth.range <= at)[:6]:
         estimate = final.get(int(truth.stamp_ns[ping]))
         if estimate is None:  # a ping lost
             continue
-        points, confirmed = level(estimate)
-        distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
-        distance[~confirmed] = np.inf
-        if not len(distance) or distance.min() > NEAR:
+        if (row := nearest(truth, estimate, ping)) is None:
             return None
-        row = int(np.argmin(distance))
         true = truth.vertical_offset[ping]
         error = estimate.state[row, 2] - true
         low, high = (estimate.extras[f'vertical_offset_{end}'][row] for end in ('lo', 'hi'))
@@ -120,18 +124,15 @@ def deferred_at(
     scene: Scene, config: ObstacleConfig, at: float, refit: bool
 ) -> list[float] | None:
     """The same of the deferred estimate from the echoes so far, known for certain to be its."""
-    truth = scene.truth[0]
-    navigation = [
-        one.measurement for one in scene.measurements if isinstance(one.measurement, Navigation)
-    ]
+    truth = truths(scene, TrueObstacle)[0]
+    received = [item.measurement for item in scene.measurements]
+    navigation = [item for item in received if isinstance(item, Navigation)]
     last = np.flatnonzero(truth.range <= at)[0]
     number = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}
     pings = [
-        one.measurement
-        for one in scene.measurements
-        if isinstance(one.measurement, Detections)
-        and len(one.measurement)
-        and number[one.measurement.stamp_ns] <= last
+        item
+        for item in received
+        if isinstance(item, Detections) and len(item) and number[item.stamp_ns] <= last
     ]
     stamps = np.array([ping.stamp_ns for ping in pings] + [int(truth.stamp_ns[last])])
     poses, _ = sonar_poses(navigation, stamps, config)
@@ -159,7 +160,8 @@ def case(
                 rows.append([deferred_at(scene, config, at, method == 'refit') for at in RANGES])
             else:
                 final = track(scene, config_of(setting, method=method, **tracker_values))
-                rows.append([offset_at(scene.truth[0], final, at) for at in RANGES])
+                truth = truths(scene, TrueObstacle)[0]
+                rows.append([offset_at(truth, final, at) for at in RANGES])
     return {f'{name}, {method}': summary(rows) for method, rows in results.items()}
 
 
@@ -169,7 +171,7 @@ def summary(rows: list[list[list[float] | None]]) -> dict[str, float]:
         found = np.array([row[column] for row in rows if row[column] is not None])
         error, squared, inside = found.T
         table |= {
-            f'RMSE {at:.0f} m': float(np.sqrt(np.mean(error**2))),
+            f'RMSE {at:.0f} m': rms(error),
             f'bias {at:.0f} m': float(np.mean(error)),
             f'NEES {at:.0f} m': float(np.mean(squared)),
             f'cover {at:.0f} m': float(np.mean(inside)),
@@ -187,7 +189,8 @@ def several(runs: int) -> dict[str, dict[str, float]]:
             setting = scenario('six', LEVER)
             scene = simulate(setting, seed)
             final = track(scene, config_of(setting, **values))
-            parts += [score(scene, ping, final) for ping in range(len(scene.truth[0].stamp_ns))]
+            stamps = truths(scene, TrueObstacle)[0].stamp_ns
+            parts += [score(scene, ping, final) for ping in range(len(stamps))]
         mean = np.nanmean([part for part in parts if part is not None], axis=0)
         names = ('GOSPA', 'localisation', 'missed', 'false', 'NEES', 'cover')
         table[label] = dict(zip(names, map(float, mean)))
@@ -197,12 +200,12 @@ def several(runs: int) -> dict[str, dict[str, float]]:
 def score(scene: Scene, ping: int, final: dict[int, Estimate]) -> tuple[float, ...] | None:
     """GOSPA of one ping and its parts, NEES and coverage of the matched. An obstacle is there from
     when the beam has held it for six pings until it has been passed."""
-    stamp = int(scene.truth[0].stamp_ns[ping])
+    stamp = int(truths(scene, TrueObstacle)[0].stamp_ns[ping])
     if stamp not in final:
         return None
     there = [
         truth
-        for truth in scene.truth
+        for truth in truths(scene, TrueObstacle)
         if truth.in_beam[: ping + 1].sum() >= 6 and ahead(truth, ping)
     ]
     points, confirmed = level(final[stamp])
@@ -238,26 +241,23 @@ def parsed(given: str) -> tuple[str, Any]:
     return name, json.loads(value) if value and value[0] in '-0123456789.tf[' else value
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=300)
-    parser.add_argument('--cases', nargs='*', choices=[*CASES, 'six'], default=[*CASES, 'six'])
-    parser.add_argument('--scene', nargs='*', default=[], help='name=value of the scene')
-    parser.add_argument('--tracker', nargs='*', default=[], help='name=value of the tracker')
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    changes = [dict(map(parsed, given)) for given in (options.scene, options.tracker)]
-    tables: dict[str, dict[str, dict[str, float]]] = {}
-    for name in options.cases:
-        if name == 'six':
-            tables[name] = several(options.runs // 3)
-        else:
-            tables[name] = case(name, options.runs, *changes)
-        print(f'\n{markdown(tables[name], 2)}', flush=True)
-    write_json(options.out, {'runs': options.runs, **tables})
+def main(
+    runs: int = 300,
+    cases: Sequence[str] = (*CASES, 'six'),
+    scene: Sequence[str] = (),
+    tracker: Sequence[str] = (),
+) -> Parts:
+    yield {'runs': runs}
+    changes = [dict(map(parsed, given)) for given in (scene, tracker)]
+    for name in cases:
+        yield {name: several(runs // 3) if name == 'six' else case(name, runs, *changes)}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        digits=2,
+        cases={'choices': [*CASES, 'six']},
+        scene={'help': 'name=value of the scene'},
+        tracker={'help': 'name=value of the tracker'},
+    )

@@ -22,22 +22,21 @@ from ping to ping by a Rayleigh law and slowly by 3 dB.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
-import json
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from attrs import evolve
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.study import Parts, study, truths
 from sonar_imm.acoustics import geometry
 from sonar_imm.measurements import Detections, Navigation
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.truth import Scene
 from sonar_imm_tools.simulation.obstacle import scenario, simulate
 from sonar_imm_tools.simulation.obstacle.images import vertical_pattern
+from sonar_imm_tools.simulation.obstacle.simulator import TrueObstacle
 
 WIDTH_DEG = 15.0
 NODDING = {'pitch_rms_deg': 3.54, 'pitch_period': 10.0}
@@ -57,19 +56,18 @@ CASES: dict[str, tuple[dict[str, Any], float, str, str]] = {
 AT = (50.0, 30.0, 20.0)
 
 
-def heard(scene: Scene, seed: int, width: float) -> Iterator[Any]:
+def with_intensities(scene: Scene, seed: int, width: float) -> Iterator[Any]:
     """The measurements of a scene, detections with intensities."""
     rng = np.random.default_rng([seed, 9])
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     index = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}
     strength = rng.normal(scale=10.0)
     slow = 3.0 * rng.normal()
     attitude = None
-    poses = [one.measurement for one in scene.measurements]
-    poses = [one for one in poses if isinstance(one, Navigation)]
-    stamps = np.array([one.stamp_ns for one in poses])
-    for one in scene.measurements:
-        measurement = one.measurement
+    received = [item.measurement for item in scene.measurements]
+    poses = [item for item in received if isinstance(item, Navigation)]
+    stamps = np.array([pose.stamp_ns for pose in poses])
+    for measurement in received:
         if isinstance(measurement, Detections) and len(measurement):
             nearest = poses[int(np.argmin(np.abs(stamps - measurement.stamp_ns)))]
             attitude = Rotation.from_quat(nearest.orientation).as_matrix()
@@ -94,12 +92,12 @@ def run(values: dict[str, Any], seed: int, factor: float, config: ObstacleConfig
     """Error of the offset, its variance, and whether the band holds, at `AT`: (3, 3)."""
     draw = {'vertical_offset': float(np.random.default_rng(seed).uniform(-4.0, 4.0))}
     scene = simulate(scenario('approach', {**draw, 'altitude': 30.0, **values}), seed)
-    truth = scene.truth[0]
+    truth = truths(scene, TrueObstacle)[0]
     tracker = ObstacleTracker(config)
     found = np.full((3, 3), np.nan)
     index = {int(stamp): k for k, stamp in enumerate(truth.stamp_ns)}
     width = factor * np.radians(WIDTH_DEG)
-    for measurement in heard(scene, seed, width):
+    for measurement in with_intensities(scene, seed, width):
         for estimate in tracker.process(measurement):
             k = index[estimate.stamp_ns]
             sure = np.flatnonzero(estimate.extras['track_state'] >= 1)
@@ -115,33 +113,23 @@ def run(values: dict[str, Any], seed: int, factor: float, config: ObstacleConfig
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--runs', type=int, default=20)
-    parser.add_argument('--cases', nargs='*', default=list(CASES))
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON here')
-    given = parser.parse_args()
-    result = {}
+def main(runs: int = 20, cases: Sequence[str] = tuple(CASES)) -> Parts:
     plain = ObstacleConfig(behaviours=('fixed',))
-    for name in given.cases:
+    configs = {'without': plain, 'with': evolve(plain, vertical_beam_width_deg=WIDTH_DEG)}
+    for name in cases:
         values, factor, study_off, study_on = CASES[name]
-        row: dict[str, Any] = {'runs': given.runs, 'study': [study_off, study_on]}
-        for label, config in (
-            ('without', plain),
-            ('with', evolve(plain, vertical_beam_width_deg=WIDTH_DEG)),
-        ):
-            runs = np.array([run(values, seed, factor, config) for seed in range(given.runs)])
-            error, variance, inside = runs[..., 0], runs[..., 1], runs[..., 2]
+        row: dict[str, Any] = {'runs': runs, 'study': [study_off, study_on]}
+        for label, config in configs.items():
+            found = np.array([run(values, seed, factor, config) for seed in range(runs)])
+            error, variance, inside = found[..., 0], found[..., 1], found[..., 2]
             row[label] = {
                 'rmse_m': np.sqrt(np.nanmean(np.square(error), axis=0)).round(3).tolist(),
                 'nees': np.nanmean(np.square(error) / variance, axis=0).round(3).tolist(),
                 'band_holds': np.nanmean(inside, axis=0).round(3).tolist(),
             }
-        result[name] = row
-        print(name, json.dumps(row))
-    if given.out:
-        given.out.write_text(json.dumps(result, indent=1) + '\n', encoding='utf-8')
+        print(name, row)
+        yield {name: row}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, cases={'choices': list(CASES)})

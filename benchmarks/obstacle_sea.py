@@ -33,25 +33,22 @@ nothing but how often it happens.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks.obstacle_accuracy import (
     config_of,
-    level,
     LEVER,
     NEAR,
+    nearest,
     offset_at,
     RANGES,
     summary,
     track,
-    true_level,
 )
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS, ObstacleConfig
 from sonar_imm_tools.evaluation.obstacle.scoring import score
@@ -93,20 +90,17 @@ METHODS: dict[str, dict[str, Any]] = {
     'all': {'behaviours': BEHAVIOURS},
 }
 AT = 30.0
+EVERY = (*CASES, 'velocity', 'movers', *(f'calibration, {name}' for name in DRAWN))
 BINS = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
 
 
-def nearest(truth: TrueObstacle, final: dict[int, Estimate], ping: int) -> dict[str, float] | None:
+def followed(
+    truth: TrueObstacle, final: dict[int, Estimate], ping: int
+) -> dict[str, float] | None:
     """The columns of the confirmed track nearest to an obstacle at a ping, None without one."""
     estimate = final.get(int(truth.stamp_ns[ping]))
-    if estimate is None:
+    if estimate is None or (row := nearest(truth, estimate, ping)) is None:
         return None
-    points, confirmed = level(estimate)
-    distance = np.linalg.norm(points - true_level(truth, ping), axis=1)
-    distance[~confirmed] = np.inf
-    if not len(distance) or distance.min() > NEAR:
-        return None
-    row = int(np.argmin(distance))
     return {name: float(values[row]) for name, values in estimate.extras.items()}
 
 
@@ -115,7 +109,7 @@ def first_at(
 ) -> tuple[int, dict[str, float]] | None:
     """The ping at which the range first falls to `at` and the obstacle is followed."""
     for ping in np.flatnonzero(truth.range <= at)[:6].tolist():
-        found = nearest(truth, final, ping)
+        found = followed(truth, final, ping)
         if found is not None:
             return ping, found
     return None
@@ -142,20 +136,18 @@ def velocity(runs: int) -> dict[str, dict[str, float]]:
         errors: dict[float, list[float]] = {seconds: [] for seconds in after}
         for seed in range(runs):
             scene = simulate(setting, seed)
-            truth = scene.truth[0]
+            truth = truths(scene, TrueObstacle)[0]
             final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             t = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
             seen = when or t[np.argmax(truth.in_beam)]
-            if when and nearest(truth, final, int(np.argmin(np.abs(t - when)))) is None:
+            if when and followed(truth, final, int(np.argmin(np.abs(t - when)))) is None:
                 continue
             for seconds, off in errors.items():
                 ping = int(np.argmin(np.abs(t - seen - seconds)))
-                found = nearest(truth, final, ping)
+                found = followed(truth, final, ping)
                 if found is not None and truth.in_beam[ping]:
                     off += off_velocity(truth, ping, found)
-        table[name] = {
-            f'{s:.0f} s': float(np.sqrt(np.mean(np.square(e)))) for s, e in errors.items()
-        }
+        table[name] = {f'{s:.0f} s': rms(e) for s, e in errors.items()}
     return table
 
 
@@ -166,29 +158,26 @@ def case(name: str, runs: int, first: int = 0) -> dict[str, dict[str, float]]:
     does, tracks = [], dict.fromkeys(METHODS, 0)
     for seed in range(first, first + runs):
         scene = simulate(setting, seed)
+        truth = truths(scene, TrueObstacle)[0]
         for method, values in METHODS.items():
             final = track(scene, config_of(setting, **values))
-            offsets[method].append([offset_at(scene.truth[0], final, at) for at in RANGES])
-            tracks[method] += len(
-                {
-                    int(number)
-                    for one in final.values()
-                    for number in one.extras['track_id'][one.extras['track_state'] > 0]
-                }
-            )
+            offsets[method].append([offset_at(truth, final, at) for at in RANGES])
+            extras = [estimate.extras for estimate in final.values()]
+            confirmed = [e['track_id'][e['track_state'] > 0] for e in extras]
+            tracks[method] += len(np.unique(np.concatenate(confirmed)))
             if method == 'all':
-                does.append(behaviour_at(scene.truth[0], final))
+                does.append(behaviour_at(truth, final))
     table = {}
     for method, rows in offsets.items():
         table[f'{name}, {method}'] = {
             **{key: value for key, value in guarded(rows).items() if 'bias' not in key},
             'tracks per obstacle': tracks[method] / runs,
         }
-    known = np.array([one for one in does if one is not None])
+    known = np.array([row for row in does if row is not None])
     if len(known):
         mean = known.mean(axis=0)
         table[f'{name}, all'] |= {f'P {b}': float(mean[i]) for i, b in enumerate(BEHAVIOURS)}
-        table[f'{name}, all']['v'] = float(np.sqrt(np.mean(known[:, 4:] ** 2)))
+        table[f'{name}, all']['v'] = rms(known[:, 4:])
     return table
 
 
@@ -199,7 +188,7 @@ def movers(runs: int) -> dict[str, dict[str, float]]:
     for seed in range(1, runs + 1):
         scene = simulate(setting, seed)
         final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
-        tables = [table for truth in scene.truth for table in told(truth)]
+        tables = [table for truth in truths(scene, TrueObstacle) for table in truth_tables(truth)]
         metrics, _ = score(series_of(final.values()), truth_of(tables), cutoff=NEAR, gap=60.0)
         tracks = metrics['tracks']
         found.append(
@@ -219,7 +208,7 @@ def movers(runs: int) -> dict[str, dict[str, float]]:
     }
 
 
-def told(truth: TrueObstacle) -> Iterator[Estimate]:
+def truth_tables(truth: TrueObstacle) -> Iterator[Estimate]:
     """The truth of an obstacle as `evaluate` reads it from a recording."""
     for table in truth.tables('odom'):
         yield Estimate.from_columns(table.columns, stamp_ns=table.stamp_ns)
@@ -244,16 +233,15 @@ def calibration(runs: int, reach: float) -> dict[str, dict[str, float]]:
         )
         for seed in range(runs):
             scene = simulate(setting, 1000 + seed)
-            truth = scene.truth[0]
+            truth = truths(scene, TrueObstacle)[0]
             final = track(scene, config_of(setting, behaviours=BEHAVIOURS))
             for at in (60.0, 40.0, 25.0):
                 seen = first_at(truth, final, at)
                 if seen is not None and np.isfinite(seen[1]['collision_probability']):
-                    hit = happened(truth, seen[0], config.safety_radius, config.safety_height)
-                    forecasts.append((kind, at, seen[1]['collision_probability'], float(hit)))
+                    ends = happened(truth, seen[0], config.safety_radius, config.safety_height)
+                    forecasts.append((kind, at, seen[1]['collision_probability'], float(ends)))
     table: dict[str, dict[str, float]] = {}
-    p = np.array([one[2] for one in forecasts])
-    hit = np.array([one[3] for one in forecasts])
+    kinds, ranges, p, hit = (np.array(column) for column in zip(*forecasts))
     for low, high in zip(BINS, BINS[1:]):
         rows = (p >= low) & ((p < high) | (high == 1.0))
         if rows.any():
@@ -266,7 +254,7 @@ def calibration(runs: int, reach: float) -> dict[str, dict[str, float]]:
         for name in ('Brier', 'guess'):
             table[f'{name}, {kind}'] = {}
         for at in (60.0, 40.0, 25.0):
-            rows = np.array([one[0] == kind and one[1] == at for one in forecasts])
+            rows = (kinds == kind) & (ranges == at)
             often = hit[rows].mean()
             table[f'Brier, {kind}'][f'{at:.0f} m'] = float(np.mean((p[rows] - hit[rows]) ** 2))
             table[f'guess, {kind}'][f'{at:.0f} m'] = float(often * (1.0 - often))
@@ -275,57 +263,30 @@ def calibration(runs: int, reach: float) -> dict[str, dict[str, float]]:
 
 def guarded(rows: list[list[list[float] | None]]) -> dict[str, float]:
     """`summary`, also where every run lost the obstacle at some range."""
-    filled = [[one or [np.nan] * 3 for one in row] for row in rows]
-    found = [[one is not None for one in row] for row in rows]
-    if all(any(column) for column in zip(*found)):
+    if all(any(row[k] for row in rows) for k in range(len(RANGES))):
         return summary(rows)
-    lost = 1.0 - np.mean(found, axis=0)
     table = {}
     for k, at in enumerate(RANGES):
-        error = np.array([row[k][0] for row in filled])
-        error = error[np.isfinite(error)]
-        table[f'RMSE {at:.0f} m'] = float(np.sqrt(np.mean(error**2))) if len(error) else np.nan
-        table[f'lost {at:.0f} m'] = float(lost[k])
+        error = [found[0] for row in rows if (found := row[k])]
+        table[f'RMSE {at:.0f} m'] = rms(error) if error else np.nan
+        table[f'lost {at:.0f} m'] = 1.0 - len(error) / len(rows)
     return table
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=100)
-    parser.add_argument('--first', type=int, default=0, help='first seed of the cases')
-    every = [*CASES, 'velocity', 'movers', *(f'calibration, {name}' for name in DRAWN)]
-    parser.add_argument('--cases', nargs='*', choices=every, default=every)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    tables: dict[str, Any] = {}
-    for name in options.cases:
-        if name == 'movers':
-            tables[name] = movers(options.runs)
-            parts = [tables[name]]
-        elif name == 'velocity':
-            tables[name] = velocity(options.runs)
-            parts = [{row: values} for row, values in tables[name].items()]
-        elif name not in CASES:
-            tables[name] = calibration(options.runs, DRAWN[name.removeprefix('calibration, ')])
-            parts = [
-                {row: values for row, values in tables[name].items() if row.startswith(words)}
-                for words in (('stated',), ('Brier', 'guess'))
-            ]
+def main(runs: int = 100, first: int = 0, cases: Sequence[str] = EVERY) -> Parts:
+    yield {'runs': runs}
+    for name in cases:
+        if name in CASES:
+            yield {name: case(name, runs, first)}
+        elif name in ('movers', 'velocity'):
+            yield {name: movers(runs) if name == 'movers' else velocity(runs)}
         else:
-            tables[name] = case(name, options.runs, options.first)
-            both = f'{name}, all'
-            told = {key: v for key, v in tables[name][both].items() if key[0] in 'Pv'}
-            errors = {
-                row: {key: v for key, v in values.items() if key not in told}
-                for row, values in tables[name].items()
-            }
-            parts = [errors, {both: told}]
-        for part in parts:
-            print(f'\n{markdown(part, 3)}', flush=True)
-        write_json(options.out, {'runs': options.runs, **tables})
+            yield {name: calibration(runs, DRAWN[name.removeprefix('calibration, ')])}
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        first={'help': 'first seed of the cases'},
+        cases={'choices': EVERY},
+    )

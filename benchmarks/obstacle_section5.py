@@ -32,14 +32,12 @@ that sways, it is the eye that sees it sway.
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.obstacle_accuracy import config_of, LEVER
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, study
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
@@ -86,10 +84,10 @@ def encounter(body: str, does: dict[str, Any], seed: int) -> tuple[ObstacleScena
 
 def echoes(setting: ObstacleScenario, scene: Scene) -> tuple[FloatArray, Pose]:
     """Exact range and azimuth (N, 2) of a scene's pings, and the poses the navigation states."""
-    received = [one.measurement for one in scene.measurements]
-    pings = [one for one in received if isinstance(one, Detections) and len(one)]
+    received = [item.measurement for item in scene.measurements]
+    pings = [item for item in received if isinstance(item, Detections) and len(item)]
     z = np.array([[ping.range[0], -ping.bearing[0]] for ping in pings])
-    navigation = [one for one in received if isinstance(one, Navigation)]
+    navigation = [item for item in received if isinstance(item, Navigation)]
     stamps = np.array([ping.stamp_ns for ping in pings])
     poses, known = sonar_poses(navigation, stamps, config_of(setting))
     return z[known], Pose(poses.position[known], poses.R[known])
@@ -138,21 +136,13 @@ def distribution(table: dict[str, list[float]], truth: float) -> dict[str, dict[
     return result
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=200)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
-    content: dict[str, Any] = {'runs': options.runs}
+def main(runs: int = 200) -> Parts:
+    yield {'runs': runs}
     for body, changes in BODIES.items():
-        found = estimates(body, options.runs)
+        found = estimates(body, runs)
         table = distribution(found, changes['vertical_offset'])
-        print(f'\n{body}, truth {changes["vertical_offset"]} m\n{markdown(table, 2)}', flush=True)
-        content[body] = {'distribution': table, 'estimates': found}
-    write_json(options.out, content)
+        yield {body: {'distribution': table, 'estimates': found}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, digits=2)

@@ -23,7 +23,8 @@ lost.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
+from functools import partial
 import os
 from pathlib import Path
 import time
@@ -31,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.study import Parts, study
 from msg_adapters.fixes import write_fix
 from sonar_imm.measurements import Fix
 from sonar_imm.nodes.messages import make, message_class
@@ -60,27 +62,26 @@ def messages(rate: float, seconds: float) -> list[Any]:
     ]
 
 
-def row(depth: int, rate: float, seconds: float) -> list[str]:
-    """One row of the table: depth, messages sent and lost, memory of the node in MB at the end."""
+def row(depth: int, rate: float, seconds: float) -> dict[str, int]:
+    """Messages sent and lost, and the memory of the node in MB at the end."""
     arguments = ['-p', f'queue_depth:={depth}']
     with (
         reserved_domain_id() as domain,
         NodeProcess('diver', domain_id=domain, arguments=arguments) as node,
         Link('bench', domain_id=domain) as link,
     ):
-        heard: dict[str, Any] = {}
+        latest: dict[str, Any] = {}
         for kind, topic, qos in (
             ('diagnostic_msgs/msg/DiagnosticArray', '/diagnostics', output_qos()),
             ('sensor_msgs/msg/PointCloud2', '/diver/processed', latched_qos()),
         ):
-            link.node.create_subscription(
-                message_class(kind), topic, lambda m, topic=topic: heard.update({topic: m}), qos
-            )
+            take = partial(latest.__setitem__, topic)
+            link.node.create_subscription(message_class(kind), topic, take, qos)
         fix = link.node.create_publisher(
             message_class('geometry_msgs/msg/PoseWithCovarianceStamped'), 'fix', output_qos(1000)
         )
         if not link.wait_for(
-            lambda: '/diver/processed' in heard and fix.get_subscription_count(), 90.0
+            lambda: '/diver/processed' in latest and fix.get_subscription_count(), 90.0
         ):
             raise LinkError('the node did not appear')
         sent = messages(rate, seconds)
@@ -89,24 +90,20 @@ def row(depth: int, rate: float, seconds: float) -> list[str]:
             time.sleep(max(0.0, begin + k / rate - time.monotonic()))
             fix.publish(message)
         link.wait_for(lambda: False, 5.0)
-        values = {pair.key: pair.value for pair in heard['/diagnostics'].status[0].values}
+        values = {pair.key: pair.value for pair in latest['/diagnostics'].status[0].values}
         status = Path(f'/proc/{node.process.pid}/status').read_text(encoding='utf-8')
         memory = next(line for line in status.splitlines() if line.startswith('VmRSS'))
-        lost = values.get('lost on fix', '0')
-        return [str(depth), str(len(sent)), lost, str(int(memory.split()[1]) // 1024)]
+        lost = int(values.get('lost on fix', '0'))
+        return {'sent': len(sent), 'lost': lost, 'memory MB': int(memory.split()[1]) // 1024}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--rate', type=float, default=100.0, help='fixes per second')
-    parser.add_argument('--seconds', type=float, default=20.0)
-    parser.add_argument('--depths', type=int, nargs='+', default=[50, 200, 500])
-    told = parser.parse_args()
+def main(
+    rate: float = 100.0, seconds: float = 20.0, depths: Sequence[int] = (50, 200, 500)
+) -> Parts:
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    print('| queue_depth | sent | lost | memory MB |\n|---|---|---|---|')
-    for depth in told.depths:
-        print('| ' + ' | '.join(row(depth, told.rate, told.seconds)) + ' |', flush=True)
+    for depth in depths:
+        yield {'queue_depth': {str(depth): row(depth, rate, seconds)}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, rate={'help': 'fixes per second'})

@@ -33,6 +33,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.real_recordings import boat_scores, BOATS, DATA, header, load, row
+from benchmarks.study import final_estimates
 from sonar_imm.estimates import Estimate
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -57,38 +58,38 @@ class PlainKalman:
         F, z = np.eye(4) + dt * np.eye(4, k=2), scan.position[:, :2]
         Q = self.noise**2 * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], np.eye(2))
         cost = np.full((len(self.tracks), len(z)), 1e3)
-        for t, one in enumerate(self.tracks):
-            one['x'], one['P'] = F @ one['x'], F @ one['P'] @ F.T + Q
-            v = z - one['x'][:2]
-            S = one['P'][:2, :2] + self.R
+        for t, track in enumerate(self.tracks):
+            track['x'], track['P'] = F @ track['x'], F @ track['P'] @ F.T + Q
+            v = z - track['x'][:2]
+            S = track['P'][:2, :2] + self.R
             nis = np.einsum('da,ab,db->d', v, np.linalg.inv(S), v)
             cost[t] = np.where(nis < 13.8, nis + np.log(np.linalg.det(S)), 1e3)
         pairs = {t: d for t, d in zip(*linear_sum_assignment(cost)) if cost[t, d] < 1e3}
-        for t, one in enumerate(self.tracks):
-            one['seen'] = [*one['seen'][1 - self.window :], t in pairs]
+        for t, track in enumerate(self.tracks):
+            track['seen'] = [*track['seen'][1 - self.window :], t in pairs]
             if t in pairs:
-                K = one['P'][:, :2] @ np.linalg.inv(one['P'][:2, :2] + self.R)
-                one['x'] = one['x'] + K @ (z[pairs[t]] - one['x'][:2])
-                one['P'] = one['P'] - K @ one['P'][:2]
-            one['firm'] = one['firm'] or sum(one['seen']) >= self.hits
+                K = track['P'][:, :2] @ np.linalg.inv(track['P'][:2, :2] + self.R)
+                track['x'] = track['x'] + K @ (z[pairs[t]] - track['x'][:2])
+                track['P'] = track['P'] - K @ track['P'][:2]
+            track['firm'] = track['firm'] or sum(track['seen']) >= self.hits
         for d in set(range(len(z))) - set(pairs.values()):
             self.number += 1
             x, P = np.append(z[d], [0.0, 0.0]), np.diag([*np.diag(self.R), 4.0, 4.0])
             self.tracks.append({'x': x, 'P': P, 'seen': [True], 'firm': False, 'id': self.number})
-        self.tracks = [one for one in self.tracks if self._lives(one)]
+        self.tracks = [track for track in self.tracks if self._lives(track)]
         return [self._estimate(scan.stamp_ns)]
 
-    def _lives(self, one: dict[str, Any]) -> bool:
-        if one['firm']:
-            return len(one['seen']) < 5 or any(one['seen'][-5:])
-        return len(one['seen']) - sum(one['seen']) <= self.window - self.hits
+    def _lives(self, track: dict[str, Any]) -> bool:
+        if track['firm']:
+            return len(track['seen']) < 5 or any(track['seen'][-5:])
+        return len(track['seen']) - sum(track['seen']) <= self.window - self.hits
 
     def _estimate(self, stamp_ns: int) -> Estimate:
         n = len(self.tracks)
-        state = np.reshape([one['x'] for one in self.tracks], (n, 4))
+        state = np.reshape([track['x'] for track in self.tracks], (n, 4))
         extras = {
-            'track_id': np.array([one['id'] for one in self.tracks], int),
-            'track_state': np.array([one['firm'] for one in self.tracks], int),
+            'track_id': np.array([track['id'] for track in self.tracks], int),
+            'track_state': np.array([track['firm'] for track in self.tracks], int),
         }
         return Estimate(
             stamp_ns=stamp_ns,
@@ -96,7 +97,7 @@ class PlainKalman:
             xyz=np.zeros((n, 3), np.float32),
             state_names=('px', 'py', 'vx', 'vy'),
             state=state,
-            covariance=np.reshape([one['P'] for one in self.tracks], (n, 4, 4)),
+            covariance=np.reshape([track['P'] for track in self.tracks], (n, 4, 4)),
             extras=extras,
         )
 
@@ -110,8 +111,13 @@ def ours(**values: Any) -> Make:
     def make(noise: float, std: float, life: tuple[int, int]) -> DiverTracker:
         name = 'speed_noise' if 'model_set' not in values else 'acceleration_noise'
         tuned = noise if name == 'speed_noise' else (noise,)
-        told = {name: tuned, 'fix_std': std, 'confirm_hits': life[0], 'confirm_window': life[1]}
-        return DiverTracker(DiverConfig(clutter_density=1e-5, **{**values, **told}))
+        settings = {
+            name: tuned,
+            'fix_std': std,
+            'confirm_hits': life[0],
+            'confirm_window': life[1],
+        }
+        return DiverTracker(DiverConfig(clutter_density=1e-5, **{**values, **settings}))
 
     return make
 
@@ -125,15 +131,8 @@ TRACKERS: dict[str, tuple[Make, tuple[float, ...]]] = {
 }
 
 
-def run(tracker: Any, items: list) -> dict[int, Estimate]:
-    final: dict[int, Estimate] = {}
-    for item in items:
-        final.update((one.stamp_ns, one) for one in tracker.process(item))
-    return final
-
-
 def half(final: dict[int, Estimate], middle_ns: int, second: bool) -> dict[int, Estimate]:
-    return {stamp: one for stamp, one in final.items() if (stamp >= middle_ns) == second}
+    return {stamp: estimate for stamp, estimate in final.items() if (stamp >= middle_ns) == second}
 
 
 def sensor_table(sensor: str, offset: float, folder: Path) -> None:
@@ -155,15 +154,18 @@ def sensor_table(sensor: str, offset: float, folder: Path) -> None:
     )
     header('GOSPA first half', 'GOSPA second half', 'missed', 'false', 'tracks', 'RMSE m')
     for label, (make, noises) in TRACKERS.items():
-        runs = [run(make(*one), items) for one in product(noises, STDS, LIVES)]
+        runs = [final_estimates(make(*s), items) for s in product(noises, STDS, LIVES)]
         halves = [
             [boat_scores(half(final, middle, second), truth) for final in runs]
             for second in (False, True)
         ]
-        best = [int(np.argmin([scores[0] for scores in one])) for one in halves]
+        best = [int(np.argmin([scores[0] for scores in each])) for each in halves]
         # Chosen on one half, scored on the other.
         scored = [halves[0][best[1]], halves[1][best[0]]]
-        row(label, [scored[0][0], scored[1][0], *np.mean([one[1:] for one in scored], axis=0)])
+        row(
+            label,
+            [scored[0][0], scored[1][0], *np.mean([scores[1:] for scores in scored], axis=0)],
+        )
 
 
 def main() -> None:

@@ -33,7 +33,6 @@ answering the mean of all true offsets, which nobody knows beforehand.
 
 from __future__ import annotations
 
-import argparse
 import os
 from pathlib import Path
 
@@ -42,7 +41,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import Parts, rms, study
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Altitude, Detections, Navigation
@@ -92,7 +91,7 @@ def dead_reckoned(folder: Path) -> Path3D:
     )
     speed = [uniform_filter1d(log[f'bottom_velocity_{axis}_cm_s'] / 100.0, 9) for axis in 'xy']
     body = np.column_stack(
-        [*(np.interp(t, log['stamp_s'], one) for one in speed), np.zeros(len(t))]
+        [*(np.interp(t, log['stamp_s'], axis) for axis in speed), np.zeros(len(t))]
     )
     over_ground = turns.apply(body)
     over_ground[:, 2] = 0.0
@@ -150,7 +149,7 @@ def encounter(
                 ),
             )
         )
-    received.sort(key=lambda one: one[0])
+    received.sort(key=lambda item: item[0])
     return [measurement for _, measurement in received], place
 
 
@@ -168,8 +167,8 @@ def judged(path: Path3D, start: float, seed: int, altimeter: bool) -> dict[str, 
     )
     known = [
         estimate
-        for one in measurements
-        for estimate in tracker.process(one)
+        for measurement in measurements
+        for estimate in tracker.process(measurement)
         if (estimate.extras['track_state'] > 0).any()
     ]
     if not known:
@@ -196,21 +195,15 @@ def judged(path: Path3D, start: float, seed: int, altimeter: bool) -> dict[str, 
 def summary(path: Path3D, runs: int = 40, altimeter: bool = True) -> dict[str, float]:
     """RMSE, NEES, coverage and mean band width over encounters all along the recording."""
     starts = np.linspace(path.t[0] + 1.0, path.t[-1] - WINDOW - 2.0, runs)
-    found = [
-        one
-        for seed, start in enumerate(starts)
-        if (one := judged(path, float(start), seed, altimeter)) is not None
-    ]
-    columns = {name: np.array([one[name] for one in found]) for name in found[0]}
-    rms = {
-        name: float(np.sqrt(np.mean(columns[name] ** 2))) for name in ('error', 'first', 'true')
-    }
+    encounters = [judged(path, float(s), seed, altimeter) for seed, s in enumerate(starts)]
+    found = [scores for scores in encounters if scores is not None]
+    columns = {name: np.array([scores[name] for scores in found]) for name in found[0]}
     return {
         'encounters': runs,
         'tracked': len(found),
-        'rmse_m': rms['error'],
-        'first_answer_rmse_m': rms['first'],
-        'answering_zero_rmse_m': rms['true'],
+        'rmse_m': rms(columns['error']),
+        'first_answer_rmse_m': rms(columns['first']),
+        'answering_zero_rmse_m': rms(columns['true']),
         'spread_of_truth_m': float(columns['true'].std()),
         'nees': float(np.mean(columns['nees'])),
         'band_coverage': float(np.mean(columns['held'])),
@@ -218,26 +211,16 @@ def summary(path: Path3D, runs: int = 40, altimeter: bool = True) -> dict[str, f
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument('--runs', type=int, default=100)
-    parser.add_argument('--out', type=Path, help='write the numbers as JSON')
-    options = parser.parse_args()
+def main(runs: int = 100) -> Parts:
     path = dead_reckoned(data_folder())
     roll = np.degrees(path.attitude.as_euler('ZYX')[:, 2])
     print(
         f'{path.t[-1] - path.t[0]:.0f} s, roll {roll.std():.2f} deg rms, travelled '
         f'{np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum():.0f} m'
     )
-    table = {
-        'between surface and sea floor': summary(path, options.runs),
-        'within 1.2 m, altitude untold': summary(path, options.runs, altimeter=False),
-    }
-    print(markdown(table, 2))
-    write_json(options.out, table)
+    yield {'between surface and sea floor': summary(path, runs)}
+    yield {'within 1.2 m, altitude untold': summary(path, runs, altimeter=False)}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, digits=2)

@@ -26,14 +26,16 @@ from __future__ import annotations
 import os
 from pathlib import Path
 import tempfile
+from typing import Any
 
 import numpy as np
 
+from benchmarks.study import final_estimates
 from msg_adapters.estimates import read_estimate
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Arrivals, Fix, Rejection
-from sonar_imm.trackers.diver.sensing import locate
+from sonar_imm.trackers.diver.births import locate
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.recordings.convert import convert_arrivals, convert_autoferry, convert_fixes
@@ -43,7 +45,7 @@ from sonar_imm_tools.recordings.reader import BagReader
 DATA = Path(os.environ.get('SONAR_IMM_DATA', '../shared/data'))
 LAG = 3.4
 
-TAG = {
+TAG: dict[str, Any] = {
     'max_tracks': 1,
     'confirm_hits': 1,
     'max_coast': 600.0,
@@ -54,49 +56,55 @@ TAG = {
 """What a user knows: one tag, silent for half a minute at a time, a metre deep, in water of this
 sound speed, with receivers of this accuracy. Everything else is at its default."""
 
-BOATS = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
-PACE = {'speed_noise': 0.07}
+BOATS: dict[str, Any] = {'speed_mean': 2.0, 'speed_std': 1.5, 'speed_noise': 0.1}
+PACE: dict[str, Any] = {'speed_noise': 0.07}
 """A swimmer whose speed, spread by `speed_std` = .4 m/s, is another one after a minute: a random
 walk of sqrt(2 / 60 s) .4 m/s over a second, as that of a process that forgets within a minute."""
-SETS = {
+COLUMNS = ('tx_id', 'rx_id', 'tx', 'rx', 'toa', 'var_toa', 'bearing', 'var_bearing')
+SETS: dict[str, dict[str, Any]] = {
     'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.1,)},
     'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.01, 0.12)},
     'heading_speed': {},
     'heading_speed, pace kept a minute': PACE,
     'heading_speed_lateral': {'model_set': 'heading_speed_lateral'},
 }
+OF_BOATS: dict[str, dict[str, Any]] = {
+    'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
+    'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
+    'heading_speed': BOATS,
+    'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
+}
 
 
 def load(bag: Path) -> tuple[list, np.ndarray]:
     """Measurements of a bag, and truth as rows (stamp s, id, x, y)."""
     with BagReader(bag) as reader:
-        heard = [one.measurement for one in measurements_of(reader, 'diver')]
+        found = [item.measurement for item in measurements_of(reader, 'diver')]
     truth = []
     with BagReader(bag) as reader:
-        for one in reader.messages(['/truth/estimate']):
-            table = read_estimate(one.message)
+        for item in reader.messages(['/truth/estimate']):
+            table = read_estimate(item.message)
             truth += [
                 (table.stamp_ns * 1e-9, int(i), x, y)
                 for i, x, y in zip(
                     table.extras['track_id'], table.extras['px'], table.extras['py']
                 )
             ]
-    return [one for one in heard if not isinstance(one, Rejection)], np.array(truth)
+    return [each for each in found if not isinstance(each, Rejection)], np.array(truth)
 
 
 def follow(config: DiverConfig, items: list) -> tuple[list, list]:
     """Estimates of the filter and of the smoother, the last word on each stamp."""
     tracker = SmoothingDiverTracker(config)
-    final = {}
-    for item in items:
-        final.update((estimate.stamp_ns, estimate) for estimate in tracker.process(item))
+    final = final_estimates(tracker, items)
     return [final[stamp] for stamp in sorted(final)], tracker.smoothed()
 
 
 def against_gps(
     stamps: np.ndarray, places: np.ndarray, truth: np.ndarray, lag: float
-) -> np.ndarray:
-    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Error (k, 2) at the stamps inside the GPS recording and not inside one of its gaps, and
+    which stamps those are."""
     t = stamps + lag
     after = np.clip(np.searchsorted(truth[:, 0], t), 1, len(truth) - 1)
     good = (
@@ -145,7 +153,7 @@ def raw_scores(items: list, truth: np.ndarray, config: DiverConfig) -> list[floa
                 xyz=np.zeros((1, 3), np.float32),
                 state_names=('px', 'py'),
                 state=place[None, :2],
-                covariance=covariance[None],
+                covariance=np.asarray(covariance)[None],
             )
             for stamp, place, covariance in rows
         ],
@@ -160,36 +168,19 @@ def thinned(items: list, receivers: int, keep: float, seed: int = 1) -> list:
     for ping in items:
         rows = np.sort(rng.permutation(len(ping))[:receivers])
         if rng.uniform() < keep and len(rows) > 1:
-            out.append(
-                Arrivals(
-                    stamp_ns=ping.stamp_ns,
-                    frame_id=ping.frame_id,
-                    **{
-                        name: getattr(ping, name)[rows]
-                        for name in (
-                            'tx_id',
-                            'rx_id',
-                            'tx',
-                            'rx',
-                            'toa',
-                            'var_toa',
-                            'bearing',
-                            'var_bearing',
-                        )
-                    },
-                )
-            )
+            columns = {name: getattr(ping, name)[rows] for name in COLUMNS}
+            out.append(Arrivals(stamp_ns=ping.stamp_ns, frame_id=ping.frame_id, **columns))
     return out
 
 
-def tag_table(title: str, items: list, truth: np.ndarray, **extra) -> None:
+def tag_table(title: str, items: list, truth: np.ndarray, **extra: Any) -> None:
     print(f'\n### {title} ({len(items)} messages)\n')
     header('RMSE m', 'RMSE, GPS 3.4 s later', 'median', 'NEES (2)', 'compared')
     config = DiverConfig(**{**TAG, **extra})
     # Three arrivals give a fix. Of a tag two give a hyperbola and one nothing: what is said then
     # is the prediction.
     least = {'pings of 3 or more': 3, 'pings of 2 or more': 2, '': 0}
-    heard = {item.stamp_ns: len(item) if isinstance(item, Arrivals) else 3 for item in items}
+    sizes = {item.stamp_ns: len(item) if isinstance(item, Arrivals) else 3 for item in items}
     row('each ping or fix by itself', raw_scores(items, truth, config))
     for name, values in SETS.items():
         filtered, smooth = follow(DiverConfig(**{**TAG, **extra, **values}), items)
@@ -199,7 +190,7 @@ def tag_table(title: str, items: list, truth: np.ndarray, **extra) -> None:
         for label, estimates in kinds.items():
             last: list[float] = []
             for which, size in least.items():
-                shared = [one for one in estimates if heard.get(one.stamp_ns, 0) >= size]
+                shared = [each for each in estimates if sizes.get(each.stamp_ns, 0) >= size]
                 scores = tag_scores(shared, truth)
                 if not which or last != scores and len(shared) < len(estimates):
                     row(', '.join(filter(None, (label, which))), scores)
@@ -218,11 +209,10 @@ def seeds_table(pings: list, truth: np.ndarray) -> None:
         for receivers in (5, 4, 3):
             scores = []
             for seed in range(1, 9):
-                tracker, final = DiverTracker(DiverConfig(**{**TAG, **values})), {}
-                for item in thinned(pings, receivers, 1.0, seed):
-                    final.update((e.stamp_ns, e) for e in tracker.process(item))
+                tracker = DiverTracker(DiverConfig(**{**TAG, **values}))
+                final = final_estimates(tracker, thinned(pings, receivers, 1.0, seed))
                 scores.append(tag_scores([final[stamp] for stamp in sorted(final)], truth)[1])
-            cells.append(' '.join(f'{one:.1f}' for one in scores))
+            cells.append(' '.join(f'{score:.1f}' for score in scores))
         print(f'| {name} | {" | ".join(cells)} |')
 
 
@@ -250,12 +240,7 @@ def boats(folder: Path) -> None:
                 f'{sum(map(len, items))} fixes\n'
             )
             header('GOSPA (20 m, 2)', 'missed', 'false', 'tracks', 'position RMSE m')
-            for name, values in {
-                'CV Kalman': {'model_set': 'cv', 'acceleration_noise': (0.3,)},
-                'IMM CV+CV': {'model_set': 'cv_cv', 'acceleration_noise': (0.05, 0.6)},
-                'heading_speed': BOATS,
-                'heading_speed, jipda': {**BOATS, 'association': 'jipda'},
-            }.items():
+            for name, values in OF_BOATS.items():
                 config = DiverConfig(
                     fix_std=4.0 if sensor == 'radar' else 2.0,
                     clutter_density=1e-5,
@@ -263,10 +248,7 @@ def boats(folder: Path) -> None:
                     confirm_window=6,
                     **values,
                 )
-                tracker, final = DiverTracker(config), {}
-                for item in items:
-                    final.update((e.stamp_ns, e) for e in tracker.process(item))
-                row(name, boat_scores(final, truth))
+                row(name, boat_scores(final_estimates(DiverTracker(config), items), truth))
 
 
 def boat_scores(final: dict, truth: np.ndarray) -> list[float]:

@@ -29,7 +29,7 @@ FOLDER stays as it was. Ends with 1 when something fell short.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 import json
 import os
 from pathlib import Path
@@ -38,7 +38,7 @@ import subprocess
 import sys
 from typing import Any
 
-from benchmarks.tables import write_json
+from benchmarks.study import known, write_json
 from sonar_imm.trackers import SYSTEMS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -70,21 +70,112 @@ SLOWER = 2.0
 _BLOCK = re.compile(r'(<!-- reliability: (\w+) -->\n).*?(<!-- /reliability -->)', re.DOTALL)
 
 Part = Any
-Rows = list[list[str]]
+"""Rows as a list, or by system."""
+Row = Mapping[str, Any]
 
 
-def faults(part: Sequence[Mapping[str, Any]]) -> Rows:
-    """A row per fault: messages until estimates are as if nothing had been, and what was lost."""
-    rows = [['fault', *SYSTEMS]]
-    for name in dict.fromkeys(row['fault'] for row in part):
-        cells = {row['system']: row for row in part if row['fault'] == name}
-        rows.append([name, *(_recovery(cells.get(system)) for system in SYSTEMS)])
-    return rows
+def _plain(name: str, form: str = '') -> Callable[[Row], str]:
+    return lambda row: format(row[name], form)
 
 
-def _recovery(row: Mapping[str, Any] | None) -> str:
-    if row is None:
-        return ''
+def _failures(row: Row) -> str:
+    return str(len(row['messages']['failures']) + len(row['parameters']['failures']))
+
+
+def _worst(kind: str) -> Callable[[Row], str]:
+    return lambda row: '' if row.get(kind) is None else f'{row[kind]:.1g}'
+
+
+SOAK: dict[str, Callable[[Row], str]] = {
+    'system': _plain('system'),
+    'hours': _plain('hours', 'g'),
+    'messages': _plain('messages', '.0f'),
+    'memory, MB': _plain('memory_mb', '.0f'),
+    'slope, MB/h': _plain('slope_mb_per_h', '.3f'),
+    'its 95 % interval': lambda row: f'{row["slope_low"]:.3f} to {row["slope_high"]:.3f}',
+    'p99 first tenth, ms': _plain('p99_first_ms', '.2f'),
+    'p99 last tenth, ms': _plain('p99_last_ms', '.2f'),
+    'not counted': _plain('uncounted', '.0f'),
+}
+COLUMNS: dict[str, dict[str, Callable[[Row], str]]] = {
+    'restart': {
+        'node': _plain('system'),
+        'killed': _plain('tried'),
+        'messages sent again': _plain('again'),
+        'estimates': _plain('estimates'),
+        'equal bit for bit': _plain('equal'),
+        'others without the file': _plain('changed_without'),
+    },
+    'damage': {
+        'what': _plain('what'),
+        'tried': _plain('tried'),
+        'said': _plain('said'),
+        'silent and not harmless': _plain('silent'),
+        'crashes, partial output': _plain('failed'),
+    },
+    'flood': {
+        'node': _plain('system'),
+        'can, 1/s': _plain('capacity', '.0f'),
+        'sent, 1/s': _plain('rate', '.0f'),
+        'messages': _plain('sent'),
+        'used': _plain('used'),
+        'dropped': _plain('dropped'),
+        'lost': _plain('lost'),
+        'latency p50, s': _plain('latency_p50', '.2f'),
+        'most, s': _plain('latency_max', '.2f'),
+        'recovery, s': _plain('recovered', '.2f'),
+    },
+    'soak': SOAK,
+    'soak_live': SOAK,
+    'hostile': {
+        'system': _plain('system'),
+        'messages': lambda row: str(row['messages']['cases']),
+        'read': lambda row: str(row['messages']['read']),
+        'extreme parameters': lambda row: str(row['parameters']['draws']),
+        'crashes': _failures,
+        'slowest of 1000, ms': lambda row: f'{row["messages"]["ms_p999"]:g}',
+        'memory grown, MB': lambda row: f'{row["messages"]["memory_grown_mb"]:g}',
+    },
+    'metamorphic': {
+        'system': _plain('system'),
+        'with': _plain('how'),
+        'scene': _plain('moved'),
+        'tolerance': _plain('tolerance', 'g'),
+        **{kind: _worst(kind) for kind in ('places', 'states', 'covariances', 'probabilities')},
+    },
+}
+"""The columns of each table with a row for each row of the part; two have one for each fault and
+system (`table_of`)."""
+
+
+def rows_of(part: Part) -> list[Row]:
+    """The rows of a part, each with its system."""
+    if isinstance(part, Mapping):
+        return [{'system': system, **row} for system, row in part.items()]
+    return list(part)
+
+
+def table_of(name: str, part: Part) -> list[list[str]]:
+    """The cells of the table of a part, the head first."""
+    rows = rows_of(part)
+    if name in ('faults', 'signals'):
+        kind = name.removesuffix('s')
+        kinds = list(dict.fromkeys(row[kind] for row in rows))
+        text = _recovery if name == 'faults' else _clean
+        cells = {(row['system'], row[kind]): text(row) for row in rows}
+        if name == 'faults':
+            body = [[k, *(cells.get((system, k), '') for system in SYSTEMS)] for k in kinds]
+            return [['fault', *SYSTEMS], *body]
+        body = [[system, *(cells.get((system, k), '') for k in kinds)] for system in SYSTEMS]
+        return [['node', *kinds], *body]
+    if name == 'metamorphic':
+        rows.sort(key=lambda row: (row['system'], row['how']))
+    columns = COLUMNS[name]
+    return [[*columns], *([text(row) for text in columns.values()] for row in rows)]
+
+
+def _recovery(row: Row) -> str:
+    """Messages until estimates are as if nothing had been, and what was lost."""
     recovered = 'never' if row['recovered'] is None else str(row['recovered'])
     losses = ', '.join(
         f'{n} {name.rpartition(": ")[2]}' for name, n in sorted(row['losses'].items())
@@ -92,181 +183,51 @@ def _recovery(row: Mapping[str, Any] | None) -> str:
     return f'{recovered}; {losses}' if losses else recovered
 
 
-def signals(part: Sequence[Mapping[str, Any]]) -> Rows:
-    """A row per system: clean ends of those tried."""
-    names = list(dict.fromkeys(row['signal'] for row in part))
-    rows = [['node', *names]]
-    for system in SYSTEMS:
-        told = {row['signal']: row for row in part if row['system'] == system}
-        cells = [f'{told[n]["clean"]} of {told[n]["tried"]}' if n in told else '' for n in names]
-        rows.append([system, *cells])
-    return rows
-
-
-def damage(part: Sequence[Mapping[str, Any]]) -> Rows:
-    """A row per kind: tried, said, neither said nor harmless."""
-    rows = [['what', 'tried', 'said', 'silent and not harmless', 'crashes, partial output']]
-    return rows + [
-        [row['what'], *(str(row[name]) for name in ('tried', 'said', 'silent', 'failed'))]
-        for row in part
-    ]
-
-
-def restart(part: Sequence[Mapping[str, Any]]) -> Rows:
-    """A row per system."""
-    rows = [['node', 'killed', 'messages sent again', 'estimates', 'equal bit for bit']]
-    rows[0].append('others without the file')
-    names = ('system', 'tried', 'again', 'estimates', 'equal', 'changed_without')
-    return rows + [[str(row[name]) for name in names] for row in part]
-
-
-def flood(part: Sequence[Mapping[str, Any]]) -> Rows:
-    """A row per system."""
-    head = ['node', 'can, 1/s', 'sent, 1/s', 'messages', 'used', 'dropped', 'lost']
-    rows = [[*head, 'latency p50, s', 'most, s', 'recovery, s']]
-    for row in part:
-        counted = [str(row[name]) for name in ('sent', 'used', 'dropped', 'lost')]
-        times = [f'{row[name]:.2f}' for name in ('latency_p50', 'latency_max', 'recovered')]
-        speed = [f'{row["capacity"]:.0f}', f'{row["rate"]:.0f}']
-        rows.append([row['system'], *speed, *counted, *times])
-    return rows
-
-
-def soak(part: Mapping[str, Mapping[str, float]]) -> Rows:
-    """A row per system."""
-    head = ['system', 'hours', 'messages', 'memory, MB', 'slope, MB/h', 'its 95 % interval']
-    rows = [[*head, 'p99 first tenth, ms', 'p99 last tenth, ms', 'not counted']]
-    for system, told in part.items():
-        rows.append(
-            [
-                system,
-                f'{told["hours"]:g}',
-                f'{told["messages"]:.0f}',
-                f'{told["memory_mb"]:.0f}',
-                f'{told["slope_mb_per_h"]:.3f}',
-                f'{told["slope_low"]:.3f} to {told["slope_high"]:.3f}',
-                f'{told["p99_first_ms"]:.2f}',
-                f'{told["p99_last_ms"]:.2f}',
-                f'{told["uncounted"]:.0f}',
-            ]
-        )
-    return rows
-
-
-def hostile(part: Mapping[str, Mapping[str, Any]]) -> Rows:
-    """A row per system."""
-    head = ['system', 'messages', 'read', 'extreme parameters', 'crashes']
-    rows = [[*head, 'slowest of 1000, ms', 'memory grown, MB']]
-    for system, told in part.items():
-        messages, parameters = told['messages'], told['parameters']
-        rows.append(
-            [
-                system,
-                str(messages['cases']),
-                str(messages['read']),
-                str(parameters['draws']),
-                str(len(messages['failures']) + len(parameters['failures'])),
-                f'{messages["ms_p999"]:g}',
-                f'{messages["memory_grown_mb"]:g}',
-            ]
-        )
-    return rows
-
-
-def metamorphic(part: Sequence[Mapping[str, Any]]) -> Rows:
-    """A row per system, variant and transformation: the tolerance, and the worst differences."""
-    kinds = ('places', 'states', 'covariances', 'probabilities')
-    rows = [['system', 'with', 'scene', 'tolerance', *kinds]]
-    for row in sorted(part, key=lambda one: (one['system'], one['how'])):
-        worst = ['' if (gap := row.get(kind)) is None else f'{gap:.1g}' for kind in kinds]
-        rows.append([row['system'], row['how'], row['moved'], f'{row["tolerance"]:g}', *worst])
-    return rows
-
-
-TABLES: dict[str, Callable[[Part], Rows]] = {
-    'faults': faults,
-    'signals': signals,
-    'restart': restart,
-    'damage': damage,
-    'flood': flood,
-    'soak': soak,
-    'soak_live': soak,
-    'hostile': hostile,
-    'metamorphic': metamorphic,
-}
+def _clean(row: Row) -> str:
+    return f'{row["clean"]} of {row["tried"]}'
 
 
 def short_of(parts: Mapping[str, Part]) -> list[str]:
     """What fell short of the promises, in sentences."""
-    said = [f'{name}: not measured' for name in PARTS if name not in parts]
-    return said + [short for name in PARTS for short in _short(name, parts.get(name, ()))]
+    missing = [f'{name}: not measured' for name in PARTS if name not in parts]
+    found = [shortfall(name, row) for name in PARTS for row in rows_of(parts.get(name, ()))]
+    return missing + [sentence for sentence in found if sentence]
 
 
-def _short(name: str, part: Part) -> list[str]:
-    rows = part.items() if isinstance(part, Mapping) else (('', row) for row in part)
-    return [sentence for system, row in rows for sentence in SHORT[name](row, system)]
-
-
-def _short_fault(row: Mapping[str, Any], _: str) -> list[str]:
-    late = row['recovered'] is None or row['recovered'] > row['limit']
-    said = f'{row["fault"]}, {row["system"]}: recovered {row["recovered"]}'
-    return [said] if late or row['traceback'] else []
-
-
-def _short_signal(row: Mapping[str, Any], _: str) -> list[str]:
-    said = f'{row["signal"]}, {row["system"]}: {row["why"]}'
-    return [said] if row['clean'] < row['tried'] else []
-
-
-def _short_restart(row: Mapping[str, Any], _: str) -> list[str]:
-    said = f'restart, {row["system"]}: {row["equal"]} of {row["estimates"]} estimates are equal'
-    return [said] if row['equal'] < row['estimates'] else []
-
-
-def _short_damage(row: Mapping[str, Any], _: str) -> list[str]:
-    said = f'{row["what"]}: {row["silent"]} silent, {row["failed"]} failed'
-    return [said] if row['silent'] or row['failed'] else []
-
-
-def _short_flood(row: Mapping[str, Any], _: str) -> list[str]:
-    uncounted = row['sent'] - row['used'] - row['dropped'] - row['lost']
-    patience = max(1.0, 6.0 / row['capacity'])
-    late = row['latency_max'] > row['max_wait'] + patience or row['recovered'] > patience
-    said = f'flood, {row["system"]}: recovered after {row["recovered"]:.2f} s, {uncounted} lost'
-    return [said] if uncounted or late else []
-
-
-def _short_soak(row: Mapping[str, float], system: str) -> list[str]:
-    said = []
-    if row['slope_low'] > FLAT:
-        said.append(f'a day at sea, {system}: memory grows {row["slope_mb_per_h"]:.2f} MB/h')
-    if row['p99_last_ms'] > SLOWER * row['p99_first_ms'] or row['uncounted']:
-        said.append(f'a day at sea, {system}: slower at the end, or messages not counted')
-    return said
-
-
-def _short_hostile(row: Mapping[str, Any], system: str) -> list[str]:
-    failed = row['messages']['failures'] or row['parameters']['failures']
-    return [f'hostile, {system}: something got through'] if failed else []
-
-
-def _short_metamorphic(row: Mapping[str, Any], _: str) -> list[str]:
-    said = f'{row["system"]}, {row["how"]}, {row["moved"]}: the states differ by {row["states"]:g}'
-    return [said] if row['states'] > row['tolerance'] else []
-
-
-SHORT: dict[str, Callable[[Any, str], list[str]]] = {
-    'faults': _short_fault,
-    'signals': _short_signal,
-    'restart': _short_restart,
-    'damage': _short_damage,
-    'flood': _short_flood,
-    'soak': _short_soak,
-    'soak_live': _short_soak,
-    'metamorphic': _short_metamorphic,
-    'hostile': _short_hostile,
-}
-"""What is wrong with a row of each part, in sentences."""
+def shortfall(name: str, row: Row) -> str:
+    """What is wrong with a row of a part, in a sentence; '' for nothing."""
+    system = row.get('system')
+    if name == 'faults':
+        late = row['recovered'] is None or row['recovered'] > row['limit']
+        sentence = f'{row["fault"]}, {system}: recovered {row["recovered"]}'
+        return sentence if late or row['traceback'] else ''
+    if name == 'signals':
+        sentence = f'{row["signal"]}, {system}: {row["why"]}'
+        return sentence if row['clean'] < row['tried'] else ''
+    if name == 'restart':
+        sentence = f'restart, {system}: {row["equal"]} of {row["estimates"]} estimates are equal'
+        return sentence if row['equal'] < row['estimates'] else ''
+    if name == 'damage':
+        sentence = f'{row["what"]}: {row["silent"]} silent, {row["failed"]} failed'
+        return sentence if row['silent'] or row['failed'] else ''
+    if name == 'flood':
+        lost = row['sent'] - row['used'] - row['dropped'] - row['lost']
+        patience = max(1.0, 6.0 / row['capacity'])
+        late = row['latency_max'] > row['max_wait'] + patience or row['recovered'] > patience
+        sentence = f'flood, {system}: recovered after {row["recovered"]:.2f} s, {lost} lost'
+        return sentence if lost or late else ''
+    if name == 'hostile':
+        return f'hostile, {system}: something got through' if _failures(row) != '0' else ''
+    if name == 'metamorphic':
+        sentence = (
+            f'{system}, {row["how"]}, {row["moved"]}: the states differ by {row["states"]:g}'
+        )
+        return sentence if row['states'] > row['tolerance'] else ''
+    grows = row['slope_low'] > FLAT
+    slower = row['p99_last_ms'] > SLOWER * row['p99_first_ms'] or row['uncounted']
+    problems = [f'memory grows {row["slope_mb_per_h"]:.2f} MB/h'] * grows
+    problems += ['slower at the end, or messages not counted'] * bool(slower)
+    return f'a day at sea, {system}: {", ".join(problems)}' if problems else ''
 
 
 def forget_the_bad(name: str, file: Path) -> None:
@@ -276,9 +237,9 @@ def forget_the_bad(name: str, file: Path) -> None:
     part = json.loads(file.read_text(encoding='utf-8'))
     good: Part
     if isinstance(part, Mapping):
-        good = {system: row for system, row in part.items() if not SHORT[name](row, system)}
+        good = {system: row for system, row in part.items() if not shortfall(name, row)}
     else:
-        good = [row for row in part if not SHORT[name](row, '')]
+        good = [row for row in part if not shortfall(name, row)]
     if good != part:
         file.write_text(json.dumps(good, indent=1) + '\n', encoding='utf-8')
 
@@ -290,10 +251,10 @@ def run(name: str, folder: Path) -> None:
     if name in WHOLE and file.is_file() and json.loads(file.read_text()).keys() == SYSTEMS.keys():
         return
     print(f'{name} ...', flush=True)
-    told = dict(os.environ, SONAR_IMM_FIGURES=str(folder))
-    told['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
+    environment = dict(os.environ, SONAR_IMM_FIGURES=str(folder))
+    environment['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
     words = [word.replace('{}', str(folder)) for word in PROGRAMS[name]]
-    code = subprocess.run([sys.executable, *words], cwd=ROOT, env=told).returncode
+    code = subprocess.run([sys.executable, *words], cwd=ROOT, env=environment).returncode
     if code:
         print(f'{name}: ended with exit code {code}', flush=True)
 
@@ -329,11 +290,11 @@ def page_of(text: str, parts: Mapping[str, Part]) -> str:
         name = found.group(2)
         if name not in parts:
             return f'{found.group(1)}Not measured yet.\n{found.group(3)}'
-        head, *body = TABLES[name](parts[name])
+        head, *body = table_of(name, parts[name])
         lines = [head, ['---'] * len(head), *body]
-        told = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
-        source = f'<!-- numbers: {RESULT.name} -->'
-        return f'{found.group(1)}{source}\n{told}\n{found.group(3)}'
+        text = '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
+        source = f'<!-- numbers: {RESULT.name}; made by benchmarks.reliability -->'
+        return f'{found.group(1)}{source}\n{text}\n{found.group(3)}'
 
     return _BLOCK.sub(table, text)
 
@@ -343,17 +304,17 @@ def main() -> None:
     parser.add_argument('folder', type=Path, nargs='?')
     parser.add_argument('--check', action='store_true')
     parser.add_argument('--run', nargs='*', choices=PARTS, metavar='PART')
-    told = parser.parse_args()
-    parts = json.loads(RESULT.read_text(encoding='utf-8')) if RESULT.is_file() else {}
+    given = parser.parse_args()
+    parts = known(RESULT)
     page = PAGE.read_text(encoding='utf-8')
-    if told.check:
+    if given.check:
         sys.exit(page != page_of(page, parts))
-    if told.folder is None:
+    if given.folder is None:
         PAGE.write_text(page_of(page, parts), encoding='utf-8')
         return
-    folder = told.folder.resolve()
+    folder = given.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    for name in () if told.run is None else told.run or PARTS:
+    for name in () if given.run is None else given.run or PARTS:
         run(name, folder)
         take_in(folder, parts)
     take_in(folder, parts)

@@ -27,13 +27,10 @@ sent. Each run is a process of its own; those that are in the file already are n
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import contextlib
 import itertools
-import json
 from pathlib import Path
-import subprocess
 import sys
 import time
 from typing import Any
@@ -41,7 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import theilslopes
 
-from benchmarks.tables import markdown, write_json
+from benchmarks.study import in_fresh_process, known, Parts, study
 from msg_adapters.inputs import inputs_of
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import fitting_topics
@@ -109,7 +106,7 @@ def offline(system: str, hours: float) -> dict[str, float]:
     return summary(memory, times, total, counted if system != 'bathymetry' else total)
 
 
-def live(system: str, hours: float) -> dict[str, float]:
+def in_node(system: str, hours: float) -> dict[str, float]:
     """The node as a process of its own, in lock-step."""
     from rclpy.serialization import deserialize_message
 
@@ -146,8 +143,8 @@ def live(system: str, hours: float) -> dict[str, float]:
             step.step(publishers[topic], message)
             if k % max(1, total // SAMPLES) == 0:
                 memory.append((k / total * hours, _resident_mb(node.process.pid)))
-        told = summary(memory, np.array(step.delays), total, step.counts.messages)
-        return told | {'exit_code': float(node.stop())}
+        result = summary(memory, np.array(step.delays), total, step.counts.messages)
+        return result | {'exit_code': float(node.stop())}
 
 
 def summary(
@@ -206,48 +203,30 @@ def _resident_mb(process: int | str) -> float:
     return pages * 4096 / 1e6
 
 
-def measured(system: str, hours: float, *, nodes: bool = False) -> dict[str, float]:
-    """A run in a fresh process."""
-    command = [sys.executable, '-m', 'benchmarks.soak', '--here', system, '--hours', str(hours)]
-    done = subprocess.run(
-        command + ['--live'] * nodes, stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT
-    )
-    told: dict[str, float] = json.loads(done.stdout)
-    return told
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--only', choices=BAGS, action='append')
-    parser.add_argument('--hours', type=float, default=24.0)
-    parser.add_argument('--live', action='store_true', help='the nodes instead of the trackers')
-    parser.add_argument('--here', choices=BAGS, help=argparse.SUPPRESS)
-    parser.add_argument('--out', type=Path)
-    arguments = parser.parse_args()
-    if arguments.here:
-        run = live if arguments.live else offline
-        with contextlib.redirect_stdout(sys.stderr):
-            result = run(arguments.here, arguments.hours)
-        print(json.dumps(result))
-        return
-    known = arguments.out is not None and arguments.out.is_file()
-    table = json.loads(arguments.out.read_text(encoding='utf-8')) if known else {}
+def main(
+    only: Sequence[str] | None = None,
+    hours: float = 24.0,
+    live: bool = False,
+    out: Path | None = None,
+) -> Parts:
+    yield (table := known(out))
     failed = []
-    for system in arguments.only or BAGS:
-        if table.get(system, {}).get('hours') == arguments.hours:
+    for system in only or BAGS:
+        if table.get(system, {}).get('hours') == hours:
             continue
         try:
-            told = measured(system, arguments.hours, nodes=arguments.live)
-        except subprocess.CalledProcessError as error:
-            failed.append(f'{system}: the run ended with exit code {error.returncode}')
-            continue
-        table[system] = told | {'hours': arguments.hours}
-        write_json(arguments.out, table)
-    if table:
-        print(markdown(table, 3))
+            row = in_fresh_process(in_node if live else offline, system, hours)
+        except Exception as error:  # the others go on
+            failed.append(f'{system}: the run ended with {error!r}')
+        else:
+            yield {system: row | {'hours': hours}}
     if failed:
         sys.exit('\n'.join(failed))
 
 
 if __name__ == '__main__':
-    main()
+    study(
+        main,
+        only={'action': 'append', 'choices': list(BAGS)},
+        live={'help': 'the nodes instead of the trackers'},
+    )

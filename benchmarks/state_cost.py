@@ -28,27 +28,28 @@ import time
 
 import numpy as np
 
+from benchmarks.study import Parts, study
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.state_file import json_parameters, Saved, write_state
 from sonar_imm.trackers.state_values import frozen_state
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
-from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 
 TIMES = 20
 
 
-def row(bag: Path, path: Path) -> list[str]:
-    """One row of the table: name, ms of taking, ms of writing, kB."""
+def row(bag: Path, path: Path) -> dict[str, float]:
+    """Milliseconds of taking and of writing the state, and its size."""
     system = SYSTEMS[bag.name.split('_')[0]]
     config = load_config(system, own_parameters(bag), {})[0]
     tracker = system.build(config)
     with BagReader(bag) as reader:
-        for heard in measurements_of(reader, system.name, settings=config.as_dict()):
-            if heard.measurement is not None and not isinstance(heard.measurement, Rejection):
-                tracker.process(heard.measurement)
+        for item in measurements_of(reader, system.name, settings=config.as_dict()):
+            if item.measurement is not None and not isinstance(item.measurement, Rejection):
+                tracker.process(item.measurement)
     taking, writing, size = [], [], 0
     for _ in range(TIMES):
         begin = time.process_time()
@@ -65,21 +66,19 @@ def row(bag: Path, path: Path) -> list[str]:
         size = write_state(path, saved)
         taking.append(1e3 * (taken - begin))
         writing.append(1e3 * (time.process_time() - taken))
-    return [
-        bag.name,
-        f'{np.median(taking):.2f}',
-        f'{np.median(writing):.0f}',
-        f'{size / 1000:.0f}',
-    ]
+    return {
+        'taken, ms': float(np.median(taking)),
+        'written, ms': float(np.median(writing)),
+        'kB': size / 1000,
+    }
 
 
-def main() -> None:
-    print('| recording | taken, ms | written, ms | kB |\n|---|---|---|---|')
+def main() -> Parts:
     with tempfile.TemporaryDirectory() as folder:
         for bag in sorted(Path('bags').iterdir()):
             if bag.is_dir() and bag.name != 'obstacle_images':
-                print('| ' + ' | '.join(row(bag, Path(folder) / 'state')) + ' |', flush=True)
+                yield {'recordings': {bag.name: row(bag, Path(folder) / 'state')}}
 
 
 if __name__ == '__main__':
-    main()
+    study(main, digits=2)

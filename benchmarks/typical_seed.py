@@ -43,13 +43,13 @@ import sys
 from attrs import frozen
 import numpy as np
 
-from benchmarks.tables import markdown
+from benchmarks.study import markdown
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main as sonar_imm
 from sonar_imm_tools.cli.sweep import planned
 from sonar_imm_tools.evaluation.judging import Limit
 from sonar_imm_tools.evaluation.sweep import Outcome, run_here, run_on_processes
-from sonar_imm_tools.recordings.own_limit import write_own_limit
+from sonar_imm_tools.recordings.own_files import write_own_limit
 
 SHARE = 0.9
 """Of the runs that are within the limit of `check`."""
@@ -69,11 +69,11 @@ def typical(outcomes: Sequence[Outcome], metrics: Sequence[str]) -> Typical:
 
     Raises ValueError when a metric is missing in more than half of the runs.
     """
-    runs = sorted(outcomes, key=lambda one: one.seed)
-    error = np.array([[abs(one.metrics.get(name, math.inf)) for name in metrics] for one in runs])
+    runs = sorted(outcomes, key=lambda run: run.seed)
+    error = np.array([[abs(run.metrics.get(name, math.inf)) for name in metrics] for run in runs])
     for name, column in zip(metrics, error.T):
         if 2 * np.isinf(column).sum() >= len(runs):
-            known = sorted({name for one in runs for name in one.metrics})
+            known = sorted({name for run in runs for name in run.metrics})
             raise ValueError(f'most runs have no {name}; there are: {", ".join(known)}')
     rank = np.argsort(np.argsort(error, axis=0, kind='stable'), axis=0)
     off = np.abs(rank - (len(runs) - 1) // 2)
@@ -164,10 +164,10 @@ def outcomes_of(given: argparse.Namespace) -> list[Outcome]:
     found = []
     for outcome in coming:
         found.append(outcome)
-        told = outcome.failure or ', '.join(
+        text = outcome.failure or ', '.join(
             f'{name} {outcome.metrics.get(name, math.nan):.3f}' for name in given.metric
         )
-        print(f'seed {outcome.seed}: {told}', file=sys.stderr, flush=True)
+        print(f'seed {outcome.seed}: {text}', file=sys.stderr, flush=True)
     return found
 
 
@@ -202,11 +202,11 @@ def main() -> None:
     limit = import_module(SYSTEMS[given.system].judge).LIMIT
     given.metric = given.metric or [limit.metric]
     outcomes = outcomes_of(given)
-    failed = [one for one in outcomes if one.failure]
+    failed = [outcome for outcome in outcomes if outcome.failure]
     try:
         found = typical(outcomes, given.metric)
     except ValueError as error:
-        reasons = sorted({one.failure for one in failed})
+        reasons = sorted({outcome.failure for outcome in failed})
         sys.exit(' '.join([str(error), *reasons]))
     print(markdown(found.spread))
     print(f'seed {found.seed}, limit for check {found.limit:g} {limit.unit}, {len(failed)} failed')

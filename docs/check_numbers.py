@@ -19,15 +19,34 @@
 
 A table with measured numbers has a comment above it, which the site shows below it:
 
-    <!-- numbers: diver_accuracy.json -->             the numbers are in docs/results of that name
-    <!-- numbers: diver_accuracy.json; not RMSE, 4 -->   but those of columns with RMSE in their
-                                                      title, and of the fourth column
     <!-- numbers: read 2026-11-20; COMMAND -->        what COMMAND printed on that day
     <!-- numbers: none -->                            nothing in it was measured
+    <!-- numbers: sea.json; made by MODULE -->        what `page_of` of that module makes of it
+    <!-- numbers: sea.json; CELLS; rows: KEYS -->     each cell is bound to values of that file
 
-`docs/results/sources.json` says by which command a result was made, and when. Not compared are the
-first column of a table, and numbers in parentheses, which are those of others. A number of d
-decimals agrees with a value that rounds to it, or 100 times the value where `%` follows.
+`docs/results/sources.json` says by which command a file of `docs/results` was made, and when.
+
+CELLS are paths into the file, one for each of the last columns, divided by `|`; a single one with
+`{col}` holds for all columns but the first. The keys of a path are divided by `>`, and what stands
+before `>>` belongs to all of them:
+
+    cases>{row}>> rmse | nees_2d & nees_3d | - | rmse ~ prototype>rmse
+
+    &        between the paths of a cell that has several numbers; a path may lead to a list, too
+    {a,b}    two paths, one with a and one with b
+    [k=v]    as a key: the only item of a list that has v under k
+    {row}    the first cell of the row (if empty, of the row above), or its entry in KEYS, which
+             are divided by `|`, with `=` where the first cell is the key
+    {col}    the head of the column; {n}: its place after the first
+    {2}      the second cell of the row; {1.2}: what follows the first comma in the first
+    -        as a path or a row: others measured it; so are numbers in parentheses, unless
+    ~        is followed by their paths
+
+A cell has to hold as many numbers as its paths have values (NaN, null and missing keys are none),
+in that order, each the value at the digits shown, or 100 times the value where `%` follows. A cell
+may be `-` in any case, which says that it is left out.
+
+How old a result is, in commits, says `result_ages`.
 """
 
 from __future__ import annotations
@@ -35,6 +54,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from datetime import date
+from functools import lru_cache
+import importlib
 import json
 import math
 from pathlib import Path
@@ -45,14 +66,15 @@ import sys
 from typing import Any
 
 from attrs import frozen
+from result_ages import age_in, history, module_file, paths_of, script_of
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
 RESULTS = DOCS / 'results'
 SOURCES = RESULTS / 'sources.json'
 
-MARK = re.compile(r'^<!-- numbers: (.+) -->$')
-NUMBER = re.compile(r'(?<![\w.])[-+]?(?:\d[\d,]*\.?\d*|\.\d+)(?:e[-+]?\d+)?(?![\w.]*\w)')
+MARK = re.compile(r'^<!-- numbers: (.+?) -->$', re.DOTALL | re.MULTILINE)
+NUMBER = re.compile(r'(?<![\w.])[-+]?(?:\d+(?:,\d{3})*(?:\.\d*)?|\.\d+)(?:e[-+]?\d+)?(?![\w.]*\w)')
 MADE = {'parameters'}
 """Folders of docs/ whose pages hold no measurement: they are generated."""
 
@@ -70,20 +92,10 @@ class Table:
     def place(self) -> str:
         return f'{self.page}:{self.line}'
 
-    def numbers(self, left_out: tuple[str, ...] = ()) -> Iterator[str]:
-        """Each number below the head, but for the first column, with `%` where it is a share."""
-        head, _, *body = self.rows
-        for row in body:
-            for place, (title, cell) in list(enumerate(zip(head, row), start=1))[1:]:
-                if not any(word in title or word == str(place) for word in left_out):
-                    bare = re.sub(r'`[^`]*`|\([^)]*\)', ' ', cell)
-                    for found in NUMBER.finditer(bare):
-                        share = bare[found.end() :].lstrip().startswith('%')
-                        yield found.group() + '%' * share
-
     def measured(self) -> bool:
         """Whether it looks like measurements: a decimal number or a share somewhere."""
-        return any('.' in number or '%' in number for number in self.numbers())
+        cells = (cell for row in self.rows[2:] for cell in row[1:])
+        return any('.' in n or n.endswith('%') for cell in cells for n in numbers_in(cell))
 
 
 def pages() -> list[Path]:
@@ -91,51 +103,188 @@ def pages() -> list[Path]:
     return [path for path in found if path.parent.name not in MADE]
 
 
-def tables(page: Path) -> Iterator[Table]:
-    name = page.relative_to(ROOT).as_posix()
-    lines = page.read_text(encoding='utf-8').splitlines()
-    fenced, mark, block, start = False, '', [], 0
-    for number, line in enumerate([*lines, ''], start=1):
+def tables(page: Path) -> list[Table]:
+    return tables_of(page.relative_to(ROOT).as_posix(), page.read_text(encoding='utf-8'))
+
+
+def tables_of(page: str, text: str) -> list[Table]:
+    found, fenced, mark, block, start = [], False, '', [], 0
+    for number, line in enumerate([*on_one_line(text).splitlines(), ''], start=1):
         fenced ^= line.startswith('```')
         if line.startswith('|') and not fenced:
             start = start or number
             block.append(tuple(cell.strip() for cell in line.strip().strip('|').split('|')))
             continue
         if block:
-            yield Table(name, start, mark, tuple(block))
+            found.append(Table(page, start, mark, tuple(block)))
             mark, block, start = '', [], 0
-        if found := MARK.match(line):
-            mark = found.group(1)
+        if marked := MARK.match(line):
+            mark = marked.group(1)
         elif line.strip():
             mark = ''
+    return found
 
 
-def values_in(content: Any) -> Iterator[float]:
-    """Every number in JSON, those in texts too."""
-    if isinstance(content, bool) or content is None:
-        return
-    if isinstance(content, (int, float)):
-        yield float(content)
-    elif isinstance(content, str):
-        for text in NUMBER.findall(content):
-            yield float(text.replace(',', ''))
-    else:
-        for one in content.values() if isinstance(content, dict) else content:
-            yield from values_in(one)
+def on_one_line(text: str) -> str:
+    """A page with each mark on one line; empty lines before it keep the numbers of the lines."""
+
+    def joined(found: re.Match[str]) -> str:
+        return '\n' * found.group().count('\n') + f'<!-- numbers: {" ".join(found[1].split())} -->'
+
+    return MARK.sub(joined, text)
 
 
-def agrees(number: str, values: list[float]) -> bool:
-    share = number.endswith('%')
+def numbers_in(cell: str) -> list[str]:
+    """Its numbers but those in code, each with `%` where it is a share."""
+    bare = re.sub(r'`[^`]*`', ' ', cell)
+    return [
+        found.group() + '%' * bare[found.end() :].lstrip().startswith('%')
+        for found in NUMBER.finditer(bare)
+    ]
+
+
+def agrees(number: str, value: float) -> bool:
+    """Whether `value` is shown as `number`."""
     text = number.rstrip('%').replace(',', '')
-    mantissa = text.split('e')[0]
-    decimals = len(mantissa.partition('.')[2])
-    unit = 10.0 ** (int(text.split('e')[1]) if 'e' in text else 0) * 10.0**-decimals
-    wanted = float(text)
-    return any(
-        math.isfinite(value) and abs(factor * value - wanted) <= 0.5001 * unit
-        for value in values
-        for factor in ((100.0, 1.0) if share else (1.0,))
-    )
+    mantissa, _, exponent = text.partition('e')
+    unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition('.')[2]))
+    return abs((100.0 if number.endswith('%') else 1.0) * value - float(text)) <= 0.5001 * unit
+
+
+@frozen
+class Binding:
+    """The mark of a table that is bound to a file: a path for each column, and a key for each row.
+
+    Raises ValueError when it does not fit the table."""
+
+    content: Any
+    table: Table
+    paths: tuple[str, ...]
+    keys: tuple[str, ...]
+
+    @classmethod
+    def of(cls, table: Table) -> Binding:
+        file, cells, *rest = (part.strip() for part in table.mark.split(';'))
+        head, _, *body = table.rows
+        base, _, columns = cells.rpartition('>>')
+        paths = [path.strip() for path in columns.split('|')]
+        if len(paths) == 1 and '{col}' in cells:
+            paths *= len(head) - 1
+        if len(paths) >= len(head):
+            raise ValueError(f'{len(paths)} paths for {len(head)} columns')
+        labels = [label(row[0]) for row in body]
+        given = rest[0].removeprefix('rows:').split('|') if rest else ['='] * len(body)
+        if len(given) != len(body):
+            raise ValueError(f'{len(given)} keys for {len(body)} rows')
+        keys: list[str] = []
+        for row, key in zip(labels, map(str.strip, given)):
+            keys.append((row if key == '=' else key) or keys[-1])
+        unbound = ['-'] * (len(head) - len(paths))
+        full = [path if path == '-' else with_base(base.strip(), path) for path in paths]
+        return cls(contents(file), table, (*unbound, *full), tuple(keys))
+
+    def wrong(self, row: int, column: int, cell: str) -> list[str]:
+        """What is wrong with a cell, were it `cell`: row of the body, column of the table."""
+        if self.paths[column] == '-' or self.keys[row] == '-' or cell == '-':
+            return []
+        mine, _, others = self.filled(row, column).partition('~')
+        outer = re.sub(r'\([^)]*\)', ' ', cell)
+        found = self.compared(outer, mine)
+        if others:
+            found += self.compared(' '.join(re.findall(r'\([^)]*\)', cell)), others)
+        return found
+
+    def filled(self, row: int, column: int) -> str:
+        cells = self.table.rows[row + 2]
+        head = label(self.table.rows[0][column])
+        words = {'row': self.keys[row], 'col': head, 'n': str(column - 1)}
+        for place, cell in enumerate(map(label, cells), start=1):
+            words[f'{place}'] = cell
+            for part, text in enumerate(cell.split(', '), start=1):
+                words[f'{place}.{part}'] = text
+        path = self.paths[column]
+        for _ in range(2):  # the key of a row may name its column
+            path = re.sub(r'\{([\w.]+)\}', lambda found: words.get(found[1], found[0]), path)
+        return path
+
+    def compared(self, cell: str, paths: str) -> list[str]:
+        numbers = numbers_in(cell)
+        values = [value for path in expanded(paths) for value in values_at(self.content, path)]
+        if len(numbers) != len(values):
+            shown = ', '.join(numbers) or 'nothing'
+            return [f'{shown} for {len(values)} values at {paths.strip()}']
+        return [
+            f'{number} is {value:.6g} at {paths.strip()}'
+            for number, value in zip(numbers, values)
+            if not agrees(number, value)
+        ]
+
+    def cells(self) -> Iterator[tuple[int, int, str]]:
+        """Row of the body, column and text of each cell that is compared."""
+        for row, cells in enumerate(self.table.rows[2:]):
+            for column, cell in enumerate(cells):
+                if self.paths[column] != '-' and self.keys[row] != '-':
+                    yield row, column, cell
+
+    def doubts(self) -> list[str]:
+        return [wrong for cell in self.cells() for wrong in self.wrong(*cell)]
+
+
+def with_base(base: str, path: str) -> str:
+    """`path` with `base` before each of the paths that it consists of."""
+    if not base:
+        return path
+    return re.sub(r'(^|[&~])\s*', lambda found: f'{found[1]} {base}>', path.strip())
+
+
+def label(cell: str) -> str:
+    return re.sub(r'[*`]', '', cell).strip()
+
+
+@lru_cache
+def contents(file: str) -> Any:
+    return json.loads((RESULTS / file).read_text(encoding='utf-8'))
+
+
+def expanded(paths: str) -> Iterator[str]:
+    """Each path of `paths`, which are divided by `&` and may hold `{a,b}`."""
+    for path in paths.split('&'):
+        found = re.search(r'\{([^{}]*,[^{}]*)\}', path)
+        if found:
+            for choice in found[1].split(','):
+                yield from expanded(path[: found.start()] + choice + path[found.end() :])
+        else:
+            yield path.strip()
+
+
+def values_at(content: Any, path: str) -> list[float]:
+    """The numbers at a path: none where there is none, several in a list."""
+    for key in path.split('>'):
+        content = item(content, key.strip())
+    found = content if isinstance(content, list) else [content]
+    kept = [value for value in found if isinstance(value, (int, float))]
+    return [float(value) for value in kept if math.isfinite(value)]
+
+
+def item(content: Any, key: str) -> Any:
+    """What is under a key of a mapping, at a place of a list, or picked from one; or None."""
+    if isinstance(content, dict):
+        return next((value for name, value in content.items() if name.strip() == key), None)
+    if not isinstance(content, list):
+        return None
+    if not key.startswith('['):
+        return content[int(key)] if key.isdigit() and int(key) < len(content) else None
+    wanted = dict(part.split('=', 1) for part in key[1:-1].split(','))
+    found = [entry for entry in content if all(same(entry.get(k), v) for k, v in wanted.items())]
+    return found[0] if len(found) == 1 else None
+
+
+def same(value: Any, text: str) -> bool:
+    """Whether `text` is `value`, or begins with that number."""
+    if isinstance(value, float):
+        numbers = NUMBER.findall(text)
+        return bool(numbers) and float(numbers[0]) == value
+    return str(value) == text
 
 
 def doubts(table: Table, sources: dict[str, dict[str, str]]) -> list[str]:
@@ -147,35 +296,42 @@ def doubts(table: Table, sources: dict[str, dict[str, str]]) -> list[str]:
         return []
     if kind.startswith('read '):
         return dated(table.place, kind.removeprefix('read ').strip(), rest.strip())
-    path = RESULTS / kind.strip()
-    if path.name not in sources or not path.is_file():
-        return [f'{table.place}: {SOURCES.name} does not know {path.name}']
-    left_out = tuple(
-        word.strip() for word in rest.replace(' not ', '', 1).split(',') if word.strip()
-    )
-    values = list(values_in(json.loads(path.read_text(encoding='utf-8'))))
-    wrong = [number for number in table.numbers(left_out) if not agrees(number, values)]
-    return [f'{table.place}: not in {path.name}: {", ".join(wrong)}'] if wrong else []
+    if kind not in sources or not (RESULTS / kind).is_file():
+        return [f'{table.place}: {SOURCES.name} does not know {kind}']
+    if not rest:
+        return [f'{table.place}: not bound to the values of {kind}']
+    try:
+        found = unlike_made(table) if 'made by ' in rest else Binding.of(table).doubts()
+    except ValueError as error:
+        found = [str(error)]
+    return [f'{table.place}: {kind}: {wrong}' for wrong in found]
+
+
+def unlike_made(table: Table) -> list[str]:
+    made = made_tables(table.page, table.mark.split('made by ')[1])
+    return [] if table.rows in [other.rows for other in made] else ['is not what its module makes']
+
+
+@lru_cache
+def made_tables(page: str, module: str) -> list[Table]:
+    """The tables of a page as a module makes them of its result."""
+    sys.path.insert(0, str(ROOT))
+    maker = importlib.import_module(module)
+    text = (ROOT / page).read_text(encoding='utf-8')
+    return tables_of(page, maker.page_of(text, contents(maker.RESULT.name)))
 
 
 def dated(place: str, day: str, command: str) -> list[str]:
+    """What is wrong with the day and the command of numbers; a command of ours has to exist."""
     try:
-        read = date.fromisoformat(day)
+        if date.fromisoformat(day) > date.today():
+            return [f'{place}: {day} has not come yet']
     except ValueError:
         return [f'{place}: {day!r} is no date']
-    if read > date.today():
-        return [f'{place}: {day} has not come yet']
-    return command_doubts(place, command)
-
-
-def command_doubts(place: str, command: str) -> list[str]:
-    """A command of ours has to exist."""
-    if not command:
-        return [f'{place}: no command']
-    if found := re.search(r'python -m (benchmarks(?:\.\w+)+)', command):
-        if not ROOT.joinpath(*found.group(1).split('.')).with_suffix('.py').is_file():
-            return [f'{place}: there is no {found.group(1)}']
-    return []
+    script = script_of(command)
+    if script and not module_file(script):
+        return [f'{place}: there is no {script}']
+    return [] if command else [f'{place}: no command']
 
 
 def known_sources() -> dict[str, dict[str, str]]:
@@ -194,43 +350,24 @@ def all_doubts() -> list[str]:
     for name, source in sources.items():
         if not (RESULTS / name).is_file():
             found.append(f'{SOURCES.name} names {name}, which is not there')
+            continue
         found += dated(f'{SOURCES.name}, {name}', source['date'], source['command'])
+        stated = re.search(r'--runs (\d+)', source['command'])
+        if stated and contents(name).get('runs', int(stated[1])) != int(stated[1]):
+            found.append(f'{SOURCES.name}: {name} is of {contents(name)["runs"]} runs')
     return found
 
 
-def caption(mark: str, up: str) -> str:
-    """What the site shows below a table for its mark; `up` leads from the page to docs/."""
-    kind, _, rest = mark.partition(';')
-    if kind == 'none':
-        return ''
-    if kind.startswith('read '):
-        return f'*Read on {kind.removeprefix("read ").strip()}:* `{rest.strip()}`'
-    source = known_sources()[kind.strip()]
-    return (
-        f'*Values of {source["date"]}, [{kind.strip()}]({up}results/{kind.strip()}):* '
-        f'`{source["command"]}`'
+def age(result: str) -> int | None:
+    """Commits to what a result depends on since it was made, None where that is not known."""
+    return age_in(
+        history(), f'docs/results/{result}', paths_of(result, known_sources()[result]['command'])
     )
 
 
-def captioned(markdown: str, up: str) -> str:
-    """A page with a caption below each table that has a mark, in place of the mark."""
-    out, waiting = [], ''
-    for line in [*markdown.splitlines(), '']:
-        if found := MARK.match(line):
-            waiting = caption(found.group(1), up)
-            continue
-        if waiting and out and out[-1].startswith('|') and not line.startswith('|'):
-            out += ['', waiting]
-            waiting = ''
-        out.append(line)
-    return '\n'.join(out)
-
-
-def changed_since(day: str) -> int:
-    """How many commits have changed the package since that day, 0 where git is not there."""
-    command = ['git', 'rev-list', '--count', f'--since={day}T23:59', 'HEAD', '--', 'sonar_imm']
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    return int(done.stdout) if done.returncode == 0 and done.stdout.strip() else 0
+def aged(result: str) -> str:
+    commits = age(result)
+    return 'unknown' if commits is None else f'{commits} commits to its code since'
 
 
 def run(name: str) -> int:
@@ -258,8 +395,11 @@ def main() -> int:
     if given.run and (status := run(given.run)):
         return status
     for name, source in known_sources().items():
-        later = changed_since(source['date'])
-        print(f'{source["date"]}  {name}: {later} commits to sonar_imm since; {source["command"]}')
+        print(f'{source["date"]}  {name}: {aged(name)}; {source["command"]}')
+    marks = [table.mark for page in pages() for table in tables(page)]
+    bound = sum('.json' in mark.partition(';')[0] for mark in marks)
+    read = sum(mark.startswith('read ') for mark in marks)
+    print(f'{bound} tables bound to results, {read} read by hand')
     found = all_doubts()
     for doubt in found:
         print(doubt, file=sys.stderr)

@@ -35,8 +35,7 @@ sys.path.insert(0, str(ROOT))
 from matplotlib import pyplot as plt  # noqa: E402
 
 from sonar_imm.acoustics import array, spatial  # noqa: E402
-from sonar_imm.trackers.bathymetry.engines import run_particles  # noqa: E402
-from sonar_imm.trackers.bathymetry.ping import look, Ping  # noqa: E402
+from sonar_imm.trackers.bathymetry.ping import look, Ping, run_particles  # noqa: E402
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.hearing import snr  # noqa: E402
 from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate  # noqa: E402

@@ -228,7 +228,7 @@ def drift(seed):
     }
     records, columns = {name: [] for name in low}, {name: [] for name in low}
     for record in range(config.records):
-        spectra = cross_spectra(config, floor, record, floor.array_depth_told[record], rng)
+        spectra = cross_spectra(config, floor, record, floor.array_depth_stated[record], rng)
         for name, tracker in trackers.items():
             records[name] += tracker.process(spectra)
             columns[name].append(tracker.response.amplitude / tracker.response.sigma)

@@ -167,7 +167,7 @@ def draw_image(above: Axes, below: Axes) -> None:
     places = [*floats, *(place for one in floats for place in one + down), *bar]
     looks = scenario('images', {'target_fading': 'rayleigh', 'max_range': 100.0})
     sonar = ImageSonar(looks, np.random.default_rng(SEED))
-    config = DetectorConfig.from_mapping(looks.told_feeder(), ignore_unknown=True)
+    config = DetectorConfig.from_mapping(looks.feeder_instruments(), ignore_unknown=True)
     one, found = 40, []
     for k in {one, *range(0, len(poses.position), 4)}:
         pixels = sonar.image(Pose(poses.position[k], poses.R[k]), places, 1.0)

@@ -104,7 +104,7 @@ def _parameter_file(name: str, specs: tuple[ParameterSpec, ...]) -> str:
 
 
 def node_specs(system: System) -> tuple[ParameterSpec, ...]:
-    """Give what the live node of `system` can be told besides the parameters of its tracker."""
+    """Give the parameters of the live node of `system` besides the parameters of its tracker."""
     own = {spec.name for spec in system.config_type().specs()}
     specs = (*type_specs(system.name), *node_config_type(system).specs())
     return tuple(spec for spec in specs if spec.name not in own)

@@ -74,10 +74,41 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Called by mkdocs with each page: show where the numbers of its tables come from."""
-    sys.path.insert(0, str(ROOT / 'docs'))
-    from check_numbers import captioned
-
     return captioned(markdown, '../' * page.file.src_uri.count('/'))
+
+
+def caption(mark: str, up: str) -> str:
+    """What is shown below a table for its mark; `up` leads from the page to docs/."""
+    from check_numbers import aged, known_sources
+
+    kind, _, rest = mark.partition(';')
+    if kind == 'none':
+        return ''
+    if kind.startswith('read '):
+        return f'*Read on {kind.removeprefix("read ").strip()}:* `{rest.strip()}`'
+    source = known_sources()[kind]
+    return (
+        f'*Values of {source["date"]} ({aged(kind)}), [{kind}]({up}results/{kind}):* '
+        f'`{source["command"]}`'
+    )
+
+
+def captioned(markdown: str, up: str) -> str:
+    """A page with a caption below each table that has a mark (`check_numbers`), in its place."""
+    sys.path.insert(0, str(ROOT / 'docs'))
+    from check_numbers import MARK, on_one_line
+
+    out: list[str] = []
+    waiting = ''
+    for line in [*on_one_line(markdown).splitlines(), '']:
+        if found := MARK.match(line):
+            waiting = caption(found.group(1), up)
+            continue
+        if waiting and out and out[-1].startswith('|') and not line.startswith('|'):
+            out += ['', waiting]
+            waiting = ''
+        out.append(line)
+    return '\n'.join(out)
 
 
 def on_post_build(config: Any) -> None:
@@ -149,18 +180,18 @@ def modules(package: str) -> list[str]:
 
 def recordings() -> str:
     """What the recordings that are shipped say of themselves: their README.md."""
-    told = {path.parent.name: path.read_text() for path in (ROOT / 'bags').glob('*/README.md')}
+    texts = {path.parent.name: path.read_text() for path in (ROOT / 'bags').glob('*/README.md')}
     rows = []
-    for name, text in sorted(told.items()):
+    for name, text in sorted(texts.items()):
         # The table of benchmarks.typical_seed: a row for each metric, the first has the limit.
         lines = [line for line in text.splitlines() if line.startswith('|')]
-        seed = re.search(r'--seed (\d+)', text).group(1)
+        (seed,) = re.findall(r'--seed (\d+)', text)[:1]
         if not lines:  # one that is not typical says so in words
             rows.append(f'| [{name}](#{name}) | {seed} | | | | |')
             continue
         head, _, first = ([cell.strip() for cell in line.split('|')[1:-1]] for line in lines[:3])
         found = dict(zip(head[1:], first[1:]))
-        limit = re.search(r'allows (\S+ \S+)', text).group(1)
+        (limit,) = re.findall(r'allows (\S+ \S+)', text)[:1]
         rows.append(
             f'| [{name}](#{name}) | {seed} | `{first[0]}` | {found["of the seed"]} | '
             f'{found["5 %"]} to {found["95 %"]} | {limit} |'
@@ -177,7 +208,7 @@ def recordings() -> str:
                         *rows,
                     ]
                 ),
-                *(f'#{text.strip()}' for _, text in sorted(told.items())),
+                *(f'#{text.strip()}' for _, text in sorted(texts.items())),
             ]
         )
         + '\n'
@@ -190,12 +221,13 @@ def options() -> str:
 
     from sonar_imm_tools.cli import command, PROGRAM
 
-    def helps(one: click.Command, name: str, parent: click.Context | None) -> list[str]:
-        context = click.Context(one, parent, info_name=name, max_content_width=100)
-        parts = [f'## {context.command_path}', f'```text\n{one.get_help(context)}\n```']
-        if isinstance(one, click.Group):
-            for sub in one.list_commands(context):
-                parts += helps(one.get_command(context, sub), sub, context)
+    def helps(shown: click.Command | None, name: str, parent: Any) -> list[str]:
+        assert shown is not None
+        context = click.Context(shown, parent, info_name=name, max_content_width=100)
+        parts = [f'## {context.command_path}', f'```text\n{shown.get_help(context)}\n```']
+        if isinstance(shown, click.Group):
+            for sub in shown.list_commands(context):
+                parts += helps(shown.get_command(context, sub), sub, context)
         return parts
 
     return '\n\n'.join(['# Options of every command', *helps(command, PROGRAM, None)]) + '\n'
@@ -213,7 +245,7 @@ def interfaces() -> str:
         '# Inputs and columns',
         'Written from the code when the site is built: the inputs that a tracker subscribes to '
         'and finds in recordings, and the columns of `~/estimate` and `estimate.csv`. What they '
-        'mean is in [Topics, services and columns](../topics.md).',
+        'mean is in [Columns](columns.md).',
     ]
     for name in SYSTEMS:
         inputs = [
@@ -245,7 +277,7 @@ def estimated_columns(bag: Path) -> dict[str, str]:
         with contextlib.redirect_stdout(io.StringIO()):
             if status := main(['track', str(bag), str(out)]):
                 raise RuntimeError(f'`sonar-imm track {bag}` ended with {status}')
-        estimate = next(one for one in RunFolder(out).read_estimates() if len(one.xyz))
+        estimate = next(table for table in RunFolder(out).read_estimates() if len(table.xyz))
     return {
         name: f'{column.dtype.kind}{column.dtype.itemsize}'
         for name, column in estimate.columns().items()

@@ -26,7 +26,7 @@ from sonar_imm_tools.simulation import bathymetry as scenes
 
 config = scenes.scenario('paper', {'pings': 2})
 scene = scenes.simulate(config, seed=1)
-tracker = SYSTEMS['bathymetry'].build(BathymetryConfig(**config.told()))
+tracker = SYSTEMS['bathymetry'].build(BathymetryConfig(**config.instruments()))
 (floor,) = tracker.process(scene.measurements[0].measurement)
 (truth,) = scene.truth[0].tables(scene.frame_id)
 heard = floor.extras['valid'] > 0

@@ -26,7 +26,7 @@ from sonar_imm_tools.simulation import fathometer as scenes
 
 config = scenes.scenario('drift_traces', {'records': 40})
 scene = scenes.simulate(config, seed=1)
-tracker = SYSTEMS['fathometer'].build(FathometerConfig(**config.told()))
+tracker = SYSTEMS['fathometer'].build(FathometerConfig(**config.instruments()))
 rows = []
 for record, received in enumerate(scene.measurements):
     for estimate in tracker.process(received.measurement):

@@ -26,7 +26,7 @@ from sonar_imm_tools.simulation import obstacle as scenes
 
 config = scenes.scenario('approach')
 scene = scenes.simulate(config, seed=1)
-tracker = SYSTEMS['obstacle'].build(ObstacleConfig(**config.told()))
+tracker = SYSTEMS['obstacle'].build(ObstacleConfig(**config.instruments()))
 rows = []
 for received in scene.measurements:  # navigation, altitude and detections, as they came
     for estimate in tracker.process(received.measurement):

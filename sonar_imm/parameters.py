@@ -20,7 +20,10 @@ A tracker is built from one frozen attrs class that derives from `Config`. Every
 
     @frozen(kw_only=True)
     class WalkerConfig(Config):
-        speed: float = parameter(0.5, 'speed of the walker', unit='m/s', low=0.0)
+        speed: float = parameter(0.5, 'm/s', 'speed of the walker', range=(0.0, 10.0))
+
+A long description begins on the next line; `live` in place of `parameter` declares what a running
+node may change.
 
 Parameters that several classes share stand in a base of theirs, written with ``slots=False`` so
 that a class can have several such bases; `inherited` gives one of them another default.
@@ -34,6 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 import difflib
+from functools import partial
 import math
 from typing import Any, TypeVar
 
@@ -137,20 +141,24 @@ class ParameterSpec:
         return value
 
 
+Range = tuple[float | None, float | None]
+"""Lowest and highest value, both inclusive; None for no limit."""
+
+
 def parameter(
     default: Any,
+    unit: str,
     description: str,
     *,
+    range: Range = (None, None),
     kind: str | None = None,
-    unit: str = '',
-    low: float | None = None,
-    high: float | None = None,
     choices: tuple[str, ...] = (),
     read_only: bool = True,
 ) -> Any:
     """One field of a `Config`. The kind follows from the default; an empty list needs `kind`.
 
-    `read_only=False` marks what a running node may change without losing its tracks.
+    The description is read alone, in ``ros2 param describe`` and in the parameter files: it does
+    not refer to the parameter before it. `unit` is empty where there is none.
     """
     return _field(
         ParameterSpec(
@@ -159,22 +167,29 @@ def parameter(
             default=default,
             description=description,
             unit=unit,
-            low=low,
-            high=high,
+            low=range[0],
+            high=range[1],
             choices=choices,
             read_only=read_only,
         )
     )
 
 
-def inherited(base: type[Config], name: str, default: Any, **changes: Any) -> Any:
+live = partial(parameter, read_only=False)
+"""`parameter` of what a running node may change without losing its tracks."""
+
+
+def inherited(
+    base: type[Config], name: str, default: Any, *, range: Range | None = None, **changes: Any
+) -> Any:
     """The parameter `name` of `base` with another default, to be assigned to that name in a class
     that derives from `base`.
 
-    changes: what else differs, e.g. ``unit`` or ``high``. Raises KeyError when `base` has no such
-    parameter.
+    changes: what else differs, e.g. ``unit``. Raises KeyError when `base` has no such parameter.
     """
     spec = attrs.fields_dict(base)[name].metadata[_KEY]
+    if range is not None:
+        changes |= {'low': range[0], 'high': range[1]}
     return _field(attrs.evolve(spec, default=default, **changes))
 
 
@@ -292,7 +307,7 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
             raise ConfigError(f'ros__parameters of {key} must hold a mapping, it holds a {kind}')
         name = str(key).strip('/').split('/')[-1]
         if key in ('/**', '/*') or not node_name or name == node_name:
-            values.update((str(one), value) for one, value in (section or {}).items())
+            values.update((str(entry), value) for entry, value in (section or {}).items())
     return values
 
 

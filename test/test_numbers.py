@@ -12,13 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Every table of the pages says where its numbers come from, and they are still those."""
+"""Every table of the pages says where its numbers come from, and they are still those.
+
+A check of numbers that never fails would pass all of that, so each number is falsified too.
+"""
 
 from __future__ import annotations
 
-import importlib.util
+from collections.abc import Callable, Iterator
+import importlib
+import json
 from pathlib import Path
+import re
 import sys
+from typing import Any
 
 from helpers.source import ROOT
 import pytest
@@ -27,64 +34,198 @@ if not (ROOT / 'docs' / 'check_numbers.py').is_file():
     pytest.skip('these tests read the source tree', allow_module_level=True)
 
 
+sys.path.insert(0, str(ROOT / 'docs'))  # as for a script there
+
+
 @pytest.fixture(scope='module')
-def checker():
-    name = 'check_numbers'
-    spec = importlib.util.spec_from_file_location(name, ROOT / 'docs' / f'{name}.py')
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # attrs looks its classes up there
-    spec.loader.exec_module(module)
-    return module
+def checker() -> Any:
+    return importlib.import_module('check_numbers')
 
 
-def test_every_number_has_its_source(checker) -> None:
+def test_every_number_has_its_source(checker: Any) -> None:
     assert checker.all_doubts() == []
 
 
+def falsified(number: str) -> Iterator[str]:
+    """A number with every other last digit that is 2 to 9 away."""
+    place = max(place for place, sign in enumerate(number) if sign.isdigit())
+    if 'e' in number:
+        place = number.index('e') - 1
+    for digit in range(10):
+        if abs(digit - int(number[place])) >= 2:
+            yield f'{number[:place]}{digit}{number[place + 1 :]}'
+
+
+def falsified_cells(checker: Any, cell: str, skipped: str) -> Iterator[str]:
+    """`cell` with one of its numbers falsified; what matches `skipped` is left alone."""
+    bare = re.sub(skipped, lambda found: ' ' * len(found.group()), cell)
+    for found in checker.NUMBER.finditer(bare):
+        for number in falsified(found.group()):
+            yield f'{cell[: found.start()]}{number}{cell[found.end() :]}'
+
+
+def with_cell(checker: Any, table: Any, row: int, column: int, cell: str) -> Any:
+    line = table.rows[row + 2]
+    changed = (*line[:column], cell, *line[column + 1 :])
+    rows = (*table.rows[: row + 2], changed, *table.rows[row + 3 :])
+    return checker.Table(table.page, table.line, table.mark, rows)
+
+
+def test_every_falsified_number_is_found_out(checker: Any) -> None:
+    """In every table of a result: the last digit of each compared number, wrong by 2 to 9."""
+    tried, passed = 0, []
+    for table in (table for page in checker.pages() for table in checker.tables(page)):
+        if '.json' not in table.mark.partition(';')[0]:
+            continue
+        made = 'made by' in table.mark
+        binding: Any = None if made else checker.Binding.of(table)
+        cells = made_cells(table) if made else binding.cells()
+        for row, column, cell in cells:
+            others = '' if made or '~' in binding.filled(row, column) else r'|\([^)]*\)'
+            for wrong in falsified_cells(checker, cell, f'`[^`]*`{others}'):
+                tried += 1
+                found = (
+                    checker.unlike_made(with_cell(checker, table, row, column, wrong))
+                    if made
+                    else binding.wrong(row, column, wrong)
+                )
+                if not found:
+                    passed.append(f'{table.place}: {wrong} for {cell}')
+    assert passed == []
+    assert tried > 15_000
+
+
+def made_cells(table: Any) -> Iterator[tuple[int, int, str]]:
+    for row, cells in enumerate(table.rows[2:]):
+        for column, cell in enumerate(cells[1:], start=1):
+            yield row, column, cell
+
+
+RESULT = {
+    'runs': 5,
+    'rmse': {'near': 1.2512, 'far': 2.5, 'study': 1.4},
+    'share': {'near': 0.5, 'far': None},
+    'list': [{'name': 'near', 'band': [0.1, 0.25]}, {'name': 'far', 'band': [1, 2]}],
+}
+
+
 @pytest.fixture
-def a_page(checker, monkeypatch, tmp_path: Path):
-    """Give what is doubted of a table under a mark, beside a result that holds 1.25."""
-    (tmp_path / 'one.json').write_text('{"rmse": 1.2512, "share": 0.5}')
+def a_page(
+    checker: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Callable[..., list[str]]]:
+    """Give what is doubted of a table under a mark, beside a result."""
+    (tmp_path / 'one.json').write_text(json.dumps(RESULT))
     monkeypatch.setattr(checker, 'ROOT', tmp_path)
     monkeypatch.setattr(checker, 'RESULTS', tmp_path)
+    checker.contents.cache_clear()
     known = {'one.json': {'command': 'python -m benchmarks.none', 'date': '2026-11-20'}}
 
-    def doubted(mark: str, cell: str = '1.25 m, 50 %') -> list[str]:
+    def doubted(mark: str, *rows: str) -> list[str]:
         page = tmp_path / 'page.md'
-        page.write_text(f'# Page\n\n{mark}\n| case | RMSE |\n|---|---|\n| 9.9 | {cell} |\n')
+        body = '\n'.join(f'| {row} |' for row in rows)
+        page.write_text(
+            f'# Page\n\n<!-- numbers: {mark} -->\n| case | RMSE |\n|---|---|\n{body}\n'
+        )
         (table,) = checker.tables(page)
         return checker.doubts(table, known)
 
-    return doubted
+    yield doubted
+    checker.contents.cache_clear()
 
 
 @pytest.mark.parametrize(
-    ('mark', 'cell', 'doubt'),
+    ('mark', 'row', 'doubt'),
     [
-        ('<!-- numbers: one.json -->', '1.25 m, 50 %', None),
-        ('<!-- numbers: one.json -->', '1.3 m (of others 1.4)', None),
-        ('<!-- numbers: one.json -->', '1.24 m', 'not in one.json: 1.24'),
-        ('<!-- numbers: one.json -->', '49 %', 'not in one.json: 49%'),
-        ('<!-- numbers: one.json; not RMSE -->', '1.24 m', None),
-        ('<!-- numbers: one.json; not 2 -->', '1.24 m', None),
-        ('<!-- numbers: two.json -->', '1.25 m', 'does not know two.json'),
-        ('<!-- numbers: none -->', '1.24 m', None),
-        ('<!-- numbers: read 2026-11-20; sonar-imm bench -->', '1.24 m', None),
-        ('<!-- numbers: read 2026-11-20 -->', '1.24 m', 'no command'),
-        ('<!-- numbers: read today; sonar-imm bench -->', '1.24 m', 'no date'),
-        ('<!-- numbers: read 2999-01-01; sonar-imm bench -->', '1.24 m', 'not come yet'),
-        ('<!-- numbers: read 2026-11-20; python -m benchmarks.no -->', '1.24 m', 'there is no'),
-        ('', '1.24 m', 'without a source'),
-        ('', 'seven', None),
+        ('one.json; rmse>{row}', 'near | 1.25 m', None),
+        ('one.json; rmse>{row}', '**near** | 1.3 (of others 1.4)', None),
+        ('one.json; rmse>{row} ~ rmse>study', 'near | 1.3 (of others 1.4)', None),
+        ('one.json; rmse>{row} ~ rmse>study', 'near | 1.3 (of others 1.5)', '1.5 is 1.4'),
+        ('one.json; rmse>{row}', 'near | 2.5', '2.5 is 1.2512 at rmse>near'),
+        ('one.json; rmse>{row}', 'close | 1.25', '1.25 for 0 values'),
+        ('one.json; rmse>{row}; rows: near', 'close | 1.25', None),
+        ('one.json; rmse>{row}; rows: near | far', 'close | 1.25', '2 keys for 1 rows'),
+        ('one.json; rmse>{row} | share>{row}', 'near | 1.25', '2 paths for 2 columns'),
+        ('one.json; rmse>{row} & share>{row}', 'near | 1.25, 50 %', None),
+        ('one.json; rmse>{row} & share>{row}', 'far | 2.5', None),
+        ('one.json; rmse>{row} & share>{row}', 'near | 1.25, 49 %', '49% is 0.5'),
+        ('one.json; rmse>{near,far}', 'near | 1.25, 2.5', None),
+        ('one.json; list>[name={row}]>band', 'far | 1 to 2', None),
+        ('one.json; list>[name={row}]>band', 'far | 1', '1 for 2 values'),
+        ('one.json; list>0>band>1', 'far | .25', None),
+        ('one.json; rmse>{row}', 'near |', 'nothing for 1 values'),
+        ('one.json; rmse>{row}', 'near | -', None),
+        ('one.json', 'near | 1.25', 'not bound'),
+        ('two.json; rmse>{row}', 'near | 1.25', 'does not know two.json'),
+        ('none', 'near | 1.24', None),
+        ('read 2026-11-20; sonar-imm bench', 'near | 1.24 m', None),
+        ('read 2026-11-20', 'near | 1.24 m', 'no command'),
+        ('read today; sonar-imm bench', 'near | 1.24 m', 'no date'),
+        ('read 2999-01-01; sonar-imm bench', 'near | 1.24 m', 'not come yet'),
+        ('read 2026-11-20; python -m benchmarks.no', 'near | 1.24 m', 'there is no'),
     ],
 )
-def test_what_is_wrong_is_found(a_page, mark: str, cell: str, doubt: str | None) -> None:
-    found = a_page(mark, cell)
+def test_what_is_wrong_is_found(a_page: Any, mark: str, row: str, doubt: str | None) -> None:
+    found = a_page(mark, row)
     assert not found if doubt is None else len(found) == 1 and doubt in found[0]
 
 
-def test_the_site_shows_the_source_below_the_table(checker) -> None:
-    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
-    assert checker.captioned(text, '') == (
-        '| a |\n|---|\n| 1.5 |\n\n*Read on 2026-11-20:* `sonar-imm bench`\n\nAfter.\n'
+def test_an_empty_first_cell_is_that_of_the_row_above(a_page: Any) -> None:
+    assert a_page('one.json; rmse>{row}', 'near | 1.25', ' | 1.25') == []
+
+
+def test_numbers_without_a_mark_are_doubted(
+    checker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checker, 'ROOT', tmp_path)
+    page = tmp_path / 'page.md'
+    page.write_text(
+        '| a | b |\n|---|---|\n| c | 1.24 m |\n\n| a | b |\n|---|---|\n| c | seven |\n'
     )
+    bare, words = checker.tables(page)
+    assert len(checker.doubts(bare, {})) == 1 and checker.doubts(words, {}) == []
+
+
+@pytest.fixture
+def ages(checker: Any) -> Any:
+    return importlib.import_module('result_ages')
+
+
+def test_a_result_is_as_old_as_the_commits_that_touch_what_it_depends_on(ages: Any) -> None:
+    log = [
+        'e d\n\nM\tpackage/new.py\n',
+        'd c\n\nR100\told.py\tpackage/new.py\nM\tother.py\n',
+        'c b x\n',
+        'x a\n\nM\told.py\n',
+        'b a\n\nA\tdocs/results/one.json\n',
+        'a\n\nA\told.py\nA\tother.py\n',
+    ]
+    commits = tuple(map(ages.commit_of, log))
+    result = 'docs/results/one.json'
+    assert ages.age_in(commits, result, frozenset({'package/new.py'})) == 2  # e and x
+    assert ages.age_in(commits, result, frozenset({'other.py'})) == 1
+    assert ages.age_in(commits, result, frozenset({'unchanged.py'})) == 0
+    assert ages.age_in(commits, 'docs/results/none.json', frozenset()) is None
+    assert ages.age_in((), result, frozenset({'other.py'})) is None
+
+
+def test_a_result_depends_on_what_its_script_imports(ages: Any) -> None:
+    paths = ages.paths_of('diver_sea.json', 'python -m benchmarks.diver_sea --runs 30')
+    assert {'benchmarks/diver_sea.py', 'sonar_imm/trackers/diver/tracker.py'} <= paths
+    assert 'sonar_imm/estimation/imm_kernels.py' in paths
+    assert not any('trackers/obstacle' in path for path in paths)
+    assert paths < ages.paths_of('reliability.json', 'make reliability') | {
+        path for path in paths if not path.startswith('sonar_imm')
+    }
+
+
+def test_without_git_no_age_is_known(
+    ages: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ages.history.cache_clear()
+    monkeypatch.setenv('PATH', str(tmp_path))
+    assert ages.history() == ()
+    ages.history.cache_clear()
+    monkeypatch.undo()
+    monkeypatch.setattr(ages, 'ROOT', tmp_path)
+    assert ages.history() == ()
+    ages.history.cache_clear()

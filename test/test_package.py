@@ -63,15 +63,12 @@ PYPI_OF_KEY = {
 }
 WITHOUT_KEY = {'backports.zstd', 'lz4', 'plotly'}
 IMPORT_OF_PYPI = {'PyYAML': 'yaml', 'backports.zstd': 'backports'}
-# Other libraries that `sonar-imm bench` measures when they are there, which come with [test], and
-# those that some commands need, each with an extra of its own.
+# Libraries that some commands need, each with an extra of its own.
 PEERS = {
     'sonar_imm_tools.offline.jobs': {'distributed'},
-    'sonar_imm_tools.offline.tables': {'pyarrow'},
+    'sonar_imm_tools.offline.run_folder': {'pyarrow'},
     'sonar_imm_tools.viewing.rerun_file': {'rerun'},
     'sonar_imm_tools.viewing.server': {'foxglove'},
-    'sonar_imm_tools.evaluation.diver.bench': {'filterpy', 'stonesoup'},
-    'sonar_imm_tools.evaluation.bathymetry.peers': {'stonesoup'},
     'sonar_imm_tools.evaluation.sweep': {'distributed'},
     'sonar_imm_tools.recordings.convert.segy': {'segyio'},
     'sonar_imm_tools.recordings.export.grid': {'rasterio'},
@@ -256,7 +253,6 @@ def test_every_system_is_found_by_its_name() -> None:
         scenes = importlib.import_module(system.scenes)
         assert scenes.SCENARIOS and callable(scenes.scenario) and callable(scenes.simulate)
         assert callable(importlib.import_module(system.judge).judge)
-        assert importlib.import_module(system.benches).BENCHES
         node = ROOT.joinpath(*system.node.split('.')).with_suffix('.py')  # importing needs rclpy
         assert '\ndef main(' in node.read_text(encoding='utf-8')
         assert list((ROOT / 'bags').glob(f'{name}_*')), f'no recording of {name} is shipped'

@@ -26,6 +26,7 @@ from sonar_imm.parameters import (
     ConfigError,
     did_you_mean,
     KINDS,
+    live,
     markdown_table,
     parameter,
     parameters_from_yaml,
@@ -36,14 +37,14 @@ from sonar_imm.trackers import SYSTEMS
 
 @attrs.frozen(kw_only=True)
 class Walker(Config):
-    speed: float = parameter(0.5, 'how fast', unit='m/s', low=0.0, high=3.0, read_only=False)
-    steps: int = parameter(3, 'how many', low=1)
-    calm: bool = parameter(True, 'whether he rests', read_only=False)
-    gait: str = parameter('walk', 'how he moves', choices=('walk', 'march', 'crawl'))
-    name: str = parameter('', 'of the walker')
-    weights: tuple = parameter((0.25, 0.75), 'of legs', low=0.0, high=1.0)
-    stops: tuple = parameter((), 'where he rests', kind='int[]', high=99)
-    roads: tuple = parameter(('a', 'b'), 'which roads')
+    speed: float = live(0.5, 'm/s', 'how fast', range=(0.0, 3.0))
+    steps: int = parameter(3, '', 'how many', range=(1, None))
+    calm: bool = live(True, '', 'whether he rests')
+    gait: str = parameter('walk', '', 'how he moves', choices=('walk', 'march', 'crawl'))
+    name: str = parameter('', '', 'of the walker')
+    weights: tuple = parameter((0.25, 0.75), '', 'of legs', range=(0.0, 1.0))
+    stops: tuple = parameter((), '', 'where he rests', range=(None, 99), kind='int[]')
+    roads: tuple = parameter(('a', 'b'), '', 'which roads')
 
     def check(self):
         return ['speed must exceed steps'] if self.speed == 2.0 and self.steps > 2 else []
@@ -223,7 +224,7 @@ def test_specs_say_what_was_declared():
 def test_a_derived_class_keeps_the_parameters_of_its_base():
     @attrs.frozen(kw_only=True)
     class Runner(Walker):
-        pulse: int = parameter(120, 'beats per minute')
+        pulse: int = parameter(120, '', 'beats per minute')
 
     names = [spec.name for spec in Walker.specs()]
     assert [spec.name for spec in Runner.specs()] == ['pulse', *names]  # its own first
@@ -239,7 +240,7 @@ def test_plain_values_come_back():
 
 def test_an_empty_list_needs_its_kind():
     with pytest.raises(TypeError, match='kind='):
-        parameter((), 'which')
+        parameter((), '', 'which')
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,10 @@ Building it needs mkdocs, and `make docs` is strict itself; these tests need nei
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import re
+import sys
+from typing import Any
 
 from helpers.source import ROOT
 import pytest
@@ -33,22 +35,22 @@ NO_API = {'sonar_imm_tools.cli', 'sonar_imm.nodes'}
 """Packages that are no library: the command has a page, the nodes have topics."""
 
 
+sys.path.insert(0, str(ROOT / 'docs'))  # as for a script there
+
+
 @pytest.fixture(scope='module')
-def made():
-    spec = importlib.util.spec_from_file_location('site_pages', ROOT / 'docs' / 'site_pages.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def made() -> Any:
+    return importlib.import_module('site_pages')
 
 
-def in_navigation(entry) -> set[str]:
+def in_navigation(entry: Any) -> set[str]:
     if isinstance(entry, str):
         return {entry}
     parts = entry.values() if isinstance(entry, dict) else entry
     return set().union(*map(in_navigation, parts))
 
 
-def test_every_page_is_in_the_navigation(made) -> None:
+def test_every_page_is_in_the_navigation(made: Any) -> None:
     config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
     pages = {path.relative_to(ROOT / 'docs').as_posix() for path in (ROOT / 'docs').rglob('*.md')}
     pages |= {*made.OUTSIDE.values(), *(f'reference/api/{name}.md' for name in made.API)}
@@ -59,13 +61,13 @@ def test_every_page_is_in_the_navigation(made) -> None:
     }
 
 
-def test_every_recording_is_on_their_page(made) -> None:
+def test_every_recording_is_on_their_page(made: Any) -> None:
     page = made.recordings()
     for path in (ROOT / 'bags').glob('*/README.md'):
         assert f'| [{path.parent.name}](#' in page and f'## {path.parent.name}\n' in page
 
 
-def test_the_api_has_every_public_module(made) -> None:
+def test_the_api_has_every_public_module(made: Any) -> None:
     described = set().union(*(made.modules(package) for package, _ in made.API.values()))
     files = [*(ROOT / 'sonar_imm').rglob('*.py'), *(ROOT / 'msg_adapters').rglob('*.py')]
     names = {'.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in files}
@@ -77,8 +79,38 @@ def test_the_api_has_every_public_module(made) -> None:
     assert 'imm_kernels' not in made.api_page('sonar_imm.estimation', 'x')
 
 
+def test_files_and_tests_named_on_pages_exist() -> None:
+    files = [
+        path.relative_to(ROOT)
+        for room in ('sonar_imm', 'sonar_imm_tools', 'msg_adapters', 'test', 'benchmarks', 'docs')
+        for path in (ROOT / room).rglob('*.py')
+    ]
+    sources = [
+        (ROOT / file).read_text(encoding='utf-8') for file in files if file.parts[0] == 'test'
+    ]
+    tests = {name for source in sources for name in re.findall(r'def (test_\w+)', source)}
+    missing = set()
+    for page in [*(ROOT / 'docs').rglob('*.md'), ROOT / 'README.md']:
+        text = page.read_text(encoding='utf-8')
+        for name in re.findall(r'`([\w./]+/\w+\.py)', text):
+            if not any(f'/{file.as_posix()}'.endswith(f'/{name}') for file in files):
+                missing.add(f'{page.name}: {name}')
+        named = set(re.findall(r'`(test_\w+)\b(?!\.py)', text))
+        missing |= {f'{page.name}: {name}' for name in named - tests}
+    assert missing == set()
+
+
+def test_no_page_is_long() -> None:
+    """Marks of numbers count too. A page that grows is cut, or its tables go to docs/results."""
+    words = {
+        path.relative_to(ROOT).as_posix(): len(path.read_text(encoding='utf-8').split())
+        for path in (ROOT / 'docs').rglob('*.md')
+    }
+    assert {page for page, count in words.items() if count > 4000} == set()
+
+
 @pytest.mark.parametrize('name', ['README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst'])
-def test_links_of_pages_from_the_root_lead_to_pages(made, name: str) -> None:
+def test_links_of_pages_from_the_root_lead_to_pages(made: Any, name: str) -> None:
     text = made.at_the_root(name)
     assert text.startswith('# ')
     for target in re.findall(r'\]\(([^)#]+)', text):
@@ -86,7 +118,7 @@ def test_links_of_pages_from_the_root_lead_to_pages(made, name: str) -> None:
         assert '://' in target or known, target
 
 
-def test_what_comes_from_another_server_is_seen(made) -> None:
+def test_what_comes_from_another_server_is_seen(made: Any) -> None:
     page = (
         '<link rel="canonical" href="https://a.org/"><link rel=stylesheet href=assets/a.css>'
         '<a href="https://b.org">b</a><script src="https://c.org/c.js"></script>'
@@ -97,3 +129,13 @@ def test_what_comes_from_another_server_is_seen(made) -> None:
         '//d.org/d.css',
         'https://e.org/e.png',
     ]
+
+
+def test_the_site_shows_the_source_below_the_table(made: Any) -> None:
+    text = '<!-- numbers: read 2026-11-20; sonar-imm bench -->\n| a |\n|---|\n| 1.5 |\n\nAfter.\n'
+    assert made.captioned(text, '') == (
+        '| a |\n|---|\n| 1.5 |\n\n*Read on 2026-11-20:* `sonar-imm bench`\n\nAfter.\n'
+    )
+    text = '<!-- numbers: bounds.json;\n  {row}>> a |\n  b -->\n| a |\n|---|\n| 1.5 |\n'
+    shown = made.captioned(text, '../')
+    assert '<!--' not in shown and '[bounds.json](../results/bounds.json)' in shown

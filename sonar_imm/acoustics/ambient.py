@@ -23,7 +23,7 @@ of the cross-spectral density is then a sum of one integral,
     R_ij = I(k (h_i - h_j)) + sum_lm a_l a_m I(-k (h_i - h_j + 2 (H_l - H_m)))
            + 2 sum_l a_l Re I(k (h_i + h_j + 2 H_l)),
 
-the last of which is what a fathometer hears.
+the last of which is what a fathometer measures.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ def surface_noise_csdm(
             pair = noise_integral(-(x + apart)) + noise_integral(-(x - apart))
             down += a[m] * a[n] * pair
     both = np.zeros((len(k), 2 * hydrophones - 1))
-    for one, strength in zip(H, a):
-        y = k * (spacing * np.arange(2 * hydrophones - 1) + 2.0 * one)
+    for height, strength in zip(H, a):
+        y = k * (spacing * np.arange(2 * hydrophones - 1) + 2.0 * height)
         both += 2.0 * strength * noise_integral(y).real
     i = np.arange(hydrophones)
     lag = i[:, None] - i[None, :]

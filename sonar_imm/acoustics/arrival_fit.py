@@ -264,13 +264,13 @@ def _expansion(
 def _damped_step(
     hessian: FloatArray, information: FloatArray, gradient: FloatArray, damping: FloatArray
 ) -> FloatArray:
-    """Solve (H + lift I) step = gradient for 2 x 2 matrices in closed form, the lift making H
+    """Solve (H + shift I) step = gradient for 2 x 2 matrices in closed form, the shift making H
     positive definite."""
     a, b, d = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]
     trace = information[:, 0, 0] + information[:, 1, 1]
     smallest = 0.5 * (a + d) - np.hypot(0.5 * (a - d), b)
-    lift = damping * trace + np.maximum(-2.0 * smallest, 0.0) + 1e-300
-    a, d = a + lift, d + lift
+    shift = damping * trace + np.maximum(-2.0 * smallest, 0.0) + 1e-300
+    a, d = a + shift, d + shift
     x, y = gradient.T
     step = np.stack([d * x - b * y, a * y - b * x], axis=-1)
     return step / np.maximum(a * d - b * b, 1e-300)[:, None]

@@ -41,7 +41,7 @@ from ..estimation.jit import kernel
 PATH, ONE_WAY, BEARING, ELEVATION, HEIGHT = range(5)
 """Kinds of number that `observe` predicts: metres, metres, rad, rad, metres."""
 
-X, Y, Z, OFFSET, CLOCK, SOUND, EMISSION = range(7)
+X, Y, Z, OFFSET, CLOCK, SOUND_SPEED_ERROR, EMISSION = range(7)
 """Places in the `columns` of `observe`; OFFSET is the x of two neighbours."""
 
 NEAREST = 1e-6
@@ -50,13 +50,13 @@ NEAREST = 1e-6
 
 class Paths(NamedTuple):
     """length (n,) m; its derivatives by_position (n, 3), by_offset (n, 2) of the receiver,
-    by_clock (n,) in metres and by_sound (n,), dc/c."""
+    by_clock (n,) in metres and by_sound_speed (n,), dc/c."""
 
     length: FloatArray
     by_position: FloatArray
     by_offset: FloatArray
     by_clock: FloatArray
-    by_sound: FloatArray
+    by_sound_speed: FloatArray
 
 
 def arrival_paths(
@@ -66,11 +66,11 @@ def arrival_paths(
     *,
     offset: FloatArray | float = 0.0,
     clock: FloatArray | float = 0.0,
-    sound: float = 0.0,
+    sound_speed_error: float = 0.0,
 ) -> Paths:
     """Path lengths for a diver at `position` (3,): tx (3,) or (n, 3), None for a tag; rx (n, 3).
 
-    offset (n, 2) m, clock (n,) m and sound = dc/c are the errors of the instruments.
+    offset (n, 2) m, clock (n,) m and sound_speed_error = dc/c are the errors of the instruments.
     """
     p, receivers = np.asarray(position, np.float64), np.array(rx, np.float64)
     receivers[:, :2] += offset
@@ -79,7 +79,7 @@ def arrival_paths(
     if tx is not None:
         first, onward = _leg(p, np.broadcast_to(np.asarray(tx, np.float64), receivers.shape))
         total, slope = leg + first, toward + onward
-    scale = 1.0 - sound
+    scale = 1.0 - sound_speed_error
     return Paths(
         total * scale + clock,
         slope * scale,
@@ -153,7 +153,7 @@ def observe(
             if iz >= 0:
                 gradient[iz] = rho / (r * r)
         return math.atan2(dz, rho)
-    iv = columns[SOUND]
+    iv = columns[SOUND_SPEED_ERROR]
     scale = 1.0 - (x[iv] if iv >= 0 else 0.0)
     total = r
     if r > NEAREST:

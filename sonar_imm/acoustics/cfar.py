@@ -48,7 +48,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..estimation.arrays import BoolArray, FloatArray
-from .cfar_kernels import across_beams, greatest_of_level
+from ..estimation.jit import kernel
 
 _LARGEST_FACTOR = 1e6
 CENSORED = 5.0
@@ -140,19 +140,19 @@ def quiet_level(
     # Of the first rows no level is known; theirs is about that of the first for which one is.
     first = level[np.argmax(known.any(axis=1))]
     about = np.where(known, level, np.where(np.isfinite(first) & (first > 0.0), first, 1.0))
-    heard = np.log(power + _TINY)
-    logarithm = np.maximum(heard, np.log(_SILENT * about))
+    logarithm_of_power = np.log(power + _TINY)
+    logarithm = np.maximum(logarithm_of_power, np.log(_SILENT * about))
     around, _ = noise_level(logarithm, **window)
     off = np.where(known, logarithm - around, np.nan)
     half = max(beams // 2, 0)
     # The mean of a Rayleigh law lies above its mean logarithm.
     above = np.log(CENSORED) + np.euler_gamma
-    quiet = ~known | (heard <= around + above)
-    # Again, by the mean logarithm of what was kept: something long has lifted the first one.
+    quiet = ~known | (logarithm_of_power <= around + above)
+    # Again, by the mean logarithm of what was kept: something long has raised the first.
     kept, few = _kept(quiet, logarithm, half)
     kept[few] = around[few]
     around, _ = greatest_of_level(kept, 0, training, guard)
-    quiet = ~known | (heard <= around + above)
+    quiet = ~known | (logarithm_of_power <= around + above)
     kept, few = _kept(quiet, power, half)
     kept[few] = np.exp(np.where(known, around, 0.0)[few] + np.euler_gamma)
     censored, _ = greatest_of_level(kept, 0, training, guard)
@@ -161,7 +161,7 @@ def quiet_level(
 
 def _kept(quiet: BoolArray, value: FloatArray, half: int) -> tuple[FloatArray, BoolArray]:
     """Mean (R, B) of the quiet cells of the beams within `half` of each, and where these are fewer
-    than one in ten and tell nothing."""
+    than one in ten and are unknown."""
     share = across_beams(quiet.astype(np.float64), half)
     kept = across_beams(np.where(quiet, value, 0.0), half) / np.maximum(share, 0.1)
     return kept, share < 0.1
@@ -218,3 +218,68 @@ def _tails(false_alarm: float) -> tuple[FloatArray, FloatArray]:
         factor = brentq(lambda x: float(tail(x, shape)) - np.log(false_alarm), -5.0, 15.0)  # noqa: B023
         factors.append(np.exp(factor) / -np.log(false_alarm))
     return np.array(variances)[::-1], np.maximum(np.array(factors)[::-1], 1.0)
+
+
+@kernel
+def across_beams(power: FloatArray, half: int) -> FloatArray:
+    """Mean (R, B) over the beams within `half` of each, fewer at the edges."""
+    R, B = power.shape
+    mean = np.empty((R, B))
+    row = np.zeros(B + 2 * half)
+    inverse = np.empty(B)
+    for b in range(B):
+        inverse[b] = 1.0 / (min(b + half, B - 1) - max(b - half, 0) + 1)
+    for r in range(R):
+        row[half : half + B] = power[r]
+        total = mean[r]
+        total[:] = 0.0
+        for k in range(2 * half + 1):
+            for b in range(B):
+                total[b] += row[b + k]
+        for b in range(B):
+            total[b] *= inverse[b]
+    return mean
+
+
+@kernel
+def greatest_of_level(
+    power: FloatArray, half: int, training: int, guard: int
+) -> tuple[FloatArray, FloatArray]:
+    """See `noise_level`; `half` beams on either side are averaged."""
+    # Sums are taken afresh for each cell: one huge value would spoil the rest of a running sum.
+    R, B = power.shape
+    smooth = across_beams(power, half)
+    window = np.empty((R, B))  # mean of the rows r to r + training - 1 that there are
+    for r in range(R):
+        last = min(r + training, R)
+        total = window[r]
+        total[:] = 0.0
+        for k in range(r, last):
+            for b in range(B):
+                total[b] += smooth[k, b]
+        for b in range(B):
+            total[b] /= last - r
+    least = (training + 1) // 2
+    level = np.full((R, B), np.inf)
+    sides = np.zeros(R)
+    for r in range(R):
+        end = r - guard  # the side before ends here, exclusive
+        if end < least:
+            continue
+        sides[r] = 1.0
+        if end >= training:
+            level[r] = window[end - training]
+        else:
+            total = level[r]
+            total[:] = 0.0
+            for k in range(end):
+                for b in range(B):
+                    total[b] += smooth[k, b]
+            for b in range(B):
+                total[b] /= end
+        behind = r + guard + 1
+        if R - behind >= least:
+            sides[r] = 2.0
+            for b in range(B):
+                level[r, b] = max(level[r, b], window[behind, b])
+    return level, sides

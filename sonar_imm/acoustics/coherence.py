@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Is there an echo in this bin at all? Coherence across the array says so, energy does not.
+"""Detection of an echo in a range bin by coherence across the array.
 
 In a shadow the staves hear independent noise; an echo is one plane wave. The **coherence**
 
@@ -125,7 +125,7 @@ def coherence_threshold(
 def silent_bins(
     gamma: ArrayLike, staves: int, *, spacing: float = 0.5, false_alarm: float = FALSE_ALARM
 ) -> BoolArray:
-    """Bins (n,) in which no echo is to be believed: `gamma` (n,) below the threshold of one bin,
+    """Bins (n,) without a detected echo: `gamma` (n,) below the threshold of one bin,
     or its mean over `GATE_BINS` below that of the mean. NaN counts as silent.
 
     Two or three staves are coherent by chance too often for one bin to say anything (an echo would

@@ -52,7 +52,7 @@ class Origin:
 
         east, north, up = np.moveaxis(np.asarray(enu, np.float64), -1, 0)
         there = enu2geodetic(east, north, up, self.latitude, self.longitude, self.height)
-        return np.stack([np.asarray(one, np.float64) for one in there], axis=-1)
+        return np.stack([np.asarray(part, np.float64) for part in there], axis=-1)
 
     def turn(self, latitude: float, longitude: float) -> FloatArray:
         """(3, 3) that turns vectors in east, north, up of a place into those of the origin.

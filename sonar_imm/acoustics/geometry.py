@@ -90,11 +90,6 @@ def flip_quaternion(q: ArrayLike) -> FloatArray:
     return np.sqrt(0.5) * np.stack([x + y, x - y, w - z, w + z], axis=-1)
 
 
-def flip_pose(pose: Pose) -> Pose:
-    """Oracle for tests: a pose in NED and FRD given in ENU and FLU, and the other way round."""
-    return Pose(flip_world(pose.position), flip_rotation(pose.R))
-
-
 def rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> FloatArray:
     """``Rz(yaw) Ry(pitch) Rx(roll)``, (..., 3, 3), of angles in radians.
 
@@ -151,7 +146,7 @@ def slerp(q0: FloatArray, q1: FloatArray, fraction: ArrayLike) -> FloatArray:
     """The quaternion (..., 4) `fraction` (...) of the way from q0 to q1 (..., 4) at constant rate,
     the short way round. Fractions outside [0, 1] go on at the same rate."""
     if np.ndim(q0) == np.ndim(q1) == 1 and np.ndim(fraction) == 0:
-        return _slerp_one(q0.tolist(), q1.tolist(), float(fraction))  # type: ignore[arg-type]
+        return _slerp_pair(q0.tolist(), q1.tolist(), float(fraction))  # type: ignore[arg-type]
     q0, q1 = q0 / np.sqrt(_dot(q0, q0)), q1 / np.sqrt(_dot(q1, q1))
     fraction = np.asarray(fraction, np.float64)[..., None]
     cosine = _dot(q0, q1)
@@ -163,7 +158,7 @@ def slerp(q0: FloatArray, q1: FloatArray, fraction: ArrayLike) -> FloatArray:
     return np.asarray(np.where(sine < 1e-12, q0, np.cos(fraction * angle) * q0 + turned))
 
 
-def _slerp_one(q0: list[float], q1: list[float], fraction: float) -> FloatArray:
+def _slerp_pair(q0: list[float], q1: list[float], fraction: float) -> FloatArray:
     """`slerp` of one pair, in plain floats: a fifth of the time."""
     size0, size1 = math.sqrt(sum(a * a for a in q0)), math.sqrt(sum(a * a for a in q1))
     q0, q1 = [a / size0 for a in q0], [a / size1 for a in q1]
@@ -258,37 +253,3 @@ def apply(R: FloatArray, vector: FloatArray) -> FloatArray:
 
 def _arcsin(argument: FloatArray) -> FloatArray:
     return np.arcsin(np.where(np.abs(argument) <= 1.0, argument, np.nan))
-
-
-# -- the paper's differential form -------------------------------------------------------------
-
-
-class Rates(NamedTuple):
-    """Time derivatives (...,): range m/s, azimuth rad/s, vertical offset m/s."""
-
-    d: FloatArray
-    delta: FloatArray
-    d_st: FloatArray
-
-
-def rates(
-    m: FloatArray, velocity: FloatArray, turn_rate: FloatArray, R: FloatArray, model: str = 'plane'
-) -> Rates:
-    """Oracle for tests of `predict`: how the echo of a fixed point m (..., 3) changes while the
-    sonar moves, eq. (3), (4).
-
-    velocity (..., 3) and turn_rate (..., 3) are the sonar's own, in its frame: ``dm/dt = -V -
-    omega x m``. `predict` agrees with it to first order:
-    the Euler step the paper takes with it is off by 0.003, 0.011, 0.07 and 0.27 degrees rms of
-    azimuth at 0.1, 0.2, 0.5 and 1 s, which is more than an obstacle's vertical offset shows.
-    """
-    moving = -velocity - np.cross(turn_rate, m)
-    d = np.linalg.norm(m, axis=-1)
-    d_rate = -np.einsum('...i,...i->...', m, velocity) / d
-    if model == 'plane':
-        delta_rate = (m[..., 0] * moving[..., 1] - m[..., 1] * moving[..., 0]) / (
-            m[..., 0] ** 2 + m[..., 1] ** 2
-        )
-    else:
-        delta_rate = (moving[..., 1] - m[..., 1] * d_rate / d) / np.sqrt(d**2 - m[..., 1] ** 2)
-    return Rates(d_rate, delta_rate, -np.einsum('...i,...i->...', R[..., 2, :], velocity))

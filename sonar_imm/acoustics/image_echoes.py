@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..estimation.arrays import FloatArray
+from ..estimation.jit import kernel
 from .cfar import effective_cells, quiet_level, tail_factor, threshold_factor
-from .image_echo_kernels import joined_parts
 
 MAX_CELLS = 20_000
 """Loud cells of an image, the strongest, that are looked at."""
@@ -52,7 +52,7 @@ _LARGEST = 1e38
 
 @frozen(kw_only=True)
 class EchoRules:
-    """How echoes are told from noise.
+    """How echoes are separated from noise.
 
     beam_width rad and range_resolution m: -3 dB widths of the echo of a point; false_alarm: of a
     cell of Rayleigh noise; margin: that threshold is so much higher (power), for noise with longer
@@ -204,3 +204,47 @@ def _measured(
 
 def _nothing() -> Echoes:
     return Echoes(*(np.empty(0) for _ in range(8)))
+
+
+@kernel
+def joined_parts(
+    part: NDArray[np.intp], distance: FloatArray, bearing: FloatArray, reach: float
+) -> NDArray[np.intp]:
+    """Part numbers (n,) of cells in which parts with cells within `reach` of each other have the
+    same one: 0, 1, ... without gaps. The cells lie at `distance` (n,) m, ascending, and `bearing`
+    (n,) rad."""
+    n = len(part)
+    count = 0
+    for i in range(n):
+        count = max(count, part[i] + 1)
+    root = np.arange(count)
+    x, y = distance * np.cos(bearing), distance * np.sin(bearing)
+    for i in range(n):
+        for j in range(i + 1, n):
+            if distance[j] - distance[i] > reach:
+                break
+            if part[i] == part[j]:
+                continue
+            if (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 > reach * reach:
+                continue
+            a, b = part[i], part[j]
+            while root[a] != a:
+                root[a] = root[root[a]]
+                a = root[a]
+            while root[b] != b:
+                root[b] = root[root[b]]
+                b = root[b]
+            if a != b:
+                root[max(a, b)] = min(a, b)
+    number = np.full(count, -1)
+    used = 0
+    joined = np.empty(n, np.intp)
+    for i in range(n):
+        a = part[i]
+        while root[a] != a:
+            a = root[a]
+        if number[a] < 0:
+            number[a] = used
+            used += 1
+        joined[i] = number[a]
+    return joined

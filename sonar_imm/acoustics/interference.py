@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike
 
 from ..estimation.arrays import ComplexArray, FloatArray
 from .array import direction_grid, phase_step
-from .laplace import autocorrelation, gaussian_log_density, IMPOSSIBLE, log_density
+from .laplace import autocorrelation
 
 
 @frozen(eq=False)
@@ -82,32 +82,6 @@ def interference_form(iq: ArrayLike, covariance: ComplexArray) -> InterferenceFo
     )
     base = (y.conj() * whitened).sum(axis=-1).real
     return InterferenceForm(base, beam, spread, np.linalg.slogdet(covariance)[1])
-
-
-def interfered_log_likelihood(
-    sines: ArrayLike,
-    y: ArrayLike,
-    signal_variance: float,
-    covariance: ComplexArray,
-    step: float,
-    likelihood: str = 'laplace',
-) -> FloatArray:
-    """Oracle for tests: log likelihood of direction sines (...) given one snapshot y (P,) and its
-    noise covariance (P, P), less what does not depend on the direction; -inf for NaN.
-
-    By linear algebra from the definition, which is slow.
-    """
-    y = np.asarray(y, np.complex128)
-    u = np.asarray(sines, np.float64)
-    staves = len(y)
-    a = np.exp(1j * step * np.nan_to_num(u)[..., None] * np.arange(staves))
-    gamma = covariance + signal_variance * a[..., :, None] * a[..., None, :].conj()
-    solved = np.linalg.solve(gamma, np.broadcast_to(y[:, None], (*u.shape, staves, 1)))[..., 0]
-    q = (y.conj() * solved).sum(axis=-1).real
-    laplace = likelihood == 'laplace'
-    density = log_density(q, staves) if laplace else gaussian_log_density(q, staves)
-    determinant = np.linalg.slogdet(gamma)[1] - np.linalg.slogdet(covariance)[1]
-    return np.where(np.isnan(u), IMPOSSIBLE, density - determinant)
 
 
 def coherence_beside(form: InterferenceForm, spacing: float) -> FloatArray:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What an array hears in one range bin: heavy-tailed echoes from one direction, and noise.
+"""The likelihood of one range bin of an array: heavy-tailed echoes from one direction, and noise.
 
 A patch of floor answers with a few strong facets, so the echo of a bin is not Gaussian: its power
 varies. Taking the power as exponentially distributed gives the complex multivariate symmetric
@@ -87,12 +87,6 @@ def log_constant(staves: int, log_determinant: ArrayLike) -> FloatArray:
     return math.log(2.0) - staves * math.log(math.pi) - np.asarray(log_determinant, np.float64)
 
 
-def gaussian_log_density(q: ArrayLike, staves: int) -> FloatArray:
-    """Oracle for tests: the same of the complex Gaussian density of P staves, -q.
-    `gaussian_log_constant` is the rest."""
-    return -np.asarray(q, np.float64)
-
-
 def gaussian_log_constant(staves: int, log_determinant: ArrayLike) -> FloatArray:
     """-P log pi - log |Gamma|."""
     return -staves * math.log(math.pi) - np.asarray(log_determinant, np.float64)
@@ -126,28 +120,3 @@ def form_coefficients(
     coefficients *= -2.0 * kappa[..., None]
     coefficients[..., 0] = power * (1.0 - kappa)
     return coefficients / noise[..., None]
-
-
-def log_likelihood(
-    sines: ArrayLike,
-    y: ArrayLike,
-    signal_variance: float,
-    noise_variance: float,
-    step: float,
-    likelihood: str = 'laplace',
-) -> FloatArray:
-    """Oracle for tests: log likelihood of direction sines (...) given one snapshot y (P,), less
-    what does not depend on the direction; -inf for NaN. `step` is from `array.phase_step`.
-
-    It builds q from the definition: slow, and what the kernels are tested against.
-    """
-    y = np.asarray(y, np.complex128)
-    u = np.asarray(sines, np.float64)
-    a = np.exp(1j * step * u[..., None] * np.arange(len(y)))
-    kappa = signal_variance / (noise_variance + len(y) * signal_variance)
-    beam = np.abs(a.conj() @ y) ** 2
-    q = (np.vdot(y, y).real - kappa * beam) / noise_variance
-    density = (
-        log_density(q, len(y)) if likelihood == 'laplace' else gaussian_log_density(q, len(y))
-    )
-    return np.where(np.isnan(q), IMPOSSIBLE, density)

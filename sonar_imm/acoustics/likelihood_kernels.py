@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The likelihood of a whole row of directions at a time: what the trackers call.
+"""The likelihood of a whole row of directions at a time, compiled for the trackers.
 
 `laplace` and `interference` say what the likelihood is. Here the same numbers come from loops that
 the processor runs several directions at a time, which calls of the C library for a cosine, a sine

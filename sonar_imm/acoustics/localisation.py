@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A position from one ping: maximum likelihood, with every doubt said out loud.
+"""A position from one ping by maximum likelihood, or the reason why there is none.
 
 `localise` takes the arrivals of one ping (range sums from known transmitters, bearings, or one-way
 arrivals from a tag whose time of emission is unknown) and gives a `Localisation` or a `Refusal`
@@ -24,14 +24,13 @@ with a short reason. What guards it:
 * **Singular baseline.** Between transmitter and receiver the gradient of the range sum vanishes. A
   fix is refused when its largest standard deviation or the condition number of its covariance
   passes the limit, or when two standard deviations away the likelihood is not what the covariance
-  says: the covariance would be a fiction.
+  says.
 * **Late reflections.** When the chi-square test fails, the row whose removal helps most is left
   out, one at a time, while a degree of freedom remains to test the rest with.
 * **Plausibility.** A fix further than `max_range` from the instruments is refused.
 
 The covariance is the inverse of the Fisher information at the solution. An error of the sound
-speed is common to all arrivals and is not in it: `multistatic.crlb` with `sound_speed_std` tells
-how much it adds.
+speed is common to all arrivals and is not in it.
 """
 
 from __future__ import annotations
@@ -271,10 +270,10 @@ def _usable(rows: FloatArray) -> BoolArray:
 
 
 def _spread(kept: BoolArray, usable: BoolArray) -> BoolArray:
-    """What was kept of the usable rows, told for all rows (n,)."""
-    told = usable.copy()
-    told[usable] = kept
-    return told
+    """What was kept of the usable rows, for all rows (n,)."""
+    out = usable.copy()
+    out[usable] = kept
+    return out
 
 
 def _dof(fit: ArrivalFit, kept: BoolArray) -> int:
@@ -296,9 +295,9 @@ def _search(fit: ArrivalFit, limits: Limits) -> tuple[BoolArray, Minima]:
             break
         seeds = minima.position[:SEEDS]
         suspects = _suspects(fit, seeds, kept)
-        all_but_one = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
+        weights = fit.weight * kept * (1.0 - np.eye(len(kept)))[suspects]
         trials = minimise(
-            fit, np.tile(seeds, (len(suspects), 1)), np.repeat(all_but_one, len(seeds), axis=0)
+            fit, np.tile(seeds, (len(suspects), 1)), np.repeat(weights, len(seeds), axis=0)
         )
         kept[suspects[int(np.argmin(trials.cost)) // len(seeds)]] = False
         weight = fit.weight * kept
@@ -355,7 +354,7 @@ def _covariance(fit: ArrivalFit, information: FloatArray) -> FloatArray:
 def _doubt(
     fit: ArrivalFit, weight: FloatArray, best: Candidate, dof: int, limits: Limits
 ) -> Refusal | None:
-    """Why the best candidate must not be believed, or None."""
+    """Why the best candidate is refused, or None."""
     variances, axes = np.linalg.eigh(best.covariance)
     if variances[1] > limits.max_std**2 or variances[1] > limits.max_condition * variances[0]:
         return Refusal(

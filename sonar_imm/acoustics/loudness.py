@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Is an echo in this bin? Where the noise is known, its power can say so.
+"""Detection of an echo in a range bin by its power, where the noise is known.
 
-Coherence (`coherence`) tells an echo from noise of any level, but supposes that an echo is one
+Coherence (`coherence`) separates an echo from noise of any level, but supposes that an echo is one
 plane wave. A diffuse floor under a wide aperture is not: its staves differ even 78 dB above the
-noise. And two staves are coherent by chance too often to tell anything from one bin. What stands
-far above a noise that is known cannot be noise, whatever its coherence.
+noise. And two staves are coherent by chance too often for a decision on one bin. A power far above
+a noise that is known is an echo, whatever its coherence.
 
 Noise fades like the echoes in the law of `laplace`, y = sqrt(z) g: the power of a bin, the mean of
 P staves in powers of the noise, is t = z Gamma(P) / P, and exceeds a level with the probability

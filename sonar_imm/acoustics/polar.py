@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From range and bearing to a position with a covariance that a Kalman filter may believe.
+"""From range and bearing to an unbiased position with a consistent covariance.
 
 The textbook conversion x = r cos b, y = r sin b with a linearised covariance is biased: noise on
 the bearing v = var_b bends the line of equal range into an arc, whose centre of mass lies r v / 2
@@ -54,24 +54,10 @@ def unbiased_polar_to_cartesian(
         np.asarray(value, np.float64) for value in (range_, var_range, var_bearing)
     )
     # expm1 because 1 - lambda^2 is about 1e-3 and is squared: the printed equations lose it.
-    one_less_lambda2, one_less_lambda4 = -np.expm1(-v_bearing), -np.expm1(-2.0 * v_bearing)
-    along = v_range * (1.0 - 0.5 * one_less_lambda4) + 0.5 * np.square(r * one_less_lambda2)
-    across = 0.5 * (np.square(r) + v_range) * one_less_lambda4
+    loss2, loss4 = -np.expm1(-v_bearing), -np.expm1(-2.0 * v_bearing)
+    along = v_range * (1.0 - 0.5 * loss4) + 0.5 * np.square(r * loss2)
+    across = 0.5 * (np.square(r) + v_range) * loss4
     return _along_bearing(r * np.exp(-0.5 * v_bearing), bearing, along, across)
-
-
-def linearised_polar_to_cartesian(
-    range_: ArrayLike, bearing: ArrayLike, var_range: ArrayLike, var_bearing: ArrayLike
-) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: the conventional conversion, biased at long range, to position (..., 2)
-    and first-order covariance (..., 2, 2)."""
-    r = np.asarray(range_, np.float64)
-    return _along_bearing(
-        r,
-        bearing,
-        np.asarray(var_range, np.float64),
-        np.square(r) * np.asarray(var_bearing, np.float64),
-    )
 
 
 def _along_bearing(

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Sound bends: rays through a profile of sound speed.
+"""Rays through a profile of sound speed.
 
 The profile is linear between its depths and constant beyond its ends, so in each layer the speed
 has a constant gradient g and a ray is an arc of a circle. From speed c0, elevation phi below the

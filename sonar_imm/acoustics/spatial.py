@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Directions without a tracker: what every array offers, and what tracking has to beat.
+"""Directions without a tracker, the baseline for tracking.
 
 Each estimator takes the snapshots iq (n, P) of one ping and gives one direction sine per bin, from
 the bin and its `half_width` neighbours to either side, which share one sample covariance

@@ -15,7 +15,7 @@
 """Cross-spectral density matrices from the pressure at many hydrophones, as it streams in.
 
 Pressure arrives in blocks of any length. It is cut into snapshots of `length` samples that overlap
-by half (or as told), each is weighted by a window and Fourier transformed with exp(-i w t), and
+by half or another share; each is weighted by a window and Fourier transformed, exp(-i w t), and
 the outer products of the snapshots at each frequency are averaged::
 
     snapshots = SnapshotStream(...)      # pressure -> spectra (k, F, M)
@@ -208,8 +208,8 @@ class SlidingAverage:
     def push(self, spectra: ComplexArray) -> list[Average]:
         """The averages due after `spectra` (k, F, M)."""
         done = []
-        for one in spectra:
-            self._spectra.append(one)
+        for snapshot in spectra:
+            self._spectra.append(snapshot)
             self._since += 1
             if len(self._spectra) == self.count and self._since >= self.step:
                 total = outer_sum(np.stack(self._spectra))

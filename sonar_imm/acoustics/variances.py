@@ -36,7 +36,8 @@ HALF_WIDTH = 10
 """Bins to either side that share one signal variance."""
 _SAMPLES = 64
 LEAST_SNR = 0.01
-"""Signal variances are kept above this many noise variances: a silent bin then says little."""
+"""Signal variances are kept above this many noise variances: a silent bin has little
+weight then."""
 
 
 def usable_bins(iq: NDArray) -> BoolArray:

@@ -22,8 +22,8 @@ Four forms (`AdaptiveChain`):
 
 counts
     Dirichlet: expected transitions ``n_ij += W_ij mu_j`` on top of a prior worth `weight`
-    transitions per row. At a constant step it is ``P = rownorm(n + weight P0)``. Sound, and the
-    default of the diver tracker.
+    transitions per row. At a constant step it is ``P = rownorm(n + weight P0)``, the mean of the
+    posterior. The default of the diver tracker.
 paper
     Eq. (1) of the diver paper read as a product, ``P_ij <- P_ij mu_j / sum``, guarded by
     ``P <- (1 - guard) P + guard P0``. The equation is lost in the source.
@@ -32,7 +32,7 @@ ratio
 fixed
     The chain as it is.
 
-`adaptation_kernels` compiles what `counts` does at each step.
+What `counts` does at each step is compiled; its arrays are float64 and C-contiguous.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from typing import get_args, Literal, Protocol
 
 import numpy as np
 
-from .adaptation_kernels import counts_transition, learn_counts
-from .arrays import FloatArray, IndexArray
+from .arrays import FloatArray, IndexArray, IntArray
+from .jit import kernel
 
 Form = Literal['counts', 'paper', 'ratio', 'fixed']
 
@@ -121,45 +121,6 @@ class AdaptiveChain:
         return learnt
 
 
-def transition_posterior(P: FloatArray, mu_before: FloatArray, mu_after: FloatArray) -> FloatArray:
-    """Oracle for tests: Pr(i at k-1, j at k | data to k) = W_ij mu_j, W the mixing weights.
-
-    P: (..., M, M); mu_before, mu_after: (..., M). Gives (..., M, M).
-    """
-    joint = P * mu_before[..., :, None]
-    c = joint.sum(axis=-2, keepdims=True)
-    return np.asarray(joint / np.where(c > 0.0, c, 1.0) * mu_after[..., None, :])
-
-
-def adapt_counts(
-    counts: FloatArray,
-    expected: FloatArray,
-    posterior: FloatArray,
-    nominal: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: Dirichlet counts, n_ij += W_ij mu_j, beside the counts that the nominal
-    matrix predicts for the same step.
-
-    All (..., M, M); gives the new (counts, expected). See `counts_correction`.
-    """
-    return counts + posterior, expected + posterior.sum(axis=-1, keepdims=True) * nominal
-
-
-def counts_correction(
-    counts: FloatArray, expected: FloatArray, prior: FloatArray, weight: float
-) -> FloatArray:
-    """Oracle for tests: factor for each transition, (n + N0 P0) / (e + N0 P0). `prior` P0 is the
-    matrix of the reference step, `weight` N0.
-
-    At a constant step e_ij = n_i. P0_ij, and the corrected matrix is the Dirichlet posterior mean,
-    rownorm(n + N0 P0). At irregular steps the factor still compares counts of the same steps.
-    """
-    given = expected + weight * prior
-    return np.asarray(
-        np.where(given > 0.0, (counts + weight * prior) / np.where(given > 0.0, given, 1.0), 1.0)
-    )
-
-
 def adapt_product(
     correction: FloatArray, factor: FloatArray, prior: FloatArray, guard: float
 ) -> FloatArray:
@@ -181,3 +142,87 @@ def corrected(P: FloatArray, correction: FloatArray) -> FloatArray:
     out = P * correction
     total = out.sum(axis=-1, keepdims=True)
     return np.asarray(np.where(total > 0.0, out / np.where(total > 0.0, total, 1.0), P))
+
+
+@kernel
+def counts_transition(
+    nominal: FloatArray, learnt: FloatArray, prior: FloatArray, weight: float
+) -> FloatArray:
+    """`corrected` by the counts (n + N0 P0) / (e + N0 P0): the matrices (T, M, M) of a step whose
+    nominal one is `nominal` (M, M), after what was `learnt` (T, 2, M, M)."""
+    T, _, M, _ = learnt.shape
+    out = np.empty((T, M, M))
+    for t in range(T):
+        for i in range(M):
+            row = out[t, i]
+            for j in range(M):
+                pseudo = weight * prior[i, j]
+                given = learnt[t, 1, i, j] + pseudo
+                factor = (learnt[t, 0, i, j] + pseudo) / given if given > 0.0 else 1.0
+                row[j] = nominal[i, j] * factor
+            total = row_sum(row)
+            for j in range(M):
+                row[j] = row[j] / total if total > 0.0 else nominal[i, j]
+    return out
+
+
+@kernel
+def learn_counts(
+    learnt: FloatArray,
+    hit: IntArray,
+    transition: FloatArray,
+    mu_before: FloatArray,
+    mu_after: FloatArray,
+    nominal: FloatArray,
+) -> FloatArray:
+    """`learnt` (T, 2, M, M) after a step with `transition` (T or 1, M, M), new for the targets
+    `hit` alone: the expected transitions n_ij += W_ij mu_j, W the mixing weights, and e_ij, those
+    that the nominal matrix predicts for the same step."""
+    out = learnt.copy()
+    M = len(nominal)
+    reach, posterior = np.empty(M), np.empty(M)
+    for t in hit:
+        P = transition[t % len(transition)]
+        for j in range(M):
+            reach[j] = 0.0
+        for i in range(M):
+            for j in range(M):
+                reach[j] += P[i, j] * mu_before[t, i]
+        for i in range(M):
+            for j in range(M):
+                known = reach[j] if reach[j] > 0.0 else 1.0
+                posterior[j] = P[i, j] * mu_before[t, i] / known * mu_after[t, j]
+            total = row_sum(posterior)
+            for j in range(M):
+                out[t, 0, i, j] += posterior[j]
+                out[t, 1, i, j] += total * nominal[i, j]
+    return out
+
+
+@kernel
+def row_sum(row: FloatArray) -> float:
+    """The sum of up to 128 numbers, eight partial sums side by side, as numpy adds a row."""
+    n = len(row)
+    if n < 8:
+        total = 0.0
+        for k in range(n):
+            total += row[k]
+        return total
+    a, b, c, d = row[0], row[1], row[2], row[3]
+    e, f, g, h = row[4], row[5], row[6], row[7]
+    last = n - n % 8
+    for k in range(8, last, 8):
+        a, b, c, d = a + row[k], b + row[k + 1], c + row[k + 2], d + row[k + 3]
+        e, f, g, h = e + row[k + 4], f + row[k + 5], g + row[k + 6], h + row[k + 7]
+    total = ((a + b) + (c + d)) + ((e + f) + (g + h))
+    for k in range(last, n):
+        total += row[k]
+    return total
+
+
+def warm() -> None:
+    """Run the kernels once on tiny input: compiled or loaded from the cache."""
+    P, mu = np.full((2, 2), 0.5), np.full((1, 2), 0.5)
+    learnt = np.zeros((1, 2, 2, 2))
+    transition = counts_transition(P, learnt, P, 1.0)
+    learn_counts(learnt, np.zeros(1, np.int64), transition, mu, mu, P)

@@ -16,9 +16,8 @@
 
 A scan gives D detections; T targets are expected. Three steps, each a pure function on arrays:
 
-1. `gate` lists the pairs (target, detection) that may belong together: those whose normalised
-   innovation squared lies below a chi-square quantile. Pairs are looked up in a KD-tree, because a
-   dense table of a million pairs for a thousand targets would cost more than everything else.
+1. `imm.gate` finds the pairs (target, detection) that may belong together: those whose normalised
+   innovation squared lies below a chi-square quantile (`gate_threshold`).
 2. `assign` picks, among those pairs, the most likely set in which no target and no detection is
    used twice (global nearest neighbour). The cost of a pair is compared with calling the target
    missed and the detection clutter,
@@ -39,18 +38,18 @@ from __future__ import annotations
 
 from enum import IntEnum
 from functools import lru_cache
-from itertools import chain
 import math
-from typing import NamedTuple
 
 from attrs import evolve, frozen
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import FloatArray, IntArray
-from .association_kernels import choose, COASTING, CONFIRMED, count, TENTATIVE
+from .arrays import BoolArray, FloatArray, IntArray
 from .imm import pairs_inside
-from .kalman import BoolArray, factorise, log_density
+from .jit import kernel
+
+TENTATIVE, CONFIRMED, COASTING = 0, 1, 2
+"""The numbers of `TrackStatus`, plain: a scan asks for them often."""
 
 
 @lru_cache(maxsize=256)
@@ -64,64 +63,6 @@ def gate_threshold(probability: float, dimension: int) -> float:
     from scipy.special import gammaincinv  # scipy.stats has it too, but takes a second to import
 
     return 2.0 * float(gammaincinv(dimension / 2.0, probability))
-
-
-class Pairs(NamedTuple):
-    """Pairs inside the gate, sorted by target, then detection.
-
-    target, detection: (pairs,) indices; nis, log_likelihood: (pairs,) of the innovation.
-    """
-
-    target: IntArray
-    detection: IntArray
-    nis: FloatArray
-    log_likelihood: FloatArray
-
-
-def gate(
-    predicted: FloatArray,
-    covariance: FloatArray,
-    detections: FloatArray,
-    R: FloatArray,
-    threshold: float,
-) -> Pairs:
-    """Oracle for tests: find the pairs whose normalised innovation squared is at most `threshold`.
-
-    predicted: (T, m) predicted measurement of each target; covariance: (T, m, m), ``H P H'``;
-    detections: (D, m); R: (D, m, m) or (m, m), covariance of the detections.
-
-    Raises CovarianceError when an innovation covariance ``S = covariance + R`` is not positive
-    definite.
-    """
-    target, detection = _near(predicted, covariance, detections, R, threshold)
-    R = np.broadcast_to(R, (len(detections), *R.shape[-2:]))
-    factor = factorise(covariance[target] + R[detection], 'innovation covariance')
-    nis, log_likelihood = log_density(detections[detection] - predicted[target], factor)
-    inside = nis <= threshold
-    return Pairs(target[inside], detection[inside], nis[inside], log_likelihood[inside])
-
-
-def _near(
-    predicted: FloatArray,
-    covariance: FloatArray,
-    detections: FloatArray,
-    R: FloatArray,
-    threshold: float,
-) -> tuple[IntArray, IntArray]:
-    """A superset of the pairs inside the gate, sorted: the ball around each gate's ellipse.
-
-    ``nis <= threshold`` implies ``|nu|^2 <= threshold * largest eigenvalue of S``, and the
-    eigenvalue of a sum is at most the sum of the eigenvalues."""
-    if not len(predicted) or not len(detections):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    from scipy.spatial import cKDTree
-
-    spread = np.linalg.eigvalsh(covariance)[:, -1] + np.linalg.eigvalsh(R)[..., -1].max()
-    radius = np.sqrt(threshold * np.maximum(spread, 0.0)) * (1.0 + 1e-9)
-    found = cKDTree(detections).query_ball_point(predicted, radius, return_sorted=True)
-    counts = np.fromiter(map(len, found), np.int64, len(found))
-    detection = np.fromiter(chain.from_iterable(found), np.int64, int(counts.sum()))
-    return np.repeat(np.arange(len(found)), counts), detection
 
 
 def association_cost(
@@ -368,3 +309,85 @@ def _window(seen: BoolArray, length: int) -> BoolArray:
         return seen
     missing = max(length - seen.shape[1], 0)
     return np.pad(seen[:, seen.shape[1] - length + missing :], ((0, 0), (missing, 0)))
+
+
+@kernel
+def choose(
+    fit: FloatArray, tentative: BoolArray, missed: float, log_clutter: float
+) -> tuple[IntArray, bool]:
+    """`assign_by_rank` where no pair competes with another: the detection (T,) of each
+    target, -1 for none, and whether that is all there is to say.
+
+    fit (T, D): of `imm.gate`; confirmed targets choose before those that are `tentative` (T,);
+    missed: ln (1 - P_D) / P_D. False where a target could take two detections, or a detection
+    could go to two targets of the same rank: then the choice has to be weighed.
+    """
+    T, D = fit.shape
+    chosen = np.full(T, -1, dtype=np.int64)
+    taken_by = np.full(D, -1, dtype=np.int64)
+    for turn in range(2):
+        for t in range(T):
+            if tentative[t] != (turn == 1):
+                continue
+            for d in range(D):
+                if not fit[t, d] > -np.inf or not missed - fit[t, d] + log_clutter < 0.0:
+                    continue
+                holder = taken_by[d]
+                if holder >= 0 and tentative[holder] != tentative[t]:
+                    continue
+                if holder >= 0 or chosen[t] >= 0:
+                    return chosen, False
+                chosen[t], taken_by[d] = d, t
+    return chosen, True
+
+
+@kernel
+def count(
+    age: IntArray,
+    seen: BoolArray,
+    misses: IntArray,
+    last_hit_ns: IntArray,
+    status: np.ndarray,
+    hit: BoolArray,
+    looked: BoolArray,
+    stamp_ns: int,
+    confirm_hits: int,
+    delete_misses: int,
+    max_coast_ns: int,
+) -> tuple[np.ndarray, IntArray, BoolArray, IntArray, IntArray, BoolArray]:
+    """See `Tracks.scan`: status, age, seen, misses and last_hit_ns of the tracks that
+    live on, and the mask kept (T,) of those."""
+    T, window = seen.shape
+    kept = np.zeros(T, dtype=np.bool_)
+    out = 0
+    status_1, age_1 = np.empty(T, dtype=np.uint8), np.empty(T, dtype=np.int64)
+    seen_1 = np.empty((T, window), dtype=np.bool_)
+    misses_1, last_1 = np.empty(T, dtype=np.int64), np.empty(T, dtype=np.int64)
+    for t in range(T):
+        there = looked[t] or hit[t]
+        hits = 0
+        for k in range(window):
+            was_hit = seen[t, k]
+            if there:
+                was_hit = seen[t, k + 1] if k + 1 < window else hit[t]
+            seen_1[out, k] = was_hit
+            hits += was_hit
+        age_1[out] = age[t] + there
+        misses_1[out] = 0 if hit[t] else misses[t] + there
+        last_1[out] = stamp_ns if hit[t] else last_hit_ns[t]
+        if status[t] != TENTATIVE or hits >= confirm_hits:
+            status_1[out] = CONFIRMED if hit[t] else (COASTING if there else status[t])
+            ended = misses_1[out] >= delete_misses
+        else:
+            status_1[out] = TENTATIVE
+            ended = min(age_1[out], window) - hits > window - confirm_hits
+        kept[t] = not ended and stamp_ns - last_1[out] <= max_coast_ns
+        out += kept[t]
+    return status_1[:out], age_1[:out], seen_1[:out], misses_1[:out], last_1[:out], kept
+
+
+def warm() -> None:
+    """Run the kernels once on tiny input: compiled or loaded from the cache."""
+    yes, no = np.ones(1, np.int64), np.zeros(1, np.bool_)
+    choose(np.zeros((1, 1)), no, 0.0, 0.0)
+    count(yes, no[:, None], yes, yes, yes.astype(np.uint8), no, no, 1, 1, 1, 1)

@@ -15,12 +15,12 @@
 """Systematic errors in a Kalman filter: constants that are considered, and the update that leaves
 them alone.
 
-A receiver that lies a metre off, a clock that is half a millisecond late: such an error is the
-same in every measurement, so it does not average out, and a larger measurement variance cannot
-stand for it. It belongs into the state as a constant b. Where the measurements can tell b it is
+An error such as a receiver that stands a metre off, or a clock that is half a millisecond late, is
+the same in every measurement. It does not average out, and a larger measurement variance does not
+model it. It belongs into the state as a constant b. Where the measurements determine b it is
 *estimated* like any state. Where they hardly can, or where its stated variance is a guess, it is
 *considered* (Schmidt, 1966): b keeps its mean and its variance for ever, and only its covariance
-with the rest of the state is kept up, which is what makes the stated covariance honest. The gain
+with the rest of the state is kept up, so that the covariance of the rest is right. The gain
 is the Kalman gain with the rows of b set to zero.
 
 A considered b has the same mean and covariance in all models, targets and times. So models mix it
@@ -38,8 +38,8 @@ import math
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
-from .covariance import JITTER, LIMIT
 from .jit import kernel
+from .small_matrices import JITTER, LIMIT
 
 
 def consider_update(

@@ -21,7 +21,6 @@ some are false and the pairing is not known; `identity_switches` along time.
 the filter is consistent (`nees` for states, `nis` for innovations). One value says little; the
 average of many has narrow `average_bounds`. An average above them means an overconfident filter,
 one below them a filter that wastes information. `interval_coverage` tests any interval.
-`innovation_autocorrelation` finds unmodelled dynamics: the innovations of a good filter are white.
 
 References: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*
 (2001), sec. 5.4; Schuhmacher, Vo, Vo, *A consistent metric for performance evaluation of
@@ -39,7 +38,6 @@ from attrs import frozen
 import numpy as np
 
 from .arrays import FloatArray, IntArray
-from .covariance import solve
 from .kalman import factorise, log_density
 
 
@@ -158,37 +156,6 @@ def interval_coverage(truth: FloatArray, low: FloatArray, high: FloatArray) -> f
     """Share of `truth` inside [low, high], NaN when there is none."""
     inside = (low <= truth) & (truth <= high)
     return float(np.mean(inside)) if inside.size else math.nan
-
-
-class Whiteness(NamedTuple):
-    """autocorrelation: (lags,) of lag 1, 2, ...; bound: for white innovations each value lies
-    within +-bound with the stated probability."""
-
-    autocorrelation: FloatArray
-    bound: float
-
-
-def innovation_autocorrelation(
-    innovation: FloatArray, covariance: FloatArray, lags: int = 10, probability: float = 0.95
-) -> Whiteness:
-    """Autocorrelation along time of the whitened innovations.
-
-    innovation: (K, m); covariance: (K, m, m). Raises ValueError unless K > lags.
-    """
-    from scipy.stats import norm
-
-    white = solve(factorise(covariance), innovation[..., None])[..., 0]
-    steps, m = white.shape
-    if steps <= lags:
-        raise ValueError(f'{steps} innovations are too few for {lags} lags')
-    values = [
-        np.sum(white[lag:] * white[:-lag])
-        / np.sqrt(np.sum(white[lag:] ** 2) * np.sum(white[:-lag] ** 2))
-        for lag in range(1, lags + 1)
-    ]
-    return Whiteness(
-        np.array(values), float(norm.ppf(0.5 * (1.0 + probability)) / np.sqrt(steps * m))
-    )
 
 
 class Gospa(NamedTuple):

@@ -19,40 +19,36 @@ one direction than its components are one by one, the covariance cannot hold bot
 formulas give a matrix with negative eigenvalues. Joseph's form is no cure: it squares what
 rounding did to the gain.
 
-So every covariance keeps to one stated limit. It is *sound* when no eigenvalue of its correlation
-matrix is below `LIMIT`: then Cholesky's method finds a factor, in whatever order it rounds. (A
-component without variance is sound when it has no covariance either.) `propagate` and `correct`
-compute in covariance form, which is the fastest, and try Cholesky's method on what they get. Where
-the limit is passed they repair, and tell, so that callers can count:
+So every covariance keeps to one stated limit (`is_psd`): no eigenvalue of its correlation matrix
+is below `LIMIT`. Then Cholesky's method finds a factor, in whatever order it rounds. (A component
+without variance must have no covariance either.) `propagate` and `correct` compute in covariance
+form, which is the fastest, and try Cholesky's method on the result. Where the limit is passed they
+repair, and say which, so that callers can count:
 
 1. The step is computed again in square-root form, from ``P = L L'``. The result is a sum of
    squares whose rounding is small beside its *own* diagonal, however small that has become.
-2. The diagonal is lifted by the share `JITTER`, more if need be. Nothing is thereby claimed to be
-   known better than before.
+2. The share `JITTER` is added to the diagonal, more if need be (`add_jitter`). Nothing is thereby
+   claimed to be known better than before.
 
 The innovation covariance ``S = H P H' + R`` obeys the same limit, and no measured value has less
 than `LIMIT` of it as its own noise: there R is raised by `JITTER` of S's diagonal, so that a
 perfect measurement leaves a variance, and can be repeated.
 
-`small_matrices` compiles the same rules. Reference: Bierman, *Factorization Methods for Discrete
-Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation* (2000), ch. 12.
+The rules and repairs are compiled in `small_matrices`. Reference: Bierman, *Factorization Methods
+for Discrete Sequential Estimation* (1977); Kailath, Sayed, Hassibi, *Linear Estimation*
+(2000), ch. 12.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from . import small_matrices
 from .arrays import BoolArray, FloatArray
-
-LIMIT = 1e-14
-"""Least eigenvalue of a correlation matrix. Rounding in Cholesky's method changes it by at most
-n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a sound covariance has a
-factor."""
-
-JITTER = 1e-13
-"""What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
+from .small_matrices import LIMIT
 
 
 class CovarianceError(ValueError):
@@ -102,50 +98,24 @@ def solve(matrix: FloatArray, columns: FloatArray) -> FloatArray:
 
 def is_psd(P: FloatArray) -> BoolArray:
     """Whether each P (..., n, n) keeps to the limit, (...,). False where it is not finite."""
-    n = P.shape[-1]
-    root = np.zeros_like(P)
-    good = np.isfinite(P).all(axis=(-1, -2))
-    with np.errstate(all='ignore'):
-        for a in range(n):
-            for b in range(a):
-                value = P[..., a, b] - np.sum(root[..., a, :b] * root[..., b, :b], axis=-1)
-                pivot = root[..., b, b]
-                good &= (pivot > 0.0) | (P[..., a, b] == 0.0)
-                root[..., a, b] = np.where(pivot > 0.0, value / pivot, 0.0)
-            own = P[..., a, a]
-            rest = own - LIMIT * own - np.sum(np.square(root[..., a, :a]), axis=-1)
-            empty = (own == 0.0) & (rest == 0.0)
-            good &= empty | (rest > 0.0)
-            root[..., a, a] = np.sqrt(np.where(rest > 0.0, rest, 0.0))
-    return np.asarray(good)
+    return small_matrices.are_psd(_batch(P)).reshape(P.shape[:-2])
 
 
 def add_jitter(P: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """`P` (..., n, n) with the diagonals of those lifted that are not sound, and which (...,).
+    """`P` (..., n, n), with larger diagonals where it did not keep to the limit, and which
+    (...,) these are.
 
-    What no lift makes sound, because it is no covariance at all, stays as it is.
+    What no jitter makes positive definite, because it is no covariance at all, stays as it is.
     """
-    bad = ~is_psd(P)
-    lifted = np.array(P)
-    own = np.where(np.eye(P.shape[-1], dtype=bool), P, 0.0)
-    left, share = bad.copy(), JITTER
-    while left.any() and share < 2.0 * P.shape[-1]:
-        lifted[left] = P[left] + share * own[left]
-        left &= ~is_psd(lifted)
-        share *= 10.0
-    lifted[left] = P[left]
-    return lifted, bad
+    out = np.array(_batch(P))
+    repaired = small_matrices.add_jitter_each(out)
+    return out.reshape(P.shape), repaired.reshape(P.shape[:-2])
 
 
-def semidefinite_root(P: FloatArray) -> FloatArray:
-    """A square root L (..., n, n) of `P`, ``L L' = P``, of which negative eigenvalues count as
-    zero. The components' units do not matter."""
-    own = _diagonal(P)
-    scale = np.sqrt(np.where(own > 0.0, own, 1.0))
-    values, vectors = np.linalg.eigh(symmetrise(P) / (scale[..., :, None] * scale[..., None, :]))
-    return np.asarray(
-        scale[..., :, None] * vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    )
+def _batch(P: FloatArray) -> FloatArray:
+    """P (..., n, n) as (B, n, n), the form that kernels take."""
+    count = math.prod(P.shape[:-2])
+    return np.ascontiguousarray(P, np.float64).reshape(count, *P.shape[-2:])
 
 
 def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -153,9 +123,12 @@ def propagate(F: FloatArray, P: FloatArray, Q: FloatArray) -> tuple[FloatArray, 
     moved = symmetrise(F @ P @ transpose(F) + Q)
     bad = np.asarray(~is_psd(moved) & np.isfinite(moved).all(axis=(-1, -2)))
     if bad.any():
-        F, P, Q = (np.broadcast_to(each, moved.shape)[bad] for each in (F, P, Q))
-        root = F @ semidefinite_root(P)
-        moved[bad] = add_jitter(symmetrise(root @ transpose(root) + Q))[0]
+        cases = zip(*(np.broadcast_to(each, moved.shape)[bad] for each in (P, F, Q)))
+        again = np.empty_like(moved[bad])
+        for case, out in zip(cases, again):
+            root_P, root_F, root_Q = map(np.ascontiguousarray, case)
+            small_matrices.square_root_predict(root_P, root_F, root_Q, out)
+        moved[bad] = again
     return moved, bad
 
 
@@ -175,52 +148,18 @@ def correct(P: FloatArray, H: FloatArray, R: FloatArray) -> Corrected:
     usable = np.ones(bad.shape, bool)
     if bad.any():
         shapes = (updated.shape, (*bad.shape, *H.shape[-2:]), S.shape)
-        P, H, R = (np.broadcast_to(each, shape)[bad] for each, shape in zip((P, H, R), shapes))
-        updated[bad], gain[bad], factor[bad], usable[bad] = _correct_root(P, H, R)
+        cases = (np.broadcast_to(each, shape)[bad] for each, shape in zip((P, H, R), shapes))
+        again = [_square_root_correct(*map(np.ascontiguousarray, case)) for case in zip(*cases)]
+        updated[bad], gain[bad], factor[bad], usable[bad] = map(np.array, zip(*again))
     return Corrected(updated, gain, factor, S, bad & usable, usable)
 
 
-def _correct_root(
+def _square_root_correct(
     P: FloatArray, H: FloatArray, R: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """P, gain, factor and usable of B cases in square-root form: P (B, n, n), H (B, m, n), R (B,
-    m, m).
-
-    [[R^1/2, H L], [0, L]] is turned into [[S^1/2, 0], [K S^1/2, L']] by an orthogonal matrix.
-    """
-    m, n = H.shape[-2:]
-    finite: BoolArray = np.ones(len(P), np.bool_)
-    for each in (P, H, R):
-        finite &= np.isfinite(each).all(axis=(1, 2))
-    safe = [np.where(finite[:, None, None], each, 0.0) for each in (P, H, R)]
-    root, noise = semidefinite_root(safe[0]), semidefinite_root(safe[2])
-    seen = safe[1] @ root
-    own = np.square(seen).sum(axis=-1) + np.square(noise).sum(axis=-1)
-    usable = finite & (own > 0.0).all(axis=-1)
-    floor = np.where(_diagonal(safe[2]) > LIMIT * own, 0.0, JITTER * own)
-    after = _triangular(noise, seen, root, floor)
-    singular = (np.square(_diagonal(after)[:, :m]) <= LIMIT * own).any(axis=1)
-    if singular.any():
-        after = _triangular(noise, seen, root, np.where(singular[:, None], JITTER * own, floor))
-    factor = np.where(usable[:, None, None], after[:, :m, :m], np.eye(m))
-    gain = transpose(solve(transpose(factor), transpose(after[:, m:, :m])))
-    updated, _ = add_jitter(symmetrise(after[:, m:, m:] @ transpose(after[:, m:, m:])))
-    return (
-        np.where(usable[:, None, None], updated, P),
-        np.where(usable[:, None, None], gain, 0.0),
-        factor,
-        usable,
-    )
-
-
-def _triangular(
-    noise: FloatArray, seen: FloatArray, root: FloatArray, lifted: FloatArray
-) -> FloatArray:
-    """Lower triangular T (B, m + n, m + n) with a positive diagonal, ``T T' = A A'``, A =
-    [[noise, seen, lifted^1/2], [0, root, 0]]; `lifted` (B, m) is a diagonal."""
-    m, n = seen.shape[-2:]
-    A = np.zeros((len(root), m + n, m + n + m))
-    A[:, :m, :m], A[:, :m, m : m + n], A[:, m:, m : m + n] = noise, seen, root
-    A[:, range(m), range(m + n, m + n + m)] = np.sqrt(lifted)
-    T = transpose(np.asarray(np.linalg.qr(transpose(A), 'r')))
-    return np.asarray(T * np.where(_diagonal(T) < 0.0, -1.0, 1.0)[:, None])
+) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
+    """P, gain, factor and usable of one case: P (n, n), H (m, n), R (m, m)."""
+    m, n = H.shape
+    out, gain, factor = np.empty((n, n)), np.empty((n, m)), np.empty((m, m))
+    if small_matrices.square_root_update(P, H, R, factor, gain, out):
+        return out, gain, factor, True
+    return P, np.zeros((n, m)), np.eye(m), False

@@ -15,7 +15,7 @@
 """Errors that are correlated in time: the first-order Gauss-Markov process.
 
 A position source that filters its output makes errors that last. As white noise they would
-average out within seconds and the track would be sure of what is wrong. The process
+average out within seconds, and the covariance of the track would be far too small. The process
 ``b' = a b + q`` with ``a = exp(-dt / time)`` and ``var q = std^2 (1 - a^2)`` keeps the variance
 ``std^2`` at any step, and its correlation fades to 1/e within `time`.
 

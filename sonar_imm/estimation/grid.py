@@ -16,12 +16,13 @@
 
 With one state the densities need no approximation but a fine grid. Probability sits on the cells
 x_g = x_0 + g step; ``p (M, G)`` is the joint probability of model j and cell g, all models
-together summing to one. A cycle is that of every multiple-model filter, with sums for integrals::
+together summing to one. A cycle is that of a particle filter whose particles never move, with sums
+for integrals; cells need neither resampling nor rejuvenation::
 
-    mix       s_j(g) = sum_i P_ij p_i(g)                      who could have become model j
-    predict   p_j(g) = sum_h N(g - h; sigma_j / step) s_j(h)  each model walks at random
-    update    p_j(g) <- p_j(g) L(g) / sum                     each cell meets the measurement
-    combine   mu_j = sum_g p_j(g),  mean = sum x_g p_j(g)
+    propagate  s_j(g) = sum_i P_ij p_i(g)                      `mix`: who could become model j
+               p_j(g) = sum_h N(g - h; sigma_j / step) s_j(h)  `walk`: each model moves at random
+    weigh      p_j(g) <- p_j(g) L(g) / sum                     each cell meets the measurement
+    summarise  mu_j = sum_g p_j(g),  mean = sum x_g p_j(g)
 
 and the smoother runs back from the last step with what the future says of each cell,
 
@@ -32,75 +33,237 @@ primes denoting the next step. Sums over equal steps converge faster than any po
 functions that are smooth on its scale: a step of the smallest sigma is already exact to 1e-8.
 A much smaller sigma keeps its variance (`NARROW`).
 
-`filter_densities` and `smooth_densities` are these lines in numpy over all cells; the kernels of
-`grid_kernels` restrict them to the cells that hold probability.
+The verbs are compiled and work on the cells that hold probability. After `weigh` nearly all of it
+lies in a narrow window [low, high) of the grid, the same for all models; what holds less than
+`TAIL` at either end is cut off. Values outside the window are garbage and never read.
+
+A walk with a large sigma would cost cells times sigma. It is smooth, so it is computed on every
+c-th cell only: probability is handed to the coarse cells with the weights of cubic interpolation,
+which keep its first four moments, walks there, and is interpolated back. With at least
+`COARSE_SIGMA` coarse cells per sigma the error is below 1e-4 of the peak.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
+import math
 
 from .arrays import FloatArray
+from .elementary import exponentials
+from .jit import kernel
 
 NARROW = 0.5
 """A walk of less than so many cells goes to the next cell at most, with the chance that gives it
 its variance: samples of the normal law would have too little."""
+TAIL = 1e-13
+COARSE_SIGMA = 8
+REACH = 7.0
+"""A walk goes no further than so many sigma."""
+WIDEST = 1e9
+"""Walks are cut to this sigma in cells, wider than any grid: cell numbers stay integers."""
 
 
-class Filtered(NamedTuple):
-    """density (T, M, G), joint over models and cells at each step; log_likelihood (T,) of each
-    measurement given those before it."""
-
-    density: FloatArray
-    log_likelihood: FloatArray
+@kernel
+def reach_of(sigma: float) -> int:
+    """Cells a walk of `sigma` cells can cross."""
+    return int(math.ceil(REACH * (sigma if sigma < WIDEST else WIDEST)))
 
 
-def walk_matrix(cells: int, sigma: float) -> FloatArray:
-    """Oracle for tests: W[h, g] (G, G), the probability of going from cell h to g, `sigma` in
-    cells. Rows far from the ends sum to one; near them probability leaves the grid."""
-    if not sigma > 0.0:
-        return np.eye(cells)
-    lag = np.arange(cells)
+@kernel
+def walk(
+    source: FloatArray,
+    low: int,
+    high: int,
+    sigma: float,
+    scratch: FloatArray,
+    out: FloatArray,
+    out_low: int,
+    out_high: int,
+) -> None:
+    """Spread source [low, high) by a normal distribution of `sigma` cells into out [out_low,
+    out_high), which is overwritten. scratch (7, max(G, 128) + 16) for a grid of G cells, whatever
+    sigma is.
+    """
+    sigma = sigma if sigma < WIDEST else WIDEST  # NaN too
+    for g in range(out_low, out_high):
+        out[g] = 0.0
+    factor = int(sigma / COARSE_SIGMA)
+    if factor < 2:
+        _spread(source, low, high, sigma, scratch[2], out, out_low, out_high)
+        return
+    inside, outside = scratch[0], scratch[1]
+    a, b, c, d = scratch[3], scratch[4], scratch[5], scratch[6]
+    # A coarse cell wider than the grid has no more fine cells than the grid.
+    for k in range(min(factor, max(high, out_high))):
+        f = k / factor
+        a[k] = -f * (f - 1.0) * (f - 2.0) / 6.0
+        b[k] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
+        c[k] = -(f + 1.0) * f * (f - 2.0) / 2.0
+        d[k] = (f + 1.0) * f * (f - 1.0) / 6.0
+    # Coarse cell m + 2 stands at the fine cell m * factor: interpolation needs one cell before it.
+    first, last = low // factor, (high - 1) // factor
+    for m in range(first + 1, last + 5):
+        inside[m] = 0.0
+    for m in range(first, last + 1):
+        shift = m * factor
+        for g in range(max(low, shift), min(high, shift + factor)):
+            k = g - shift
+            inside[m + 1] += source[g] * a[k]
+            inside[m + 2] += source[g] * b[k]
+            inside[m + 3] += source[g] * c[k]
+            inside[m + 4] += source[g] * d[k]
+    to, end = out_low // factor, (out_high - 1) // factor
+    for m in range(to + 1, end + 5):
+        outside[m] = 0.0
+    coarse = sigma / factor
+    _spread(inside, first + 1, last + 5, coarse, scratch[2], outside, to + 1, end + 5)
+    for m in range(to, end + 1):
+        shift = m * factor
+        va, vb = outside[m + 1] / factor, outside[m + 2] / factor
+        vc, vd = outside[m + 3] / factor, outside[m + 4] / factor
+        for k in range(max(out_low - shift, 0), min(out_high - shift, factor)):
+            out[shift + k] = max(va * a[k] + vb * b[k] + vc * c[k] + vd * d[k], 0.0)
+
+
+@kernel
+def _spread(
+    source: FloatArray,
+    low: int,
+    high: int,
+    sigma: float,
+    taps: FloatArray,
+    out: FloatArray,
+    out_low: int,
+    out_high: int,
+) -> None:
+    """`walk` on the cells themselves, added to `out`."""
     if sigma < NARROW:
-        row = np.where(lag == 0, 1.0 - sigma**2, np.where(lag == 1, 0.5 * sigma**2, 0.0))
-        return np.asarray(row[np.abs(lag[:, None] - lag)])
-    row = np.exp(-0.5 * (lag / sigma) ** 2)
-    return np.asarray(row[np.abs(lag[:, None] - lag)] / (2.0 * row.sum() - 1.0))
+        taps[0], taps[1] = 1.0 - sigma * sigma, 0.5 * sigma * sigma
+        for lag in range(-1, 2):
+            for g in range(max(out_low, low + lag), min(out_high, high + lag)):
+                out[g] += taps[abs(lag)] * source[g - lag]
+        return
+    reach = reach_of(sigma)
+    total = -1.0
+    for lag in range(reach + 1):
+        taps[lag] = math.exp(-0.5 * (lag / sigma) ** 2) if lag > 0 else 1.0
+        total += 2.0 * taps[lag]
+    tap = taps[0] / total
+    for g in range(max(out_low, low), min(out_high, high)):
+        out[g] += tap * source[g]
+    for lag in range(1, reach + 1):
+        tap = taps[lag] / total
+        # Where both the source `lag` above and that `lag` below exist they come in one pass.
+        above, above_end = max(out_low, low - lag), min(out_high, high - lag)
+        below, below_end = max(out_low, low + lag), min(out_high, high + lag)
+        both, both_end = max(above, below), max(min(above_end, below_end), max(above, below))
+        for g in range(above, min(above_end, both)):
+            out[g] += tap * source[g + lag]
+        for g in range(both, both_end):
+            out[g] += tap * (source[g + lag] + source[g - lag])
+        for g in range(max(below, both_end if both_end > both else below), below_end):
+            out[g] += tap * source[g - lag]
 
 
-def filter_densities(
-    start: FloatArray, transition: FloatArray, sigma: FloatArray, log_likelihood: FloatArray
-) -> Filtered:
-    """Oracle for tests: filter T steps. start (M, G) before the first step; sigma (T, M) in cells;
-    log_likelihood (T, G)."""
-    T, G = log_likelihood.shape
-    density, log_sums = np.empty((T, *start.shape)), np.empty(T)
-    p = start
-    for t in range(T):
-        mixed = transition.T @ p
-        p = np.stack([m @ walk_matrix(G, s) for m, s in zip(mixed, sigma[t])])
-        p /= p.sum()
-        best = log_likelihood[t].max()
-        p = p * np.exp(log_likelihood[t] - best)
-        log_sums[t] = best + np.log(p.sum())
-        density[t] = p = p / p.sum()
-    return Filtered(density, log_sums)
+@kernel
+def mix(p: FloatArray, low: int, high: int, transition: FloatArray, mixed: FloatArray) -> None:
+    """Let the models change: p (M, G) into mixed (M, G), both on [low, high)."""
+    M = p.shape[0]
+    for j in range(M):
+        out = mixed[j]
+        for g in range(low, high):
+            out[g] = 0.0
+        for i in range(M):
+            source, share = p[i], transition[i, j]
+            for g in range(low, high):
+                out[g] += share * source[g]
 
 
-def smooth_densities(
-    density: FloatArray, transition: FloatArray, sigma: FloatArray, log_likelihood: FloatArray
-) -> FloatArray:
-    """Oracle for tests: smoothed densities (T, M, G) from the filtered ones; arguments as in
-    `filter_densities`."""
-    T, M, G = density.shape
-    smoothed, beta = density.copy(), np.ones((M, G))
-    for t in range(T - 2, -1, -1):
-        L = np.exp(log_likelihood[t + 1] - log_likelihood[t + 1].max())
-        back = np.stack([walk_matrix(G, s) @ (L * b) for b, s in zip(beta, sigma[t + 1])])
-        beta = transition @ back
-        beta /= beta.max()
-        smoothed[t] = density[t] * beta
-        smoothed[t] /= smoothed[t].sum()
-    return smoothed
+@kernel
+def weigh(
+    p: FloatArray, low: int, high: int, log_likelihood: FloatArray, work: FloatArray
+) -> float:
+    """Multiply p (M, G) on [low, high) by a likelihood (high - low,) and normalise it. Gives the
+    log likelihood of the measurement; -inf when it is impossible and p was only normalised.
+    work (2, G) is scratch."""
+    M, n = p.shape[0], high - low
+    best, before, after = -math.inf, 0.0, 0.0
+    for g in range(n):
+        best = log_likelihood[g] if log_likelihood[g] > best else best
+    possible = math.isfinite(best)
+    scratch, q = work[0, :n], work[1, :n]
+    if possible:
+        for g in range(n):
+            log_likelihood[g] -= best
+        exponentials(log_likelihood, scratch, q)
+    for j in range(M):
+        row = p[j, low:high]
+        # Four sums at a time: each addition would wait for the one before.
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for g in range(0, n - 3, 4):
+            a += row[g]
+            b += row[g + 1]
+            c += row[g + 2]
+            d += row[g + 3]
+        for g in range(n - n % 4, n):
+            a += row[g]
+        before += (a + b) + (c + d)
+        if possible:
+            a, b, c, d = 0.0, 0.0, 0.0, 0.0
+            for g in range(0, n - 3, 4):
+                a += row[g] * q[g]
+                b += row[g + 1] * q[g + 1]
+                c += row[g + 2] * q[g + 2]
+                d += row[g + 3] * q[g + 3]
+            for g in range(n - n % 4, n):
+                a += row[g] * q[g]
+            after += (a + b) + (c + d)
+    possible = possible and after > 0.0
+    total = after if possible else before
+    for j in range(M):
+        row = p[j, low:high]
+        if possible:
+            for g in range(n):
+                row[g] *= q[g] / total
+        else:
+            for g in range(n):
+                row[g] /= total
+    return best + math.log(after / before) if possible else -math.inf
+
+
+@kernel
+def trim(p: FloatArray, low: int, high: int) -> tuple[int, int]:
+    """The part of [low, high) outside of which p (M, G) holds less than `TAIL` at either end."""
+    tail = 0.0
+    while low < high - 1:
+        for j in range(p.shape[0]):
+            tail += p[j, low]
+        if tail > TAIL:
+            break
+        low += 1
+    tail = 0.0
+    while low < high - 1:
+        for j in range(p.shape[0]):
+            tail += p[j, high - 1]
+        if tail > TAIL:
+            break
+        high -= 1
+    return low, high
+
+
+@kernel
+def summarise(
+    p: FloatArray, low: int, high: int, cells: FloatArray, probability: FloatArray
+) -> tuple[float, float]:
+    """Mean and variance of the state and probability (M,) of the models; cells (G,) are the
+    states on the grid."""
+    M = p.shape[0]
+    mean, variance = 0.0, 0.0
+    for j in range(M):
+        probability[j] = 0.0
+        for g in range(low, high):
+            probability[j] += p[j, g]
+            mean += p[j, g] * cells[g]
+    for j in range(M):
+        for g in range(low, high):
+            variance += p[j, g] * (cells[g] - mean) ** 2
+    return mean, variance

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Late, shuffled, repeated and outlying stamps, and how to get the right answer in spite of them.
+"""Late, shuffled, repeated and outlying stamps.
 
 Sonar data carry the instant of transmission and may arrive seconds later, in any order. Two
 objects deal with that.
@@ -115,7 +115,7 @@ class _Run(Generic[Item]):
 
     @property
     def doubtful(self) -> int:
-        return sum(not one.late for one in self.held)
+        return sum(not item.late for item in self.held)
 
     @property
     def full(self) -> bool:
@@ -130,7 +130,7 @@ class _Run(Generic[Item]):
         dropped = [self.held.pop(0)] if self.full else []
         self.held.append(_Held(stamp_ns, item, late))
         _insert_distinct(self.stamps, stamp_ns)
-        return sum(not one.late for one in dropped)
+        return sum(not item.late for item in dropped)
 
 
 class StampGate(Generic[Item]):
@@ -223,14 +223,14 @@ class StampGate(Generic[Item]):
     def _restart(self, abandoned: int) -> GateDecision[Item]:
         held, self._run = self._run.held, _Run(self.hold)
         self._first, self._newest = [], []
-        for one in held:
-            self._accept(one.stamp_ns)
+        for entry in held:
+            self._accept(entry.stamp_ns)
         # The last one was never reported to anybody, so it cannot be reinstated.
         return GateDecision(
             'restart',
-            released=tuple(one.item for one in held),
+            released=tuple(entry.item for entry in held),
             abandoned=abandoned,
-            reinstated=sum(one.late for one in held[:-1]),
+            reinstated=sum(entry.late for entry in held[:-1]),
         )
 
 

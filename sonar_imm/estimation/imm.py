@@ -85,7 +85,7 @@ class Updated(NamedTuple):
 
 
 def mix(x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray) -> Mixed:
-    """Oracle for tests: c_j = sum_i P_ij mu_i; x0_j = sum_i W_ij x_i; P0_j = sum_i W_ij [P_i +
+    """c_j = sum_i P_ij mu_i; x0_j = sum_i W_ij x_i; P0_j = sum_i W_ij [P_i +
     (x_i - x0_j)(.)^T], W_ij = P_ij mu_i / c_j.
 
     A model that nothing can become (c_j = 0) is given the mixture of all, so that it stays finite
@@ -177,7 +177,7 @@ def gate(
     R: FloatArray,
     threshold: float,
 ) -> FloatArray:
-    """Oracle for tests: how well each detection (D, m) with covariance R (D, m, m) fits each
+    """How well each detection (D, m) with covariance R (D, m, m) fits each
     target: (T, D) log-likelihoods ln sum_j c_j N(nu_j; 0, S_j), -inf outside the gate.
 
     h (T, M, m): what each model expects; H (T or 1, M, m, n) its Jacobian; P (T, M, n, n) and

@@ -27,16 +27,17 @@ import math
 import numpy as np
 
 from .arrays import BoolArray, FloatArray
-from .covariance import LIMIT
 from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import (
     cholesky,
-    cholesky_lifted,
+    cholesky_with_jitter,
     gain,
     innovation_covariance,
     is_psd,
     joseph,
+    LIMIT,
+    product,
     square_root_predict,
     square_root_update,
     whitened_square,
@@ -137,14 +138,11 @@ def predict(
     FP, L = np.empty((n, n)), np.empty((n, n))
     for t in range(T):
         for j in range(M):
+            product(F[j], P[t, j], FP)
             for a in range(n):
                 total = B[j, a]
                 for b in range(n):
                     total += F[j, a, b] * x[t, j, b]
-                    value = 0.0
-                    for k in range(n):
-                        value += F[j, a, k] * P[t, j, k, b]
-                    FP[a, b] = value
                 x1[t, j, a] = total
             for a in range(n):
                 for b in range(a + 1):
@@ -237,7 +235,7 @@ def update(
         for j in range(M):
             mu[t, j] /= total
         log_likelihood[t] = best + math.log(total)
-        if cholesky_lifted(S_mix, L):
+        if cholesky_with_jitter(S_mix, L):
             nis[t] = whitened_square(L, mean, scratch)
     return x1, P1, mu, log_likelihood, nis, ok, repaired
 
@@ -289,7 +287,7 @@ def gate(
                     v[r] = z[d, r] - h[t, j, r]
                     for s in range(m):
                         S[r, s] = S0[j, r, s] + R[d, r, s]
-                if cholesky_lifted(S, L):
+                if cholesky_with_jitter(S, L):
                     nis = whitened_square(L, v, w)
                     inside = inside or nis <= threshold
                     value = -0.5 * (nis + m * LOG_2PI)
@@ -323,12 +321,7 @@ def combine(
         for j in range(M):
             if mu[t, j] == 0.0:
                 continue
-            for a in range(q):
-                for b in range(n):
-                    value = 0.0
-                    for k in range(n):
-                        value += E[j, a, k] * P[t, j, k, b]
-                    EP[a, b] = value
+            product(E[j], P[t, j], EP)
             for a in range(q):
                 for b in range(a + 1):
                     value = (y[j, a] - mean[t, a]) * (y[j, b] - mean[t, b])

@@ -33,17 +33,25 @@ by cluster (`associate`); a cluster with more than `MOST_EVENTS` gets a smaller 
 track, model j shares detection i in proportion to N_ji (`update`), ``beta_i|j ~ beta_i N_ji /
 f_i`` and ``mu_j ~ c_j (beta_0 + sum_i beta_i N_ji / f_i)``, moment-matched in each model.
 
-This module is the readable numpy form; `jipda_kernels` compiles the same mathematics.
+All arrays are float64 and C-contiguous. `warm` compiles or loads every kernel.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
 
 import numpy as np
 
-from .arrays import BoolArray, FloatArray
-from .covariance import add_jitter
+from .arrays import BoolArray, FloatArray, IntArray
+from .jit import kernel
+from .small_matrices import (
+    add_jitter,
+    cholesky_with_jitter,
+    gain,
+    innovation_covariance,
+    joseph,
+    whitened_square,
+)
 
 MOST_EVENTS = 20_000
 """Joint events of a cluster beyond which its gate shrinks."""
@@ -57,179 +65,338 @@ LEAST_GATE = 1e-6
 OPENS_GATE = 0.01
 """A model less probable than this opens no gate for a shared detection."""
 
-
-class Likelihoods(NamedTuple):
-    """density (T, D, M): ``N(z_i; h_j, S_j)``; mixture (T, D): f; nis (T, D): the least of the
-    models that open a gate, infinite where there is none."""
-
-    density: FloatArray
-    mixture: FloatArray
-    nis: FloatArray
+LOG_2PI = math.log(2.0 * math.pi)
 
 
-class Association(NamedTuple):
-    """beta (T, D), missed (T,): see the module's text; existence (T,) is their sum."""
-
-    beta: FloatArray
-    missed: FloatArray
-    existence: FloatArray
-
-
+@kernel
 def likelihoods(
-    h: FloatArray, H: FloatArray, P: FloatArray, c: FloatArray, z: FloatArray, R: FloatArray
-) -> Likelihoods:
-    """Oracle for tests: how each detection (D, m) with covariance R (D, m, m) fits each model of
-    each track.
+    h: FloatArray,
+    H: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    threshold: float = np.inf,
+) -> tuple[FloatArray, FloatArray]:
+    """See `jipda.likelihoods`: mixture and nis (T, D). A pair whose nis is sure to be above
+    `threshold` has none: mixture 0, nis infinite."""
+    T, M, m = h.shape
+    D, n = len(z), P.shape[2]
+    mixture, least = np.zeros((T, D)), np.full((T, D), np.inf)
+    PHt, nothing, S0 = np.empty((n, m)), np.zeros((m, m)), np.empty((M, m, m))
+    S, L, v, w = np.empty((m, m)), np.zeros((m, m)), np.empty(m), np.empty(m)
+    for t in range(T):
+        for j in range(M):
+            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0[j])
+        for d in range(D):
+            # nis is at least v_r^2 / S_rr: most fixes are far from most tracks.
+            near = threshold == np.inf
+            j = 0
+            while not near and j < M:
+                near = c[t, j] > OPENS_GATE
+                for r in range(m):
+                    gap = z[d, r] - h[t, j, r]
+                    near = near and not gap * gap > threshold * (S0[j, r, r] + R[d, r, r])
+                j += 1
+            if not near:
+                continue
+            for j in range(M):
+                for r in range(m):
+                    v[r] = z[d, r] - h[t, j, r]
+                    for s in range(m):
+                        S[r, s] = S0[j, r, s] + R[d, r, s]
+                if not cholesky_with_jitter(S, L):
+                    continue
+                nis = whitened_square(L, v, w)
+                value = -0.5 * (nis + m * LOG_2PI)
+                for r in range(m):
+                    value -= math.log(L[r, r])
+                mixture[t, d] += c[t, j] * math.exp(value)
+                if c[t, j] > OPENS_GATE and nis < least[t, d]:
+                    least[t, d] = nis
+    return mixture, least
 
-    h (T, M, m): what the models expect; H (T or 1, M, m, n); P (T, M, n, n) and c (T, M),
-    predicted.
-    """
-    S, _ = add_jitter((H @ P @ np.swapaxes(H, -1, -2))[:, None] + R[None, :, None])
-    v = z[None, :, None] - h[:, None]
-    nis = np.einsum('tdjm,tdjm->tdj', v, np.linalg.solve(S, v[..., None])[..., 0])
-    m = h.shape[-1]
-    density = np.exp(-0.5 * (nis + m * np.log(2.0 * np.pi) + np.linalg.slogdet(S)[1]))
-    opens = (c > OPENS_GATE)[:, None]
-    return Likelihoods(
-        density,
-        np.einsum('tj,tdj->td', c, density),
-        np.where(opens, nis, np.inf).min(axis=-1, initial=np.inf),
-    )
 
-
+@kernel
 def associate(
     ratio: FloatArray,
     nis: FloatArray,
     existence: FloatArray,
     detection_probability: FloatArray,
     threshold: float,
-) -> Association:
-    """Oracle for tests: the sums over all joint events.
-
-    ratio (T, D): f / lambda; nis (T, D): a pair is possible where it is below `threshold`, and
-    below less in a cluster that is too large; existence, detection_probability (T,).
-    """
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """See `jipda.associate`: beta (T, D), missed (T,), existence (T,)."""
     T, D = ratio.shape
-    beta = np.zeros((T, D))
-    missed = existence * (1.0 - detection_probability)
-    missed = missed / (1.0 - existence * detection_probability)
-    for tracks, inside in _clusters(nis, threshold):
-        total, alone = 0.0, np.zeros(T)
-        shares = np.zeros((T, D))
-        for event in _events(inside, tracks):
-            weight = 1.0
-            for t, d in zip(tracks, event):
-                detected = existence[t] * detection_probability[t]
-                weight *= 1.0 - detected if d < 0 else detected * ratio[t, d]
-            total += weight
-            for t, d in zip(tracks, event):
-                if d < 0:
-                    alone[t] += weight
-                else:
-                    shares[t, d] += weight
-        beta[tracks] = shares[tracks] / total
-        missed[tracks] *= alone[tracks] / total
-    return Association(beta, missed, beta.sum(axis=1) + missed)
-
-
-def _clusters(nis: FloatArray, threshold: float) -> list[tuple[list[int], BoolArray]]:
-    """Tracks that share detections, and which pairs of them are possible (T, D)."""
-    inside = nis <= threshold
-    waiting = [t for t in range(len(nis)) if inside[t].any()]
-    clusters = []
-    while waiting:
-        tracks, detections = {waiting[0]}, inside[waiting[0]]
-        while new := {t for t in waiting if t not in tracks and (inside[t] & detections).any()}:
-            tracks |= new
-            detections = inside[sorted(tracks)].any(axis=0)
-        members = sorted(tracks)
-        waiting = [t for t in waiting if t not in tracks]
-        own, gate = inside, threshold
-        while _count(own, members) > MOST_EVENTS:
+    beta, missed, after = np.zeros((T, D)), np.empty(T), np.empty(T)
+    inside = np.empty((T, D), dtype=np.bool_)
+    for t in range(T):
+        detected = existence[t] * detection_probability[t]
+        missed[t] = existence[t] * (1.0 - detection_probability[t]) / (1.0 - detected)
+        for d in range(D):
+            inside[t, d] = nis[t, d] <= threshold
+    label = _labels(inside)
+    members, shares, alone = np.empty(T, dtype=np.int64), np.empty((T, D)), np.empty(T)
+    for first in range(T):
+        if label[first] != first:
+            continue
+        size = 0
+        for t in range(first, T):
+            if label[t] == first:
+                members[size] = t
+                size += 1
+        own = members[:size]
+        gate = threshold
+        while _enumerate(own, inside, ratio, existence, detection_probability, shares, alone) < 0:
             gate = gate * SMALLER if gate > LEAST_GATE else -1.0
-            own = nis <= gate
-        clusters.append((members, own))
-    return clusters
+            for t in own:
+                for d in range(D):
+                    inside[t, d] = nis[t, d] <= gate
+        for t in own:
+            missed[t] *= alone[t]
+            for d in range(D):
+                beta[t, d] = shares[t, d]
+    for t in range(T):
+        after[t] = missed[t]
+        for d in range(D):
+            after[t] += beta[t, d]
+    return beta, missed, after
 
 
-def _events(inside: BoolArray, tracks: list[int]) -> list[tuple[int, ...]]:
-    """All ways in which each of `tracks` takes a detection or none (-1), none taken twice; in
-    rising order."""
-    events: list[tuple[int, ...]] = [()]
-    for t in tracks:
-        events = [
-            (*event, d)
-            for event in events
-            for d in (-1, *np.flatnonzero(inside[t]).tolist())
-            if d < 0 or d not in event
-        ]
-    return events
-
-
-def _count(inside: BoolArray, tracks: list[int]) -> int:
-    """The number of joint events, or a number above `MOST_EVENTS`."""
-    used: set[int] = set()
-
-    def below(place: int, limit: int) -> int:
-        if place == len(tracks):
-            return 1
-        found = below(place + 1, limit)
-        for d in np.flatnonzero(inside[tracks[place]]).tolist():
-            if found > limit:
+@kernel
+def _labels(inside: BoolArray) -> IntArray:
+    """For each track the first track of its cluster; -1 for one without a detection."""
+    T, D = inside.shape
+    label = np.full(T, -1, dtype=np.int64)
+    for t in range(T):
+        for d in range(D):
+            if inside[t, d]:
+                label[t] = t
                 break
-            if d not in used:
-                used.add(d)
-                found += below(place + 1, limit - found)
-                used.remove(d)
-        return found
+    changed = True
+    while changed:
+        changed = False
+        for d in range(D):
+            least = T
+            for t in range(T):
+                if inside[t, d]:
+                    least = min(least, label[t])
+            for t in range(T):
+                if inside[t, d] and label[t] > least:
+                    label[t] = least
+                    changed = True
+    return label
 
-    return below(0, MOST_EVENTS)
+
+@kernel
+def _enumerate(
+    tracks: IntArray,
+    inside: BoolArray,
+    ratio: FloatArray,
+    existence: FloatArray,
+    detection_probability: FloatArray,
+    shares: FloatArray,
+    alone: FloatArray,
+) -> int:
+    """Visit the joint events of a cluster: the probability of each pair into `shares` (T, D), of
+    no detection into `alone` (T,). Gives their number, -1 where there are too many."""
+    size, D = len(tracks), inside.shape[1]
+    for t in tracks:
+        alone[t] = 0.0
+        for d in range(D):
+            shares[t, d] = 0.0
+    used = np.zeros(D, dtype=np.bool_)
+    chosen = np.full(size, -2, dtype=np.int64)
+    weight = np.ones(size + 1)
+    count, total, place = 0, 0.0, 0
+    while place >= 0:
+        if place == size:
+            count += 1
+            if count > MOST_EVENTS:
+                return -1
+            total += weight[size]
+            for k in range(size):
+                if chosen[k] < 0:
+                    alone[tracks[k]] += weight[size]
+                else:
+                    shares[tracks[k], chosen[k]] += weight[size]
+            place -= 1
+            continue
+        t = tracks[place]
+        if chosen[place] >= 0:
+            used[chosen[place]] = False
+        chosen[place] += 1
+        while chosen[place] >= 0 and chosen[place] < D:
+            if inside[t, chosen[place]] and not used[chosen[place]]:
+                break
+            chosen[place] += 1
+        if chosen[place] >= D:
+            chosen[place] = -2
+            place -= 1
+            continue
+        detected = existence[t] * detection_probability[t]
+        if chosen[place] < 0:
+            weight[place + 1] = weight[place] * (1.0 - detected)
+        else:
+            used[chosen[place]] = True
+            weight[place + 1] = weight[place] * detected * ratio[t, chosen[place]]
+        place += 1
+    for t in tracks:
+        alone[t] /= total
+        for d in range(D):
+            shares[t, d] /= total
+    return count
 
 
+@kernel
 def update(
     x: FloatArray,
     P: FloatArray,
     c: FloatArray,
-    innovation: FloatArray,
+    h: FloatArray,
     H: FloatArray,
+    z: FloatArray,
     R: FloatArray,
     beta: FloatArray,
-    missed: float,
-    considered: BoolArray | None = None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Oracle for tests: one track by all its detections, x (M, n), P (M, n, n) and mu (M,).
+    missed: FloatArray,
+    considered: BoolArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """`jipda.update` of each track: x (T, M, n), P (T, M, n, n), mu (T, M), covariances repaired.
 
-    innovation (D, M, m); H (M, m, n); R (D, m, m); beta (D,), missed: given that the target
-    exists, so that they sum to one; considered: (n,) states that have an influence but are not
-    estimated.
+    h (T, M, m) expected; z (D, m); R (D, m, m); beta (T, D) and missed (T,) as of `associate`:
+    they need not sum to one. considered (n,).
     """
-    M, n = x.shape
-    if not beta.any():
-        return x.copy(), P.copy(), c.copy()
-    S = (H @ P @ np.swapaxes(H, -1, -2))[None] + R[:, None]
-    root = np.linalg.cholesky(S)
-    white = np.linalg.solve(root, innovation[..., None])[..., 0]
-    log = -0.5 * np.sum(white**2, axis=-1) - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(
-        axis=-1
-    )
-    log_c = np.log(np.where(c > 0.0, c, 1.0)) + np.where(c > 0.0, 0.0, -np.inf)
-    # share[i, j] = beta_i N_ji / f_i, in the log domain: f_i is the sum over the models.
-    top = (log + log_c).max(axis=1, keepdims=True)
-    mixture = top + np.log(np.exp(log + log_c - top).sum(axis=1, keepdims=True))
-    share = beta[:, None] * np.exp(log - mixture)
-    weight = missed + share.sum(axis=0)
-    mu = c * weight
-    x1, P1 = np.empty((M, n)), np.empty((M, n, n))
-    for j in range(M):
-        b0, b = missed / weight[j], share[:, j] / weight[j]
-        gain = P[j] @ H[j].T @ np.linalg.inv(S[:, j])
-        if considered is not None:
-            gain[:, considered] = 0.0
-        shift = np.einsum('dam,dm->da', gain, innovation[:, j])
-        mean = b @ shift
-        left = np.eye(n) - gain @ H[j]
-        after = left @ P[j] @ np.swapaxes(left, -1, -2) + gain @ R @ np.swapaxes(gain, -1, -2)
-        spread = np.einsum('d,da,db->ab', b, shift, shift) - np.outer(mean, mean)
-        total = b0 * P[j] + np.einsum('d,dab->ab', b, after) + spread
-        x1[j], P1[j] = x[j] + mean, 0.5 * (total + total.T)
-    return x1, P1, mu / mu.sum()
+    T, M, n = x.shape
+    D, m = z.shape
+    x1, P1, mu = x.copy(), P.copy(), c.copy()
+    repairs = 0
+    log, shift = np.empty((D, M)), np.empty((D, M, n))
+    after, nothing = np.empty((D, M, n, n)), np.zeros((m, m))
+    PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
+    A, AP, root = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    S, S0, L = np.empty((m, m)), np.empty((m, m)), np.zeros((m, m))
+    v, w, mean = np.empty(m), np.empty(m), np.empty(n)
+    share, weight = np.empty((D, M)), np.empty(M)
+    for t in range(T):
+        exists = missed[t]
+        for d in range(D):
+            exists += beta[t, d]
+        if not exists > missed[t]:
+            continue
+        for j in range(M):
+            innovation_covariance(P[t, j], H[t % H.shape[0], j], nothing, PHt, S0)
+            for d in range(D):
+                if not beta[t, d] > 0.0:
+                    continue
+                log[d, j] = -np.inf
+                for r in range(m):
+                    v[r] = z[d, r] - h[t, j, r]
+                    for s in range(m):
+                        S[r, s] = S0[r, s] + R[d, r, s]
+                for a in range(n):
+                    shift[d, j, a] = 0.0
+                if not cholesky_with_jitter(S, L):
+                    continue
+                log[d, j] = -0.5 * whitened_square(L, v, w)
+                for r in range(m):
+                    log[d, j] -= math.log(L[r, r])
+                gain(PHt, L, K)
+                for a in range(n):
+                    for r in range(m):
+                        if considered[a]:
+                            K[a, r] = 0.0
+                        shift[d, j, a] += K[a, r] * v[r]
+                joseph(P[t, j], K, H[t % H.shape[0], j], R[d], A, AP, KR, after[d, j])
+        for j in range(M):
+            weight[j] = missed[t] / exists
+        for d in range(D):
+            if not beta[t, d] > 0.0:
+                continue
+            top, total = -np.inf, 0.0
+            for j in range(M):
+                if c[t, j] > 0.0:
+                    top = max(top, log[d, j])
+            for j in range(M):
+                total += c[t, j] * math.exp(log[d, j] - top) if c[t, j] > 0.0 else 0.0
+            for j in range(M):
+                share[d, j] = beta[t, d] / exists * math.exp(log[d, j] - top - math.log(total))
+                weight[j] += share[d, j]
+        total = 0.0
+        for j in range(M):
+            mu[t, j] = c[t, j] * weight[j]
+            total += mu[t, j]
+            if not (weight[j] > 0.0 and weight[j] < np.inf):
+                continue
+            for a in range(n):
+                mean[a] = 0.0
+                for d in range(D):
+                    if beta[t, d] > 0.0 and share[d, j] > 0.0:
+                        mean[a] += share[d, j] / weight[j] * shift[d, j, a]
+                x1[t, j, a] = x[t, j, a] + mean[a]
+            for a in range(n):
+                for b in range(a + 1):
+                    value = missed[t] / exists / weight[j] * P[t, j, a, b] - mean[a] * mean[b]
+                    for d in range(D):
+                        if beta[t, d] > 0.0 and share[d, j] > 0.0:
+                            value += (
+                                share[d, j]
+                                / weight[j]
+                                * (after[d, j, a, b] + shift[d, j, a] * shift[d, j, b])
+                            )
+                    P1[t, j, a, b] = value
+                    P1[t, j, b, a] = value
+            if add_jitter(P1[t, j], root):
+                repairs += 1
+        for j in range(M):
+            mu[t, j] /= total
+    return x1, P1, mu, repairs
+
+
+@kernel
+def nearest_older(
+    mean: FloatArray, covariance: FloatArray, ids: IntArray, free: BoolArray, firm: BoolArray
+) -> tuple[IntArray, FloatArray]:
+    """For each track (T,) the older one that is nearest, -1 for none, and how far it is
+    (Mahalanobis distance squared of their difference).
+
+    mean (T, 2), covariance (T, 2, 2); ids (T,) rise with age; of `free` (T,) tracks alone; a
+    `firm` (T,) one is compared with firm ones only.
+    """
+    T = len(ids)
+    partner, distance = np.full(T, -1, dtype=np.int64), np.full(T, np.inf)
+    for t in range(T):
+        for u in range(T):
+            if not (free[t] and free[u] and ids[u] < ids[t] and (firm[u] or not firm[t])):
+                continue
+            x, y = mean[t, 0] - mean[u, 0], mean[t, 1] - mean[u, 1]
+            a = covariance[t, 0, 0] + covariance[u, 0, 0]
+            b = covariance[t, 0, 1] + covariance[u, 0, 1]
+            d = covariance[t, 1, 1] + covariance[u, 1, 1]
+            # By the Cholesky factor, written out.
+            y -= b / a * x
+            now = x * x / a + y * y / (d - b / a * b)
+            if now < distance[t]:
+                partner[t], distance[t] = u, now
+    return partner, distance
+
+
+@kernel
+def log_odds(existence: FloatArray) -> FloatArray:
+    """ln r / (1 - r) of probabilities (T,), minus infinity at 0."""
+    out = np.empty(len(existence))
+    for t in range(len(existence)):
+        out[t] = -np.inf
+        if existence[t] > 0.0:
+            out[t] = math.log(existence[t]) - math.log(max(1.0 - existence[t], 1e-300))
+    return out
+
+
+def warm() -> None:
+    """Run the kernels once on tiny input: compiled or loaded from the cache."""
+    x, P, c = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
+    H, R, z = np.tile(np.eye(2), (1, 2, 1, 1)), np.eye(2)[None], np.zeros((1, 2))
+    mixture, nis = likelihoods(x, H, P, c, z, R, 9.0)
+    beta, missed, _ = associate(mixture, nis, np.full(1, 0.5), np.full(1, 0.9), 9.0)
+    update(x, P, c, x, H, z, R, beta, missed, np.zeros(2, np.bool_))
+    yes = np.ones(1, np.bool_)
+    log_odds(missed)
+    nearest_older(z, R, np.ones(1, np.int64), yes, yes)

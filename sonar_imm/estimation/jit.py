@@ -14,17 +14,29 @@
 
 """The one place that knows how hot loops are compiled.
 
-Kernels are compiled on their first call and kept in numba's cache: beside the source when that is
-writable, else in the user's cache folder (or ``NUMBA_CACHE_DIR``). Where neither can be written,
-as in a locked-down container, the kernel still works and is compiled anew in each process.
+Kernels are compiled on their first call and kept on disk: beside the source when that is writable,
+else in the user's cache folder (or ``NUMBA_CACHE_DIR``). Where neither can be written, as in a
+locked-down container, the kernel still works and is compiled anew in each process.
 
 Compiled code contains the kernels it calls and the constants it names, wherever they are defined.
-numba itself compiles anew only when the kernel's own file changes. Here a cached kernel is valid
-only while every source file that its own file imports, directly or not, is unchanged.
+numba itself compiles anew only when the kernel's own file changes. Here a compiled kernel is valid
+as long as its own file and every file of the package that it imports, directly or not, have the
+same contents. Their dates do not matter, so a copy, a checkout or a wheel keeps what is compiled.
 
 numba keeps an index file beside files of code with running numbers. Processes that compile at the
 same time take the same number for different code, and one then runs the other's. Here each file
 has the name of what it holds, and says it inside.
+
+numba has no public way to do this. The private parts in use are
+
+* ``numba.core.caching.FunctionCache(function)``, which finds the folder and turns compiled code
+  into data; its attribute ``_cache_file``, which is replaced, and of which it calls ``load(key)``,
+  ``save(key, data)`` and ``flush()``;
+* the attribute ``_cache`` of a compiled function;
+* ``numba.core.serialize.dumps``, which pickles that data.
+
+They are the same in numba 0.58 to 0.68. Where one is missing or has another form, numba's own
+cache is used, and a warning says so.
 """
 
 from __future__ import annotations
@@ -34,80 +46,125 @@ import contextlib
 from functools import cache
 import hashlib
 import inspect
+import os
 from pathlib import Path
+import pickle
 import re
+import sys
 import time
 from typing import Any, cast, TypeVar
+import uuid
+import warnings
 
 import numba
-from numba import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
-from numba.core.dispatcher import Dispatcher
 
 F = TypeVar('F', bound=Callable[..., Any])
 
 KEPT_SECONDS = 7 * 86400.0
 """How long code is kept that was compiled of sources as they no longer are."""
 
+_OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)
 
 
 def kernel(function: F) -> F:
-    """Compile `function` with numba, cached when any cache folder can be written.
+    """Compile `function` with numba, kept on disk when any cache folder can be written.
 
     No fast-math and no threads: the same input gives the same bits on every call.
     """
-    compiled: Any = numba.njit(nogil=True, error_model='numpy')(function)
-    if isinstance(compiled, Dispatcher):  # not with NUMBA_DISABLE_JIT
-        try:
-            compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
-        except RuntimeError:  # numba: 'cannot cache function ...: no locator available'
-            pass
+    compiled: Any = numba.njit(**_OPTIONS)(function)
+    if compiled is function:  # with NUMBA_DISABLE_JIT
+        return function
+    try:
+        _attach_cache(compiled, function)
+    except (ImportError, AttributeError, TypeError):
+        _warn_of_other_numba()
+        with contextlib.suppress(RuntimeError):
+            compiled = numba.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # numba: 'cannot cache function ...: no locator available'
+        pass
     return cast(F, compiled)
 
 
-class _KernelCacheImpl(CompileResultCacheImpl):
-    """Adds to numba's stamp of a function's file those of the files it depends on."""
+def _attach_cache(compiled: Any, function: Callable[..., Any]) -> None:
+    """Have `compiled` loaded from and saved to files of ours. ImportError, AttributeError or
+    TypeError where numba's private parts are not those that we know."""
+    from numba.core.caching import FunctionCache
 
-    def __init__(self, function: Callable[..., Any]):
-        super().__init__(function)
-        own_stamp, digest = self._locator.get_source_stamp, digest_of(inspect.getfile(function))
-        checked = bool(config.BOUNDSCHECK)  # type: ignore[attr-defined]
-        self._locator.get_source_stamp = lambda: (own_stamp(), digest, checked)
+    numbas_own: Any = FunctionCache(function)
+    files: Any = type(numbas_own._cache_file)
+    replaced: Any = type(compiled._cache)
+    _check_verbs(files, replaced)
+    numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
+    compiled._cache = numbas_own
 
 
-class _FilePerKey(IndexDataCacheFile):
-    """One file for each source stamp and key, instead of an index."""
+@cache
+def _check_verbs(files: Any, kernel_cache: Any) -> None:
+    """AttributeError or TypeError where these classes are not called as ours are."""
+    inspect.signature(files.load).bind('self', 'key')
+    inspect.signature(files.save).bind('self', 'key', 'data')
+    inspect.signature(files.flush).bind('self')
+    inspect.signature(kernel_cache.load_overload).bind('self', 'signature', 'context')
+    inspect.signature(kernel_cache.save_overload).bind('self', 'signature', 'data')
+
+
+@cache
+def _warn_of_other_numba() -> None:
+    warnings.warn(
+        f'numba {numba.__version__} keeps compiled code in a way that sonar_imm does not know. '
+        "numba's own cache is used: after every update of sonar_imm delete its __pycache__ "
+        'folders, or code of the old version may run.',
+        RuntimeWarning,
+        stacklevel=4,
+    )
+
+
+class _FilePerKey:
+    """One file for each state of the sources and each key, which numba makes of the argument
+    types, the processor and the bytecode."""
+
+    def __init__(self, folder: Path, function: Callable[..., Any]):
+        self.folder = folder
+        path, code = inspect.getfile(function), function.__code__
+        name = re.sub('[<>]', '', f'{Path(path).stem}.{function.__qualname__}')
+        python = f'py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, "abiflags", "")}'
+        self._base = f'{name}-{code.co_firstlineno}.{python}.'
+        checked = bool(getattr(numba.config, 'BOUNDSCHECK', False))
+        self._stamp = (numba.__version__, digest_of(path) or _cell_digest(function), checked)
+        self._stem = f'{self._base}{_short_digest(self._stamp)}.'
 
     def load(self, key: Any) -> Any:
         try:
-            stamp, held, data = self._load_data(self._name_of(key))
-        except OSError:
+            stamp, held, data = pickle.loads(self._path_of(key).read_bytes())
+        except (OSError, EOFError, pickle.UnpicklingError):
             return None
-        return data if (stamp, held) == (self._source_stamp, key) else None
+        return data if (stamp, held) == (self._stamp, key) else None
 
     def save(self, key: Any, data: Any) -> None:
-        self._save_data(self._name_of(key), (self._source_stamp, key, data))
+        from numba.core.serialize import dumps
+
+        path = self._path_of(key)
+        written = path.with_name(f'{path.name}.{uuid.uuid4().hex[:16]}')
+        try:
+            written.write_bytes(dumps((self._stamp, key, data)))
+            os.replace(written, path)
+        finally:
+            written.unlink(missing_ok=True)
         self._tidy()
 
     def flush(self) -> None:
         for path in self._files():
             path.unlink(missing_ok=True)
 
-    def _name_of(self, key: Any) -> str:
-        return f'{self._stem}{_short_digest(key)}.nbc'
-
-    @property
-    def _stem(self) -> str:
-        """How the names of files of this state of the sources begin."""
-        return self._data_name(0).removesuffix('0.nbc') + _short_digest(self._source_stamp) + '.'
+    def _path_of(self, key: Any) -> Path:
+        return self.folder / f'{self._stem}{_short_digest(key)}.nbc'
 
     def _files(self) -> Iterator[Path]:
         """The files of this kernel, of any state of the sources."""
-        base = self._data_name(0).removesuffix('0.nbc')
-        for path in Path(self._cache_path).iterdir():
-            if path.name.startswith(base) and path.suffix == '.nbc':
+        for path in self.folder.iterdir():
+            if path.name.startswith(self._base) and path.suffix == '.nbc':
                 yield path
 
     def _tidy(self) -> None:
@@ -119,44 +176,42 @@ class _FilePerKey(IndexDataCacheFile):
                     path.unlink()
 
 
-class _KernelCache(FunctionCache):
-    _impl_class = _KernelCacheImpl
-
-    def __init__(self, function: Callable[..., Any]):
-        super().__init__(function)
-        self._cache_file = _FilePerKey(
-            cache_path=self._cache_path,
-            filename_base=self._impl.filename_base,
-            source_stamp=self._impl.locator.get_source_stamp(),
-        )
-
-
 def _short_digest(value: Any) -> str:
-    return hashlib.sha256(repr((numba.__version__, value)).encode()).hexdigest()[:16]
+    return hashlib.sha256(repr(value).encode()).hexdigest()[:16]
 
 
-@cache
+def _cell_digest(function: Callable[..., Any]) -> str:
+    """Digest of a function without a file, as in a notebook."""
+    try:
+        return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()
+    except (OSError, TypeError):
+        return ''
+
+
 def digest_of(path: str) -> str:
     """Digest of the source file at `path` and of those of this package that it imports, directly
-    or not."""
-    waiting, found = [Path(path)], {}
+    or not; '' where there is no such file."""
+    waiting, found = [path], dict[str, bytes]()
     while waiting:
         file = waiting.pop()
         if file not in found:
-            found[file], imported = _read(file)
+            try:
+                status = os.stat(file)
+                found[file], imported = _read(file, status.st_mtime_ns, status.st_size)
+            except OSError:
+                continue
             waiting += imported
     contents = b''.join(found[file] for file in sorted(found))
-    return hashlib.sha256(contents).hexdigest()
+    return hashlib.sha256(contents).hexdigest() if found else ''
 
 
 @cache
-def _read(file: Path) -> tuple[bytes, tuple[Path, ...]]:
-    """Digest of a source file, and the files of this package that it imports itself."""
-    try:
-        source = file.read_bytes()
-    except OSError:  # a notebook's cell; it has no other files to go stale
-        return b'', ()
-    return hashlib.sha256(source).digest(), tuple(_imported_files(source.decode(), file))
+def _read(file: str, mtime_ns: int, size: int) -> tuple[bytes, tuple[str, ...]]:
+    """Digest of a source file of this date and size, and the files of this package that it
+    imports itself."""
+    source = Path(file).read_bytes()
+    imported = _imported_files(source.decode(), Path(file))
+    return hashlib.sha256(source).digest(), tuple(map(str, imported))
 
 
 def _imported_files(source: str, file: Path) -> Iterator[Path]:

@@ -61,20 +61,6 @@ def check_transition_matrix(
     return P / sums[:, None]
 
 
-def stationary_law(P: FloatArray) -> FloatArray:
-    """Oracle for tests: the stationary distribution (M,), pi P = pi. ValueError when there is more
-    than one."""
-    M = len(P)
-    system = np.vstack([P.T - np.eye(M), np.ones(M)])
-    if np.linalg.matrix_rank(system, tol=1e-12 * M) < M:
-        raise ValueError(
-            'the chain has closed classes that never meet: its stationary law is not unique'
-        )
-    law = np.linalg.lstsq(system, np.append(np.zeros(M), 1.0), rcond=None)[0]
-    law = np.clip(law, 0.0, None)
-    return np.asarray(law / law.sum())
-
-
 class RateChain:
     """A chain stated at `step` seconds, usable at any step.
 

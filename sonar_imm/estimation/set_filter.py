@@ -12,15 +12,48 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The filter of `set_particles`, run: one record after the other, on any number of threads.
+"""A particle filter for sets of unknown size: the multiple-model particle filter, verb by verb.
 
-`SetFilter.step` is pure: it takes the weighted sets before a record and gives those after it. A
-record can therefore be tried without being taken in (a preview), and the sets at one record can be
-weighted again when later records are in (`LagSmoother`).
+A particle is one set of the model (`set_model`), ``[m, z_1 .. z_m]``, and the filter is one
+importance sampler for sets of every size at once. A cycle takes in one record::
+
+    record = filter.record(b, key)                 # tables of this record
+    before = before or filter.start(record)        # sets before the first record
+    sets = filter.propagate(before, record)        # shift, deaths, walks, births
+    step = filter.weigh(sets, record)              # each set meets the record
+    step = filter.resample(step, record)           # where few of the sets count
+    step = filter.move(step, record)               # copies of a set differ again
+    before = step.after
+    summary = filter.summarise(step)               # order, and what lies on each cell
+
+Each verb is pure: it takes a value and gives another. A record can therefore be tried without
+being taken in (a preview), and the sets at one record can be weighted again when later records are
+in (`LagSmoother`).
+
+Data-driven proposals
+    A walk is drawn from ``share * K(z' - z) exp(g(z')) / Z(z) + (1 - share) * K(z' - z)``, with
+    ``g = max(s b, 0)^2 / 2`` (what a member of sign s alone would be worth); of the births a share
+    is drawn in proportion to the sign's probability times ``exp(min(g, cap))`` and the rest
+    uniformly, at the places that those already there leave free. The cap lets a weak peak have
+    births beside a strong one; the uniform rest bounds the weight of a birth where the record
+    shows nothing. Each draw is weighted by the exact ratio of model to proposal, so proposals
+    change how many particles are needed and nothing else. Shares of zero make the bootstrap
+    filter: with eight sharp peaks in a record, all but a handful of its particles are lost at
+    every step.
 
 Random numbers are counter based: those of a record come from a Philox generator whose key is the
-seed and the record's own name (its stamp), and each particle has its row of them. The result is
+seed and the record's own name (its stamp), and each particle has its row of them, ``(1 + c + J)``
+for the order, the c members that can come or go at once, and the J that can walk. The result is
 therefore the same whatever was processed before, and on one thread or several.
+
+From weighted sets to a list of members (`find_members`): the **intensity** of the particles, how
+many members are expected on each cell, has a hill for each member. No set has two members closer
+than the separation, so the intensity summed over a window narrower than that is a probability:
+that there is a member in it. Members are taken one after the other, the window that holds most
+first; what lies within the separation of one is its own. Where the sets are of two minds about a
+member, its hill has two humps, and the mean lies where nothing is. With `modes` the moments are
+then those of the greater hump alone, a mode with its own spread; the existence is that of the
+member, in whichever hump.
 """
 
 from __future__ import annotations
@@ -34,26 +67,40 @@ from typing import NamedTuple
 from attrs import evolve, frozen
 import numpy as np
 
-from . import set_amplitudes as amplitudes
-from . import set_particles_kernels as kernels
+from . import set_kernels as kernels
 from .arrays import FloatArray, IntArray
-from .particles import effective_sample_size, normalise
-from .resampling import systematic
+from .particles import effective_sample_size, normalise, systematic
 from .set_model import SetModel, Sets
-from .set_particles import gains, Proposals, propose_births
-from .set_scatter import fit_scatter, ScatterFit
+from .set_scatter import fit_scatter, guide, NO_SCATTER, ScatterFit
 from .set_shifts import shift_tables, ShiftPath
 
-_STEP, _START, _RESAMPLE, _OFFSET = range(4)
+_STEP, _START, _RESAMPLE, _MOVE = range(4)
+_VALLEY, _ASIDE = 0.05, 0.1
+
+
+class Record(NamedTuple):
+    """A record as the verbs take it: b (n,), or (n + 2 pad,) with a shift, in units of its noise;
+    key: of its random numbers, seed and name, each in 0 .. 2^64 - 1; gains (S, n) by sign, see
+    `gains`; amplitudes: how members answer in it; background: of its scatter; proposals: its
+    tables, walks not filled in."""
+
+    b: FloatArray
+    key: tuple[int, int]
+    gains: FloatArray
+    amplitudes: kernels.AmplitudeModel
+    background: ScatterFit
+    proposals: kernels.Proposals
 
 
 class Weighted(NamedTuple):
     """Sets with log weights (N,) that need not be normalised: the state between records. path: of
-    their shifts, None without."""
+    their shifts, None without. log_before: log of the sum of the weights before the record, of
+    sets that were propagated."""
 
     sets: Sets
     log_weight: FloatArray
     path: ShiftPath | None = None
+    log_before: float = 0.0
 
 
 @frozen(eq=False)
@@ -61,21 +108,31 @@ class SetStep:
     """One record taken in.
 
     sets: weighted by w (N,), summing to one; amplitude (N, J) given each set, in units of the
-    noise. after: the same, resampled when needed; source (N,) the index into `sets` of each of
-    them. log_evidence: log of the record's probability given those before, against that of an
-    empty record; effective: sample size; ok False when no set could explain the record; path: of
-    the shifts of `sets`, None without.
+    noise; path: of their shifts, None without. log_evidence: log of the record's probability given
+    those before, against that of an empty record; effective: sample size; ok False when no set
+    could explain the record. after: the same sets as the next record finds them, resampled when
+    needed, with source (N,) the index into `sets` of each of them.
     """
 
     sets: Sets
     w: FloatArray
     amplitude: FloatArray
-    after: Weighted
-    source: IntArray
+    path: ShiftPath | None
     log_evidence: float
     effective: float
     ok: bool
-    path: ShiftPath | None = None
+    after: Weighted
+    source: IntArray
+    resampled: bool = False
+
+
+class Summary(NamedTuple):
+    """pmf (orders,) of the order; sums (5, n), or (8, n + 2 pad) with a shift, see
+    `set_kernels.moments`; shift: its mean and standard deviation in cells, None without."""
+
+    pmf: FloatArray
+    sums: FloatArray
+    shift: tuple[float, float] | None
 
 
 class SetFilter:
@@ -85,17 +142,17 @@ class SetFilter:
         self.model = model
         self.particles = particles
         self.threads = threads
-        shape = model.record_cells * len(model.signs), len(model.move)
-        self._move, self._move_ratio = np.empty(shape), np.empty(shape)
+        shape = model.record_cells * len(model.signs), len(model.walk)
+        self._walk, self._walk_ratio = np.empty(shape), np.empty(shape)
         log_sum = np.zeros((len(model.signs), model.record_cells if model.shift else 0))
-        self._shifts = shift_tables(model.shift, log_sum, model.move_share)
+        self._shifts = shift_tables(model.shift, log_sum, model.walk_share)
         self._motion = kernels.SetMotion(
             order_min=model.order_min,
             separation=model.separation,
             most_changes=model.most_changes,
             cumulative=np.cumsum(model.transition, axis=1),
         )
-        self._amplitudes = amplitudes.AmplitudeModel(
+        self._amplitudes = kernels.AmplitudeModel(
             gram=model.gram,
             ridge=float(model.ridge),
             penalty=float(model.penalty),
@@ -109,175 +166,138 @@ class SetFilter:
                 for m in range(model.order_min, model.order_max + 1)
             ]
         )
+        self._uniforms = model.uniforms
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def step(
-        self,
-        before: Weighted | None,
-        b: FloatArray,
-        key: tuple[int, int],
-        gram: FloatArray | None = None,
-    ) -> SetStep:
-        """Take in the record b (n,), or (n + 2 pad,) with a shift, in units of its noise. before:
-        None before the first record. key: seed and name of the record, each in 0 .. 2^64 - 1.
-        gram (n,): of this record, where it is not the model's."""
-        answer = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
-        fit = fit_scatter(self.model.scatter, b)
-        if before is None:
-            before = self._start(b, key, fit)
-        sets, log_ratio = self._propagate(before.sets, b, _uniform(key, _STEP), fit)
-        log_weight = before.log_weight + log_ratio
-        amplitude = self._weigh(sets, b, log_weight, answer, fit)
-        w, log_sum = normalise(log_weight)
+    def record(
+        self, b: FloatArray, key: tuple[int, int], gram: FloatArray | None = None
+    ) -> Record:
+        """The record b, see `Record`. gram (n,): of this record, where it is not the model's."""
+        model = self.model
+        amplitudes = self._amplitudes if gram is None else self._amplitudes._replace(gram=gram)
+        background = fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
+        g = gains(model, b, background)
+        births = propose_births(model, g)
+        proposals = kernels.Proposals(self._walk, self._walk_ratio, *births, self._shifts)
+        return Record(b, key, g, amplitudes, background, proposals)
+
+    def start(self, record: Record) -> Weighted:
+        """Sets before the first record, drawn where it will want them."""
+        model, sets = self.model, Sets.empty(self.model, self.particles)
+        uniform = _generator(record.key, _START).random(
+            (self.particles, 1 + model.order_max + (model.shift is not None))
+        )
+        log_ratio = np.zeros(self.particles)
+        self._split(
+            lambda first, last: kernels.start(
+                first, last, self._motion, self._charge, record.proposals, uniform, sets, log_ratio
+            )
+        )
+        # An impossible set has members that mean nothing; it must not walk.
+        sets.cell[~np.isfinite(log_ratio)] = 0
+        # The sets are draws from the prior in disguise: as many particles as if they were.
+        return Weighted(sets, log_ratio)
+
+    def propagate(self, before: Weighted, record: Record) -> Weighted:
+        """Sets as they may have become by the time of the record: shift, deaths, walks, births."""
+        uniform = _generator(record.key, _STEP).random((self.particles, self._uniforms))
+        sets, log_ratio = self._drawn(before.sets, record, uniform)
+        path, shift = None, self.model.shift
+        if shift is not None:
+            path = ShiftPath.begin(shift, sets.shift)
+            if before.path is not None:
+                path = before.path.then(shift, before.sets.shift, sets.shift)
         _, log_before = normalise(before.log_weight)
+        return Weighted(sets, before.log_weight + log_ratio, path, float(log_before))
+
+    def weigh(self, propagated: Weighted, record: Record) -> SetStep:
+        """Each set meets the record."""
+        sets, log_weight = propagated.sets, propagated.log_weight.copy()
+        amplitude = np.zeros(sets.cell.shape)
+        answer, background = record.amplitudes, record.background
+        self._split(
+            lambda first, last: kernels.weigh(
+                first, last, record.b, answer, background, sets, log_weight, amplitude
+            )
+        )
+        w, log_sum = normalise(log_weight)
         ok = bool(np.isfinite(log_sum))
-        effective = float(effective_sample_size(w)) if ok else 0.0
-        path = seen = self._path(before, sets)
-        source = np.arange(self.particles)
-        resampled = ok and effective < 0.5 * self.particles
-        if resampled:
-            source = systematic(w, self.particles, _uniform(key, _RESAMPLE))
-            log_weight = np.zeros(self.particles)
-            path = path.take(source) if path else None
-        after = self._remembered(sets.take(source), amplitude[source], answer)
-        known = Weighted(after, log_weight, path)
-        if resampled:
-            known = self._offset(known, _uniform(key, _OFFSET))
-        evidence = float(log_sum - log_before)
-        return SetStep(sets, w, amplitude, known, source, evidence, effective, ok, seen)
+        return SetStep(
+            sets,
+            w,
+            amplitude,
+            propagated.path,
+            log_evidence=float(log_sum - propagated.log_before),
+            effective=float(effective_sample_size(w)) if ok else 0.0,
+            ok=ok,
+            after=Weighted(sets, log_weight, propagated.path),
+            source=np.arange(self.particles),
+        )
 
-    def warm(self) -> None:
-        """Compile or load the kernels."""
-        lag = np.minimum(np.arange(self.model.record_cells), self.model.cells - 1)
-        b = np.maximum(0.0, 10.0 * self.model.gram[np.abs(lag - 1)])
-        step = SetFilter(self.model, 8).step(None, b, (0, 0))
-        self.summary(step)
+    def resample(self, step: SetStep, record: Record) -> SetStep:
+        """Equally weighted sets for the next record where less than half of these count, else the
+        same; they remember their amplitudes."""
+        after, source = step.after, step.source
+        resampled = step.ok and step.effective < 0.5 * self.particles
+        if resampled:
+            source = systematic(step.w, self.particles, _generator(record.key, _RESAMPLE))
+            path = step.path.take(source) if step.path else None
+            after = Weighted(step.sets.take(source), np.zeros(self.particles), path)
+        if self.model.amplitude_memory > 0.0:
+            sets = after.sets if resampled else after.sets.take(source)
+            amplitude, answer = step.amplitude[source], record.amplitudes
+            self._split(lambda first, last: kernels.remember(first, last, answer, amplitude, sets))
+            after = after._replace(sets=sets)
+        return evolve(step, after=after, source=source, resampled=resampled)
 
-    def summary(self, step: SetStep) -> tuple[FloatArray, FloatArray]:
-        """PMF (orders,) of the order and sums (5, n), see `set_particles_kernels.moments`."""
+    def move(self, step: SetStep, record: Record) -> SetStep:
+        """With the offset of members and shift drawn anew after resampling, so that copies of a
+        set differ: a Gibbs move, see `set_shifts`. Without a shift there is none."""
+        shift, (sets, _, path, _) = self.model.shift, step.after
+        if shift is None or path is None or not step.resampled:
+            return step
+        u = _generator(record.key, _MOVE).random((self.particles, 2))
+        low, high = kernels.free(sets, self.model.cells)
+        d, path = path.draw(shift, sets.shift, (low, high), u)
+        moved = sets._replace(cell=kernels.lowered(sets, d), shift=sets.shift + d)
+        return evolve(step, after=step.after._replace(sets=moved, path=path))
+
+    def summarise(self, step: SetStep) -> Summary:
+        """What the sets say together."""
         pmf = np.zeros(len(self.model.transition))
         rows = kernels.SHIFTED_SUMS if self.model.shift else kernels.SUMS
         sums = np.zeros((rows, self.model.record_cells))
-        offset, variance = _offset_of(step.path)
+        # Of the shift, what is still to be drawn: its mean (N,) and variance, cells.
+        offset, variance, shift = np.empty(0), 0.0, None
+        if step.path:
+            offset, variance = step.path.mean, 1.0 / step.path.precision
+            place = step.sets.shift + offset
+            mean = float(step.w @ place)
+            spread = math.sqrt(float(step.w @ np.square(place - mean)) + variance)
+            shift = mean - self.model.pad, spread
         prior, least = self._amplitudes.variance, self.model.order_min
         kernels.moments(
             step.w, step.sets, step.amplitude, offset, variance, prior, least, pmf, sums
         )
         # Weights add up to one but for rounding: no probability may pass it for that.
-        return np.minimum(pmf, 1.0), sums
+        return Summary(np.minimum(pmf, 1.0), sums, shift)
 
-    def shift(self, step: SetStep) -> tuple[float, float]:
-        """Mean and standard deviation of the shift, cells."""
-        offset, variance = _offset_of(step.path)
-        there = step.sets.shift + offset
-        mean = float(step.w @ there)
-        spread = math.sqrt(float(step.w @ np.square(there - mean)) + variance)
-        return mean - self.model.pad, spread
-
-    def _start(
-        self, b: FloatArray, key: tuple[int, int], fit: ScatterFit | None = None
-    ) -> Weighted:
-        model, sets = self.model, Sets.empty(self.model, self.particles)
-        uniform = _uniform(key, _START).random(
-            (self.particles, 1 + model.order_max + (model.shift is not None))
-        )
-        log_ratio = np.zeros(self.particles)
-        proposals = self._proposals(self._gains(b, fit))
-        self._split(
-            lambda first, last: kernels.start(
-                first, last, self._motion, self._charge, proposals, uniform, sets, log_ratio
-            )
-        )
-        # An impossible set has members that mean nothing; it must not be moved.
-        sets.cell[~np.isfinite(log_ratio)] = 0
-        # The sets are draws from the prior in disguise: as many particles as if they were.
-        return Weighted(sets, log_ratio)
-
-    def _path(self, before: Weighted, sets: Sets) -> ShiftPath | None:
-        shift = self.model.shift
-        if shift is None:
-            return None
-        if before.path is None:
-            return ShiftPath.begin(shift, sets.shift)
-        return before.path.then(shift, before.sets.shift, sets.shift)
-
-    def _offset(self, known: Weighted, rng: np.random.Generator) -> Weighted:
-        """With the offset of members and shift drawn anew, so that copies of a set differ."""
-        sets, shift = known.sets, self.model.shift
-        if shift is None or known.path is None:
-            return known
-        u = rng.random((self.particles, 2))
-        low, high = kernels.free(sets, self.model.cells)
-        d, path = known.path.draw(shift, sets.shift, (low, high), u)
-        moved = sets._replace(cell=kernels.lowered(sets, d), shift=sets.shift + d)
-        return known._replace(sets=moved, path=path)
-
-    def _gains(self, b: FloatArray, fit: ScatterFit | None) -> FloatArray:
-        background = fit_scatter(self.model.scatter, b) if fit is None else fit
-        return gains(self.model, b, background)
-
-    def _proposals(self, g: FloatArray) -> Proposals:
-        """The tables of one record of gains g (S, n), moves not filled in."""
-        births = propose_births(self.model, g)
-        return Proposals(self._move, self._move_ratio, *births, self._shifts)
-
-    def _propagate(
-        self,
-        old: Sets,
-        b: FloatArray,
-        rng: np.random.Generator,
-        fit: ScatterFit | None = None,
-    ) -> tuple[Sets, FloatArray]:
+    def _drawn(self, old: Sets, record: Record, uniform: FloatArray) -> tuple[Sets, FloatArray]:
+        """Sets drawn from the proposals by uniform (N, uniforms), and log of model to proposal."""
         model, new = self.model, Sets.empty(self.model, self.particles)
-        log_ratio = np.empty(self.particles)
-        uniform = rng.random((self.particles, model.uniforms))
-        g = self._gains(b, fit)
-        proposals = self._proposals(g)
+        log_ratio, proposals = np.empty(self.particles), record.proposals
         if model.shift:
-            kernels.fill_all_moves(old, g, model.move, model.move_share, proposals)
+            kernels.fill_all_walks(old, record.gains, model.walk, model.walk_share, proposals)
         else:
-            filled = np.zeros(len(self._move), np.bool_)
-            kernels.fill_moves(old, g, model.move, model.move_share, filled, proposals)
+            filled = np.zeros(len(self._walk), np.bool_)
+            kernels.fill_walks(old, record.gains, model.walk, model.walk_share, filled, proposals)
+        motion, amplitudes = self._motion, self._amplitudes
         self._split(
             lambda first, last: kernels.propagate(
-                first,
-                last,
-                self._motion,
-                self._amplitudes,
-                proposals,
-                uniform,
-                old,
-                new,
-                log_ratio,
+                first, last, motion, amplitudes, proposals, uniform, old, new, log_ratio
             )
         )
         return new, log_ratio
-
-    def _weigh(
-        self,
-        sets: Sets,
-        b: FloatArray,
-        log_weight: FloatArray,
-        answer: amplitudes.AmplitudeModel,
-        fit: ScatterFit | None = None,
-    ) -> FloatArray:
-        background = fit_scatter(self.model.scatter, b) if fit is None else fit
-        amplitude = np.zeros(sets.cell.shape)
-        self._split(
-            lambda first, last: amplitudes.weigh(
-                first, last, b, answer, background, sets, log_weight, amplitude
-            )
-        )
-        return amplitude
-
-    def _remembered(
-        self, sets: Sets, amplitude: FloatArray, answer: amplitudes.AmplitudeModel
-    ) -> Sets:
-        if self.model.amplitude_memory > 0.0:
-            self._split(
-                lambda first, last: amplitudes.remember(first, last, answer, amplitude, sets)
-            )
-        return sets
 
     def _split(self, work: Callable[[int, int], None]) -> None:
         """Run work(first, last) over all particles, a share for each thread."""
@@ -286,6 +306,26 @@ class SetFilter:
             return
         edges = np.linspace(0, self.particles, self.threads + 1).astype(int).tolist()
         list(self._pool.map(work, edges[:-1], edges[1:]))
+
+
+def gains(model: SetModel, b: FloatArray, fit: ScatterFit) -> FloatArray:
+    """g (S, n) for each sign: the best log likelihood ratio of one member alone at each cell."""
+    if model.scatter:
+        b = guide(fit, b)
+    return np.stack([0.5 * np.square(np.maximum(sign * b, 0.0)) for sign in model.signs])
+
+
+def propose_births(model: SetModel, g: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """birth (n + 1,), birth_ratio (S, n) and birth_positive (n,) of `set_kernels.Proposals`, from
+    the gains g (S, n)."""
+    prior = np.array(list(model.signs.values()))[:, None]
+    data_driven = prior * np.exp(np.minimum(g, model.birth_cap))
+    weight = (
+        model.birth_share * data_driven / data_driven.sum()
+        + (1.0 - model.birth_share) * prior / model.cells
+    )
+    running = np.append(0.0, np.cumsum(weight.sum(axis=0)))
+    return running, -np.log(model.cells * weight / prior), weight[0]
 
 
 class LagSmoother:
@@ -324,16 +364,101 @@ class LagSmoother:
             first, sets=first.sets.take(line), w=step.w, amplitude=first.amplitude[line], path=path
         )
 
-    def clear(self) -> None:
-        self._steps.clear()
+
+class Members(NamedTuple):
+    """K members by place: place (K,) in cells, mean over the hill or its greatest hump; amplitude
+    (K,) mean in units of the noise; covariance (K, 2, 2) of both, the spread of the particles;
+    prior_variance (K,) of the amplitude before the record, given the place; foremost (K,), the
+    probability that it is the first of its set; existence (K,), the probability that it is there,
+    at most 1."""
+
+    place: FloatArray
+    amplitude: FloatArray
+    covariance: FloatArray
+    prior_variance: FloatArray
+    foremost: FloatArray
+    existence: FloatArray
 
 
-def _offset_of(path: ShiftPath | None) -> tuple[FloatArray, float]:
-    """Mean (N,) and variance of what is still to be drawn, cells."""
-    return (path.mean, 1.0 / path.precision) if path else (np.empty(0), 0.0)
+def find_members(
+    sums: FloatArray, separation: int, most: int, least_existence: float, *, modes: bool = False
+) -> Members:
+    """At most `most` members whose existence is at least `least_existence`.
+
+    sums (5, n): intensity, first and second moment of the amplitude, its prior variance, and the
+    share of first members on each cell, and with a shift three more (see `SetFilter.summarise`).
+    """
+    n, half = sums.shape[1], max(0, (separation - 1) // 2)
+    left = sums.copy()
+    found = []
+    for _ in range(most):
+        mass = _windowed(left[0], half)
+        peak = int(np.argmax(mass))
+        low, high = max(0, peak - separation + 1), min(n, peak + separation)
+        weight = left[0, low:high]
+        existence = float(weight.sum())
+        if not existence > 0.0 or existence < least_existence:
+            break
+        hill = left[:, low:high]
+        foremost = min(1.0, float(hill[4].sum()))
+        first, last = 0, len(weight)
+        if modes:
+            first, last = _greatest_hump(weight, max(1, separation // 4))
+        hump = _moments(hill[:, first:last], low + first)
+        found.append((*hump, foremost, min(1.0, existence)))
+        left[:, low:high] = 0.0
+    found.sort(key=lambda member: member[0])
+    if not found:
+        nothing = np.empty(0)
+        return Members(nothing, nothing, np.empty((0, 2, 2)), nothing, nothing, nothing)
+    return Members(*(np.array(column) for column in zip(*found)))
 
 
-def _uniform(key: tuple[int, int], purpose: int) -> np.random.Generator:
+def _greatest_hump(weight: FloatArray, width: int) -> tuple[int, int]:
+    """First cell and the one after the last of the greatest hump of a hill (n,), seen through a
+    window of `width` cells: from its top as far as it stays above `_VALLEY` of that; the whole
+    hill when less than `_ASIDE` of it lies elsewhere."""
+    seen = np.convolve(weight, np.ones(width), 'same')
+    top = int(np.argmax(seen))
+    low = np.flatnonzero(seen <= _VALLEY * seen[top])
+    first = int(low[low < top].max(initial=-1)) + 1
+    last = int(low[low > top].min(initial=len(weight)))
+    inside = float(weight[first:last].sum())
+    if inside >= (1.0 - _ASIDE) * float(weight.sum()):
+        return 0, len(weight)
+    return first, last
+
+
+def _moments(sums: FloatArray, first: int) -> tuple[float, float, FloatArray, float]:
+    cells = first + np.arange(sums.shape[1])
+    total = sums[0].sum()
+    place, amplitude = float(sums[0] @ cells) / total, float(sums[1].sum()) / total
+    prior = float(sums[3].sum()) / total
+    if len(sums) > 5:
+        place, second = float(sums[5].sum()) / total, float(sums[6].sum()) / total
+        cross = float(sums[7].sum()) / total - place * amplitude
+        spread_of = max(0.0, second - place**2), cross
+        left = float(sums[2].sum()) / total - amplitude**2
+        left = max(left, cross**2 / spread_of[0] if spread_of[0] else 0.0)
+        return place, amplitude, np.array([spread_of, (cross, left)]), prior
+    spread = cells - place
+    cross = float(sums[1] @ spread) / total
+    covariance = np.array(
+        [
+            [float(sums[0] @ np.square(spread)) / total, cross],
+            [cross, max(0.0, float(sums[2].sum()) / total - amplitude**2)],
+        ]
+    )
+    return place, amplitude, covariance, prior
+
+
+def _windowed(intensity: FloatArray, half: int) -> FloatArray:
+    """Sums (n,) over cells no further than `half`."""
+    running = np.append(0.0, np.cumsum(np.pad(intensity, half)))
+    return np.asarray(running[2 * half + 1 :] - running[: -2 * half - 1])
+
+
+def _generator(key: tuple[int, int], purpose: int) -> np.random.Generator:
     """The random numbers of one record for one purpose."""
     counter = np.array([0, 0, 0, purpose], np.uint64)
     return np.random.Generator(np.random.Philox(key=np.array(key, np.uint64), counter=counter))

@@ -12,7 +12,48 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What `set_particles` assumes of a set of unknown size and of its records, and sets as arrays."""
+"""What the particle filter for sets of unknown size (`set_filter`) assumes of them and of records.
+
+What is tracked is a set of m members, each a place on a line, m itself, the **order**, unknown and
+changing; **births** and **deaths** may happen at any place and time. Places are the **cells of a
+lattice**, the one on which a record is sampled, so that sums over places are exact, everything
+that depends on a record is a table made once, and no particle ever looks at a whole record.
+
+The set, in the order in which it is drawn
+    1. the order m' from row m of ``transition`` (rows from, columns to, from ``order_min`` on);
+    2. deaths: for m' < m, a uniformly drawn subset of m - m' leaves;
+    3. each survivor walks by ``walk``; what leaves the lattice is impossible;
+    4. births: for m' > m, m' - m are born, each uniformly on the lattice;
+    5. sets whose members come closer than ``separation`` cells are impossible.
+    Before the first record, m is uniform, and so is the set among the possible ones of that size.
+
+The record
+    ``b (n,)``, in units of its noise: the correlation of what was measured with the pulse that a
+    single member leaves, whose own autocorrelation is ``gram``. The members answer with amplitudes
+    a, in the same units. Given the places, b at the places is all that matters: with G =
+    gram(z_i - z_j)
+
+        log p(record | z, a) / p(record | nothing) = a' b - a' G a / 2,
+
+    which equals the least-squares fit to the whole record, in O(m^3) instead of O(n). Amplitudes
+    are not sampled:
+
+    ``marginal``   a ~ N(0, s^2) is integrated out:
+                   b' (G + I/s^2)^-1 b / 2 - log det(I + s^2 G) / 2
+    ``bic_half``   the best a, and a penalty of log(N) / 2 for each member, N independent samples;
+    ``paper``      the best a, and a penalty of log(N) for each. The prior of births already
+                   charges for the place, so this charges twice: too much.
+
+    With ``scatter`` the members stand in a background that begins at the first of them: see
+    `set_scatter`. With ``shift`` all of them show elsewhere by the same distance: see
+    `set_shifts`.
+
+Each member has a sign for life, drawn at its birth: negative with ``negative_probability``. A set
+that needs an amplitude of another sign is impossible.
+
+Sources: C. Yardim, P. Gerstoft, Z.-H. Michalopoulou, *Passive fathometer reflector identification
+with multiple model particle filtering* (2012); the weights by first principles.
+"""
 
 from __future__ import annotations
 
@@ -38,15 +79,15 @@ def banded_transition(orders: int, switch: float) -> FloatArray:
     return np.asarray(P + np.diag(1.0 - P.sum(axis=1)))
 
 
-def move_reach(std: float, *, reach: float = 4.0) -> float:
-    """How many cells `gaussian_move` reaches to either side."""
+def walk_reach(std: float, *, reach: float = 4.0) -> float:
+    """How many cells `gaussian_walk` reaches to either side."""
     return max(1.0, math.floor(reach * std)) if math.isfinite(reach * std) else math.inf
 
 
-def gaussian_move(std: float, *, reach: float = 4.0) -> FloatArray:
-    """Probabilities (2 r + 1,) of moving by -r .. r cells: Gaussian of `std` cells, cut at `reach`
+def gaussian_walk(std: float, *, reach: float = 4.0) -> FloatArray:
+    """Probabilities (2 r + 1,) of a walk by -r .. r cells: Gaussian of `std` cells, cut at `reach`
     standard deviations."""
-    radius = int(move_reach(std, reach=reach))
+    radius = int(walk_reach(std, reach=reach))
     K = np.exp(-0.5 * np.square(np.arange(-radius, radius + 1) / std))
     return np.asarray(K / K.sum())
 
@@ -56,9 +97,9 @@ class SetModel:
     """What is assumed of the set and of the record; see the module's text.
 
     cells: n, of the lattice; separation: smallest distance of two members, cells; order_min: the
-    smallest set; transition (orders, orders); move (2 r + 1,); gram (n,) by lag in cells, one at
-    0; amplitude_prior: one of PRIORS, with amplitude_std: s, and independent_samples: N;
-    move_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
+    smallest set; transition (orders, orders); walk (2 r + 1,); gram (n,) by lag in cells, one at
+    0; amplitude_prior: of PRIORS, with amplitude_std: s, and independent_samples: N;
+    walk_share, birth_share and birth_cap: of the proposals; amplitude_memory: phi of a' = phi a +
     noise, with stationary standard deviation s, 0 for amplitudes drawn anew at each record;
     negative_probability: that a member is negative; shift: that all members share, None for none;
     scatter: background below the first member, None for none.
@@ -70,12 +111,12 @@ class SetModel:
     separation: int
     order_min: int
     transition: FloatArray = field(converter=check_transition_matrix)
-    move: FloatArray
+    walk: FloatArray
     gram: FloatArray
     amplitude_prior: str = 'marginal'
     amplitude_std: float = 7.5
     independent_samples: float = 500.0
-    move_share: float = 0.95
+    walk_share: float = 0.95
     birth_share: float = 0.75
     birth_cap: float = 8.0
     amplitude_memory: float = 0.0

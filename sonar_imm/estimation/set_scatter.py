@@ -109,11 +109,11 @@ def decaying_profile(pulse: FloatArray, decays: FloatArray) -> FloatArray:
     return np.array(rows)
 
 
-def fit_scatter(scatter: Scatter | None, b: FloatArray) -> ScatterFit:
+NO_SCATTER = ScatterFit(np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty((0, 1)), 0.0)
+
+
+def fit_scatter(scatter: Scatter, b: FloatArray) -> ScatterFit:
     """The background of the record b (n,), in units of its noise."""
-    if scatter is None:
-        nothing = np.empty(0)
-        return ScatterFit(nothing, nothing, np.empty(0, np.int64), np.empty((0, 1)), 0.0)
     n, profile = len(b), scatter.profile
     middle = profile.shape[1] // 2
     D = np.ascontiguousarray(profile[:, middle - (n - 1) : middle + n])

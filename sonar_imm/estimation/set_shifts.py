@@ -21,8 +21,8 @@ with a memory (an autoregression of first order on the grid). Its proposal sees 
 
     q(shift) = share * p(shift | before) exp(sum_i log Z(z_i + shift)) / sum + (1 - share) * p
 
-where Z, by sign, is what the moves from a cell hold of the record, so that a few members that were
-followed well fix the shift before any of them moves.
+where Z, by sign, is what the walks from a cell hold of the record, so that a few members that were
+followed well fix the shift before any of them walks.
 
 Records tell where members lie plus the shift, and never one of both alone. All members lower and
 all shifts since the first record higher by the same offset d explain every record as well; only
@@ -190,20 +190,6 @@ def shift_tables(shift: Shift | None, log_sum: FloatArray, share: float) -> Shif
     return ShiftTables(shift.step, start, log_prior, prior, log_sum, share)
 
 
-def propose_shift(
-    tables: ShiftTables, before: int, cells: IntArray, negative: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
-    `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
-    prior = tables.log_prior[before // tables.step if len(tables.log_prior) > 1 else 0]
-    at = cells[:, None] + tables.step * np.arange(len(prior))
-    score = prior + tables.log_sum[negative[:, None], at].sum(axis=0)
-    driven = np.exp(score - score.max())
-    q = tables.share * driven / driven.sum() + (1.0 - tables.share) * np.exp(prior)
-    with np.errstate(divide='ignore'):
-        return q, prior - np.log(q)
-
-
 class ShiftMemory(NamedTuple):
     """What `score_shifts` found for sets that are likely to come again: sets that were resampled
     from one have one proposal. For each of the SLOTS: key (J + 2,), driven (2, G), span (2,)."""
@@ -223,7 +209,7 @@ def empty_memory(members: int, shifts: int) -> ShiftMemory:
 def score_shifts(
     tables: ShiftTables, before: int, rows: IntArray, count: int, cells: int, driven: FloatArray
 ) -> tuple[int, int]:
-    """The data-driven part of `propose_shift` for the members rows[:count], their cell plus
+    """The data-driven part of the proposal for the members rows[:count], their cell plus
     `cells` (n + 2 pad) where they are negative: driven (2, G) gets its weights and their running
     sums, both divided by their total, from the first place that has any to the last, which are
     given."""
@@ -270,9 +256,9 @@ def draw_shift(
     uniform: float,
     memory: ShiftMemory,
 ) -> tuple[int, float]:
-    """The shift plus pad, and log of model to proposal: `propose_shift` for the members
-    rows[:count], their cell plus `cells` (n + 2 pad) where they are negative; shift: that of the
-    record before, plus pad. `memory` changes the time and nothing else."""
+    """The shift plus pad, drawn from q of the module's text, and log of model to q. The members
+    are rows[:count], their cell plus `cells` (n + 2 pad) where they are negative; shift: that of
+    the record before, plus pad. `memory` changes the time and nothing else."""
     before = shift // tables.step if len(tables.prior) > 1 else 0
     slot = before
     for k in range(count):

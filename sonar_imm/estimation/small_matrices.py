@@ -17,7 +17,13 @@
 For matrices of a few rows the call of a library costs more than the arithmetic. Every function
 writes into arrays the caller owns, so that nothing is allocated in a loop over models and targets;
 only the repairs, which are rare, allocate. `is_psd`, `add_jitter` and the ``square_root_``
-functions are the rules of `covariance`, which explains them.
+functions are the rules that `covariance` explains.
+
+`semidefinite_roots` and `not_psd` work on many matrices side by side, each in a *lane*: an array
+(.., lanes) has one number of every matrix in a row, and the last loop of everything runs along
+such a row, with few arrays in each loop, so that it is compiled to vector instructions: one small
+matrix hardly fills a processor that does several additions at a time. What is done to a lane does
+not depend on its neighbours, so a matrix gives the same bits in any company.
 """
 
 from __future__ import annotations
@@ -26,9 +32,40 @@ import math
 
 import numpy as np
 
-from .arrays import FloatArray
-from .covariance import JITTER, LIMIT
+from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
+
+LIMIT = 1e-14
+"""Least eigenvalue of a correlation matrix. Rounding in Cholesky's method changes it by at most
+n (n + 1) / 2^53, 2e-15 for four states, so that up to eight states a covariance within the limit
+has a factor."""
+
+JITTER = 1e-13
+"""What a repair adds to the diagonal, as a share of it; ten times more until it is enough."""
+
+
+@kernel
+def product(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """A B into `out`; A (n, k), B (k, m)."""
+    n, m = out.shape
+    for a in range(n):
+        for b in range(m):
+            value = 0.0
+            for k in range(A.shape[1]):
+                value += A[a, k] * B[k, b]
+            out[a, b] = value
+
+
+@kernel
+def product_transposed(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
+    """A B^T into `out`; A (n, k), B (m, k)."""
+    n, m = out.shape
+    for a in range(n):
+        for b in range(m):
+            value = 0.0
+            for k in range(A.shape[1]):
+                value += A[a, k] * B[b, k]
+            out[a, b] = value
 
 
 @kernel
@@ -52,7 +89,8 @@ def cholesky(S: FloatArray, L: FloatArray) -> bool:
 
 @kernel
 def is_psd(P: FloatArray, L: FloatArray) -> bool:
-    """`covariance.is_psd` of one P (n, n); L (n, n) is scratch."""
+    """Whether P (n, n) keeps to the limit of `covariance`; False where it is not finite. L (n, n)
+    is scratch."""
     # L D L' without square roots: L below the diagonal, L D above it, 1 / D on it.
     n = P.shape[0]
     for a in range(n):
@@ -77,7 +115,8 @@ def is_psd(P: FloatArray, L: FloatArray) -> bool:
 
 @kernel
 def add_jitter(P: FloatArray, L: FloatArray) -> bool:
-    """`covariance.add_jitter` of one P (n, n), in place; whether it was needed. L: scratch."""
+    """Add to the diagonal of P (n, n), in place, what it lacks to be positive definite; whether
+    that was needed. L (n, n) is scratch. A P that is no covariance at all stays as it is."""
     if is_psd(P, L):
         return False
     n = P.shape[0]
@@ -97,7 +136,25 @@ def add_jitter(P: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
-def lift_all(P: FloatArray) -> int:
+def are_psd(P: FloatArray) -> BoolArray:
+    """`is_psd` of each of P (B, n, n), (B,)."""
+    L, good = np.empty(P.shape[1:]), np.empty(len(P), dtype=np.bool_)
+    for b in range(len(P)):
+        good[b] = is_psd(P[b], L)
+    return good
+
+
+@kernel
+def add_jitter_each(P: FloatArray) -> BoolArray:
+    """`add_jitter` each of P (B, n, n) in place: which (B,) needed it."""
+    L, needed = np.empty(P.shape[1:]), np.empty(len(P), dtype=np.bool_)
+    for b in range(len(P)):
+        needed[b] = add_jitter(P[b], L)
+    return needed
+
+
+@kernel
+def add_jitter_all(P: FloatArray) -> int:
     """`add_jitter` each of P (M, n, n) in place that is finite: how many needed it."""
     L = np.empty(P.shape[1:])
     repairs = 0
@@ -109,8 +166,8 @@ def lift_all(P: FloatArray) -> int:
 
 
 @kernel
-def cholesky_lifted(S: FloatArray, L: FloatArray) -> bool:
-    """`cholesky`, after lifting the diagonal of S in place until there is a factor."""
+def cholesky_with_jitter(S: FloatArray, L: FloatArray) -> bool:
+    """`cholesky`, after adding to the diagonal of S in place until there is a factor."""
     share = JITTER
     while not cholesky(S, L):
         if not share < 2.0 * len(S):
@@ -174,16 +231,11 @@ def triangularise(A: FloatArray) -> None:
 
 @kernel
 def square_root_predict(P: FloatArray, F: FloatArray, Q: FloatArray, out: FloatArray) -> None:
-    """F P F^T + Q into `out` by a root of P, sound (`covariance.propagate`)."""
+    """F P F^T + Q into `out` by a root of P, positive definite (`covariance.propagate`)."""
     n = P.shape[0]
     L, FL = np.zeros((n, n)), np.empty((n, n))
     semidefinite_root(P, L)
-    for a in range(n):
-        for b in range(n):
-            value = 0.0
-            for k in range(n):
-                value += F[a, k] * L[k, b]
-            FL[a, b] = value
+    product(F, L, FL)
     for a in range(n):
         for b in range(a + 1):
             value = 0.0
@@ -204,8 +256,8 @@ def square_root_update(
     out: FloatArray,
 ) -> bool:
     """The update in square-root form (`covariance.correct`): the factor of S into L (m, m), the
-    gain into K (n, m), the sound covariance into `out` (n, n). False, with nothing of use written,
-    where S is not finite or has a component without any variance."""
+    gain into K (n, m), the covariance, positive definite, into `out` (n, n). False, with nothing
+    of use written, where S is not finite or has a component without any variance."""
     m, n = H.shape
     for a in range(n):
         for b in range(n):
@@ -218,14 +270,11 @@ def square_root_update(
     semidefinite_root(P, root)
     semidefinite_root(R, noise)
     seen, own = np.empty((m, n)), np.empty(m)
+    product(H, root, seen)
     for r in range(m):
         own[r] = 0.0
         for b in range(n):
-            value = 0.0
-            for k in range(n):
-                value += H[r, k] * root[k, b]
-            seen[r, b] = value
-            own[r] += value * value
+            own[r] += seen[r, b] * seen[r, b]
         for s in range(m):
             own[r] += noise[r, s] * noise[r, s]
             if not math.isfinite(R[r, s]):
@@ -272,12 +321,7 @@ def innovation_covariance(
 ) -> None:
     """P H^T into PHt (n, m) and H P H^T + R into S (m, m)."""
     m, n = H.shape
-    for a in range(n):
-        for r in range(m):
-            value = 0.0
-            for k in range(n):
-                value += P[a, k] * H[r, k]
-            PHt[a, r] = value
+    product_transposed(P, H, PHt)
     for r in range(m):
         for s in range(r + 1):
             value = 0.5 * (R[r, s] + R[s, r])
@@ -324,17 +368,8 @@ def joseph(
             for r in range(m):
                 value -= K[a, r] * H[r, b]
             A[a, b] = value
-        for r in range(m):
-            value = 0.0
-            for s in range(m):
-                value += K[a, s] * R[s, r]
-            KR[a, r] = value
-    for a in range(n):
-        for b in range(n):
-            value = 0.0
-            for k in range(n):
-                value += A[a, k] * P[k, b]
-            AP[a, b] = value
+    product(K, R, KR)
+    product(A, P, AP)
     for a in range(n):
         for b in range(a + 1):
             value = 0.0
@@ -357,3 +392,77 @@ def whitened_square(L: FloatArray, v: FloatArray, w: FloatArray) -> float:
         w[r] = value / L[r, r]
         total += w[r] * w[r]
     return total
+
+
+MOST_LANES = 48
+"""With more, the numbers of all lanes do not fit into the fastest memory."""
+
+
+@kernel
+def lanes_for(count: int) -> int:
+    """How many lanes `count` > 0 components are worked on with, in as few turns as can be."""
+    turns = (count + MOST_LANES - 1) // MOST_LANES
+    return (count + turns - 1) // turns
+
+
+@kernel
+def turn_of(first: int, count: int, lanes: int) -> int:
+    """Where the turn that would begin with component `first` does begin, so that it ends with the
+    last of `count`; some are then done twice, which changes nothing."""
+    return min(first, count - lanes)
+
+
+@kernel
+def semidefinite_roots(S: FloatArray, L: FloatArray, scratch: FloatArray) -> None:
+    """`semidefinite_root` of the matrices S (n, n, lanes), into L; only lower
+    triangles are read and written. scratch: (lanes,)."""
+    n, _, lanes = S.shape
+    for b in range(n):
+        for a in range(b, n):
+            for k in range(lanes):
+                L[a, b, k] = S[a, b, k]
+            for c in range(b):
+                for k in range(lanes):
+                    L[a, b, k] -= L[a, c, k] * L[b, c, k]
+        for k in range(lanes):
+            pivot = L[b, b, k]
+            known = pivot <= LIMIT * S[b, b, k] or not pivot > 0.0
+            root = math.sqrt(pivot)
+            L[b, b, k] = 0.0 if known else root
+            scratch[k] = 0.0 if known else 1.0 / root
+        for a in range(b + 1, n):
+            for k in range(lanes):
+                L[a, b, k] *= scratch[k]
+
+
+@kernel
+def not_psd(S: FloatArray, L: FloatArray, scratch: FloatArray, bad: IntArray) -> None:
+    """bad (lanes,): 1 where `is_psd` would refuse the matrix of S (n, n, lanes), 0
+    elsewhere. The lower triangle is read; L (n, n, lanes) and scratch (lanes,) are written."""
+    n, _, lanes = S.shape
+    for k in range(lanes):
+        bad[k] = 0
+    for a in range(n):
+        # L D L' without square roots: L below the diagonal, L D above it, 1 / D on it.
+        for k in range(lanes):
+            scratch[k] = S[a, a, k] - LIMIT * S[a, a, k]
+        for b in range(a):
+            for k in range(lanes):
+                L[b, a, k] = S[a, b, k]
+            for c in range(b):
+                for k in range(lanes):
+                    L[b, a, k] -= L[c, a, k] * L[b, c, k]
+            for k in range(lanes):
+                L[a, b, k] = L[b, a, k] * L[b, b, k]
+            for k in range(lanes):
+                lost = (L[b, b, k] == 0.0) & (L[b, a, k] != 0.0)
+                bad[k] = 1 if lost else bad[k]
+            for k in range(lanes):
+                scratch[k] -= L[b, a, k] * L[a, b, k]
+        for k in range(lanes):
+            rest = scratch[k]
+            positive = (rest > 0.0) & (rest < math.inf)
+            L[a, a, k] = 1.0 / rest if positive else 0.0
+        for k in range(lanes):
+            nothing = (S[a, a, k] == 0.0) & (scratch[k] == 0.0)
+            bad[k] = bad[k] if (L[a, a, k] > 0.0) | nothing else 1

@@ -12,9 +12,9 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Smoothing: what the past was, once the future is known.
+"""Smoothing: estimates of the past, given all data.
 
-`rts_smooth` is the Rauch-Tung-Striebel smoother. It walks back over a stored forward pass,
+The Rauch-Tung-Striebel smoother of one model walks back over a stored forward pass,
 
     G   = P_k F' (F P_k F' + Q)^-1                      the gain, F and Q of the step from k to k+1
     x^s_k = x_k + G (x^s_{k+1} - F x_k - b)
@@ -30,15 +30,22 @@ smoothed as above, and the pairs are merged over j with their probabilities,
     Pr(i, j | all data) = Pr(j | all data) E[ Pr(i | x', j) ],        x' ~ N(x^s_j, P^s_j),
     Pr(i | x', j) ~ P_ij mu_i N(x'; F_j x_i + b_j, F_j P_i F_j' + Q_j).
 
-The normal density is what the state one step later tells about the model now; without it (Kim
-1994) the smoother forgets that a diver who is found in the east must have gone east. The
+The normal density is what the state one step later says of the model now. Without it (Kim 1994)
+the smoother neglects that a diver who is found in the east must have gone east. The
 expectation is taken over the sigma points of x^s_j. The same shares Pr(i | x', j) sort those
 points into the cases i, and each case has its own mean and covariance of x', from which x_i is
 drawn back: a sharper form of Barber's expectation correction.
 
-With one model, or with models that are all the same, this is the RTS smoother exactly; with states
-that are drawn anew at each step it is the forward-backward algorithm exactly. Otherwise it is
-approximate, as the filter is: mixtures are replaced by their first two moments.
+`smooth_modes` is that neglect on purpose: Kim's backward pass over model probabilities alone,
+
+    Pr(i at k | all data) = mu_i sum_j P_ij Pr(j at k+1 | all data) / c_j,   c_j = sum_i P_ij mu_i
+
+with mu_i filtered at k and c_j predicted for k+1. It is exact for states that are drawn anew at
+each step, and cheap: it needs the filtered probabilities and nothing else.
+
+With one model, or with models that are all the same, `imm_smooth` is the RTS smoother exactly;
+with states that are drawn anew at each step it is the forward-backward algorithm exactly.
+Otherwise it is approximate, as the filter is: mixtures are replaced by their first two moments.
 
 Convention: the arrays of step k describe the move *into* k, from k-1; those of step 0 are not
 used.
@@ -77,30 +84,6 @@ class IMMSmoothed(NamedTuple):
     def combine(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (K, q) and covariance (K, q, q) of the outputs ``E x``, with E (M, q, n)."""
         return imm.combine(self.x, self.P, self.mu, E)
-
-
-def rts_smooth(
-    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Oracle for tests: smooth a forward pass of one model: x (K, ..., n) and P (K, ..., n, n)
-    filtered; F, Q (K, ..., n, n) and B (K, ..., n) of the move into each step. Returns the
-    smoothed x and P."""
-    smoothed_x, smoothed_P = x.copy(), P.copy()
-    for k in range(len(x) - 2, -1, -1):
-        predicted = apply(F[k + 1], x[k]) + (0.0 if B is None else B[k + 1])
-        S = F[k + 1] @ P[k] @ transpose(F[k + 1]) + Q[k + 1]
-        precision, _ = _precision(S, np.diagonal(S, axis1=-2, axis2=-1))
-        smoothed_x[k], drawn_P = _draw_back(
-            x[k],
-            P[k],
-            F[k + 1],
-            Q[k + 1],
-            precision,
-            smoothed_x[k + 1] - predicted,
-            smoothed_P[k + 1],
-        )
-        smoothed_P[k], _ = add_jitter(drawn_P)
-    return smoothed_x, smoothed_P
 
 
 def imm_smooth(
@@ -223,7 +206,7 @@ def _precision(S: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray
     """Inverse (..., n, n) and log determinant (...,) of `S`, which may be singular.
 
     `scale` (..., n) are variances that take the units out; after that, eigenvalues that are
-    rounding are lifted to `_NEGLIGIBLE`. A direction without any uncertainty thereby gets a huge
+    rounding are raised to `_NEGLIGIBLE`. A direction without any uncertainty thereby gets a huge
     precision, and deviations in it are zero.
     """
     root = np.sqrt(np.where(scale > 0.0, scale, 1.0))
@@ -234,3 +217,30 @@ def _precision(S: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray
         (scaled / values[..., None, :]) @ transpose(scaled),
         np.log(values).sum(axis=-1) + 2.0 * np.log(root).sum(axis=-1),
     )
+
+
+def smooth_modes(
+    mu: FloatArray, transition: FloatArray, moved: BoolArray | None = None
+) -> FloatArray:
+    """Smoothed probabilities (T, M) from filtered ones mu (T, M).
+
+    moved (T,): False where the chain rested on the step into k, True everywhere if not given.
+
+    >>> import numpy as np
+    >>> mu = np.array([[0.5, 0.5], [0.99, 0.01]])  # undecided, then sure
+    >>> smooth_modes(mu, np.array([[0.9, 0.1], [0.1, 0.9]])).round(3).tolist()
+    [[0.892, 0.108], [0.99, 0.01]]
+    """
+    smoothed = mu.copy()
+    predicted = mu[:-1] @ transition
+    for k in range(len(mu) - 2, -1, -1):
+        if moved is not None and not moved[k + 1]:
+            smoothed[k] = smoothed[k + 1]
+            continue
+        c = predicted[k]
+        ratio = np.divide(smoothed[k + 1], c, out=np.zeros_like(c), where=c > 0.0)
+        weight = mu[k] * (transition @ ratio)
+        total = weight.sum()
+        if total > 0.0:
+            smoothed[k] = weight / total
+    return smoothed

@@ -23,9 +23,8 @@ from __future__ import annotations
 
 from .bathymetry import MAX_BINS, Snapshot
 from .checks import check_covariance, check_stamp, nanoseconds, Rejection
-from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, usable_fixes
+from .diver import Arrivals, Fix, Fixes, NOBODY, scan_of, Start, usable_fixes
 from .fathometer import ArrayDepth, CrossSpectra, Pressure, Trace
-from .frames import frame_role, FrameGuard, Frames
 from .obstacle import (
     Altitude,
     BEAM_AXES,
@@ -36,10 +35,14 @@ from .obstacle import (
     OPTIONAL_COLUMNS,
     SonarImage,
 )
-from .positions import GeodeticFix, RelativeFix, VesselFix, VesselHeading, VesselPose
-from .repeats import RepeatGuard
-from .starts import Start
-from .transforms import FrameTree, moved, StaticTransforms
+from .positions import (
+    GeodeticFix,
+    RelativeFix,
+    StaticTransforms,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
 
 __all__ = [
     'Altitude',
@@ -52,16 +55,11 @@ __all__ = [
     'Detections',
     'Fix',
     'Fixes',
-    'frame_role',
-    'FrameGuard',
-    'Frames',
-    'FrameTree',
     'GeodeticFix',
     'IMAGE_ORDERS',
     'MAX_BINS',
     'MAX_IMAGE_CELLS',
     'Measurement',
-    'moved',
     'nanoseconds',
     'Navigation',
     'NOBODY',
@@ -69,7 +67,6 @@ __all__ = [
     'Pressure',
     'Rejection',
     'RelativeFix',
-    'RepeatGuard',
     'scan_of',
     'Snapshot',
     'SonarImage',

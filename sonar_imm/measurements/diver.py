@@ -80,10 +80,10 @@ class Fix:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        return content_key('fix' + self.sensor, self.position, self.covariance, _said(self))
+        return content_key('fix' + self.sensor, self.position, self.covariance, _target_ids(self))
 
 
-def _said(fix: Fix) -> NDArray | None:
+def _target_ids(fix: Fix) -> NDArray | None:
     """The name of a fix as an array, None when it has none."""
     return None if fix.target_id == NOBODY else np.array([fix.target_id], np.int32)
 
@@ -164,7 +164,7 @@ def usable_fixes(position: FloatArray, covariance: FloatArray | None) -> NDArray
         a, b, c, d = (covariance[:, i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
         scale = np.abs(covariance).max(axis=(1, 2), initial=0.0)
         # Relative to the largest entry, so that nothing overflows; as `check_covariance`.
-        a, b, c, d = (one / np.where(scale > 0.0, scale, 1.0) for one in (a, b, c, d))
+        a, b, c, d = (part / np.where(scale > 0.0, scale, 1.0) for part in (a, b, c, d))
         least = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
         known = np.isfinite(scale) & (scale > 0.0) & (np.abs(b - c) <= 1e-6) & (least > 1e-12)
         return np.asarray(usable & (known | np.isnan(covariance).all(axis=(1, 2))))
@@ -237,8 +237,8 @@ class Arrivals:
 
     def key(self) -> bytes:
         """See `content_key`."""
-        one = self.in_order()
-        return content_key('arrivals', *(getattr(one, name) for name in ARRIVAL_COLUMNS))
+        ordered = self.in_order()
+        return content_key('arrivals', *(getattr(ordered, name) for name in ARRIVAL_COLUMNS))
 
     def in_order(self) -> Arrivals:
         """The same ping with its rows in the order of their content."""
@@ -257,3 +257,37 @@ class Arrivals:
     def passive(self) -> bool:
         """True when the target itself emits, at an unknown time."""
         return len(self) > 0 and bool(np.isnan(self.tx).all())
+
+
+def plane_covariance(value: Any) -> FloatArray:
+    """Read-only (2, 2)."""
+    return floats(value, 2, 2)
+
+
+@frozen(eq=False, kw_only=True)
+class Start:
+    """Where somebody says that a diver is: not measured, but from a person or another program.
+
+    position: (3,) x, y, z in `frame_id`, the frame of the tracks, m; z is not used by a tracker of
+    two dimensions. covariance: (2, 2) of x and y, m^2; there is no start without one.
+    """
+
+    stamp_ns: int
+    position: FloatArray = field(converter=point)
+    covariance: FloatArray = field(converter=plane_covariance)
+    frame_id: str = ''
+
+    def __attrs_post_init__(self) -> None:
+        check_stamp(self.stamp_ns)
+        if not np.isfinite(self.position[:2]).all():
+            raise Rejection('nan', 'the start has a position that is not finite')
+        if np.abs(self.position[:2]).max() > FARTHEST_FIX:
+            raise Rejection(
+                'out_of_range',
+                f'the start lies at {self.position[:2]}, further than 100,000 km from the origin',
+            )
+        check_covariance(self.covariance, 'a start')
+
+    def key(self) -> bytes:
+        """See `content_key`."""
+        return content_key('start', self.position, self.covariance)

@@ -13,7 +13,8 @@
 # limitations under the License.
 
 """Positions that are not in the frame of the tracks: latitude and longitude, or relative to a
-transceiver on a vessel; and the vessel's own pose. The diver tracker places them."""
+transceiver on a vessel; and the vessel's own pose. The diver tracker places them. Beside them
+what is known of frames that are fixed to each other."""
 
 from __future__ import annotations
 
@@ -22,6 +23,7 @@ from typing import ClassVar
 from attrs import field, frozen
 import numpy as np
 
+from ..acoustics.geometry import Pose
 from ..estimation.arrays import FloatArray
 from .checks import (
     check_covariance,
@@ -174,3 +176,19 @@ class RelativeFix:
         """See `content_key`."""
         turned = np.array([self.target_id, self.levelled], np.int64)
         return content_key('relative', self.offset, self.covariance, turned)
+
+
+@frozen(eq=False, kw_only=True)
+class StaticTransforms:
+    """What one message says of frames that are fixed to each other: of each child frame its parent
+    and its pose in that, FLU or ENU axes."""
+
+    FRAME: ClassVar[str] = 'none'
+
+    poses: dict[str, tuple[str, Pose]]
+    stamp_ns: int = 0
+    frame_id: str = ''
+
+    def key(self) -> bytes:
+        """No tracker takes it into its history."""
+        return b'transforms'

@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The node around a tracker: everything that is the same for all systems.
+"""The nodes: `BaseNode` is the same for all, `TrackerNode` is the node around a tracker.
 
-A message becomes a measurement (`msg_adapters`), the tracker makes estimates of it, estimates
-become messages. The only clock the tracker knows is ``header.stamp``; a /clock that jumps back (a
-looped bag, a restarted simulation) resets it. One node, one process, one thread: a queue, not
-threads, takes up bursts.
+A message becomes a measurement (`msg_adapters`), passes the `intake`, the tracker makes estimates
+of it, estimates become messages. The only clock the tracker knows is ``header.stamp``; a /clock
+that jumps back (a looped bag, a restarted simulation) resets it. One node, one process, one
+thread: a queue, not threads, takes up bursts.
 
 Every message is answered: after its estimates, however many, comes one row on ``~/processed``
 (latched) with the number of messages taken, refused and of estimates published since the start.
@@ -29,89 +29,241 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-import contextlib
 import functools
-from pathlib import Path
-import sys
 import threading
 import time
 import traceback
 from typing import Any
 
 from attrs import evolve
-import rclpy
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
-from ..measurements import FrameGuard, FrameTree, Rejection, RepeatGuard
-from ..node_config import node_config_type, NodeConfig, type_spec, type_specs
-from ..parameters import ConfigError
+from ..measurements import Rejection
+from ..node_config import node_config_type, type_spec, type_specs
+from ..parameters import Config
 from ..trackers import SYSTEMS
-from ..trackers.frames import FrameDoor
-from .answers import Answers
-from .arguments import help_text, warn_of_foreign_files
 from .diagnostics import Announcer, Meter, Reporter
-from .drawing import Drawing
-from .executor import MessagesFirst
-from .keeping import StateKeeper
 from .messages import make, message_class
+from .outputs import DisplayPublisher, ProcessedPublisher, TablePublisher
 from .parameters import NodeParameters
 from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos, transforms_qos
-from .stopping import START_PATIENCE, stopper
-from .tables import TablePublisher
+from .saved_state import SavedState
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
 _PATIENCE = 3.0
+_UNKNOWN = {'received_timestamp': 0}
+"""The info of a message that did not come from the middleware."""
 
 
-class TrackerNode(Node):
-    """One tracker as a ROS 2 node. A system's own node may publish more by `show`."""
+class BaseNode(Node):
+    """Hears the inputs of `inputs_of`, answers each message, and reports on /diagnostics.
 
-    def __init__(self, system: str, **options: Any):
-        """Declare, compile, then subscribe: the first message meets a warm tracker.
+    A node that derives from it says in `take` what it does with a message. Its constructor gets
+    ready to work, then offers its outputs and calls `begin`, so that the first message meets a
+    warm node.
+    """
+
+    def __init__(self, name: str, config_types: tuple[type[Config], type[Config]], **options: Any):
+        """Declare the parameters: those of what works on the messages, and those of the node.
 
         `options` go to `rclpy.node.Node`. Raises `ConfigError` for parameters that cannot be used.
         """
-        super().__init__(system, **options)
-        self._system, self._full_name = system, self.get_fully_qualified_name().lstrip('/')
-        self._topics = inputs_of(system)
-        config_type = self._config_type = SYSTEMS[system].config_type()
-        self._node_config_type = node_config_type(SYSTEMS[system])
-        self._settings = NodeParameters(
-            self, (config_type, self._node_config_type), type_specs(system)
-        )
-        config = self._settings[config_type]
-        self._guard = FrameGuard(self._node_config.frame_id)
-        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
-        tree = FrameTree()
-        guards = (self._guard, self._repeats, tree)
-        self._keeper = StateKeeper(self, system, self._node_config, guards)
-        self.tracker = self._keeper.begin(config)
-        self._door = FrameDoor(self.tracker, self._guard, tree)
-        self._warm()
-
-        self._enabled = True
-        self._ignored = self._published = self._withheld = 0
+        super().__init__(name, **options)
+        self._settings = NodeParameters(self, config_types, type_specs(name))
+        self._config_type, self._node_config_type = config_types
+        self._node_config: Any = self._settings[self._node_config_type]
+        self._name = name
+        self._full_name = self.get_fully_qualified_name().lstrip('/')
+        self._inputs: dict[str, tuple[InputTopic, Callable[[Any], Any]]] = {}
+        self._published = 0
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
+
+    def begin(self) -> None:
+        """Offer what every node does, hear the inputs, report from now on."""
         with explained_overrides(self):
-            self._advertise()
-            told = {**self.tracker.config.as_dict(), **self._node_config.as_dict()}
-            hears = {
-                name: self._listen(topic, name)
-                for topic in self._topics
-                for name in topic.instances(told)
-                if topic.wanted(told)
+            self._processed = ProcessedPublisher(
+                self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
+            )
+            self._announcer = Announcer(self._endpoints, self._full_name)
+            settings, topics = self._settings.values(), inputs_of(self._name)
+            resolved = {
+                name: self._listen(topic, name, settings)
+                for topic in topics
+                for name in topic.instances(settings)
+                if topic.wanted(settings)
             }
+        required, one_of = needed(topics, settings)
+        self._reporter = Reporter(
+            self._full_name, resolved, self._meter, required=required, one_of=one_of
+        )
+        self.create_timer(
+            self._node_config.diagnostics_period,
+            self._report,
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        self._settings.on_change(self._reconfigure)
+        self._settings.warn_of_unknown()
+        self._acknowledge(None)
+        self.get_logger().info(f'ready, hears {", ".join(resolved.values())}')
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Messages refused so far, by reason."""
+        return self._meter.refused
+
+    def receive(self, name: str, message: Any, info: Mapping[str, Any] = _UNKNOWN) -> None:
+        """Take one message of the input `name` all the way; whatever it holds, the node goes on.
+
+        info: as rclpy gives it beside a message.
+        """
+        start = time.monotonic()
+        topic, reader = self._inputs[name]
+        stamp = message.header.stamp if hasattr(message, 'header') else None
+        self._meter.arrived(name, start)
+        if self._waited_too_long(name, info):
+            self._acknowledge(stamp)
+            return
+        try:
+            self.take(topic, reader, message)
+        except Rejection as rejection:
+            self._refuse(name, rejection)
+        except Exception:
+            if not self.context.ok():
+                raise  # the middleware went away under our feet: `run` knows
+            self._recover(name)
+        self._acknowledge(stamp)
+        self._meter.spent(time.monotonic() - start)
+
+    # -- what a node says of itself ------------------------------------------------------------
+
+    def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
+        """Do with a message what the node is there for. Raises `Rejection`."""
+        raise NotImplementedError
+
+    def start_afresh(self) -> None:
+        """Forget what came so far, after an internal error."""
+        raise NotImplementedError
+
+    def reconfigure(self) -> None:
+        """Take over parameters that were changed while running."""
+
+    def work_report(self) -> dict[str, Any]:
+        """`enabled`, `counts`, `health` and `warnings` for `Reporter.report`."""
+        raise NotImplementedError
+
+    def answer(self) -> dict[str, int]:
+        """The row on ``~/processed``."""
+        return {
+            'messages': self._meter.received.total(),
+            'refused': self._meter.refused.total(),
+            'estimates': self._published,
+        }
+
+    def message_words(self, name: str) -> str:
+        """What a message of the input `name` is called in a sentence."""
+        return f"a message on '{name}'"
+
+    def error_words(self) -> str:
+        """What follows of an internal error, for a sentence about it."""
+        return ''
+
+    # -- the same for all ----------------------------------------------------------------------
+
+    def _listen(self, topic: InputTopic, name: str, settings: Mapping[str, Any]) -> str:
+        """Subscribe to one input on the topic `name`, and give the resolved name of that."""
+        spec = type_spec(topic)
+        type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
+        convention = settings.get('world_frame_convention', 'enu')
+        reader = topic.reader(type_name, convention, settings, name)
+        self._inputs[name] = evolve(topic, name=name), reader
+        subscription = self._endpoints.subscribe(
+            message_class(type_name),
+            topic.prefix + name,
+            functools.partial(self.receive, name),
+            transforms_qos() if topic.latched else input_qos(self._node_config.queue_depth),
+        )
+        resolved: str = subscription.topic_name
+        return resolved
+
+    def _reconfigure(self) -> None:
+        self._node_config = self._settings[self._node_config_type]
+        self.reconfigure()
+
+    def _waited_too_long(self, name: str, info: Mapping[str, Any]) -> bool:
+        """Whether a message lay in the queue for more than `max_wait`; counts it."""
+        limit = getattr(self._node_config, 'max_wait', 0.0)
+        arrived_ns = info['received_timestamp']
+        # 0: a middleware that does not know. Both times are those of the system's clock.
+        if not limit or not arrived_ns or time.time_ns() - arrived_ns <= limit * 1e9:
+            return False
+        if not self._meter.dropped:
+            self.get_logger().warning(
+                f"messages on '{name}' come faster than they can be processed: those that "
+                f'waited more than {limit:g} s are dropped (said once, counted in /diagnostics)'
+            )
+        self._meter.dropped[name] += 1
+        return True
+
+    def _refuse(self, name: str, rejection: Rejection) -> None:
+        if rejection.reason not in self._meter.refused:
+            self.get_logger().warning(
+                f'{self.message_words(name)} is refused: {rejection.sentence} '
+                f"(said once; '{rejection.reason}' is counted in /diagnostics)"
+            )
+        self._meter.refused[rejection.reason] += 1
+
+    def _recover(self, name: str) -> None:
+        """Outlive a bug: a node at sea must not end because of one message."""
+        self._errors['internal_error'] += 1
+        self.get_logger().error(
+            f'internal error on {self.message_words(name)}{self.error_words()}; '
+            f'please report this:\n{traceback.format_exc()}'
+        )
+        self.start_afresh()
+
+    def _acknowledge(self, stamp: Any) -> None:
+        """Say on ~/processed that everything so far is answered; `stamp` is the message's."""
+        self._processed.publish(self.answer(), stamp)
+
+    def _report(self) -> None:
+        self._announcer.publish(
+            self._reporter.report(
+                self.get_clock().now().to_msg(),
+                time.monotonic(),
+                stale_after=self._node_config.stale_after,
+                lost=self._endpoints.lost,
+                incompatible=self._endpoints.incompatible,
+                **self.work_report(),
+            )
+        )
+
+
+class TrackerNode(BaseNode):
+    """One tracker as a ROS 2 node. A system's own node may publish more by `show`."""
+
+    def __init__(self, system: str, **options: Any):
+        """Get the tracker ready and begin. As `BaseNode`."""
+        config_types = SYSTEMS[system].config_type(), node_config_type(SYSTEMS[system])
+        super().__init__(system, config_types, **options)
+        self._saved_state = SavedState(self, system, self._node_config)
+        self._intake = self._saved_state.load(self._config)
+        self.tracker = self._intake.tracker
+        self._enabled = True
+        self._ignored = self._withheld = 0
+        self._warm()
+        with explained_overrides(self):
+            self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
+            self._displays = DisplayPublisher(system, self.advertise)
+            self.advertise_more()
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(SetBool, '~/enable', self._on_enable)
         self._jumps = self.get_clock().create_jump_callback(
@@ -120,24 +272,12 @@ class TrackerNode(Node):
             ),
             post_callback=self._on_clock_back,
         )
-        required, one_of = needed(self._topics, told)
-        self._reporter = Reporter(
-            self._full_name, hears, self._meter, required=required, one_of=one_of
-        )
-        self.create_timer(
-            self._node_config.diagnostics_period,
-            self._report,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
-        self._keeper.save_every_now_and_then(lambda: (self.tracker, self._settings[config_type]))
-        self._settings.on_change(lambda: self._door.reconfigure(self._settings[config_type]))
-        self._settings.warn_of_unknown()
-        self._acknowledge(None)
-        self.get_logger().info(f'ready, hears {", ".join(hears.values())}')
+        self._saved_state.save_periodically(lambda: self._config)
+        self.begin()
 
     def destroy_node(self) -> None:
         """Save the state, then end."""
-        self._keeper.save(self.tracker, self._settings[self._config_type], wait=True)
+        self._saved_state.save(self._config, wait=True)
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:
@@ -147,17 +287,65 @@ class TrackerNode(Node):
     def advertise_more(self) -> None:
         """Offer what a system's own node publishes besides the displays."""
 
-    def show(self, newest: Estimate) -> None:
-        """Publish the newest state for displays."""
-        self._drawing.show(newest)
+    def show(self, estimates: list[Estimate]) -> None:
+        """Publish for displays what the estimates of one message are to be shown as."""
+        self._displays.publish(estimates[-1])
 
-    def show_all(self, estimates: list[Estimate]) -> None:
-        """Publish what each of the estimates of one message is to be shown as."""
-        self.show(estimates[-1])
+    def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
+        """Read, admit, process, publish."""
+        if not self._enabled:
+            self._ignored += 1
+            return
+        measurement = reader(message)
+        doubt = topic.doubt(message, measurement)
+        repeated_rows = self._intake.repeats.rows
+        measurement = self._intake.admit(measurement)
+        if measurement is None:
+            return
+        if self._intake.repeats.rows > repeated_rows:
+            self._doubt(topic.name, 'repeated_rows')
+        if doubt is not None:
+            self._doubt(topic.name, doubt)
+        if not self._saved_state.still_fits(measurement.stamp_ns):
+            self.start_afresh()
+        estimates = self.tracker.process(measurement)
+        if estimates:
+            self._publish(estimates)
+
+    def start_afresh(self) -> None:
+        """Forget all measurements and take away what is drawn."""
+        self._intake.reset()
+        self._displays.clear()
+
+    def reconfigure(self) -> None:
+        """Hand the parameters on to the tracker."""
+        self._intake.reconfigure(self._config)
+
+    def work_report(self) -> dict[str, Any]:
+        """What the tracker says of itself."""
+        counts = Counter(self.tracker.counts) + self._errors
+        if self._withheld:
+            counts['revisions_withheld'] = self._withheld
+        if self._ignored:
+            counts['ignored_while_disabled'] = self._ignored
+        return {
+            'enabled': self._enabled,
+            'counts': counts,
+            'health': self.tracker.health(),
+            'warnings': [
+                *getattr(self.tracker, 'warnings', list)(),
+                *filter(None, [self._saved_state.trouble]),
+            ],
+        }
+
+    def error_words(self) -> str:
+        """What follows of an internal error."""
+        return ', the tracker starts afresh'
 
     @property
-    def _node_config(self) -> NodeConfig:
-        return self._settings[self._node_config_type]
+    def _config(self) -> Any:
+        """The parameters of the tracker without what /tf_static says."""
+        return self._settings[self._config_type]
 
     def _warm(self) -> None:
         """Compile or load the kernels, with a word to the user when that takes long."""
@@ -175,149 +363,28 @@ class TrackerNode(Node):
         finally:
             notice.cancel()
 
-    def _advertise(self) -> None:
-        self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
-        self._answers = Answers(
-            self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
-        )
-        self._announcer = Announcer(self._endpoints, self._full_name)
-        self._drawing = Drawing(self._system, self.advertise)
-        self.advertise_more()
-
-    def _listen(self, topic: InputTopic, name: str) -> str:
-        """Subscribe to one input on the topic `name`, and give the resolved name of that."""
-        spec = type_spec(topic)
-        type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
-        reader = topic.reader(
-            type_name,
-            self._node_config.world_frame_convention,
-            self.tracker.config.as_dict(),
-            name,
-        )
-        subscription = self._endpoints.subscribe(
-            message_class(type_name),
-            topic.prefix + name,
-            functools.partial(self._receive, evolve(topic, name=name), reader),
-            transforms_qos() if topic.latched else input_qos(self._node_config.queue_depth),
-        )
-        return subscription.topic_name
-
-    def _receive(
-        self,
-        topic: InputTopic,
-        reader: Callable[[Any], Any],
-        message: Any,
-        info: Mapping[str, Any],
-    ) -> None:
-        """Take one message all the way; whatever it holds, the node goes on."""
-        start = time.monotonic()
-        stamp = message.header.stamp if hasattr(message, 'header') else None
-        self._meter.arrived(topic.name, start)
-        if self._waited_too_long(topic, info):
-            self._acknowledge(stamp)
-            return
-        try:
-            if self._enabled:
-                self._process(topic, reader, message)
-            else:
-                self._ignored += 1
-        except Rejection as rejection:
-            self._refuse(topic, rejection)
-        except Exception:
-            if not self.context.ok():
-                raise  # the middleware went away under our feet: `run` knows
-            self._recover(topic)
-        self._acknowledge(stamp)
-        self._meter.spent(time.monotonic() - start)
-
-    def _waited_too_long(self, topic: InputTopic, info: Mapping[str, Any]) -> bool:
-        """Whether a message lay in the queue for more than `max_wait`; counts it."""
-        limit, arrived_ns = self._node_config.max_wait, info['received_timestamp']
-        # 0: a middleware that does not know. Both times are those of the system's clock.
-        if not limit or not arrived_ns or time.time_ns() - arrived_ns <= limit * 1e9:
-            return False
-        if not self._meter.dropped:
-            self.get_logger().warning(
-                f"messages on '{topic.name}' come faster than they can be processed: those that "
-                f'waited more than {limit:g} s are dropped (said once, counted in /diagnostics)'
-            )
-        self._meter.dropped[topic.name] += 1
-        return True
-
-    def _process(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
-        measurement = reader(message)
-        doubt = topic.doubt(message, measurement)
-        measurement = self._door.admit(measurement)
-        if measurement is None:
-            return
-        rows = self._repeats.rows
-        measurement = self._repeats.fresh(measurement)
-        if self._repeats.rows > rows:
-            self._doubt(topic, 'repeated_rows')
-        if doubt is not None:
-            self._doubt(topic, doubt)
-        if not self._keeper.goes_on(measurement.stamp_ns):
-            self._start_afresh()
-        self._publish(self.tracker.process(measurement))
-
     def _publish(self, estimates: list[Estimate]) -> None:
-        if not estimates:
-            return
-        for estimate in self._wanted(estimates):
+        """Publish the newest estimate, and before it the newest revised ones, as many as are
+        wanted."""
+        wanted = 1
+        if self._node_config.publish_revisions:
+            wanted += self._node_config.max_revisions or len(estimates)
+            self._withheld += max(0, len(estimates) - wanted)
+        for estimate in estimates[-wanted:]:
             self._estimates.publish(write_estimate(estimate, make))
             self._published += 1
-        self.show_all(estimates)
+        self.show(estimates)
 
-    def _wanted(self, estimates: list[Estimate]) -> list[Estimate]:
-        """The newest estimate, and before it the newest revised ones, as many as are wanted."""
-        if not self._node_config.publish_revisions:
-            return estimates[-1:]
-        limit = self._node_config.max_revisions or len(estimates)
-        self._withheld += max(0, len(estimates) - 1 - limit)
-        return estimates[-limit - 1 :]
-
-    def _doubt(self, topic: InputTopic, reason: str) -> None:
+    def _doubt(self, name: str, reason: str) -> None:
         if reason not in self._meter.doubted:
             self.get_logger().warning(
-                f"messages on '{topic.name}' {DOUBTS.get(reason, reason)} "
+                f"messages on '{name}' {DOUBTS.get(reason, reason)} "
                 f"(said once; '{reason}' is counted in /diagnostics)"
             )
         self._meter.doubted[reason] += 1
 
-    def _refuse(self, topic: InputTopic, rejection: Rejection) -> None:
-        if rejection.reason not in self._meter.refused:
-            self.get_logger().warning(
-                f"a message on '{topic.name}' is refused: {rejection.sentence} "
-                f"(said once; '{rejection.reason}' is counted in /diagnostics)"
-            )
-        self._meter.refused[rejection.reason] += 1
-
-    def _recover(self, topic: InputTopic) -> None:
-        """Outlive a bug: a node at sea must not end because of one message."""
-        self._errors['internal_error'] += 1
-        self.get_logger().error(
-            f"internal error on a message on '{topic.name}', the tracker "
-            f'starts afresh; please report this:\n{traceback.format_exc()}'
-        )
-        self._start_afresh()
-
-    def _acknowledge(self, stamp: Any) -> None:
-        """Say on ~/processed that everything so far is answered; `stamp` is the message's."""
-        row = {
-            'messages': self._meter.received.total(),
-            'refused': self._meter.refused.total(),
-            'estimates': self._published,
-        }
-        self._answers.say(row, stamp)
-
-    def _start_afresh(self) -> None:
-        self.tracker.reset()
-        self._guard.reset()
-        self._repeats.reset()
-        self._drawing.forget()
-
     def _on_reset(self, request: Any, response: Any) -> Any:
-        self._start_afresh()
+        self.start_afresh()
         self.get_logger().info('reset on request')
         response.success, response.message = True, 'all tracks are forgotten'
         return response
@@ -333,73 +400,4 @@ class TrackerNode(Node):
         self.get_logger().warning(
             f'/clock is back by {-jump.delta.nanoseconds / 1e9:.3f} s: the tracker starts afresh'
         )
-        self._start_afresh()
-
-    def _report(self) -> None:
-        counts = Counter(self.tracker.counts) + self._errors
-        if self._withheld:
-            counts['revisions_withheld'] = self._withheld
-        if self._ignored:
-            counts['ignored_while_disabled'] = self._ignored
-        self._announcer.publish(
-            self._reporter.report(
-                self.get_clock().now().to_msg(),
-                time.monotonic(),
-                enabled=self._enabled,
-                stale_after=self._node_config.stale_after,
-                counts=counts,
-                health=self.tracker.health(),
-                warnings=[
-                    *getattr(self.tracker, 'warnings', list)(),
-                    *filter(None, [self._keeper.trouble]),
-                ],
-                lost=self._endpoints.lost,
-                incompatible=self._endpoints.incompatible,
-            )
-        )
-
-
-def run(make_node: Callable[[], Node], args: list[str] | None = None) -> int:
-    """Spin a node until SIGINT, SIGTERM or SIGHUP. Gives the exit code: 0 done, 2 unusable
-    parameters.
-
-    The order of things matters: the textbook version fails on every tenth signal, because the
-    context can vanish inside any call, the constructor included.
-    """
-    first = stopper.listen()
-    node = None
-    try:
-        _init(args)
-        if text := help_text(args):
-            print(text)
-            return 0
-        stopper.on_stop(rclpy.try_shutdown, START_PATIENCE)
-        executor = MessagesFirst()
-        node = make_node()
-        warn_of_foreign_files(node, args)
-        stopper.on_stop(rclpy.try_shutdown)
-        rclpy.spin(node, executor)
-    except ExternalShutdownException:
-        pass
-    except ConfigError as error:
-        print(f'{Path(sys.argv[0]).stem}: {error}', file=sys.stderr)
-        return 2
-    except Exception:  # of many kinds, when the context vanished in the middle of a call
-        if rclpy.ok():
-            raise
-    finally:
-        with contextlib.suppress(*([Exception] if stopper.asked else [])):
-            if node is not None:
-                node.destroy_node()
-        rclpy.try_shutdown()
-        stopper.release() if first else stopper.ignore()
-    return 0
-
-
-def _init(args: list[str] | None) -> None:
-    try:
-        # Where signals cannot be taken here, they remain with whoever has them.
-        mine = SignalHandlerOptions.NO if stopper.listening else None
-        rclpy.init(args=args, signal_handler_options=mine)
-    except RuntimeError as error:  # a parameter file or a ROS argument that rcl cannot parse
-        raise ConfigError(' '.join(str(error).split())) from None
+        self.start_afresh()

@@ -15,10 +15,11 @@
 """The bathymetry node: ``ros2 run sonar_imm bathymetry_node``, or
 ``python -m sonar_imm.nodes.bathymetry``.
 
-Hears ``snapshot``, one message a ping, and publishes one ``~/estimate`` a ping, one row a range
-bin. The points are the floor in the frame of the sonar; the column ``label`` is the number of the
-most probable terrain model, by which RViz2 and Foxglove colour them (config/bathymetry.rviz,
-config/foxglove_bathymetry.json), ``label_probability`` how probable it is.
+Hears ``snapshot``, one message per ping, and publishes one ``~/estimate`` per ping, one row per
+range bin. The points are the floor in the frame of the sonar; the column ``label`` is the number
+of the most probable terrain model, by which RViz2 and Foxglove colour them
+(config/bathymetry.rviz, config/foxglove_bathymetry.json), ``label_probability`` how probable it
+is.
 
 Also published, for each ping: ``~/model_probabilities``, the share of the bins that each terrain
 model holds, and with navigation on ``nav`` ``~/soundings``, what goes into a chart: a row for each
@@ -50,8 +51,9 @@ from msg_adapters.soundings import write_soundings
 
 from ..estimates import Estimate
 from ..soundings import soundings_of
-from .base import run, TrackerNode
+from .base import TrackerNode
 from .messages import make
+from .running import run
 
 
 class BathymetryNode(TrackerNode):
@@ -63,9 +65,9 @@ class BathymetryNode(TrackerNode):
     def advertise_more(self) -> None:
         self._soundings = self.advertise('sensor_msgs/msg/PointCloud2', '~/soundings')
 
-    def show_all(self, estimates: list[Estimate]) -> None:
+    def show(self, estimates: list[Estimate]) -> None:
         for estimate in estimates:
-            self.show(estimate)
+            super().show([estimate])
             soundings = soundings_of(estimate)
             if soundings is not None and self._soundings.get_subscription_count():
                 self._soundings.publish(write_soundings(soundings, make))

@@ -14,32 +14,67 @@
 
 """What /diagnostics says of a node, in the shape of diagnostic_updater.
 
-Two entries a node: ``<node>: input`` (rates, silence, refused and lost messages) and
-``<node>: tracker`` (what the tracker says of itself, and how long it takes). When a finding
-becomes a level is decided in `health`. Everything here is
+Two entries per node: ``<node>: input`` (rates, silence, refused and lost messages) and
+``<node>: tracker`` (what the tracker says of itself, and how long it takes). Everything here is
 measured with the steady clock of the machine: under simulated time, paused or looped, silence
-still shows.
+still shows. Nothing here knows of subscriptions and clocks; the node tells what happened and when.
 
-The class knows nothing of subscriptions and clocks; the node tells it what happened and when.
+From what is found in one period comes a level that a watchdog can use. A value at its limit is now
+above and now below it. So a finding counts only after it was there in `RISE` periods in a row, and
+is over only after it was gone for `FALL` periods in a row. What is final by itself (an error that
+was caught, a silence, which has its own patience) counts at once. A period without a message says
+nothing of what only messages show, so that slow sensors count too.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 
-from .health import ERROR, FALL, Finding, Hysteresis, RISE, STALE, summary, told, WARN
 from .qos import Endpoints, latched_qos, output_qos
-from .unused import Unused
 
+OK, WARN, ERROR, STALE = (
+    DiagnosticStatus.OK,
+    DiagnosticStatus.WARN,
+    DiagnosticStatus.ERROR,
+    DiagnosticStatus.STALE,
+)
+RISE, FALL = 2, 5
+"""Periods of diagnostics, of one second by default."""
+_WORSE = (OK, WARN, STALE, ERROR)
+"""From good to bad; the numbers of the message are in another order."""
 MUCH_LOST = 0.1
 _WINDOW = 1000
 _PATIENCE = 5.0
 """Mean intervals after which an input that is not needed is said to be gone."""
+UNUSED_REASONS = frozenset(
+    {
+        'doubted',
+        'full',
+        'navigation_gap',
+        'navigation_missing',
+        'no_origin',
+        'other_depths',
+        'other_frame',
+        'too_late',
+        'unknown_type',
+        'vessel_pose_gap',
+        'vessel_pose_missing',
+    }
+)
+"""Counts of a tracker that say that a message was of no use."""
+UNUSED_HINTS = {
+    'too_late': 'too_late (older than the history: a long delay, or clocks that disagree)',
+    'doubted': 'doubted (their stamps do not go on from those before)',
+}
+UNUSED_WINDOW = 10.0
+"""Seconds over which the share is taken."""
+UNUSED_SHARE, UNUSED_LEAST = 0.1, 5
+"""The share, and the number of messages, from which on it is said."""
 
 
 class Meter:
@@ -77,6 +112,106 @@ class Meter:
         return 1e3 * float(p50), 1e3 * float(p99)
 
 
+class Finding(NamedTuple):
+    """Something that is not as it should be. key: what it is, the same from period to period;
+    at_once: it need not be found again to count; timed: it can be judged in a period without a
+    message; passing: it is over as soon as it is not found."""
+
+    key: str
+    level: bytes
+    sentence: str
+    at_once: bool = False
+    timed: bool = False
+    passing: bool = False
+
+
+class Hysteresis:
+    """Decides which findings count, once a period."""
+
+    def __init__(self, rise: int = RISE, fall: int = FALL):
+        self._rise, self._fall = rise, fall
+        self._found: dict[tuple[str, bytes], int] = {}
+        self._missed: dict[tuple[str, bytes], int] = {}
+        self._counting: dict[tuple[str, bytes], Finding] = {}
+
+    def settle(self, findings: Iterable[Finding], *, quiet: bool = False) -> list[Finding]:
+        """The findings that count now, the worst first. quiet: no message came, which says nothing
+        for or against what messages show. One that is just not there keeps its last sentence until
+        it is over."""
+        now = {(finding.key, finding.level): finding for finding in findings}
+        for name, finding in now.items():
+            self._found[name] = self._found.get(name, 0) + 1
+            self._missed.pop(name, None)
+            if finding.at_once or self._found[name] >= self._rise or name in self._counting:
+                self._counting[name] = finding
+        for name in [name for name in self._found if name not in now]:
+            known = self._counting.get(name)
+            if quiet and not (known and (known.timed or known.passing)):
+                continue
+            if known is None:
+                del self._found[name]
+                continue
+            self._missed[name] = self._missed.get(name, 0) + 1
+            if known.passing or self._missed[name] >= self._fall:
+                del self._counting[name], self._found[name], self._missed[name]
+        return sorted(self._counting.values(), key=lambda finding: -_WORSE.index(finding.level))
+
+
+def worst(levels: Iterable[bytes]) -> bytes:
+    """The worst of some levels: OK, WARN, STALE, ERROR."""
+    return max(levels, key=_WORSE.index, default=OK)
+
+
+def level_and_text(findings: list[Finding], otherwise: str) -> tuple[bytes, str]:
+    """The level of a status and its text."""
+    text = '; '.join(dict.fromkeys(finding.sentence for finding in findings))
+    return worst(finding.level for finding in findings), text or otherwise
+
+
+def summary(name: str, parts: Iterable[DiagnosticStatus]) -> DiagnosticStatus:
+    """One status for a node: the worst level of its `parts`, and the sentences behind it."""
+    parts = list(parts)
+    level = worst(part.level for part in parts)
+    text = '; '.join(dict.fromkeys(part.message for part in parts if part.level == level))
+    pairs = [(part.name.rpartition(': ')[2], part.message) for part in parts]
+    return DiagnosticStatus(
+        level=level,
+        name=name,
+        message=text,
+        hardware_id='sonar_imm',
+        values=[KeyValue(key=key, value=value) for key, value in pairs],
+    )
+
+
+class UnusedShare:
+    """The share of the messages of the last seconds that the tracker could not use, and why.
+
+    Single messages are lost at sea all the time. When a tenth of them is, something is set up
+    wrongly: clocks that disagree, a sensor in another frame, a tracker without navigation.
+    """
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[float, int, Counter[str]]] = deque()
+
+    def sentence(self, now: float, received: int, counts: Mapping[str, int]) -> str:
+        """What to say, nothing where all is well. now: steady s; received, counts: so far."""
+        unused = Counter({name: n for name, n in counts.items() if name in UNUSED_REASONS})
+        self._past.append((now, received, unused))
+        while len(self._past) > 1 and self._past[1][0] <= now - UNUSED_WINDOW:
+            self._past.popleft()
+        then, before, then_unused = self._past[0]
+        fresh, lost = received - before, unused - then_unused
+        if lost.total() < max(UNUSED_LEAST, UNUSED_SHARE * fresh):
+            return ''
+        reasons = ', '.join(UNUSED_HINTS.get(name, name) for name, _ in lost.most_common(3))
+        share = 100.0 * min(1.0, lost.total() / max(fresh, 1))
+        return f'{share:.0f} % of the messages of the last {now - then:.0f} s not used: {reasons}'
+
+
+_Totals = tuple[float | None, Counter[str], Counter[str], int, Counter[str]]
+"""Steady seconds of a report, and received, refused, dropped and lost messages until then."""
+
+
 class Reporter:
     """Turns a `Meter` and the tracker's own numbers into a DiagnosticArray, once a period."""
 
@@ -94,15 +229,15 @@ class Reporter:
         """Report as `name`; `topics` maps input names to resolved topic names.
 
         required: inputs that are all needed; one_of: inputs of which one is enough. rise, fall:
-        see `health.Hysteresis`.
+        see `Hysteresis`.
         """
         self._name = name
         self._topics = dict(topics)
         self._needed = [(name,) for name in required] + ([tuple(one_of)] if one_of else [])
         self._meter = meter
-        self._before = (None, Counter(), Counter(), 0, Counter())
+        self._before: _Totals = None, Counter(), Counter(), 0, Counter()
         self._of_input, self._of_tracker = Hysteresis(rise, fall), Hysteresis(rise, fall)
-        self._unused = Unused()
+        self._unused = UnusedShare()
 
     def report(
         self,
@@ -169,10 +304,10 @@ class Reporter:
         """Sentences about what is needed and does not come."""
         sentences, last = [], self._meter.last
         for names in self._needed:
-            heard = [name for name in names if name in last]
-            silence = now - max((last[name] for name in heard), default=-np.inf)
-            where = ' or '.join(self._topics[name] for name in heard or names)
-            if not heard:
+            arrived = [name for name in names if name in last]
+            silence = now - max((last[name] for name in arrived), default=-np.inf)
+            where = ' or '.join(self._topics[name] for name in arrived or names)
+            if not arrived:
                 sentences.append(f'no message yet on {where}')
             elif silence > stale_after:
                 sentences.append(f'no message for {silence:.1f} s on {where}')
@@ -218,7 +353,8 @@ class Reporter:
             for topic, policy in sorted(incompatible.items())
         }
         found = [
-            Finding(one.split(' for ')[0], STALE, one, at_once=True, passing=True) for one in stale
+            Finding(silence.split(' for ')[0], STALE, silence, at_once=True, passing=True)
+            for silence in stale
         ]
         if refused and refused.total() >= fresh.total():
             sentence = f'every message is refused: {_most(refused)}'
@@ -234,9 +370,9 @@ class Reporter:
             found.append(Finding('incompatible', WARN, sentence, timed=True))
         if not stale:
             gone = self._gone(now, stale_after)
-            found += [Finding(f'gone {one}', WARN, text, timed=True) for one, text in gone]
+            found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]
         counting = self._of_input.settle(found, quiet=not fresh)
-        level, text = told(counting, 'receiving')
+        level, text = level_and_text(counting, 'receiving')
         if not enabled:
             text += ' (disabled, input is not used)'
         return self._status('input', level, text, values)
@@ -256,7 +392,7 @@ class Reporter:
         values: dict[str, Any] = {f'count: {reason}': n for reason, n in sorted(counts.items())}
         values |= dict(health)
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
-        found = [Finding(_wording(one), WARN, one) for one in warnings]
+        found = [Finding(_wording(warning), WARN, warning) for warning in warnings]
         if stale and enabled:
             sentence = f'waiting for input: {stale[0]}'
             found.append(Finding('stale', STALE, sentence, at_once=True, passing=True))
@@ -273,7 +409,7 @@ class Reporter:
             sentence = 'an internal error was caught, see the log'
             found.append(Finding('internal_error', ERROR, sentence, at_once=True))
         counting = self._of_tracker.settle(found, quiet=quiet)
-        level, text = told(counting, 'tracking' if enabled else 'disabled')
+        level, text = level_and_text(counting, 'tracking' if enabled else 'disabled')
         return self._status('tracker', level, text, values)
 
     def _status(
@@ -300,12 +436,12 @@ class Announcer:
         self._name = name
         self.health = DiagnosticStatus(level=STALE, name=name, message='starting')
         self._all = endpoints.advertise(DiagnosticArray, '/diagnostics', output_qos())
-        self._one = endpoints.advertise(DiagnosticStatus, '~/health', latched_qos())
+        self._summary = endpoints.advertise(DiagnosticStatus, '~/health', latched_qos())
 
     def publish(self, message: DiagnosticArray) -> None:
         self._all.publish(message)
         self.health = summary(self._name, message.status)
-        self._one.publish(self.health)
+        self._summary.publish(self.health)
 
 
 def _share_lost(missing: Counter[str], fresh: Counter[str]) -> str:

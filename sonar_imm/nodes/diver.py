@@ -17,8 +17,8 @@
 Hears ``fix``, ``fixes``, ``relative``, ``arrivals``, and for ``relative`` the vessel's ``nav`` or
 ``nav_fix`` and ``heading``. Besides ``~/estimate`` it publishes, for the newest state only:
 
-- ``~/odometry``: one message a confirmed diver (coasting ones too), told apart by
-  ``child_frame_id`` = ``diver_<track_id>``;
+- ``~/odometry``: one message per confirmed diver (coasting ones too), whose ``child_frame_id`` is
+  ``diver_<track_id>``;
 - ``~/geo``: the same as NavSatFix, when it is known where the frame of the tracks lies on Earth;
 - ``~/model_probabilities``: those of the diver that has been tracked longest.
 """
@@ -39,8 +39,9 @@ from msg_adapters.displays.tracks import confirmed_rows
 from msg_adapters.geodetic import write_geo
 
 from ..estimates import Estimate
-from .base import run, TrackerNode
+from .base import TrackerNode
 from .messages import make
+from .running import run
 
 
 class DiverNode(TrackerNode):
@@ -52,9 +53,9 @@ class DiverNode(TrackerNode):
     def advertise_more(self) -> None:
         self._geo = self.advertise('sensor_msgs/msg/NavSatFix', '~/geo')
 
-    def show(self, newest: Estimate) -> None:
-        super().show(newest)
-        origin = self.tracker.origin
+    def show(self, estimates: list[Estimate]) -> None:
+        super().show(estimates)
+        newest, origin = estimates[-1], self.tracker.origin
         if origin is not None and self._geo.get_subscription_count():
             for row in confirmed_rows(newest):
                 self._geo.publish(write_geo(newest, row, origin, make))

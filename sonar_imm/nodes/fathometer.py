@@ -15,7 +15,7 @@
 """The fathometer node: ``ros2 run sonar_imm fathometer_node``, or
 ``python -m sonar_imm.nodes.fathometer``.
 
-Hears ``csdm``, ``pressure`` or ``trace``, and ``array_depth`` beside them. One ``~/estimate`` a
+Hears ``csdm``, ``pressure`` or ``trace``, and ``array_depth`` beside them. One ``~/estimate`` per
 record; with `preview_seconds` also one at each sliding update between records, marked `preview`.
 Besides, for the newest record or preview:
 
@@ -38,8 +38,9 @@ from typing import Any
 from msg_adapters.array_records import write_response
 
 from ..estimates import Estimate
-from .base import run, TABLE, TrackerNode
+from .base import TABLE, TrackerNode
 from .messages import make
+from .running import run
 
 
 class FathometerNode(TrackerNode):
@@ -51,8 +52,8 @@ class FathometerNode(TrackerNode):
     def advertise_more(self) -> None:
         self._response = self.advertise(TABLE, '~/response')
 
-    def show(self, newest: Estimate) -> None:
-        super().show(newest)
+    def show(self, estimates: list[Estimate]) -> None:
+        super().show(estimates)
         if self._response.get_subscription_count() and self.tracker.response is not None:
             self._response.publish(write_response(self.tracker.response, make))
 

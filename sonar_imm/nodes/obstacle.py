@@ -34,7 +34,8 @@ if __name__ == '__main__':
 import sys
 from typing import Any
 
-from .base import run, TrackerNode
+from .base import TrackerNode
+from .running import run
 
 
 class ObstacleNode(TrackerNode):

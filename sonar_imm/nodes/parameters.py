@@ -90,16 +90,24 @@ class NodeParameters:
         """Give the value of one of the further parameters."""
         return self._chosen[name]
 
+    def values(self) -> dict[str, Any]:
+        """The parameters of all classes by name; where two share one, the last one's."""
+        return {
+            name: value
+            for config in self._configs.values()
+            for name, value in config.as_dict().items()
+        }
+
     def on_change(self, apply: Callable[[], None]) -> None:
         """Call `apply` after a change made from outside has been taken over."""
 
         def take_over(changed: list[Parameter]) -> None:
             if ours := self._ours(changed):
                 values = _plain_values(ours)
-                self._configs = self._build(self._values() | values)
+                self._configs = self._build(self.values() | values)
                 apply()
-                told = ', '.join(f'{name} is {value} now' for name, value in values.items())
-                self._node.get_logger().info(f'parameters changed: {told}')
+                changes = ', '.join(f'{name} is {value} now' for name, value in values.items())
+                self._node.get_logger().info(f'parameters changed: {changes}')
 
         self._node.add_post_set_parameters_callback(take_over)
 
@@ -141,8 +149,9 @@ class NodeParameters:
         return values
 
     def _build(self, values: Mapping[str, Any]) -> dict[type[Config], Any]:
-        """Build one config a class, with the mistakes of all classes in one `ConfigError`."""
-        built, problems = {}, []
+        """Build a config of each class, with the mistakes of all classes in one `ConfigError`."""
+        built: dict[type[Config], Any] = {}
+        problems: list[str] = []
         for config_type in self._types:
             try:
                 built[config_type] = config_type.from_mapping(values, ignore_unknown=True)
@@ -152,25 +161,18 @@ class NodeParameters:
             raise ConfigError(*problems)
         return built
 
-    def _values(self) -> dict[str, Any]:
-        return {
-            name: value
-            for config in self._configs.values()
-            for name, value in config.as_dict().items()
-        }
-
     def _declare(self, spec: ParameterSpec) -> None:
-        value, told = (self._values() | self._chosen)[spec.name], descriptor(spec)
+        value, described = (self.values() | self._chosen)[spec.name], descriptor(spec)
         if value != []:
-            self._node.declare_parameter(spec.name, value, told, ignore_override=True)
+            self._node.declare_parameter(spec.name, value, described, ignore_override=True)
             return
         # rclpy takes an empty list for an array of bytes. A parameter that has only a type has no
         # value, and then `ros2 param dump` shows those of no parameter of the node.
         kind = _TYPES[spec.kind]
         self._node.declare_parameter(spec.name, kind, ignore_override=True)
         self._node.set_parameters([Parameter(spec.name, kind, [])])
-        told.name, told.type = spec.name, kind.value
-        self._node.set_descriptor(spec.name, told)
+        described.name, described.type = spec.name, kind.value
+        self._node.set_descriptor(spec.name, described)
 
     def _ours(self, parameters: Iterable[Parameter]) -> list[Parameter]:
         return [p for p in parameters if p.name in self._specs]
@@ -178,7 +180,7 @@ class NodeParameters:
     def _check(self, changed: list[Parameter]) -> SetParametersResult:
         """Judge a change of good type, which rclpy has checked by now."""
         try:
-            self._build(self._values() | _plain_values(self._ours(changed)))
+            self._build(self.values() | _plain_values(self._ours(changed)))
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -26,7 +26,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
-from typing import Any
+import time
+from typing import Any, cast
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
@@ -45,7 +46,6 @@ from rclpy.subscription import Subscription
 import yaml
 
 from ..parameters import ConfigError
-from .losses import SequenceGaps
 
 _POLICIES = {
     'history': HistoryPolicy,
@@ -88,6 +88,66 @@ def lockstep_qos() -> QoSProfile:
     return QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_ALL)
 
 
+class SequenceGaps:
+    """Gaps in the numbers of the messages of one topic: how many never reached the node.
+
+    A publisher numbers what it sends. A number that is left out is a message that was lost: on the
+    network, or in the queue of the node, where a new message pushes out the oldest. The middleware
+    says nothing of the latter, so that a node at its limit would look healthy.
+
+    The number comes with each message, the publisher's identity does not. So each publisher is
+    known by the last number that came from it, and a message belongs to the one it continues, or,
+    after a gap, to the one with the smallest gap. In doubt nothing is counted: the count is a
+    lower bound.
+
+    lost: messages missed so far. numbered: whether the middleware tells numbers; None before the
+    first message.
+    """
+
+    def __init__(self, publisher_count: Callable[[], int]):
+        """`publisher_count` tells how many publishers are heard now; asked at a gap only."""
+        self.lost = 0
+        self.numbered: bool | None = None
+        self._publisher_count = publisher_count
+        self._last: list[int] = []
+        """The last number of each publisher, that of the message before last."""
+        self._since_ns = 0
+
+    def count(self, info: Mapping[str, Any]) -> int:
+        """Take the info of a message, as rclpy gives it; returns how many were lost before."""
+        number = info['publication_sequence_number']
+        last = self._last
+        if last and last[-1] + 1 == number:
+            last[-1] = number
+            return 0
+        self.numbered = number is not None
+        if number is None or 0 < info['received_timestamp'] < self._since_ns:
+            return 0  # the latter was in the queue when its publisher left, or another one did
+        gap = self._continue(number)
+        self.lost += gap
+        return gap
+
+    def publisher_left(self) -> None:
+        """Which one is not known, so all that are left are to be known anew."""
+        self._last.clear()
+        self._since_ns = time.time_ns()
+
+    def _continue(self, number: int) -> int:
+        """Find the publisher of message `number`, put it last; returns how many are missing."""
+        last = self._last
+        before = max((known for known in last if known < number), default=None)
+        if before is None or before + 1 != number:
+            if len(last) < self._publisher_count():
+                last.append(number)
+                return 0
+            if before is None:  # one of them has started again
+                last[:] = [*last[1:], number]
+                return 0
+        last.remove(before)
+        last.append(number)
+        return number - before - 1
+
+
 class Endpoints:
     """Makes the publishers and subscriptions of a node and remembers what they lost.
 
@@ -97,7 +157,7 @@ class Endpoints:
     def __init__(self, node: Node):
         self._node = node
         self._gaps: dict[str, SequenceGaps] = {}
-        self._told: Counter[str] = Counter()
+        self._reported_lost: Counter[str] = Counter()
         self._warned: set[str] = set()
         self.incompatible: dict[str, str] = {}
 
@@ -105,7 +165,7 @@ class Endpoints:
     def lost(self) -> dict[str, int]:
         """Messages that never reached the node, by topic; those without a loss are left out."""
         counts = {
-            topic: gaps.lost if gaps.numbered else self._told[topic]
+            topic: gaps.lost if gaps.numbered else self._reported_lost[topic]
             for topic, gaps in self._gaps.items()
         }
         return {topic: n for topic, n in counts.items() if n}
@@ -122,7 +182,7 @@ class Endpoints:
         `callback` takes a message and its info, as rclpy gives it."""
 
         def receive(message: Any, info: Mapping[str, Any]) -> None:
-            if gaps.heard(info):
+            if gaps.count(info):
                 self._warn_of_loss(topic)
             callback(message, info)
 
@@ -131,12 +191,12 @@ class Endpoints:
                 topic, event, 'cannot be heard', 'subscription'
             ),
             message_lost=lambda event: self._lost(topic, event),
-            matched=lambda event: event.current_count_change < 0 and gaps.publisher_left(),
+            matched=lambda event: self._matched(topic, event),
         )
         subscription = self._node.create_subscription(
             message_type,
             topic,
-            receive,
+            cast(Any, receive),  # rclpy's types know callbacks without the info only
             qos,
             event_callbacks=events,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
@@ -177,8 +237,12 @@ class Endpoints:
             )
         self.incompatible[topic] = policy
 
+    def _matched(self, topic: str, event: Any) -> None:
+        if event.current_count_change < 0:
+            self._gaps[topic].publisher_left()
+
     def _lost(self, topic: str, event: Any) -> None:
-        self._told[topic] = event.total_count
+        self._reported_lost[topic] = event.total_count
         self._warn_of_loss(topic)
 
     def _warn_of_loss(self, topic: str) -> None:
@@ -200,7 +264,7 @@ def profiles_of(text: str) -> dict[str, QoSProfile]:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError(f'not a YAML file: {" ".join(str(error).split())}') from None
-    if not isinstance(tree, dict) or not all(isinstance(one, dict) for one in tree.values()):
+    if not isinstance(tree, dict) or not all(isinstance(item, dict) for item in tree.values()):
         raise ConfigError('it must hold a mapping of policies for each topic')
     return {str(topic): _profile(str(topic), policies) for topic, policies in tree.items()}
 

@@ -109,11 +109,11 @@ class Stopper:
 
     def _read(self, reading: int) -> None:
         with os.fdopen(reading, 'rb', buffering=0) as pipe:
-            while said := pipe.read(1):
-                if said[0] in ENDING:
-                    self._told()
+            while signals := pipe.read(1):
+                if signals[0] in ENDING:
+                    self._on_signal()
 
-    def _told(self) -> None:
+    def _on_signal(self) -> None:
         with self._lock:
             first, self.asked = not self.asked, True
             stop, patience = self._stop, self._patience

@@ -41,7 +41,7 @@ from typing import Any, Protocol
 from attrs import frozen
 
 from ..estimates import Estimate
-from ..measurements import Frames
+from ..intake import KnownFrames
 from ..parameters import Config, ConfigError
 
 
@@ -59,7 +59,7 @@ class Tracker(Protocol):
     counts: Counter[str]
 
     @property
-    def frames(self) -> Frames:
+    def frames(self) -> KnownFrames:
         """The frames of what was used so far."""
         ...
 
@@ -84,24 +84,6 @@ class Tracker(Protocol):
 
     def health(self) -> dict[str, float]:
         """Numbers for diagnostics: NIS, effective sample size, covariance repairs, tracks, ..."""
-        ...
-
-
-class SharingTracker(Tracker, Protocol):
-    """A tracker whose work falls into tasks that need nothing of each other, so that processes can
-    share a recording; ``process(m)`` is ``take(work(task))`` for all ``tasks(m)``."""
-
-    def tasks(self, measurement: Any) -> list[Any]:
-        """What is to be done now that `measurement` is known, in order; can be pickled."""
-        ...
-
-    @staticmethod
-    def work(task: Any) -> Any:
-        """Do a task, in any process and order."""
-        ...
-
-    def take(self, found: Any) -> list[Estimate]:
-        """The estimates that follow from what `work` found, in the order of the tasks."""
         ...
 
 
@@ -142,11 +124,6 @@ class System:
     def judge(self) -> str:
         """The module with `judge` and `LIMIT`, see `evaluation.judging`."""
         return f'sonar_imm_tools.evaluation.{self.name}'
-
-    @property
-    def benches(self) -> str:
-        """The module with `BENCHES`, see `evaluation.benches`."""
-        return f'{self.judge}.bench'
 
     @property
     def node(self) -> str:

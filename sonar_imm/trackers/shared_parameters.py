@@ -25,50 +25,36 @@ from __future__ import annotations
 
 from attrs import frozen
 
-from ..parameters import Config, parameter
+from ..parameters import Config, live, parameter
 
 
 @frozen(kw_only=True, slots=False)
 class DetectionParameters(Config):
     """Which measurements may belong to a target, and how probable a detection is."""
 
-    gate_probability: float = parameter(
-        0.999,
+    # fmt: off
+    gate_probability: float = live(0.999, '',
         'chi-square probability inside which a measurement may belong to a track',
-        low=0.5,
-        high=0.9999999,
-        read_only=False,
-    )
-    detection_probability: float = parameter(
-        0.9,
-        'probability that a scan or ping shows a target that it covers',
-        low=0.01,
-        high=0.9999,
-        read_only=False,
-    )
-    clutter_density: float = parameter(
-        1e-6,
-        'false fixes expected in a scan, for each square metre',
-        unit='1/m^2',
-        low=1e-12,
-        high=1e4,
-        read_only=False,
-    )
+        range=(0.5, 0.9999999))
+    detection_probability: float = live(0.9, '',
+        'probability that a scan or ping shows a target that it covers', range=(0.01, 0.9999))
+    clutter_density: float = live(1e-6, '1/m^2',
+        'number of false fixes expected in a scan, per square metre', range=(1e-12, 1e4))
+    # fmt: on
 
 
 @frozen(kw_only=True, slots=False)
 class MountingParameters(Config):
     """Where the place of the sonar on its vehicle is taken from."""
 
-    vehicle_frame: str = parameter(
-        '', 'with sonar_frame: the frame in which the poses of nav are, e.g. base_link'
-    )
-    sonar_frame: str = parameter(
-        '',
-        'the frame of the sonar (x forward, y port, z up); with it and vehicle_frame /tf_static '
-        'says sonar_lever and sonar_mount_rpy_deg, and pings before it does are refused; empty: '
-        'the parameters say it',
-    )
+    # fmt: off
+    vehicle_frame: str = parameter('', '',
+        'frame in which the poses of nav are, e.g. base_link; needed together with sonar_frame')
+    sonar_frame: str = parameter('', '',
+        'frame of the sonar (x forward, y port, z up): with it and vehicle_frame, sonar_lever and '
+        'sonar_mount_rpy_deg are taken from /tf_static, and pings before that are refused; empty: '
+        'as those two parameters say')
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check()
@@ -81,29 +67,18 @@ class MountingParameters(Config):
 class TrackLifeParameters(Config):
     """When tracks begin, are confirmed and end."""
 
-    max_tracks: int = parameter(20, 'most targets at once', low=1, high=2000, read_only=False)
-    confirm_hits: int = parameter(
-        3, 'hits within confirm_window that confirm a track', low=1, high=100, read_only=False
-    )
-    confirm_window: int = parameter(
-        5, 'scans or pings looked at for confirmation', low=1, high=100, read_only=False
-    )
-    delete_misses: int = parameter(
-        5,
-        'consecutive scans or pings that cover a confirmed target without a hit and so end its '
-        'track',
-        low=1,
-        high=10000,
-        read_only=False,
-    )
-    max_coast: float = parameter(
-        60.0,
-        'time without a hit that ends any track',
-        unit='s',
-        low=0.01,
-        high=1e6,
-        read_only=False,
-    )
+    # fmt: off
+    max_tracks: int = live(20, '', 'largest number of targets tracked at once', range=(1, 2000))
+    confirm_hits: int = live(3, '',
+        'number of hits within confirm_window that confirm a track', range=(1, 100))
+    confirm_window: int = live(5, '',
+        'number of latest scans or pings in which confirm_hits are counted to confirm a track',
+        range=(1, 100))
+    delete_misses: int = live(5, '',
+        'number of consecutive scans or pings without a hit that cover a confirmed target and so '
+        'end its track', range=(1, 10000))
+    max_coast: float = live(60.0, 's', 'time without a hit that ends any track', range=(0.01, 1e6))
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check()
@@ -119,31 +94,23 @@ class TrackLifeParameters(Config):
 class StampParameters(Config):
     """Which stamps are believed."""
 
-    max_gap: float = parameter(
-        3600.0,
-        'a stamp further ahead than this is doubted until the following ones agree',
-        unit='s',
-        low=1.0,
-        high=1e8,
-    )
-    restart_after: int = parameter(
-        5,
-        'consecutive agreeing stamps that count as a restarted clock: further ahead than max_gap, '
-        'more than five minutes late, or a repeated beginning; 20 times as many where it may be a '
-        'burst of late messages',
-        low=2,
-        high=1000,
-    )
+    # fmt: off
+    max_gap: float = parameter(3600.0, 's',
+        'a stamp further ahead of the last one than this is not trusted until the following '
+        'stamps agree with it', range=(1.0, 1e8))
+    restart_after: int = parameter(5, '',
+        'number of consecutive agreeing stamps that count as a restarted clock: further ahead '
+        'than max_gap, more than five minutes late, or a repeated beginning; 20 times as many '
+        'where it may be a burst of late messages', range=(2, 1000))
+    # fmt: on
 
 
 @frozen(kw_only=True, slots=False)
 class StreamParameters(StampParameters):
     """Which stamps are believed, and how long late measurements are put in their place."""
 
-    history: float = parameter(
-        10.0,
-        'how late a measurement may be and still be used, in its right place',
-        unit='s',
-        low=0.0,
-        high=3600.0,
-    )
+    # fmt: off
+    history: float = parameter(10.0, 's',
+        'how late a measurement may arrive and still be used, in the order of the stamps',
+        range=(0.0, 3600.0))
+    # fmt: on

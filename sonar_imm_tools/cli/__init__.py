@@ -173,7 +173,6 @@ def missing_package(name: str) -> str | None:
         'foxglove': 'foxglove-sdk, which serves the view, is not here: pip install '
         "'sonar_imm[view]', or use --browser",
         'rerun': "rerun-sdk, which writes the file, is not here: pip install 'sonar_imm[rerun]'",
-        'filterpy': "FilterPy is not installed: pip install 'sonar_imm[test]'",
     }
     return remedies.get(name)
 

@@ -16,11 +16,15 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
+import sys
+from types import ModuleType
 from typing import Any
 
 import click
 
+import sonar_imm
 from sonar_imm.trackers import SYSTEMS
 
 from .common import BAG, example, json_option, print_json, say
@@ -50,14 +54,15 @@ def command(
     """Measure the speed of the filters, beside other libraries in the same run, and of the nodes.
 
     Times depend on the machine and its load; the ratio to another program hardly does. Without
-    SYSTEMS all are measured.
+    SYSTEMS all are measured. Needs the folder benchmarks/ of a source checkout.
     """
     if bag is not None and len(systems or SYSTEMS) > 1:
         raise click.UsageError('--bag needs exactly one system')
+    speed = _speed()
     results = {}
     for system in systems or SYSTEMS:
         say(f'{system}:', quiet=as_json)
-        results[system] = _measure(system, rounds, quiet=as_json)
+        results[system] = _measure(speed, system, rounds, quiet=as_json)
         if not skip_node:
             results[system]['node_ms'] = latency = _node_latency(system, bag)
             say(
@@ -73,26 +78,40 @@ def command(
         raise click.exceptions.Exit(1)
 
 
-def _measure(system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
-    """The benches of one system, without those that need a library that is not installed."""
-    from ..evaluation.benches import benches_of
-    from . import missing_package
+def _speed() -> ModuleType:
+    """The package `benchmarks.speed` of the source checkout that this runs from."""
+    root = Path(sonar_imm.__file__).resolve().parents[1]
+    if not (root / 'benchmarks' / 'speed').is_dir():
+        raise click.ClickException(
+            'the benches are in the folder benchmarks/ of the source, which is not installed: '
+            'run `make bench` in a checkout'
+        )
+    if str(root) not in sys.path:
+        sys.path.insert(0, str(root))
+    return import_module('benchmarks.speed')
 
+
+def _measure(speed: ModuleType, system: str, rounds: int, *, quiet: bool) -> dict[str, Any]:
+    """The benches of one system, without those that need a library that is not installed."""
     result = {}
-    for bench in benches_of(system):
+    for bench in speed.benches_of(system):
         try:
             result[bench.name] = bench.measure(rounds)
         except ModuleNotFoundError as error:
-            if (remedy := missing_package((error.name or '').split('.')[0])) is None:
+            if (missing := (error.name or '').split('.')[0]) not in speed.PEERS:
                 raise
-            say(f'  {bench.name} left out, nothing to compare with: {remedy}', quiet=quiet)
+            say(
+                f'  {bench.name} left out, nothing to compare with: {missing} is not installed: '
+                "pip install 'sonar_imm[test]'",
+                quiet=quiet,
+            )
         else:
             say(f'  {bench.sentence(result[bench.name])}', quiet=quiet)
     return result
 
 
 def _node_latency(system: str, bag: Path | None) -> dict[str, float]:
-    from ..recordings.own_parameters import own_parameters
+    from ..recordings.own_files import own_parameters
     from ..replay.harness import run_lockstep
     from .checking import shipped_bags
 

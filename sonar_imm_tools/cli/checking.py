@@ -34,8 +34,7 @@ from ..evaluation.judging import Check, Judgement
 from ..offline.batch import Job
 from ..offline.run_folder import BAG, CSV, RunFolder
 from ..offline.tracking import final_estimates, InputOptions
-from ..recordings.own_limit import own_limit
-from ..recordings.own_parameters import own_parameters
+from ..recordings.own_files import own_limit, own_parameters
 from ..recordings.reader import BagReader
 from ..recordings.topics import instruments
 from ..replay.harness import LockstepResult, run_lockstep

@@ -39,7 +39,7 @@ from sonar_imm.parameters import (
 from sonar_imm.texts import visible
 from sonar_imm.trackers import System, SYSTEMS
 
-from ..recordings.own_parameters import NAME as OWN_PARAMETERS
+from ..recordings.own_files import PARAMETERS as OWN_PARAMETERS
 
 Advance = Callable[[int], None]
 
@@ -142,10 +142,10 @@ def load_config(
 
     Raises `ConfigError` with one sentence for each mistake.
     """
-    types = (system.config_type(), node_config_type(system))
+    tracker, node = system.config_type(), node_config_type(system)
     choices = {spec.name: spec for spec in type_specs(system.name)}
     values = _parameters_of(params, system.name) if params else {}
-    specs = {spec.name: spec for config_type in types for spec in config_type.specs()} | choices
+    specs = {spec.name: spec for config in (tracker, node) for spec in config.specs()} | choices
     values.update({name: _typed(text, specs.get(name)) for name, text in overrides.items()})
     others = _detector_specs(system)
     unknown = [
@@ -161,10 +161,10 @@ def load_config(
     ]
     if problems:
         raise ConfigError(*problems)
-    tracker, node = (
-        config_type.from_mapping(values, ignore_unknown=True) for config_type in types
+    return (
+        tracker.from_mapping(values, ignore_unknown=True),
+        node.from_mapping(values, ignore_unknown=True),
     )
-    return tracker, node
 
 
 def load_detector(
@@ -223,7 +223,7 @@ def _parameters_of(path: Path, node_name: str, *, needed: bool = True) -> dict[s
 def _others(text: str, node_name: str) -> list[str]:
     """The nodes that a parameter file is for where `node_name` is not among them."""
     names = sections_of(text)
-    mine = [one for one in names if one in ('/**', '/*') or one.split('/')[-1] == node_name]
+    mine = [name for name in names if name in ('/**', '/*') or name.split('/')[-1] == node_name]
     return [] if mine else names
 
 
@@ -258,13 +258,13 @@ def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[A
 
 def _plain_progress(what: str, total: int) -> Advance:
     """Print a line every few seconds, so that the log of a short job stays empty."""
-    done, told = 0, time.monotonic()
+    done, printed = 0, time.monotonic()
 
     def advance(count: int) -> None:
-        nonlocal done, told
+        nonlocal done, printed
         done += count
-        if time.monotonic() - told > SECONDS_BETWEEN_LINES:
-            told = time.monotonic()
+        if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
+            printed = time.monotonic()
             click.echo(f'{what}: {done} of {total}', err=True)
 
     return advance

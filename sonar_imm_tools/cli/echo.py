@@ -29,12 +29,12 @@ import click
 from .common import example, say
 
 if TYPE_CHECKING:
-    from ..replay.listening import HeardTable
+    from ..replay.listening import ReceivedTable
 
 NAME = 'sonar_imm_echo'
 Columns = Mapping[str, Any]
 Rows = list[dict[str, str]]
-Show = Callable[['HeardTable'], None]
+Show = Callable[['ReceivedTable'], None]
 
 
 @click.command(
@@ -99,10 +99,10 @@ def _shower(most: int, as_json: bool) -> Iterator[Show]:
     elif sys.stdout.isatty():
         from rich.live import Live
 
-        newest: dict[str, HeardTable] = {}
+        newest: dict[str, ReceivedTable] = {}
         with Live(refresh_per_second=8) as live:
 
-            def show(table: HeardTable) -> None:
+            def show(table: ReceivedTable) -> None:
                 newest[table.topic] = table
                 live.update(_picture(newest, most))
 
@@ -111,7 +111,7 @@ def _shower(most: int, as_json: bool) -> Iterator[Show]:
         yield lambda table: say('\n'.join(text_lines(table, most)))
 
 
-def _picture(newest: Mapping[str, HeardTable], most: int) -> Any:
+def _picture(newest: Mapping[str, ReceivedTable], most: int) -> Any:
     """The newest table of each topic, one below the other."""
     from rich.console import Group
     from rich.table import Table
@@ -130,7 +130,7 @@ def _picture(newest: Mapping[str, HeardTable], most: int) -> Any:
     return Group(*parts)
 
 
-def text_lines(table: HeardTable, most: int) -> list[str]:
+def text_lines(table: ReceivedTable, most: int) -> list[str]:
     """A table as lines of text: where and when, one line per row, and how many are not shown."""
     if table.problem:
         return [f'{table.topic}: {table.problem}']
@@ -141,7 +141,7 @@ def text_lines(table: HeardTable, most: int) -> list[str]:
     return [line for line in (*lines, _further(table, most)) if line]
 
 
-def json_line(table: HeardTable) -> str:
+def json_line(table: ReceivedTable) -> str:
     """A table as one line of JSON: all columns with their types; no NaN, which JSON lacks."""
     from ..offline.run_folder import finite
 
@@ -157,7 +157,7 @@ def json_line(table: HeardTable) -> str:
     return json.dumps(finite(content))
 
 
-def _head(table: HeardTable) -> str:
+def _head(table: ReceivedTable) -> str:
     if table.problem:
         return table.topic
     moment = datetime.fromtimestamp(table.stamp_ns // 10**9, timezone.utc)
@@ -169,11 +169,11 @@ def _head(table: HeardTable) -> str:
     )
 
 
-def _count(table: HeardTable) -> int:
+def _count(table: ReceivedTable) -> int:
     return len(next(iter((table.columns or {}).values()), ()))
 
 
-def _further(table: HeardTable, most: int) -> str:
+def _further(table: ReceivedTable, most: int) -> str:
     left = _count(table) - most
     return f'... {left} more rows (--rows)' if left > 0 else ''
 

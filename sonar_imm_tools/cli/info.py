@@ -51,7 +51,7 @@ def command(bag: Path, strict: bool, as_json: bool) -> None:
 
 def _detector(bag: Path) -> dict[str, Any]:
     """What the parameter file beside a recording says of its images."""
-    from ..recordings.own_parameters import own_parameters
+    from ..recordings.own_files import own_parameters
 
     return load_detector(SYSTEMS['obstacle'], own_parameters(bag), {})
 

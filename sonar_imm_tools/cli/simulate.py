@@ -73,15 +73,15 @@ def command(
         raise click.UsageError("Missing argument 'OUT_BAG'")
     from sonar_imm.truth import TrueTrack
 
-    from ..recordings.own_parameters import own_parameters, unusual
+    from ..recordings.own_files import own_parameters, unusual
     from ..recordings.scenes import write_scene
 
     name = scenario or next(iter(scenes.SCENARIOS))
     config = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     scene = scenes.simulate(config, seed)
-    told = unusual(config.told(), SYSTEMS[system].config_type())
-    sections = {system: told}
-    if fed := config.told_feeder():
+    known = unusual(config.instruments(), SYSTEMS[system].config_type())
+    sections = {system: known}
+    if fed := config.feeder_instruments():
         # A scene writes its images as the only type that needs no further package.
         sections[FEEDERS[system]] = {'image_type': 'sensor_msgs/msg/Image', **fed}
     report = write_scene(
@@ -97,14 +97,14 @@ def command(
         },
     )
     parameters = own_parameters(out_bag)
-    targets = sum(isinstance(one, TrueTrack) for one in scene.truth)
+    targets = sum(isinstance(true, TrueTrack) for true in scene.truth)
     result = {
         'bag': str(out_bag),
         'scenario': name,
         'seed': seed,
         'messages': report.messages,
         'targets': targets,
-        'parameters': told,
+        'parameters': known,
     }
     if as_json:
         print_json(result)

@@ -150,7 +150,7 @@ def planned(
     """What all runs have in common, from the texts of a command line. Raises `ConfigError`."""
     from ..evaluation.sweep import Sweep
     from ..offline.tracking import InputOptions
-    from ..recordings.own_parameters import unusual
+    from ..recordings.own_files import unusual
     from .track import inputs_by_topic
 
     scenes = import_module(SYSTEMS[system].scenes)
@@ -158,7 +158,7 @@ def planned(
     scene = scenes.scenario(name, typed_overrides(type(scenes.scenario(name)), overrides))
     config, node = load_config(SYSTEMS[system], params, {})
     if params is None:
-        config = evolve(config, **unusual(scene.told(), type(config)))
+        config = evolve(config, **unusual(scene.instruments(), type(config)))
     return Sweep(
         system=system,
         scenario=name,
@@ -169,7 +169,9 @@ def planned(
             frame_id=node.frame_id,
             use_tf_static=hears_transforms(node),
             world_frame=node.world_frame_convention,
-            detector=load_detector(SYSTEMS[system], params, {}) if params else scene.told_feeder(),
+            detector=load_detector(SYSTEMS[system], params, {})
+            if params
+            else scene.feeder_instruments(),
         ),
     )
 
@@ -183,9 +185,9 @@ def _print(content: dict[str, Any], out: Path | None) -> None:
     if summary:
         width = max(map(len, summary))
         say(f'  {"metric":<{width}} {"mean":>11} {"std":>11} {"std error":>11} {"runs":>6}')
-    for name, one in summary.items():
-        numbers = ' '.join(f'{one[key]:11.4g}' for key in ('mean', 'std', 'stderr'))
-        say(f'  {name:<{width}} {numbers} {one["runs"]:6d}')
+    for name, entry in summary.items():
+        numbers = ' '.join(f'{entry[key]:11.4g}' for key in ('mean', 'std', 'stderr'))
+        say(f'  {name:<{width}} {numbers} {entry["runs"]:6d}')
     seeds_by_reason: dict[str, list[str]] = {}
     for seed, sentence in failures.items():
         seeds_by_reason.setdefault(sentence, []).append(seed)

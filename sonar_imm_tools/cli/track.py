@@ -116,7 +116,7 @@ def command(
     if scheduler is not None and jobs > 1:
         raise click.UsageError('--jobs and --scheduler exclude each other')
     if parquet:
-        from ..offline.tables import require_parquet
+        from ..offline.run_folder import require_parquet
 
         require_parquet()
     plan = Plan(parquet=parquet, **options)
@@ -149,7 +149,7 @@ class Plan:
 
     def parameters_of(self, bag: Path) -> Path | None:
         """The parameter file for `bag`: the one that was named, else the bag's own."""
-        from ..recordings.own_parameters import own_parameters
+        from ..recordings.own_files import own_parameters
 
         return self.params if self.params is not None else own_parameters(bag)
 

@@ -153,7 +153,7 @@ def _show_recorded(
 
 def _show_live(topics: Sequence[str], host: str, port: int, layout_file: Path | None) -> None:
     from ..replay.link import Link
-    from ..replay.relay import Relay
+    from ..replay.listening import Relay
     from ..viewing.material import Channel, Shown
     from ..viewing.server import ViewServer
 
@@ -163,7 +163,7 @@ def _show_live(topics: Sequence[str], host: str, port: int, layout_file: Path | 
             topics,
             appeared=lambda *channel: server.advertise([Channel(*channel)]),
             vanished=server.withdraw,
-            heard=lambda *message: server.publish(Shown(*message)),
+            received=lambda *message: server.publish(Shown(*message)),
             watched=server.watched,
         )
         relay.step(0.5)

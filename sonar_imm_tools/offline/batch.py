@@ -96,8 +96,8 @@ def track(job: Job, advance: Callable[[int], Advance] | None = None) -> Outcome:
                 return _outcome(job, KEPT, run)
             overwrite = True  # it is not finished, or the same without Parquet
         with folder.fresh(overwrite=overwrite) as unfinished:
-            heard = advance(offline.total) if advance else lambda count: None
-            run = write_run(unfinished, offline, heard, parquet=job.parquet)
+            advanced = advance(offline.total) if advance else lambda count: None
+            run = write_run(unfinished, offline, advanced, parquet=job.parquet)
         return _outcome(job, TRACKED, run)
 
 

@@ -38,7 +38,7 @@ LONG_GAP = 10.0
 
 
 @define
-class _Heard:
+class _Found:
     """What was found on one topic."""
 
     topic: TopicInfo
@@ -65,18 +65,18 @@ def inspect(
     the best fitting one first. topic_options: topic by input that has to be named to the tracker;
     nothing where the names say enough.
     """
-    heard = {topic.name: _Heard(topic) for topic in bag.topics}
+    found = {topic.name: _Found(topic) for topic in bag.topics}
     for item in bag.messages():
         advance(1)
-        _look_at(item, heard[item.topic], detector or {})
-    topics = [_topic_entry(entry) for entry in heard.values()]
-    first = min((entry.logs[0] for entry in heard.values() if entry.logs), default=0)
-    last = max((entry.logs[-1] for entry in heard.values() if entry.logs), default=0)
-    systems, options = _systems(bag, list(heard.values()))
+        _look_at(item, found[item.topic], detector or {})
+    topics = [_topic_entry(entry) for entry in found.values()]
+    first = min((entry.logs[0] for entry in found.values() if entry.logs), default=0)
+    last = max((entry.logs[-1] for entry in found.values() if entry.logs), default=0)
+    systems, options = _systems(bag, list(found.values()))
     return {
         'bag': str(bag.path),
         'duration_s': (last - first) / SECOND,
-        'messages': sum(len(entry.logs) for entry in heard.values()),
+        'messages': sum(len(entry.logs) for entry in found.values()),
         'topics': topics,
         'systems': systems,
         'topic_options': options,
@@ -84,25 +84,25 @@ def inspect(
     }
 
 
-def _look_at(item: BagMessage, heard: _Heard, detector: Mapping[str, Any]) -> None:
-    heard.logs.append(item.log_ns)
+def _look_at(item: BagMessage, found: _Found, detector: Mapping[str, Any]) -> None:
+    found.logs.append(item.log_ns)
     header = getattr(item.message, 'header', None)
     if header is not None:
-        heard.frames[str(header.frame_id)] += 1
+        found.frames[str(header.frame_id)] += 1
         if stamp := _usable_stamp(item.message):
-            heard.stamps.append(stamp)
+            found.stamps.append(stamp)
         else:
-            heard.no_stamp += 1
+            found.no_stamp += 1
     for system, entry in _readers(item):
         try:
-            told = detector if entry.makes else {}
-            made = entry.reader(item.type_name, 'enu', told)(item.message)
-            heard.good[system, entry.name] += 1
+            settings = detector if entry.makes else {}
+            made = entry.reader(item.type_name, 'enu', settings)(item.message)
+            found.good[system, entry.name] += 1
             if (code := entry.doubt(item.message, made)) is not None:
-                heard.doubts[code] += 1
+                found.doubts[code] += 1
         except Rejection as rejection:
-            heard.refused.setdefault((system, entry.name), Counter())[rejection.reason] += 1
-            heard.examples.setdefault(rejection.reason, rejection.sentence)
+            found.refused.setdefault((system, entry.name), Counter())[rejection.reason] += 1
+            found.examples.setdefault(rejection.reason, rejection.sentence)
 
 
 def _usable_stamp(message: Any) -> int | None:
@@ -120,12 +120,12 @@ def _readers(item: BagMessage) -> list[tuple[str, InputTopic]]:
     found = []
     for system in SYSTEMS:
         fitting = [
-            one
-            for one in (*inputs_of(system), *made_inputs(system))
-            if one.may_be(item.topic, item.type_name)
+            entry
+            for entry in (*inputs_of(system), *made_inputs(system))
+            if entry.may_be(item.topic, item.type_name)
         ]
         # Of several inputs that a name says, the later one counts, as in `fitting_topics`.
-        named = [one for one in fitting if one.is_named(item.topic)][-1:]
+        named = [entry for entry in fitting if entry.is_named(item.topic)][-1:]
         found += [(system, entry) for entry in named or fitting]
     return found
 
@@ -134,50 +134,50 @@ def _is_truth(topic: str) -> bool:
     return 'truth' in topic.split('/')
 
 
-def _topic_entry(heard: _Heard) -> dict[str, Any]:
-    span = (heard.logs[-1] - heard.logs[0]) / SECOND if heard.logs else 0.0
-    suits = [f'{system} {name}' for system, name in heard.good]
+def _topic_entry(found: _Found) -> dict[str, Any]:
+    span = (found.logs[-1] - found.logs[0]) / SECOND if found.logs else 0.0
+    suits = [f'{system} {name}' for system, name in found.good]
     return {
-        'name': heard.topic.name,
-        'type': heard.topic.type_name,
-        'count': heard.topic.count,
-        'rate_hz': (len(heard.logs) - 1) / span if span > 0 else None,
-        'frames': list(heard.frames),
+        'name': found.topic.name,
+        'type': found.topic.type_name,
+        'count': found.topic.count,
+        'rate_hz': (len(found.logs) - 1) / span if span > 0 else None,
+        'frames': list(found.frames),
         'suits': suits,
-        'scans': _scans(heard),
-        'problems': _stamp_problems(heard) + _content_problems(heard),
+        'scans': _scans(found),
+        'problems': _stamp_problems(found) + _content_problems(found),
     }
 
 
-def _scans(heard: _Heard) -> dict[str, int] | None:
+def _scans(found: _Found) -> dict[str, int] | None:
     """Number of stamps of a topic of scans, and the most messages that share one; else None."""
-    if not heard.stamps or not _holds_scans(heard):
+    if not found.stamps or not _holds_scans(found):
         return None
-    counts = np.unique(np.array(heard.stamps, np.int64), return_counts=True)[1]
+    counts = np.unique(np.array(found.stamps, np.int64), return_counts=True)[1]
     return {'count': len(counts), 'most': int(counts.max())}
 
 
-def _holds_scans(heard: _Heard) -> bool:
+def _holds_scans(found: _Found) -> bool:
     """Whether messages with equal stamps are one scan of several targets, not repetitions."""
-    return _is_truth(heard.topic.name) or any(
+    return _is_truth(found.topic.name) or any(
         entry.scans
-        for system, name in heard.good
+        for system, name in found.good
         for entry in inputs_of(system)
         if entry.name == name
     )
 
 
-def _stamp_problems(heard: _Heard) -> list[str]:
+def _stamp_problems(found: _Found) -> list[str]:
     problems = []
-    if heard.no_stamp:
-        problems.append(f'{heard.no_stamp} messages without a usable stamp')
-    steps = np.diff(np.array(heard.stamps, np.int64))
+    if found.no_stamp:
+        problems.append(f'{found.no_stamp} messages without a usable stamp')
+    steps = np.diff(np.array(found.stamps, np.int64))
     if backward := int(np.count_nonzero(steps < 0)):
         problems.append(
             f'{backward} stamps older than the one before, by up to {-steps.min() / SECOND:.3g} s'
         )
     repeated = int(np.count_nonzero(steps == 0))
-    if repeated and not _holds_scans(heard):
+    if repeated and not _holds_scans(found):
         problems.append(f'{repeated} stamps equal to the one before')
     forward = steps[steps > 0]
     if len(forward) > 2 and forward.max() > LONG_GAP * np.median(forward):
@@ -189,19 +189,19 @@ def _stamp_problems(heard: _Heard) -> list[str]:
     return problems
 
 
-def _content_problems(heard: _Heard) -> list[str]:
+def _content_problems(found: _Found) -> list[str]:
     """Problems of messages; refusals only for the input that the topic suits or is named after."""
     problems = []
-    if len(heard.frames) > 1:
-        problems.append(f'several frames: {", ".join(map(repr, heard.frames))}')
-    for key, reasons in heard.refused.items():
-        if key in heard.good or heard.topic.name.split('/')[-1] == key[1]:
+    if len(found.frames) > 1:
+        problems.append(f'several frames: {", ".join(map(repr, found.frames))}')
+    for key, reasons in found.refused.items():
+        if key in found.good or found.topic.name.split('/')[-1] == key[1]:
             problems += [
-                f'{count} messages refused as {key[1]} ({reason}): {heard.examples[reason]}'
+                f'{count} messages refused as {key[1]} ({reason}): {found.examples[reason]}'
                 for reason, count in reasons.items()
             ]
     problems += [
-        f'{count} messages with {code.replace("_", " ")}' for code, count in heard.doubts.items()
+        f'{count} messages with {code.replace("_", " ")}' for code, count in found.doubts.items()
     ]
     return problems
 
@@ -211,7 +211,7 @@ Inputs = dict[str, list[str]]
 
 
 def _systems(
-    bag: BagReader, heard: list[_Heard]
+    bag: BagReader, topics: list[_Found]
 ) -> tuple[dict[str, Inputs], dict[str, dict[str, str]]]:
     """Topics by input for each tracker that can use the recording, the best fitting one first, and
     what has to be named to it.
@@ -222,10 +222,10 @@ def _systems(
     """
     found: dict[str, Inputs] = {}
     good: Counter[tuple[str, str, str]] = Counter()
-    for one in heard:
-        for (system, name), count in one.good.items():
-            found.setdefault(system, {}).setdefault(name, []).append(one.topic.name)
-            good[system, name, one.topic.name] = count
+    for topic in topics:
+        for (system, name), count in topic.good.items():
+            found.setdefault(system, {}).setdefault(name, []).append(topic.topic.name)
+            good[system, name, topic.topic.name] = count
     systems: dict[str, Inputs] = {}
     options: dict[str, dict[str, str]] = {}
     for system in fitting_systems(bag):
@@ -235,11 +235,11 @@ def _systems(
         if _enough(system, named & found.get(system, {}).keys()):
             systems[system], options[system] = found[system], {}
     taken = {
-        topic.name
+        recorded.name
         for system in systems
         for each in instruments(bag, system).values()
-        for topic in bag.topics
-        if topic.name in each
+        for recorded in bag.topics
+        if recorded.name in each
     }
     for system in sorted(found.keys() - systems.keys(), key=lambda name: -len(found[name])):
         chosen: dict[str, str] = {}
@@ -254,7 +254,9 @@ def _systems(
 
 
 def _entry(system: str, name: str) -> InputTopic:
-    return next(one for one in (*inputs_of(system), *made_inputs(system)) if one.name == name)
+    return next(
+        entry for entry in (*inputs_of(system), *made_inputs(system)) if entry.name == name
+    )
 
 
 def _enough(system: str, names: Collection[str]) -> bool:

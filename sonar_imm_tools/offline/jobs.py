@@ -67,9 +67,9 @@ def ignore_interrupt() -> None:
 
 def sentence_of(error: BaseException) -> str:
     """One line; what is not a mistake of the user keeps the name of its class."""
-    told = ' '.join(str(error).split())
+    text = ' '.join(str(error).split())
     expected = isinstance(error, (ConfigError, Rejection, BagError, OSError))
-    return told if expected and told else f'{type(error).__name__}: {told}'
+    return text if expected and text else f'{type(error).__name__}: {text}'
 
 
 @contextlib.contextmanager

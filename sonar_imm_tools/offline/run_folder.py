@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 import contextlib
+import csv
 import hashlib
 from importlib.metadata import version
 import json
@@ -39,10 +40,10 @@ import math
 from pathlib import Path
 import platform
 import shutil
-from typing import Any
+from typing import Any, Protocol
 
 import numba
-import numpy
+import numpy as np
 import scipy
 
 from msg_adapters.estimates import read_estimate, write_estimate
@@ -57,8 +58,7 @@ from sonar_imm.trackers import SYSTEMS
 from ..recordings.measurements import measurements_of
 from ..recordings.reader import BagError, BagReader
 from ..recordings.truth import TRUTH_TOPIC
-from ..recordings.writer import BagWriter, ros_message
-from .tables import CsvTable, ParquetTable, Table
+from ..recordings.writer import BagWriter, naming, ros_message
 
 BAG, CSV, SOUNDINGS, RUN, METRICS, REPORT = (
     'estimate',
@@ -76,6 +76,8 @@ _RUN_FILES = (RUN, METRICS, REPORT, BAG, CSV, SOUNDINGS, *PARQUET.values())
 """All that belongs to a run; without the first one there is no finished run."""
 
 
+ROWS_IN_A_GROUP = 65536
+
 _KINDS = {
     'system': str,
     'bag': str,
@@ -84,6 +86,111 @@ _KINDS = {
 }
 """What of run.json is read again; what is not required may be missing."""
 _NAMES = {str: 'a text', dict: 'a mapping'}
+
+
+class Table(Protocol):
+    """What rows can be appended to; use it in a ``with`` statement."""
+
+    def __enter__(self) -> Table: ...
+
+    def __exit__(self, kind: object, *_: object) -> None: ...
+
+    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
+        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
+        ...
+
+
+class CsvTable:
+    """A table as CSV, one line per row; floats as the shortest text that reads back exactly."""
+
+    def __init__(self, path: Path):
+        self._path = path
+        self._file = path.open('w', encoding='utf-8', newline='')
+        self._writer = csv.writer(self._file, lineterminator='\n')
+        self._names: list[str] | None = None
+
+    def __enter__(self) -> CsvTable:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        with naming(self._path):
+            self._file.close()
+
+    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
+        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
+        if self._names is None:
+            self._names = list(columns)
+            self._writer.writerow(['stamp_ns', *columns])
+        elif self._names != list(columns):
+            raise ValueError('the columns change from one estimate to another')
+        with naming(self._path):
+            for row in zip(*(column.tolist() for column in columns.values())):
+                self._writer.writerow([stamp_ns, *row])
+
+
+def require_parquet() -> None:
+    """Raise ModuleNotFoundError when Parquet cannot be written; to say so before the work."""
+    import pyarrow.parquet  # noqa: F401
+
+
+class ParquetTable:
+    """A table as Parquet, with the types of the columns: stamp_ns is int64.
+
+    notes: texts kept in the metadata of the file, by name. Rows are held until there are enough
+    for a row group. Raises ModuleNotFoundError without pyarrow.
+    """
+
+    def __init__(self, path: Path, notes: Mapping[str, str] | None = None):
+        import pyarrow
+        import pyarrow.parquet
+
+        self._arrow = pyarrow
+        self._path = path
+        self._notes = dict(notes or {})
+        self._writer: Any = None
+        self._held: list[dict[str, np.ndarray]] = []
+        self._rows_held = 0
+        self._types: dict[str, np.dtype] = {}
+
+    def __enter__(self) -> ParquetTable:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        with naming(self._path):
+            if kind is None:
+                self._write_group()
+            if self._writer is not None:
+                self._writer.close()
+
+    def write(self, stamp_ns: int, columns: Mapping[str, Any]) -> None:
+        """Append the rows (n,) of one stamp. Raises ValueError when the columns change."""
+        rows = len(next(iter(columns.values()), ()))
+        found = {'stamp_ns': np.full(rows, stamp_ns, np.int64)}
+        found |= {name: np.array(column) for name, column in columns.items()}
+        if not self._types:
+            self._types = {name: column.dtype for name, column in found.items()}
+        elif list(self._types) != list(found):
+            raise ValueError('the columns change from one estimate to another')
+        self._held.append(found)
+        self._rows_held += rows
+        if self._rows_held >= ROWS_IN_A_GROUP:
+            self._write_group()
+
+    def _write_group(self) -> None:
+        arrow = self._arrow
+        types = self._types or {'stamp_ns': np.dtype(np.int64)}
+        if self._writer is None:
+            fields = [(name, arrow.from_numpy_dtype(dtype)) for name, dtype in types.items()]
+            schema = arrow.schema(fields, metadata=self._notes)
+            self._writer = arrow.parquet.ParquetWriter(str(self._path), schema)
+        if not self._held:
+            return
+        columns = [
+            np.concatenate([rows[name] for rows in self._held]).astype(dtype, copy=False)
+            for name, dtype in types.items()
+        ]
+        self._held, self._rows_held = [], 0
+        self._writer.write_table(arrow.table(columns, schema=self._writer.schema))
 
 
 class RunFolder:
@@ -241,7 +348,7 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
     if not Path(run['bag']).exists():
         return
     with BagReader(run['bag']) as bag:
-        for heard in measurements_of(
+        for item in measurements_of(
             bag,
             run['system'],
             run['topics'],
@@ -249,8 +356,8 @@ def read_measurements(run: Mapping[str, Any]) -> Iterator[Any]:
             settings=run.get('parameters'),
             detector=run.get('detector'),
         ):
-            if heard.measurement is not None and not isinstance(heard.measurement, Rejection):
-                yield heard.measurement
+            if item.measurement is not None and not isinstance(item.measurement, Rejection):
+                yield item.measurement
 
 
 def _read_estimates(path: Path, topics: list[str] | None = None) -> list[Estimate]:
@@ -268,7 +375,7 @@ def run_record(**facts: Any) -> dict[str, Any]:
     versions = {
         'sonar_imm': __version__,
         'python': platform.python_version(),
-        'numpy': numpy.__version__,
+        'numpy': np.__version__,
         'scipy': scipy.__version__,
         'numba': numba.__version__,
         'rosbags': version('rosbags'),

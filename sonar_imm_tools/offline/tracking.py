@@ -34,10 +34,10 @@ import numpy as np
 
 from sonar_imm import __version__
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import FrameGuard, Rejection, RepeatGuard
+from sonar_imm.intake import Intake
+from sonar_imm.measurements import Rejection
 from sonar_imm.parameters import Config
 from sonar_imm.trackers import System
-from sonar_imm.trackers.frames import FrameDoor
 
 from .. import SECOND
 from ..recordings.measurements import measurements_of
@@ -142,16 +142,17 @@ class OfflineRun:
         self.bag = bag
         self.system = system
         chosen = fitting_topics(bag, system.name, self.options.topics)
-        told = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
-        self.topics = {name: entry.name for name, entry in chosen.items() if entry.wanted(told)}
+        settings = {**config.as_dict(), 'use_tf_static': self.options.use_tf_static}
+        self.topics = {
+            name: entry.name for name, entry in chosen.items() if entry.wanted(settings)
+        }
         build = system.build_smoother if self.options.smooth else system.build
-        self.tracker = build(config.for_inputs(frozenset(self.topics.values())))
+        self.tracker: Any = build(config.for_inputs(frozenset(self.topics.values())))
         self.refused: dict[str, Refused] = {}
         self.messages = 0
         self.durations = array('d')
         self._window_ns = window_ns(config)
-        self._repeats = RepeatGuard(getattr(config, 'repeat_time', 0.0))
-        self._door = FrameDoor(self.tracker, FrameGuard(self.options.frame_id))
+        self._intake = Intake(self.tracker, self.options.frame_id)
 
     @property
     def total(self) -> int:
@@ -163,7 +164,7 @@ class OfflineRun:
         revisions = Revisions(self._window_ns)
         self.tracker.warm()
         share = self.options.jobs > 1 and hasattr(self.tracker, 'tasks')
-        for made in self._shared_out(advance) if share else self._one_by_one(advance):
+        for made in self._shared_out(advance) if share else self._in_turn(advance):
             final = revisions.add(made)
             if not self.options.smooth:
                 yield from final
@@ -173,7 +174,7 @@ class OfflineRun:
         elif last:
             yield from self.tracker.smoothed()
 
-    def _one_by_one(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
+    def _in_turn(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
         """What the tracker makes of each measurement."""
         for measurement in self._measurements(advance):
             begin = time.perf_counter()
@@ -182,7 +183,9 @@ class OfflineRun:
             yield made
 
     def _shared_out(self, advance: Callable[[int], None]) -> Iterator[list[Estimate]]:
-        """The same from a `SharingTracker`, whose tasks `jobs` processes do."""
+        """The same from a tracker whose work falls into tasks that need nothing of each other, so
+        that `jobs` processes can do them: ``process(m)`` is ``take(work(task))`` for all of
+        ``tasks(m)``, in order. A task can be pickled, and ``work`` needs no tracker."""
         ahead = AHEAD * self.options.jobs
         waiting: deque[Future[tuple[Any, float]]] = deque()
         with processes(self.options.jobs) as pool:
@@ -195,8 +198,8 @@ class OfflineRun:
                 while waiting:
                     yield self._taken(waiting.popleft())
             finally:
-                for one in waiting:
-                    one.cancel()
+                for future in waiting:
+                    future.cancel()
 
     def _taken(self, done: Future[tuple[Any, float]]) -> list[Estimate]:
         found, seconds = done.result()
@@ -205,8 +208,7 @@ class OfflineRun:
         return made
 
     def _measurements(self, advance: Callable[[int], None]) -> Iterator[Any]:
-        door = self._door
-        for heard in measurements_of(
+        for item in measurements_of(
             self.bag,
             self.system.name,
             self.topics,
@@ -217,16 +219,14 @@ class OfflineRun:
         ):
             self.messages += 1
             advance(1)
-            if heard.measurement is None:
+            if item.measurement is None:
                 continue
             try:
-                if isinstance(heard.measurement, Rejection):
-                    raise heard.measurement
-                measurement = door.admit(heard.measurement)
-                if measurement is not None:
-                    measurement = self._repeats.fresh(measurement)
+                if isinstance(item.measurement, Rejection):
+                    raise item.measurement
+                measurement = self._intake.admit(item.measurement)
             except Rejection as rejection:
-                self._refuse(heard.topic, rejection)
+                self._refuse(item.topic, rejection)
                 continue
             if measurement is not None:
                 yield measurement
@@ -261,8 +261,8 @@ class OfflineRun:
         for name in kept:
             if count := health.get(name):
                 counts[name] = int(count)
-        if self._repeats.rows:
-            counts['repeated_rows'] = self._repeats.rows
+        if self._intake.repeats.rows:
+            counts['repeated_rows'] = self._intake.repeats.rows
         refused = sum(entry.count for entry in self.refused.values())
         return {**counts, 'refused': refused} if refused else counts
 
@@ -277,7 +277,7 @@ class OfflineRun:
 
     def mounting(self) -> dict[str, Any]:
         """Where /tf_static says that the sonar is on its vehicle; nothing where it does not."""
-        return {'mounting': self._door.mounting} if self._door.mounting else {}
+        return {'mounting': self._intake.mounting} if self._intake.mounting else {}
 
     def refusals(self) -> dict[str, dict[str, Any]]:
         """Count and example by reason, as plain values."""

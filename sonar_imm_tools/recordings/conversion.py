@@ -17,15 +17,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+import zipfile
+import zlib
 
 from attrs import define, Factory
+import numpy as np
+from numpy.typing import NDArray
 
+from msg_adapters.inputs import InputTopic
 from sonar_imm.measurements import Rejection
 
 from .csv_table import BadRow, CsvTable, Row
+from .messages import ros_message
+from .reader import BagMessage, BagReader
 from .sources import BagError
 from .writer import BagWriter
 
@@ -112,3 +119,66 @@ def write_bag(
 def provenance(source: str, notes: Mapping[str, str]) -> dict[str, str]:
     """What a converted bag notes beside its messages."""
     return {'source': source, 'converted_by': 'sonar-imm convert', **notes}
+
+
+def write_from_bag(
+    out: str | Path,
+    bag: BagReader,
+    topics: Collection[str],
+    make: Callable[[BagMessage], tuple[str, Any] | None],
+    report: ConversionReport,
+    *,
+    storage: str,
+) -> None:
+    """Write a new bag at `out` of messages of another one, in recorded order and with their times.
+
+    make: topic and message for a message of `bag`, or None where there is none yet; messages for
+    which it raises `Rejection` are counted and named.
+    """
+    notes = provenance(bag.path.name, report.notes)
+    with BagWriter(out, storage=storage, custom_data=notes) as made:
+        for item in bag.messages(topics):
+            report.rows += 1
+            try:
+                written = make(item)
+            except Rejection as rejection:
+                report.bad_row(bag.path, f'{item.topic} #{item.index}', rejection)
+                continue
+            if written is not None:
+                topic, message = written
+                made.write(topic, message, item.log_ns)
+                report.messages[topic] = report.messages.get(topic, 0) + 1
+
+
+def companion_topics(bag: BagReader, wanted: Mapping[str, InputTopic]) -> dict[str, str]:
+    """Inputs that a tracker needs beside what is converted, such as navigation: input name by
+    topic, for the first topic of `bag` of each kind in `wanted`."""
+    chosen = {}
+    for name, entry in wanted.items():
+        fitting = [topic.name for topic in bag.topics if topic.type_name in entry.readers]
+        if fitting:
+            chosen[fitting[0]] = name
+    return chosen
+
+
+def copied(entry: InputTopic, type_name: str, message: Any) -> Any:
+    """The message of a bag as our own. Raises `Rejection`."""
+    # A frame that calls itself NED is turned into ENU; others stay as they are, and whoever tracks
+    # the new bag states their convention.
+    ned = str(message.header.frame_id).endswith('_ned')
+    measurement = entry.readers[type_name](message, world_frame='ned' if ned else 'enu')
+    return entry.write(measurement, ros_message)
+
+
+def read_npz(path: Path) -> dict[str, NDArray]:
+    """Every array of a numpy archive (npz) by name. Raises `BagError`."""
+    try:
+        with path.open('rb') as file:
+            if not zipfile.is_zipfile(file):
+                raise BagError(f'{path} is not a numpy archive (npz)')
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except OSError as error:
+        raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
+    except (ValueError, EOFError, zlib.error, zipfile.BadZipFile):
+        raise BagError(f'{path} is damaged, or holds more than plain arrays') from None

@@ -23,18 +23,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 import contextlib
 import csv
+from datetime import datetime, timedelta, timezone, tzinfo
 from decimal import Decimal
 import itertools
 import math
 from pathlib import Path
 import re
 from typing import Any, TextIO
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from attrs import field, frozen
+from attrs import frozen
 
 from sonar_imm.parameters import did_you_mean
 
-from .csv_times import BadRow, dated, iso_ns, TIME_OF_DAY, TIME_TEXT, zone_of
+from .options import nanoseconds, option
 from .sources import BagError
 
 TIME_UNITS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
@@ -44,106 +46,98 @@ LONGEST_NS = 10**8 * 10**9
 LOOKED_AT = 1000
 """Rows by which a file is judged."""
 
-ALIASES: dict[str, tuple[str, ...]] = {
+USUAL_NAMES = {
     'stamp': (
-        'stamp',
-        'time',
-        'timestamp',
-        't',
-        'datetime',
-        'date_time',
-        'utc',
-        'utc_time',
-        'time_utc',
-        'timestamp_utc',
-        'datetime_utc',
-        'epoch',
-        'unix_time',
+        'time timestamp t datetime date_time utc utc_time time_utc timestamp_utc datetime_utc '
+        'epoch unix_time'
     ),
-    'date': ('date', 'utc_date', 'gps_date', 'date_utc', 'day'),
-    'x': ('x', 'east', 'easting', 'px', 'pos_x', 'position_x', 'utm_e', 'utm_x', 'e'),
-    'y': ('y', 'north', 'northing', 'py', 'pos_y', 'position_y', 'utm_n', 'utm_y', 'n'),
-    'z': ('z', 'up', 'pz', 'pos_z', 'position_z'),
-    'depth': ('depth', 'down'),
-    'latitude': ('latitude', 'lat', 'gps_latitude', 'gps_lat', 'decimal_latitude', 'lat_dd'),
+    'date': 'utc_date gps_date date_utc day',
+    'x': 'east easting px pos_x position_x utm_e utm_x e',
+    'y': 'north northing py pos_y position_y utm_n utm_y n',
+    'z': 'up pz pos_z position_z',
+    'depth': 'down',
+    'latitude': 'lat gps_latitude gps_lat decimal_latitude lat_dd',
     'longitude': (
-        'longitude',
-        'lon',
-        'lng',
-        'long',
-        'gps_longitude',
-        'gps_lon',
-        'gps_lng',
-        'gps_long',
-        'decimal_longitude',
-        'lon_dd',
-        'long_dd',
+        'lon lng long gps_longitude gps_lon gps_lng gps_long decimal_longitude lon_dd long_dd'
     ),
-    'height': ('height', 'altitude', 'alt', 'ellipsoidal_height'),
-    'var_x': ('var_x', 'var_east', 'xx', 'cov_xx', 'cov_x_x'),
-    'cov_xy': ('cov_xy', 'cov_east_north', 'xy', 'cov_x_y'),
-    'var_y': ('var_y', 'var_north', 'yy', 'cov_yy', 'cov_y_y'),
-    'std_x': ('std_x', 'std_east', 'sigma_x', 'sigma_east', 'sd_x', 'sx'),
-    'std_y': ('std_y', 'std_north', 'sigma_y', 'sigma_north', 'sd_y', 'sy'),
-    'std': ('std', 'sigma', 'accuracy', 'std_xy', 'sigma_xy', 'position_std'),
-    'vx': ('vx', 'v_east', 've', 'vel_x', 'velocity_x'),
-    'vy': ('vy', 'v_north', 'vn', 'vel_y', 'velocity_y'),
-    'id': ('id', 'track_id', 'target', 'target_id', 'tag', 'diver', 'name'),
-    'valid': ('valid', 'position_valid', 'is_valid', 'fix_valid', 'validity'),
-    'tag': ('tag', 'tag_id', 'transmitter', 'transmitter_id', 'tx', 'tx_id'),
-    'ping': ('ping', 'ping_id', 'ping_number'),
-    'receiver': (
-        'receiver',
-        'rx',
-        'rx_id',
-        'receiver_id',
-        'hydro',
-        'hydrophone',
-        'station',
-        'name',
-        'id',
-    ),
-    'transmitter': ('transmitter', 'tx', 'tx_id', 'transmitter_id', 'source', 'name', 'id'),
-    'arrival': ('arrival', 'arrival_time', 'time_of_arrival', 'detection_time'),
-    'toa': ('toa', 'travel_time', 'delay', 'tof', 'time_of_flight'),
-    'var_toa': ('var_toa', 'toa_variance', 'var_arrival'),
-    'std_toa': ('std_toa', 'sigma_toa', 'std_arrival', 'sigma_arrival'),
-    'bearing': ('bearing', 'azimuth', 'doa'),
-    'amplitude': ('amplitude', 'amp', 'response', 'value'),
-    'var_bearing': ('var_bearing',),
-    'std_bearing': ('std_bearing', 'sigma_bearing'),
-    'elevation': ('elevation', 'elevation_angle'),
-    'var_elevation': ('var_elevation',),
-    'std_elevation': ('std_elevation', 'sigma_elevation'),
-    'var_depth': ('var_depth',),
-    'std_depth': ('std_depth', 'sigma_depth'),
+    'height': 'altitude alt ellipsoidal_height',
+    'var_x': 'var_east xx cov_xx cov_x_x',
+    'cov_xy': 'cov_east_north xy cov_x_y',
+    'var_y': 'var_north yy cov_yy cov_y_y',
+    'std_x': 'std_east sigma_x sigma_east sd_x sx',
+    'std_y': 'std_north sigma_y sigma_north sd_y sy',
+    'std': 'sigma accuracy std_xy sigma_xy position_std',
+    'vx': 'v_east ve vel_x velocity_x',
+    'vy': 'v_north vn vel_y velocity_y',
+    'id': 'track_id target target_id tag diver name',
+    'valid': 'position_valid is_valid fix_valid validity',
+    'tag': 'tag_id transmitter transmitter_id tx tx_id',
+    'ping': 'ping_id ping_number',
+    'receiver': 'rx rx_id receiver_id hydro hydrophone station name id',
+    'transmitter': 'tx tx_id transmitter_id source name id',
+    'arrival': 'arrival_time time_of_arrival detection_time',
+    'toa': 'travel_time delay tof time_of_flight',
+    'var_toa': 'toa_variance var_arrival',
+    'std_toa': 'sigma_toa std_arrival sigma_arrival',
+    'bearing': 'azimuth doa',
+    'amplitude': 'amp response value',
+    'var_bearing': '',
+    'std_bearing': 'sigma_bearing',
+    'elevation': 'elevation_angle',
+    'var_elevation': '',
+    'std_elevation': 'sigma_elevation',
+    'var_depth': '',
+    'std_depth': 'sigma_depth',
 }
+ALIASES = {name: (name, *others.split()) for name, others in USUAL_NAMES.items()}
+"""The names of the columns of all kinds of table: those by which each quantity is found."""
 _UNIT = re.compile(r'_(deg|degrees?|m|s|ms|us|ns|m2|s2|m_s|mps|rad|rad2)$')
 
-
+TIME_TEXT = re.compile(
+    r'(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$'
+)
+TIME_OF_DAY = re.compile(r'\d\d?:\d\d(:\d\d)?([.,]\d+)?\s*(Z|[+-]\d\d:?\d\d)?$')
+_DATES = (
+    (re.compile(r'(\d{4})[-/.](\d\d?)[-/.](\d\d?)$'), (1, 2, 3)),
+    (re.compile(r'(\d{4})(\d\d)(\d\d)$'), (1, 2, 3)),
+    (re.compile(r'(\d\d?)\.(\d\d?)\.(\d{4})$'), (3, 2, 1)),
+)
+"""Forms of a date that can be read in one way only, with the places of year, month and day."""
 _YES = ('1', '1.0', 'true', 't', 'yes', 'y', 'valid', 'ok')
 _NO = ('0', '0.0', 'false', 'f', 'no', 'n', 'invalid')
+
+
+class BadRow(ValueError):
+    """A row that cannot be used; the text says why, `reason` is a code where rows are counted by
+    reason."""
+
+    def __init__(self, why: str, reason: str = ''):
+        super().__init__(why)
+        self.reason = reason
 
 
 @frozen(kw_only=True)
 class CsvOptions:
     """How to read a CSV file.
 
-    columns: header in the file by our name, e.g. ``{'x': 'easting_utm'}``. What is not listed is
-    found by its usual names (`ALIASES`); case and units are ignored.
-    time_unit: of numeric times, one of s, ms, us, ns. Empty: from the header (``time_ms``), else
-    s. ISO 8601 texts are recognised, also as a date and a time of day in two columns.
-    time_zone: of texts that do not say theirs: ``UTC``, ``+02:00`` or a name such as
-    ``Europe/Berlin``. Empty: UTC where the header says so (``utc_time``), else they are refused.
-    time_offset_ns: added to every time, for files that count from their own start.
-    delimiter: empty to find it from the header line.
+    columns: what is not listed is found by its usual names (`ALIASES`); case and units are
+    ignored. time_zone, empty: UTC where the header says so (``utc_time``), else times without a
+    zone are refused. time_unit, empty: from the header (``time_ms``), else s; ISO 8601 texts are
+    recognised, also as a date and a time of day in two columns.
     """
 
-    columns: Mapping[str, str] = field(factory=dict)
-    time_unit: str = ''
-    time_zone: str = ''
-    time_offset_ns: int = 0
-    delimiter: str = ''
+    # fmt: off
+    columns: Mapping[str, str] = option({}, 'NAME=HEADER',
+        'Header of a column of {what}, e.g. x=easting.', flag='column', kind='pairs')
+    time_zone: str = option('', 'ZONE',
+        'Zone of times in {what} that do not say it: UTC, +02:00 or Europe/Berlin.')
+    time_unit: str = option('', 'UNIT',
+        'Unit of numeric times in {what}: s, ms, us or ns.', choices=('', *TIME_UNITS))
+    time_offset_ns: int = option(0, 'SECONDS',
+        'Added to every time of {what}.', flag='time-offset', parse=nanoseconds)
+    delimiter: str = option('', '',
+        'Delimiter between the columns of {what}; found automatically by default.')
+    # fmt: on
 
     def __attrs_post_init__(self) -> None:
         if self.time_unit not in ('', *TIME_UNITS):
@@ -196,12 +190,12 @@ class Row:
 
     def require_valid(self) -> None:
         """Raise `BadRow` for a row whose column ``valid`` says that it is not."""
-        said = self.text('valid').lower()
-        if said in ('', *_YES):
+        flag = self.text('valid').lower()
+        if flag in ('', *_YES):
             return
-        if said in _NO:
+        if flag in _NO:
             raise BadRow('the row is flagged as invalid', 'flagged invalid')
-        raise BadRow(f"{self.table.header('valid')} is '{said[:40]}', neither true nor false")
+        raise BadRow(f"{self.table.header('valid')} is '{flag[:40]}', neither true nor false")
 
     def seconds_ns(self, name: str) -> int:
         """A duration or a time as integer nanoseconds, exactly as written."""
@@ -225,8 +219,8 @@ class Row:
         """A time since 1970 in integer nanoseconds, with the offset of the options added."""
         parts = TIME_TEXT.match(self._moment(name))
         if parts:
-            *moment, zone = parts.groups()
-            stamp = iso_ns(*moment, zone_of(zone or self._zone(name)))
+            date, clock, fraction, zone = parts.groups()
+            stamp = iso_ns(date, clock, fraction, zone_of(zone or self._zone(name)))
         else:
             stamp = self.seconds_ns(name)
         stamp += self.table.options.time_offset_ns
@@ -328,22 +322,22 @@ class CsvTable:
         """Whether the first times of the file are seconds from its own start rather than a date,
         so that a time of 0 is one, and not one that is missing."""
         if name not in self._from_zero:
-            told = []
+            times = []
             for row in itertools.islice(self, LOOKED_AT):
                 with contextlib.suppress(BadRow):
-                    told.append(row.seconds_ns(name))
-            self._from_zero[name] = max(told, default=0) < LONGEST_NS
+                    times.append(row.seconds_ns(name))
+            self._from_zero[name] = max(times, default=0) < LONGEST_NS
         return self._from_zero[name]
 
     def columns_used(self) -> tuple[str, str]:
         """What was taken from which column so far, and which columns were not, as text."""
         taken = {name: self.index[name] for name in self.index if name in self.used}
-        told = ', '.join(
+        columns = ', '.join(
             name if self.headers[k] == name else f'{name} = {self.headers[k]}'
             for name, k in taken.items()
         )
         left = [header for k, header in enumerate(self.headers) if k not in taken.values()]
-        return told, ', '.join(header or '(no name)' for header in left)
+        return columns, ', '.join(header or '(no name)' for header in left)
 
     def header(self, name: str) -> str:
         """What the file calls a quantity."""
@@ -403,3 +397,43 @@ def _plain(header: str) -> str:
     """Reduce a header to its name: ``East [m]``, ``east_m`` and ``EAST`` are all ``east``."""
     name = re.sub(r'[\[(].*', '', header.lower()).strip()
     return _UNIT.sub('', re.sub(r'[^a-z0-9]+', '_', name).strip('_'))
+
+
+def zone_of(name: str) -> tzinfo:
+    """A time zone by what stands behind a time (``Z``, ``+0200``) or by its name. Raises
+    `BagError`."""
+    if name.upper() in ('Z', 'UTC', 'GMT'):
+        return timezone.utc
+    if offset := re.match(r'([+-])(\d\d):?(\d\d)$', name):
+        hours, minutes = int(offset.group(2)), int(offset.group(3))
+        if hours < 24 and minutes < 60:
+            ahead = timedelta(hours=hours, minutes=minutes)
+            return timezone(ahead if offset.group(1) == '+' else -ahead)
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise BagError(
+            f"there is no time zone '{name}'; write UTC, +02:00 or Europe/Berlin"
+        ) from None
+
+
+def iso_ns(date: str, clock: str, fraction: str | None, zone: tzinfo) -> int:
+    """Nanoseconds since 1970 of an ISO 8601 time."""
+    try:
+        moment = datetime.fromisoformat(f'{date}T{clock}').replace(tzinfo=zone)
+    except ValueError:
+        raise BadRow(f"'{date} {clock}' is no date and time of the calendar") from None
+    elapsed = moment - datetime(1970, 1, 1, tzinfo=timezone.utc)
+    nanoseconds = (elapsed.days * 86400 + elapsed.seconds) * 10**9
+    return nanoseconds + round(Decimal('0.' + (fraction or '.0')[1:]) * 10**9)
+
+
+def dated(date: str, clock: str, header: str) -> str:
+    """A date and a time of day as one text; header: of the date. Raises `BadRow` for a date that
+    can be read in several ways."""
+    for form, places in _DATES:
+        if found := form.match(date):
+            year, month, day = (int(found.group(place)) for place in places)
+            padded = clock if clock[2] == ':' else f'0{clock}'
+            return f'{year:04d}-{month:02d}-{day:02d} {padded}'
+    raise BadRow(f"{header} is '{date[:40]}', which can be read in several ways; write 2024-05-31")

@@ -37,8 +37,8 @@ class LocalFrame:
         self.geodetic = not table.has('x', 'y') and table.has('latitude', 'longitude')
         if not self.geodetic:
             if not any(table.has(name) for name in ('x', 'y')):
-                for one, other in (('latitude', 'longitude'), ('longitude', 'latitude')):
-                    if table.has(one):
+                for found, other in (('latitude', 'longitude'), ('longitude', 'latitude')):
+                    if table.has(found):
                         table.require(other)
                 raise BagError(
                     f'{table.path} has no column for x and y, nor for latitude and longitude; it '

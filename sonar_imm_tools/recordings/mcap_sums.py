@@ -79,7 +79,7 @@ def wrong_sums(path: Path) -> list[str]:
             'data': not _data_is_right(file, footer.summary),
             'index': not summary_is_right(file, size, footer),
         }
-        return [part for part, said in wrong.items() if said]
+        return [part for part, is_wrong in wrong.items() if is_wrong]
 
 
 def summary_is_right(file: BinaryIO, size: int, footer: Footer) -> bool:

@@ -17,13 +17,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from msg_adapters.inputs import DOUBTS
-from sonar_imm.measurements import Rejection
+from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic
+from sonar_imm.measurements import Detections, Rejection
+from sonar_imm.trackers.obstacle.detector import DetectorConfig, ImageDetector
 
-from .detected import DetectedImages
+from .messages import ros_message
 from .reader import BagReader
 from .topics import fitting_topics
 
@@ -56,12 +57,12 @@ def measurements_of(
     counted in ``bag.problems`` at the end. Raises `BagError` when no topic fits.
     """
     chosen = fitting_topics(bag, system, topics)
-    told = settings or {}
-    images = DetectedImages(system, detector or {}, told)
+    known = settings or {}
+    images = DetectedImages(system, detector or {}, known)
     readers = {
         (name, type_name): images.reader(entry, type_name)
         if entry.makes
-        else entry.reader(type_name, world_frame, told, name)
+        else entry.reader(type_name, world_frame, known, name)
         for name, entry in chosen.items()
         for type_name in entry.readers
     }
@@ -81,3 +82,32 @@ def measurements_of(
         yield Heard(item.topic, measurement, item.log_ns)
     for (topic, code), count in doubts.items():
         bag.add_problem(f'topic {topic}: {count} messages {DOUBTS.get(code, code)}')
+
+
+class DetectedImages:
+    """Reads recorded images as detections, in recorded order, as the live detector does.
+
+    Live, a message lies between detector and tracker, whose columns of four bytes round. So the
+    offline tracker takes the detections through such a message too, and both have the same bits.
+    """
+
+    def __init__(self, system: str, detector: Mapping[str, Any], settings: Mapping[str, Any]):
+        """detector: parameters of `DetectorConfig` that are not the default; settings: parameters
+        of the tracker, by name. Raises `ConfigError`."""
+        self._inputs = {entry.name: entry for entry in inputs_of(system)}
+        self._settings = settings
+        self._config = DetectorConfig.from_mapping(detector)
+
+    def reader(self, entry: InputTopic, type_name: str) -> Callable[[Any], Detections | None]:
+        """The reader of one topic of images: from a message to detections, None while a scanning
+        sonar is at its sweep. It raises `Rejection`."""
+        made = self._inputs[entry.makes]
+        read = entry.reader(type_name, 'enu', self._config.as_dict())
+        again = made.reader('sensor_msgs/msg/PointCloud2', 'enu', self._settings)
+        detector = ImageDetector(self._config)
+
+        def detections(message: Any) -> Detections | None:
+            found = detector.process(read(message))
+            return None if found is None else again(made.write(found, ros_message))
+
+        return detections

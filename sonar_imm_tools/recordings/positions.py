@@ -101,7 +101,7 @@ def read_navigated(
 
 
 def _named(topics: list[str], name: str) -> list[str]:
-    return [one for one in topics if f'/{one}'.endswith(f'/{name}')]
+    return [topic for topic in topics if f'/{topic}'.endswith(f'/{name}')]
 
 
 def _read(

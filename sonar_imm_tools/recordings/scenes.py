@@ -47,13 +47,13 @@ def write_scene(
             for measurement in (entry.measurement, *entry.also):
                 inputs.setdefault(measurement, entry)
     records: list[Record] = []
-    for one in scene.measurements:
-        entry = inputs[type(one.measurement)]
-        topic = namespaced(one.namespace, f'/{entry.name}')
-        records.append((one.received_ns, topic, entry.write(one.measurement, ros_message)))
+    for item in scene.measurements:
+        entry = inputs[type(item.measurement)]
+        topic = namespaced(item.namespace, f'/{entry.name}')
+        records.append((item.received_ns, topic, entry.write(item.measurement, ros_message)))
     for true in scene.truth:
         records += records_of(true, scene.frame_id)
-    images = any(inputs[type(one.measurement)].makes for one in scene.measurements)
+    images = any(inputs[type(item.measurement)].makes for item in scene.measurements)
     with BagWriter(
         out, compressed=compressed or images, custom_data=provenance, parameters=parameters
     ) as bag:

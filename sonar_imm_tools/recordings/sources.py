@@ -20,7 +20,7 @@ one sentence here.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -37,7 +37,6 @@ from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
 from .mcap_scan import Channel, McapScan
 from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
-from .source_hints import advice, convert_hint, leftovers, packed_hint
 
 SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -130,7 +129,7 @@ class RosbagsSource:
     def _unpack_here(self) -> None:
         """Have compressed messages handed out as they are: rosbags unpacks without a limit."""
         for reader in self._reader.readers:
-            storage = getattr(reader, 'storage', None)
+            storage: Any = getattr(reader, 'storage', None)
             if getattr(getattr(storage, 'metadata', None), 'compression_mode', None) == 'message':
                 storage.metadata = storage.metadata._replace(compression_mode=None)
 
@@ -151,10 +150,12 @@ class RosbagsSource:
         links = self._reader.connections
         if not all(isinstance(link.msgcount, int) for link in links):
             return 'a message count that is no number'
-        if not all(isinstance(one, str) for link in links for one in (link.topic, link.msgtype)):
+        if not all(
+            isinstance(link.topic, str) and isinstance(link.msgtype, str) for link in links
+        ):
             return 'a topic whose name or type is no text'
         for reader in self._reader.readers:
-            storage = getattr(reader, 'storage', None)
+            storage: Any = getattr(reader, 'storage', None)
             if not isinstance(getattr(storage, 'files', []), list):
                 storage.files = []  # rosbags could not close it
                 return 'a list of files that is none'
@@ -389,3 +390,33 @@ def one_line(error: Exception) -> str:
     """The text of any exception as one line without a full stop."""
     text = ' '.join(str(error).split()).rstrip('.')
     return text if text and not isinstance(error, KeyError) else f'{type(error).__name__} {text}'
+
+
+def leftovers(path: Path) -> list[str]:
+    """Sentences about write-ahead logs that a crashed recorder left, whose rows are not read."""
+    logs = path.glob('*.db3-wal') if path.is_dir() else [path.with_name(path.name + '-wal')]
+    return [
+        f'{log} holds {log.stat().st_size} bytes that the recorder did not finish writing; '
+        f"the messages in it are not read (sqlite3 {log.name[:-4]} 'pragma wal_checkpoint' "
+        'merges them)'
+        for log in logs
+        if log.exists() and log.stat().st_size
+    ]
+
+
+def advice(file: Path) -> str:
+    return f' (sqlite3 {file.name} .recover may save some of it)' if file.suffix == '.db3' else ''
+
+
+def convert_hint(path: Path) -> str:
+    """Which conversion makes a recording of a file of another kind."""
+    kinds = {'fixes': ('.csv', '.txt'), 'snapshots': ('.npz',), 'segy': ('.sgy', '.segy', '.seg')}
+    found = [kind for kind, suffixes in kinds.items() if path.suffix.lower() in suffixes]
+    if not found:
+        return ''
+    return f'; sonar-imm convert makes one, e.g. sonar-imm convert {found[0]} {path} OUT_BAG'
+
+
+def packed_hint(files: Iterable[Path]) -> str:
+    packed = [file.name for file in files if file.suffix in ('.zstd', '.zst')]
+    return f'; {packed[0]} is compressed, unpack it with zstd first' if packed else ''

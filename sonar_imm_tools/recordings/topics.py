@@ -44,7 +44,9 @@ def fitting_topics(
     """
     found = instruments(bag, system, topics)
     if len(found) > 1:
-        names = [name for each in found.values() for name, one in each.items() if one.one_topic]
+        names = [
+            name for inputs in found.values() for name, entry in inputs.items() if entry.one_topic
+        ]
         entry = next(iter(found.values()))[names[0]]
         raise BagError(
             f'several topics fit the {system} tracker as instruments of their own: '
@@ -87,10 +89,10 @@ def instruments(
 
 def _free_name(place: str, own: Mapping[str, InputTopic], used: Collection[str]) -> str:
     """The name of an instrument, fit for a folder: of its namespace, or else of its input."""
-    words = place.strip('/_') or next(one.name for one in own.values() if one.one_topic)
+    words = place.strip('/_') or next(entry.name for entry in own.values() if entry.one_topic)
     name = '_'.join(re.findall(r'[^\W_]+', words))
     further = (f'{name}_{k}' for k in itertools.count(2))
-    return name if name not in used else next(one for one in further if one not in used)
+    return name if name not in used else next(free for free in further if free not in used)
 
 
 def fitting_systems(bag: BagReader, topics: Mapping[str, str] | None = None) -> list[str]:

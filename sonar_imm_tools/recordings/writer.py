@@ -38,7 +38,7 @@ from sonar_imm.files import whole
 
 from .mcap_sums import seal
 from .messages import cdr_of, ros_message, typestore
-from .own_parameters import write_own_parameters
+from .own_files import write_own_parameters
 from .sources import BagError
 
 __all__ = ['BagWriter', 'naming', 'ros_message', 'STORAGES']

@@ -42,9 +42,8 @@ from sonar_imm.trackers import SYSTEMS
 
 from ..recordings.reader import BagReader
 from ..recordings.topics import fitting_topics
-from .chain import Chain, FirstStep
 from .link import Link, LinkError
-from .lockstep import Counts, LockStep, Recorder
+from .lockstep import Chain, Counts, FirstStep, LockStep, Recorder
 from .player import NAME, Player, PlayOptions
 
 START_LIMIT = 300.0
@@ -112,9 +111,8 @@ def run_lockstep(
         node = stack.enter_context(NodeProcess(system, domain_id=domain, arguments=arguments))
         link = stack.enter_context(Link(NAME, domain_id=domain))
         recorder = Recorder(link, f'/{system}')
-        lockstep: LockStep | Chain = LockStep(
-            link, f'/{system}', recorder=recorder, trouble=node.trouble
-        )
+        last = LockStep(link, f'/{system}', recorder=recorder, trouble=node.trouble)
+        lockstep: LockStep | Chain = last
         before: NodeProcess | None = None
         if fed:
             name = FEEDERS[system]
@@ -126,11 +124,11 @@ def run_lockstep(
                     name,
                     domain_id=domain,
                     arguments=arguments,
-                    module=f'{__package__}.{name}',
+                    module=f'sonar_imm.nodes.{name}',
                 )
             )
             first = FirstStep(link, f'/{name}', trouble=before.trouble)
-            lockstep = Chain(first, lockstep, {f'/{entry.name}' for entry in fed.values()})
+            lockstep = Chain(first, last, {f'/{entry.name}' for entry in fed.values()})
         player = Player(
             bag,
             link,

@@ -120,7 +120,7 @@ class LockStep:
         self._counts: Counts | None = None
         self._start = Counts(0, 0, 0)
         self._sent = 0
-        self._told_estimates = 0
+        self._estimates_before = 0
         self.delays: list[float] = []
         link.node.create_subscription(
             PointCloud2, node_name + _ANSWERS, self._answered, latched_qos()
@@ -146,26 +146,26 @@ class LockStep:
                 'domain, and one of this package?'
             )
         topics = {p.topic_name for p in publishers}
-        heard: set[str] = set()
+        hearing: set[str] = set()
         last = time.monotonic()
 
         def connected() -> bool:
             nonlocal last
-            if fresh := self._heard(publishers) - heard:
-                heard.update(fresh)
+            if fresh := self._subscribed(publishers) - hearing:
+                hearing.update(fresh)
                 last = time.monotonic()
             return (
-                bool(heard)
-                and (heard == topics or time.monotonic() - last > _OTHER_INPUTS)
-                and all(p.get_subscription_count() for p in publishers if p.topic_name in heard)
+                bool(hearing)
+                and (hearing == topics or time.monotonic() - last > _OTHER_INPUTS)
+                and all(p.get_subscription_count() for p in publishers if p.topic_name in hearing)
                 and self._recorded()
             )
 
         if not self._link.wait_for(connected, MATCH_LIMIT, self._trouble):
-            raise LinkError(self._silence(publishers, heard))
-        self._start = self._counts
-        self._told_estimates = self._counts.estimates
-        return heard
+            raise LinkError(self._silence(publishers, hearing))
+        self._start = self._counts or self._start
+        self._estimates_before = 0
+        return hearing
 
     def step(self, publisher: Publisher, message: Any) -> None:
         """Publish `message` and wait for its answer. Raises `LinkError` when there is none."""
@@ -183,9 +183,10 @@ class LockStep:
                 f"node '{self._name}' did not answer message {self._sent} on "
                 f'{topic} within {ANSWER_LIMIT:g} s'
             )
-        if self._counts.estimates > self._told_estimates:
+        estimates = self.counts.estimates
+        if estimates > self._estimates_before:
             self.delays.append(time.monotonic() - sent)
-        self._told_estimates = self._counts.estimates
+        self._estimates_before = estimates
         if self.counts.messages > self._sent:
             raise LinkError(
                 f"something else publishes to the node '{self._name}': it took "
@@ -218,7 +219,7 @@ class LockStep:
             return f"node '{self._name}' has gone"
         return None
 
-    def _heard(self, publishers: list[Publisher]) -> set[str]:
+    def _subscribed(self, publishers: list[Publisher]) -> set[str]:
         """Topics among those of `publishers` that the node itself subscribes to."""
         return {
             p.topic_name
@@ -229,7 +230,7 @@ class LockStep:
             )
         }
 
-    def _silence(self, publishers: list[Publisher], heard: set[str]) -> str:
+    def _silence(self, publishers: list[Publisher], hearing: set[str]) -> str:
         """Say why no topic of the bag reaches the node."""
         for publisher in publishers:
             for info in self._link.node.get_subscriptions_info_by_topic(publisher.topic_name):
@@ -239,12 +240,73 @@ class LockStep:
                         f"node '{self._name}' expects {wanted} on {publisher.topic_name}, the "
                         f'bag holds {offered}; change the type parameter of the node'
                     )
-        if heard:
-            return f"node '{self._name}' does not take what is published on {', '.join(heard)}"
+        if hearing:
+            return f"node '{self._name}' does not take what is published on {', '.join(hearing)}"
         names = ', '.join(p.topic_name for p in publishers) or 'no topics'
         return (
             f"node '{self._name}' listens to none of the topics of the bag ({names}); remap them"
         )
+
+
+class FirstStep(LockStep):
+    """Keeps step with a node whose output another one hears, as that of a detector of images.
+    listeners: how many do."""
+
+    listeners = 0
+
+    def _answered(self, message: Any) -> None:
+        super()._answered(message)
+        self.listeners = int(decode_table(message)['listeners'][0])
+
+
+class Chain:
+    """Keeps step with two nodes; takes the place of a `LockStep` in the player. A message for the
+    first node is answered there; for each message that this one published since, the second has to
+    answer too.
+
+    fed: names of the published topics that the first node hears.
+    """
+
+    def __init__(self, first: FirstStep, second: LockStep, fed: Iterable[str]):
+        self.first, self.second = first, second
+        self._fed = frozenset(fed)
+
+    @property
+    def counts(self) -> Counts:
+        """Messages taken by either node, but for those that the first sent to the second; what
+        both refused; estimates of the second."""
+        first, second = self.first.counts, self.second.counts
+        return Counts(
+            first.messages + second.messages - first.estimates,
+            first.refused + second.refused,
+            second.estimates,
+        )
+
+    @property
+    def delays(self) -> list[float]:
+        return self.second.delays
+
+    def connect(self, publishers: Iterable[Publisher], limit: float = MATCH_LIMIT) -> set[str]:
+        """As `LockStep.connect`, for both nodes and for what one sends to the other."""
+        publishers = list(publishers)
+        connected = self.first.connect([p for p in publishers if p.topic_name in self._fed], limit)
+        connected |= self.second.connect(
+            [p for p in publishers if p.topic_name not in self._fed], limit
+        )
+        if not self.first.wait_for(lambda: self.first.listeners):
+            raise LinkError('the second node does not hear what the first one makes')
+        return connected
+
+    def step(self, publisher: Publisher, message: Any) -> None:
+        """Publish `message` and wait for all answers. Raises `LinkError` without one."""
+        if publisher.topic_name not in self._fed:
+            self.second.step(publisher, message)
+            return
+        sent, made = time.monotonic(), self.first.counts.estimates
+        self.first.step(publisher, message)
+        fresh = self.first.counts.estimates - made
+        if fresh:
+            self.second.follow(fresh, publisher.topic_name, sent)
 
 
 def _full_name(info: Any) -> str:
@@ -252,5 +314,6 @@ def _full_name(info: Any) -> str:
 
 
 def _type_name(publisher: Publisher) -> str:
-    package, _, name = publisher.msg_type.__module__.partition('.')
-    return f'{package}/msg/{publisher.msg_type.__name__}'
+    message_type: Any = publisher.msg_type
+    package, _, name = message_type.__module__.partition('.')
+    return f'{package}/msg/{message_type.__name__}'

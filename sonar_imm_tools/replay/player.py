@@ -24,8 +24,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 import time
+from typing import Any
 
-from attrs import field, frozen
+from attrs import Attribute, field, frozen
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
@@ -36,9 +37,8 @@ from sonar_imm.nodes.qos import lockstep_qos, output_qos, transforms_qos
 from sonar_imm.parameters import ConfigError, did_you_mean
 
 from ..recordings.reader import BagError, BagReader
-from .chain import Chain
 from .link import Link, MATCH_LIMIT
-from .lockstep import LockStep, only_node
+from .lockstep import Chain, LockStep, only_node
 
 NAME = 'sonar_imm_player'
 _FIRST_LISTENER, _OTHER_LISTENERS = 5.0, 0.5
@@ -46,12 +46,12 @@ _DEPTH = 100
 _NANO = 10**9
 
 
-def _positive(instance: PlayOptions, attribute: object, value: float | None) -> None:
+def _positive(instance: PlayOptions, attribute: Attribute[Any], value: float | None) -> None:
     if value is not None and not 0.0 < value < float('inf'):
         raise ConfigError(f'the {attribute.name} must be positive, got {value:g}')
 
 
-def _not_negative(instance: PlayOptions, attribute: object, value: float) -> None:
+def _not_negative(instance: PlayOptions, attribute: Attribute[Any], value: float) -> None:
     if not 0.0 <= value < float('inf'):
         raise ConfigError(f'the {attribute.name} must not be negative, got {value:g}')
 
@@ -223,7 +223,7 @@ class Player:
             pace = pace or Pace(item.log_ns, self._options.rate)
             self._wait(pace, item.log_ns, paced=not stepped)
             publisher = self._publishers[item.topic]
-            if publisher.topic_name in stepped:
+            if self._lockstep and publisher.topic_name in stepped:
                 self._lockstep.step(publisher, self._bag.cdr(item))
             else:
                 publisher.publish(self._bag.cdr(item))

@@ -51,10 +51,10 @@ class Scenario(Config):
             )
         return cls.from_mapping({**scenarios[name][1], **(overrides or {})})
 
-    def told(self) -> dict[str, Any]:
+    def instruments(self) -> dict[str, Any]:
         """What a tracker has to know of the instruments, by the names of its parameters."""
         return {name: getattr(self, name) for name in self.INSTRUMENT}
 
-    def told_feeder(self) -> dict[str, Any]:
+    def feeder_instruments(self) -> dict[str, Any]:
         """What a node before that of the tracker has to know of the instruments."""
         return {}

@@ -50,7 +50,7 @@ def write_layout(file: Path, system: str, topics: Sequence[str]) -> None:
         if topic.startswith(own):
             topic = namespace + topic
         elif topic not in topics:
-            same = [one for one in topics if one.endswith(topic)]
+            same = [name for name in topics if name.endswith(topic)]
             topic = same[0] if len(same) == 1 else topic
         return topic + dot + rest
 
@@ -64,7 +64,9 @@ def _estimates(system: str, topics: Sequence[str]) -> list[str]:
 def _with_names(value: Any, renamed: Any) -> Any:
     """The same tree; every text that is a topic, with a field or without, is `renamed`."""
     if isinstance(value, dict):
-        return {_with_names(key, renamed): _with_names(one, renamed) for key, one in value.items()}
+        return {
+            _with_names(key, renamed): _with_names(item, renamed) for key, item in value.items()
+        }
     if isinstance(value, list):
-        return [_with_names(one, renamed) for one in value]
+        return [_with_names(item, renamed) for item in value]
     return renamed(value) if isinstance(value, str) and value.startswith('/') else value

@@ -31,6 +31,7 @@ from foxglove.websocket import (
     PlaybackControlRequest,
     PlaybackState,
     PlaybackStatus,
+    ServerListener,
 )
 
 from .material import Channel, Shown
@@ -98,13 +99,15 @@ class ViewServer:
 
     def advertise(self, channels: Iterable[Channel]) -> None:
         """Offer topics; one that is offered already is left as it is."""
-        for one in channels:
-            if one.topic not in self._channels:
-                self._channels[one.topic] = foxglove.Channel(
-                    one.topic,
+        for channel in channels:
+            if channel.topic not in self._channels:
+                self._channels[channel.topic] = foxglove.Channel(
+                    channel.topic,
                     message_encoding='cdr',
                     schema=foxglove.Schema(
-                        name=one.type_name, encoding='ros2msg', data=one.definition.encode()
+                        name=channel.type_name,
+                        encoding='ros2msg',
+                        data=channel.definition.encode(),
                     ),
                     context=self._context,
                 )
@@ -130,7 +133,7 @@ class ViewServer:
         self._server.broadcast_playback_state(_playback_state(state, None))
 
 
-class _Listener:
+class _Listener(ServerListener):
     """What viewers ask for; called from the threads of the server."""
 
     def __init__(self, playback: Playback | None, autostart: bool):

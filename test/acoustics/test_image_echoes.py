@@ -20,8 +20,7 @@ from attrs import evolve
 import numpy as np
 import pytest
 
-from sonar_imm.acoustics.image_echo_kernels import joined_parts
-from sonar_imm.acoustics.image_echoes import EchoRules, find_echoes
+from sonar_imm.acoustics.image_echoes import EchoRules, find_echoes, joined_parts
 
 RANGE = 10.0 + 0.1 * np.arange(300)
 BEARING = np.radians(np.linspace(-20.0, 20.0, 161))
@@ -46,12 +45,14 @@ def image(*points, seed=0, sidelobes=0.0):
     noise = np.apply_along_axis(np.convolve, 1, noise, pulse, 'same')
     noise *= np.sqrt(0.5 / (np.square(beam).sum() * np.square(pulse).sum()))
     total = noise[0] + 1j * noise[1]
-    for one in points:
-        across = np.exp(-2.0 * np.log(2.0) * np.square((BEARING - one.bearing) / RULES.beam_width))
+    for point in points:
+        across = np.exp(
+            -2.0 * np.log(2.0) * np.square((BEARING - point.bearing) / RULES.beam_width)
+        )
         across = np.maximum(across, sidelobes)
-        along = np.exp(-2.0 * np.log(2.0) * np.square((RANGE - one.range) / 0.3))
+        along = np.exp(-2.0 * np.log(2.0) * np.square((RANGE - point.range) / 0.3))
         phase = np.exp(2j * np.pi * rng.uniform())
-        total += 10.0 ** (one.snr_db / 20.0) * phase * along[:, None] * across
+        total += 10.0 ** (point.snr_db / 20.0) * phase * along[:, None] * across
     return np.abs(total)
 
 

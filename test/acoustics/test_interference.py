@@ -13,6 +13,7 @@
 # limitations under the License.
 
 import numpy as np
+from oracles.array_likelihood import interfered_log_likelihood, log_likelihood
 import pytest
 
 from sonar_imm.acoustics import array, interference, laplace, likelihood_kernels
@@ -59,9 +60,7 @@ def test_the_compiled_likelihood_is_that_of_linear_algebra(scene, likelihood):
             np.empty((4, len(u))),
             out,
         )
-        expected = interference.interfered_log_likelihood(
-            u, y[n], signal, covariance[n], STEP, likelihood
-        )
+        expected = interfered_log_likelihood(u, y[n], signal, covariance[n], STEP, likelihood)
         assert out[-1] == expected[-1] == -np.inf
         assert np.allclose(out[:-1], expected[:-1], rtol=3e-7, atol=1e-6)
 
@@ -72,8 +71,8 @@ def test_without_interferers_it_is_the_plain_law(scene):
     form = interference.interference_form(y, covariance)
     assert np.allclose(form.log_determinant, STAVES * np.log(NOISE))
     u = np.linspace(-0.9, 0.9, 31)
-    plain = laplace.log_likelihood(u, y[0], 7.0, NOISE[0], STEP)
-    other = interference.interfered_log_likelihood(u, y[0], 7.0, covariance[0], STEP)
+    plain = log_likelihood(u, y[0], 7.0, NOISE[0], STEP)
+    other = interfered_log_likelihood(u, y[0], 7.0, covariance[0], STEP)
     assert np.ptp(plain - other) < 1e-9
 
 
@@ -86,8 +85,8 @@ def test_an_interferer_no_longer_draws_the_likelihood():
         s = 10.0 * np.exp(2j * np.pi * rng.uniform(size=2)) * [1.0, 3.0]
         y = s[0] * array.steering(0.2, 8, 0.5) + s[1] * array.steering(-0.6, 8, 0.5)
         y += (rng.normal(size=8) + 1j * rng.normal(size=8)) / np.sqrt(2.0)
-        told = interference.interfered_log_likelihood(grid, y, 100.0, covariance, STEP)
-        found.append(grid[told.argmax()])
-        drawn.append(grid[laplace.log_likelihood(grid, y, 100.0, 1.0, STEP).argmax()])
+        likelihood = interfered_log_likelihood(grid, y, 100.0, covariance, STEP)
+        found.append(grid[likelihood.argmax()])
+        drawn.append(grid[log_likelihood(grid, y, 100.0, 1.0, STEP).argmax()])
     assert np.abs(np.array(found) - 0.2).max() < 0.06
     assert np.abs(np.median(drawn) + 0.6) < 0.06

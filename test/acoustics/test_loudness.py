@@ -59,8 +59,8 @@ def test_a_burst_is_none_of_the_floor_and_an_edge_is_no_burst():
     power[[60, 61, 300]] = [1e3, 1e3, 1e7]
     assert loudness.bursts(power)[[60, 61, 300]].all()
     usable = np.ones(400, bool)
-    heard = loudness.loud_bins(power, 5.0, bins=5, usable=usable)
-    assert heard[210:].mean() > 0.95 and not heard[[60, 61, 300]].any()
+    loud = loudness.loud_bins(power, 5.0, bins=5, usable=usable)
+    assert loud[210:].mean() > 0.95 and not loud[[60, 61, 300]].any()
     usable[350] = False
     assert not loudness.loud_bins(power, 5.0, bins=5, usable=usable)[350]
 
@@ -108,5 +108,5 @@ def test_coherence_alone_takes_a_loud_diffuse_floor_for_noise():
     assert coherence.silent_bins(gamma_of, 2, spacing=2.0).mean() > 0.5
     power = variances.mean_power(iq)
     level = loudness.loud_level(2, 5, 1e-3)
-    heard = loudness.loud_bins(power, level, bins=5, usable=np.ones(2000, bool))
-    assert heard.mean() > 0.97
+    loud = loudness.loud_bins(power, level, bins=5, usable=np.ones(2000, bool))
+    assert loud.mean() > 0.97

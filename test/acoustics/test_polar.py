@@ -18,10 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 from numpy.testing import assert_allclose
+from oracles.polar import linearised_polar_to_cartesian
 import pytest
 from scipy.stats import chi2
 
-from sonar_imm.acoustics.polar import linearised_polar_to_cartesian, unbiased_polar_to_cartesian
+from sonar_imm.acoustics.polar import unbiased_polar_to_cartesian
 
 SIGMA_RANGE, SIGMA_BEARING = 0.1, np.radians(2.0)
 

@@ -27,7 +27,7 @@ GRID = np.linspace(-0.9, 0.9, 361)
 @pytest.fixture(scope='module')
 def pings():
     scene = simulate(scenario('paper', {'pings': 24}), 11)
-    return [(one.measurement, true) for one, true in zip(scene.measurements, scene.truth)]
+    return [(entry.measurement, true) for entry, true in zip(scene.measurements, scene.truth)]
 
 
 def plane_waves(u, staves=8, spacing=0.5, noise=0.01, conjugate=False, seed=0):
@@ -89,17 +89,17 @@ def test_phase_difference_of_any_pair():
     u = np.linspace(-0.4, 0.4, 25)
     for pair, spacing, conjugate in (((0, 1), 0.5, False), ((3, 5), 0.3, True)):
         iq = plane_waves(u, spacing=spacing, noise=1e-6, conjugate=conjugate)
-        told = spatial.phase_difference_sines(
+        sines = spatial.phase_difference_sines(
             iq, spacing, pair=pair, half_width=0, conjugate=conjugate
         )
-        assert np.allclose(told, u, atol=1e-4)
+        assert np.allclose(sines, u, atol=1e-4)
 
 
 def test_spoilt_bins_are_left_out():
     iq = plane_waves(np.full(40, 0.2))
     iq[10:15, 2], iq[30] = np.nan, 0.0
-    told = spatial.phase_difference_sines(iq, 0.5, half_width=3)
-    assert np.isfinite(told).all() and np.abs(told - 0.2).max() < 0.02
+    sines = spatial.phase_difference_sines(iq, 0.5, half_width=3)
+    assert np.isfinite(sines).all() and np.abs(sines - 0.2).max() < 0.02
     for method in spatial.SPECTRA:
         spectrum = spatial.ping_spectrum(iq, GRID, 0.5, method=method, half_width=3)
         assert np.abs(spatial.peak_sines(spectrum, GRID) - 0.2).max() < 0.01

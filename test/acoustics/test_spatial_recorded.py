@@ -81,10 +81,10 @@ def test_power_hears_the_floor_that_coherence_takes_for_noise(ping):
     ratio = power / power[water].mean()
     level = loudness.loud_level(2, coherence.GATE_BINS, 1e-3)
     usable = np.ones(len(ranges), bool)
-    heard = loudness.loud_bins(ratio, level, bins=coherence.GATE_BINS, usable=usable)
+    loud = loudness.loud_bins(ratio, level, bins=coherence.GATE_BINS, usable=usable)
     floor = (ratio > loudness.VERY_LOUD) & (ranges > 12.0)
     assert floor.sum() > 150 and silent[floor].mean() > 0.85  # 20 to 78 dB above the noise
-    assert heard[floor].mean() > 0.98
-    assert silent[water].all() and heard[water].mean() < 0.005
+    assert loud[floor].mean() > 0.98
+    assert silent[water].all() and loud[water].mean() < 0.005
     # A diffuse floor: a quarter of its power differs between the halves.
     assert 0.1 < variances.decorrelation(iq, floor) < 0.35

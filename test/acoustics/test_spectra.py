@@ -73,20 +73,20 @@ def test_a_restart_forgets_half_a_snapshot():
 def test_block_averages_share_no_sample():
     spectra = spectra_of(pressure())
     average = BlockAverage(5, 1)
-    done = [one for part in np.split(spectra, [1, 8, 9]) for one in average.push(part)]
+    done = [made for part in np.split(spectra, [1, 8, 9]) for made in average.push(part)]
     assert len(done) == (len(spectra) + 1) // 6
-    for k, one in enumerate(done):
-        assert one.csdm == pytest.approx(outer_sum(spectra[6 * k : 6 * k + 5]) / 5, rel=1e-5)
-        assert one.snapshots == 5
+    for k, made in enumerate(done):
+        assert made.csdm == pytest.approx(outer_sum(spectra[6 * k : 6 * k + 5]) / 5, rel=1e-5)
+        assert made.snapshots == 5
 
 
 def test_sliding_averages_are_of_the_last_snapshots():
     spectra = spectra_of(pressure())
     average = SlidingAverage(10, 4)
-    done = [one for part in np.split(spectra, [3, 11]) for one in average.push(part)]
+    done = [made for part in np.split(spectra, [3, 11]) for made in average.push(part)]
     assert len(done) == (len(spectra) - 10) // 4 + 1
-    for k, one in enumerate(done):
-        assert one.csdm == pytest.approx(outer_sum(spectra[4 * k : 4 * k + 10]) / 10, rel=1e-5)
+    for k, made in enumerate(done):
+        assert made.csdm == pytest.approx(outer_sum(spectra[4 * k : 4 * k + 10]) / 10, rel=1e-5)
 
 
 def test_windows_have_unit_power_and_the_autocorrelation_they_claim():

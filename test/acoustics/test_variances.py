@@ -23,7 +23,7 @@ from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
 @pytest.fixture(scope='module')
 def pings():
     scene = simulate(scenario('paper', {'pings': 12}), 7)
-    return [(one.measurement, true) for one, true in zip(scene.measurements, scene.truth)]
+    return [(entry.measurement, true) for entry, true in zip(scene.measurements, scene.truth)]
 
 
 def test_moving_mean_over_usable_rows_only():
@@ -64,9 +64,9 @@ def test_silence_leaves_a_floor_and_spoilt_bins_do_not_count(pings):
     usable[500] = False
     spoilt = power.copy()
     spoilt[500] = np.nan
-    told = variances.signal_variance(spoilt, 1.0, usable=usable)
-    assert np.isfinite(told).all() and np.abs(10.0 * np.log10(told / clean)).max() < 6.0
-    assert (told[:490] == clean[:490]).all()
+    found = variances.signal_variance(spoilt, 1.0, usable=usable)
+    assert np.isfinite(found).all() and np.abs(10.0 * np.log10(found / clean)).max() < 6.0
+    assert (found[:490] == clean[:490]).all()
 
 
 def test_noise_from_the_water_column():
@@ -78,6 +78,6 @@ def test_noise_from_the_water_column():
 
 
 def test_blind_noise_is_right_within_two_decibels(pings):
-    told = [variances.blind_noise_variance(ping.iq) for ping, _ in pings]
-    assert np.abs(10.0 * np.log10(told)).max() < 2.0
+    found = [variances.blind_noise_variance(ping.iq) for ping, _ in pings]
+    assert np.abs(10.0 * np.log10(found)).max() < 2.0
     assert np.isnan(variances.blind_noise_variance(pings[0][0].iq[:5]))

@@ -31,20 +31,20 @@ LIMITS = {
 @pytest.mark.parametrize('system', LIMITS)
 def test_a_tracker_grows_and_slows_no_more_once_it_is_warm(system):
     hours, limit = LIMITS[system]
-    told = soak.offline(system, hours)
-    assert told['messages'] > 50 and told['uncounted'] == 0
-    assert told['grown_mb'] < limit
-    assert told['p50_last_ms'] < 3.0 * told['p50_first_ms'] + 1.0
+    result = soak.offline(system, hours)
+    assert result['messages'] > 50 and result['uncounted'] == 0
+    assert result['grown_mb'] < limit
+    assert result['p50_last_ms'] < 3.0 * result['p50_first_ms'] + 1.0
 
 
 def test_growth_and_slowing_down_show():
     hours = np.linspace(0.0, 2.0, 200)
     memory = list(zip(hours, 100.0 + 3.0 * hours))
     times = np.linspace(1e-3, 5e-3, 1000)
-    told = soak.summary(memory, times, sent=1000, counted=998)
-    assert told['slope_mb_per_h'] == pytest.approx(3.0)
-    assert told['slope_low'] == pytest.approx(3.0) and 2.0 < told['grown_mb'] < 3.1
-    assert told['uncounted'] == 2 and told['p99_last_ms'] > 3.0 * told['p99_first_ms']
+    result = soak.summary(memory, times, sent=1000, counted=998)
+    assert result['slope_mb_per_h'] == pytest.approx(3.0)
+    assert result['slope_low'] == pytest.approx(3.0) and 2.0 < result['grown_mb'] < 3.1
+    assert result['uncounted'] == 2 and result['p99_last_ms'] > 3.0 * result['p99_first_ms']
 
 
 def test_stamps_go_on_from_one_turn_to_the_next():

@@ -112,7 +112,7 @@ def test_a_node_that_loses_messages_or_dies_is_found_out(check, said, name):
 
 
 def test_a_recording_may_state_its_own_limit(check, dive):
-    from sonar_imm_tools.recordings.own_limit import write_own_limit
+    from sonar_imm_tools.recordings.own_files import write_own_limit
 
     try:
         write_own_limit(dive, 0.001)

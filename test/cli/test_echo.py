@@ -23,14 +23,14 @@ import pytest
 pytest.importorskip('rclpy')
 
 from sonar_imm_tools.cli.echo import json_line, readable, text_lines  # noqa: E402
-from sonar_imm_tools.replay.listening import HeardTable  # noqa: E402
+from sonar_imm_tools.replay.listening import ReceivedTable  # noqa: E402
 
 ESTIMATE = single_run(count=20)[0][-1]
 
 
 def table(columns, **more):
     given = {'stamp_ns': 1_700_000_000_250_000_000, 'frame_id': 'map', **more}
-    return HeardTable(topic='/diver/estimate', columns=columns, **given)
+    return ReceivedTable(topic='/diver/estimate', columns=columns, **given)
 
 
 def test_a_state_stands_with_its_deviation_and_the_models_as_the_most_probable_one():
@@ -64,8 +64,8 @@ def test_any_table_is_shown_with_its_first_rows():
 def test_tables_without_rows_and_messages_that_are_none():
     assert len(text_lines(table({'x': np.zeros(0)}), 3)) == 2
     assert text_lines(table({}), 3) == [text_lines(table({}), 3)[0]]
-    assert text_lines(HeardTable(topic='/a', problem='it is broken'), 3) == ['/a: it is broken']
-    assert json.loads(json_line(HeardTable(topic='/a', problem='no')))['problem'] == 'no'
+    assert text_lines(ReceivedTable(topic='/a', problem='it is broken'), 3) == ['/a: it is broken']
+    assert json.loads(json_line(ReceivedTable(topic='/a', problem='no')))['problem'] == 'no'
 
 
 def test_json_has_all_columns_with_their_types():

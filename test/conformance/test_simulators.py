@@ -68,7 +68,7 @@ def test_the_truth_is_a_table_a_stamp_that_draws(system, scenes):
 
 def test_the_tracker_takes_what_the_scene_tells_of_its_instruments(system, scenes):
     config, scene = small_scene(system, 3)
-    tracker = system.build(system.config_type()(**config.told()))
+    tracker = system.build(system.config_type()(**config.instruments()))
     for item in scene.measurements:
         tracker.process(item.measurement)
     assert tracker.counts['used'] > 0 and not tracker.counts['unknown_type']

@@ -15,17 +15,16 @@
 """Learning transitions: the printed formulas, irregular steps, and that it learns what is true."""
 
 import numpy as np
+from oracles.adaptation import adapt_counts, counts_correction, transition_posterior
 import pytest
 
 from sonar_imm.estimation import markov
 from sonar_imm.estimation.adaptation import (
-    adapt_counts,
     AdaptiveChain,
     corrected,
-    counts_correction,
-    transition_posterior,
+    counts_transition,
+    learn_counts,
 )
-from sonar_imm.estimation.adaptation_kernels import counts_transition, learn_counts
 
 PRIOR = np.array([[0.8, 0.15, 0.05], [0.3, 0.5, 0.2], [0.1, 0.2, 0.7]])
 

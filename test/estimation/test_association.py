@@ -21,20 +21,19 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import chi2
 
+from sonar_imm.estimation import imm
 from sonar_imm.estimation.association import (
     assign,
     assign_by_rank,
     association_cost,
-    gate,
+    choose,
     gate_threshold,
     TrackRules,
     Tracks,
     TrackStatus,
 )
-from sonar_imm.estimation.association_kernels import choose
-from sonar_imm.estimation.kalman import CovarianceError
 
 RULES = TrackRules(confirm_hits=3, confirm_window=5, delete_misses=2, max_coast_ns=100)
 
@@ -47,43 +46,6 @@ def covariances(rng, count, n=2):
 @pytest.mark.parametrize('dimension', [1, 2, 3])
 def test_gate_threshold_is_the_quantile(dimension):
     assert chi2.cdf(gate_threshold(0.99, dimension), dimension) == pytest.approx(0.99, abs=1e-12)
-
-
-@pytest.mark.parametrize('spread', [3.0, 30.0, 300.0])
-@pytest.mark.parametrize('n', [1, 2, 3])
-def test_gate_finds_exactly_the_pairs_a_dense_table_finds(spread, n):
-    rng = np.random.default_rng(int(spread) + n)
-    predicted, detections = rng.normal(size=(30, n)) * spread, rng.normal(size=(40, n)) * spread
-    covariance, R = covariances(rng, 30, n), covariances(rng, 40, n)
-    pairs = gate(predicted, covariance, detections, R, gate_threshold(0.99, n))
-    expected = []
-    for t, d in itertools.product(range(30), range(40)):
-        S, nu = covariance[t] + R[d], detections[d] - predicted[t]
-        if nu @ np.linalg.inv(S) @ nu <= gate_threshold(0.99, n):
-            expected.append((t, d, multivariate_normal(cov=S).logpdf(nu)))
-    assert list(zip(pairs.target, pairs.detection)) == [(t, d) for t, d, _ in expected]
-    np.testing.assert_allclose(pairs.log_likelihood, [log for *_, log in expected], rtol=1e-9)
-
-
-@pytest.mark.parametrize('targets, detections', [(0, 0), (3, 0), (0, 3)])
-def test_gate_of_nothing_is_nothing(targets, detections):
-    pairs = gate(
-        np.zeros((targets, 2)),
-        np.tile(np.eye(2), (targets, 1, 1)),
-        np.zeros((detections, 2)),
-        np.eye(2),
-        9.0,
-    )
-    assert [len(part) for part in pairs] == [0] * 4
-    assert (
-        list(assign(pairs.target, pairs.detection, pairs.nis, targets, detections))
-        == [-1] * targets
-    )
-
-
-def test_gate_names_a_singular_innovation():
-    with pytest.raises(CovarianceError):
-        gate(np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2)), np.zeros((2, 2)), 9.0)
 
 
 def brute_force(table):
@@ -198,9 +160,13 @@ def test_nearest_in_all_beats_nearest_for_each():
     """Two targets, the left detection near both: greedy leaves one target without, global does
     not."""
     predicted, detections = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.9, 0.0], [2.0, 0.0]])
-    pairs = gate(predicted, np.tile(np.eye(2), (2, 1, 1)), detections, 0.1 * np.eye(2), 9.0)
-    cost = association_cost(pairs.log_likelihood, 0.9, 1e-6)
-    assert list(assign(pairs.target, pairs.detection, cost, 2, 2)) == [0, 1]
+    P, R = np.tile(np.eye(2), (2, 1, 1, 1)), np.tile(0.1 * np.eye(2), (2, 1, 1))
+    fit = imm.gate(
+        predicted[:, None], np.eye(2)[None, None], P, np.ones((2, 1)), detections, R, 9.0
+    )
+    target, detection = imm.pairs_inside(fit)
+    cost = association_cost(fit[target, detection], 0.9, 1e-6)
+    assert list(assign(target, detection, cost, 2, 2)) == [0, 1]
 
 
 # -- life of tracks -------------------------------------------------------------------------------

@@ -23,12 +23,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sonar_imm.estimation import kalman
 from sonar_imm.estimation.consistency import (
     average_bounds,
     gospa,
     identity_switches,
-    innovation_autocorrelation,
     interval_coverage,
     nees,
     nis,
@@ -69,35 +67,6 @@ def test_coverage_of_honest_and_of_boastful_intervals():
     boastful = interval_coverage(truth, -0.5 * half, 0.5 * half)
     assert boastful == pytest.approx(0.5892, abs=4.0 * np.sqrt(0.59 * 0.41 / 2000))
     assert np.isnan(interval_coverage(np.empty(0), np.empty(0), np.empty(0)))
-
-
-def filtered_innovations(rng, q, q_assumed):
-    """Innovations of a filter that assumes process noise `q_assumed` on a walk with `q`."""
-    F, H, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]]), np.eye(1)
-    shape = np.array([[0.25, 0.5], [0.5, 1.0]])
-    truth, x, P, nus, Ss = np.zeros(2), np.zeros(2), np.eye(2), [], []
-    for _ in range(600):
-        truth = F @ truth + np.array([0.5, 1.0]) * rng.normal() * np.sqrt(q)
-        x, P, _ = kalman.predict(x, P, F, q_assumed * shape)
-        nu = H @ truth + rng.normal(size=1) - H @ x
-        updated = kalman.update(x, P, nu, H, R)
-        x, P = updated.x, updated.P
-        nus.append(nu)
-        Ss.append(updated.innovation_covariance)
-    return np.array(nus), np.array(Ss)
-
-
-def test_whiteness_tells_a_good_filter_from_a_sluggish_one():
-    good = innovation_autocorrelation(
-        *filtered_innovations(np.random.default_rng(3), 0.1, 0.1), lags=20, probability=0.999
-    )
-    assert (np.abs(good.autocorrelation) < good.bound).all()
-    sluggish = innovation_autocorrelation(
-        *filtered_innovations(np.random.default_rng(3), 0.1, 1e-4), lags=20
-    )
-    assert sluggish.autocorrelation[0] > 5 * sluggish.bound
-    with pytest.raises(ValueError, match='too few'):
-        innovation_autocorrelation(np.zeros((5, 1)), np.ones((5, 1, 1)), lags=5)
 
 
 # -- sets of targets ------------------------------------------------------------------------------

@@ -23,7 +23,8 @@ import numpy as np
 import pytest
 
 from sonar_imm.estimation import imm, imm_kernels, kalman, small_matrices
-from sonar_imm.estimation.covariance import add_jitter, correct, is_psd, JITTER, LIMIT, propagate
+from sonar_imm.estimation.covariance import add_jitter, correct, is_psd, propagate
+from sonar_imm.estimation.small_matrices import JITTER, LIMIT
 from sonar_imm.trackers.obstacle import kernels as obstacle_kernels
 
 ROUNDING = 1e-14
@@ -123,9 +124,9 @@ def test_a_measurement_much_better_than_the_state(engine):
     P = np.diag([1e12, 1e12])[None, None]
     h = np.array([1.0, 1.0 + 1e-7])
     H, R = h[None, None, None], np.array([[[1e-6]]])
-    x, one = np.zeros((1, 1, 2)), np.ones((1, 1))
+    x, mu = np.zeros((1, 1, 2)), np.ones((1, 1))
     for k in range(1, 51):
-        out = engine.update(x, P, one, np.zeros((1, 1, 1)), H, R)
+        out = engine.update(x, P, mu, np.zeros((1, 1, 1)), H, R)
         x, P = out[:2]
         assert is_covariance(P)
         claimed = [Fraction(value) for value in P[0, 0].ravel()]
@@ -204,7 +205,7 @@ def test_ordinary_covariances_keep_their_bits():
     np.testing.assert_array_equal(lifted, P)
     assert not repaired.any()
     L = np.empty((4, 4))
-    assert not any(small_matrices.add_jitter(one, L) for one in lifted)
+    assert not any(small_matrices.add_jitter(each, L) for each in lifted)
 
 
 def test_a_lift_adds_no_more_than_it_must():

@@ -41,7 +41,7 @@ def test_what_is_impossible_is_zero():
 def test_a_row_gives_the_same_bits_however_it_is_cut():
     values = -np.random.default_rng(1).exponential(30.0, 101)
     whole = row(values)
-    assert all(row([value])[0] == one for value, one in zip(values, whole))
+    assert all(row([value])[0] == expected for value, expected in zip(values, whole))
 
 
 def bell(values):

@@ -15,9 +15,10 @@
 """Point masses: Kalman filter and smoother, the dense form, and the kernels on windows."""
 
 import numpy as np
+from oracles.grid import filter_densities, smooth_densities, walk_matrix
 import pytest
 
-from sonar_imm.estimation import grid, grid_kernels
+from sonar_imm.estimation import grid
 
 CELLS = np.arange(-400, 401) * 0.05
 STEP = 0.05
@@ -42,10 +43,10 @@ def test_one_model_is_the_kalman_filter_and_smoother():
     rng = np.random.default_rng(1)
     z, log_likelihood = measurements(rng)
     q, r = 0.2, 0.3
-    filtered = grid.filter_densities(
+    filtered = filter_densities(
         start([1.0]), np.eye(1), np.full((len(z), 1), q / STEP), log_likelihood
     )
-    smoothed = grid.smooth_densities(
+    smoothed = smooth_densities(
         filtered.density, np.eye(1), np.full((len(z), 1), q / STEP), log_likelihood
     )
     m, P, passes = 0.0, 1.0, []
@@ -67,7 +68,7 @@ def test_one_model_is_the_kalman_filter_and_smoother():
 def test_identical_models_leave_the_chain_alone():
     _, log_likelihood = measurements(np.random.default_rng(2), T=6)
     sigma = np.full((6, 2), 4.0)
-    density = grid.filter_densities(start([0.8, 0.2]), ASYMMETRIC, sigma, log_likelihood).density
+    density = filter_densities(start([0.8, 0.2]), ASYMMETRIC, sigma, log_likelihood).density
     mu = np.array([0.8, 0.2])
     for step in density:
         mu = mu @ ASYMMETRIC
@@ -79,11 +80,11 @@ def test_identical_models_leave_the_chain_alone():
 def test_the_walk_on_windows_is_the_walk_on_all_cells(sigma, low, high):
     p = np.zeros(801)
     p[low:high] = np.random.default_rng(3).random(high - low)
-    exact = p @ grid.walk_matrix(801, sigma)
+    exact = p @ walk_matrix(801, sigma)
     out, scratch = np.full(801, np.nan), np.full((7, 900), np.nan)
     out_low, out_high = 1, 797
     source = np.where((np.arange(801) >= low) & (np.arange(801) < high), p, np.nan)
-    grid_kernels.walk(source, low, high, sigma, scratch, out, out_low, out_high)
+    grid.walk(source, low, high, sigma, scratch, out, out_low, out_high)
     assert np.abs(out[out_low:out_high] - exact[out_low:out_high]).max() < 1e-4 * exact.max()
     assert np.isnan(out[:out_low]).all() and np.isnan(out[out_high:]).all()
 
@@ -94,10 +95,10 @@ def test_a_walk_wider_than_the_grid_stays_in_its_arrays(sigma, cells, low, high)
     p = np.zeros(cells)
     p[low:high] = np.random.default_rng(3).random(high - low)
     guarded, out = np.full((8, max(cells, 128) + 16), np.nan), np.empty(cells)
-    grid_kernels.walk(p, low, high, sigma, guarded[:7], out, 0, cells)
+    grid.walk(p, low, high, sigma, guarded[:7], out, 0, cells)
     assert np.isnan(guarded[7]).all()
-    assert grid_kernels.reach_of(sigma) > cells
-    widest = min(sigma, grid_kernels.WIDEST) if sigma > 0.0 else grid_kernels.WIDEST
+    assert grid.reach_of(sigma) > cells
+    widest = min(sigma, grid.WIDEST) if sigma > 0.0 else grid.WIDEST
     exact = p.sum() / (np.sqrt(2.0 * np.pi) * widest)
     if sigma > 100 * cells:
         assert out == pytest.approx(exact, rel=1e-3)
@@ -107,22 +108,22 @@ def test_a_walk_wider_than_the_grid_stays_in_its_arrays(sigma, cells, low, high)
         assert np.abs(out - exact).max() < 1e-4 * exact.max()
 
 
-def test_mix_update_and_combine_are_the_dense_ones():
+def test_mix_weigh_and_summarise_are_the_dense_ones():
     rng = np.random.default_rng(4)
     z, log_likelihood = measurements(rng, T=1)
     p = start([0.8, 0.2])
-    dense = grid.filter_densities(p, ASYMMETRIC, np.array([[2.0, 9.0]]), log_likelihood)
+    dense = filter_densities(p, ASYMMETRIC, np.array([[2.0, 9.0]]), log_likelihood)
     mixed, work, probability = np.empty_like(p), np.empty((2, 801)), np.empty(2)
-    grid_kernels.mix(p, 0, 801, ASYMMETRIC, mixed)
+    grid.mix(p, 0, 801, ASYMMETRIC, mixed)
     for j, sigma in enumerate((2.0, 9.0)):
-        grid_kernels.walk(mixed[j], 0, 801, sigma, np.empty((7, 900)), p[j], 0, 801)
-    log_sum = grid_kernels.update(p, 0, 801, log_likelihood[0].copy(), work)
+        grid.walk(mixed[j], 0, 801, sigma, np.empty((7, 900)), p[j], 0, 801)
+    log_sum = grid.weigh(p, 0, 801, log_likelihood[0].copy(), work)
     assert p == pytest.approx(dense.density[0], abs=1e-9)
     assert log_sum == pytest.approx(dense.log_likelihood[0], abs=1e-6)
-    mean, variance = grid_kernels.combine(p, 0, 801, CELLS, probability)
+    mean, variance = grid.summarise(p, 0, 801, CELLS, probability)
     assert probability == pytest.approx(dense.density[0].sum(axis=1))
     assert mean == pytest.approx(dense.density[0].sum(axis=0) @ CELLS)
-    low, high = grid_kernels.trim(p, 0, 801)
+    low, high = grid.trim(p, 0, 801)
     assert 0 < low < high < 801 and p[:, low:high].sum() == pytest.approx(1.0, abs=1e-12)
 
 
@@ -130,7 +131,7 @@ def test_mix_update_and_combine_are_the_dense_ones():
 def test_an_impossible_measurement_keeps_the_prediction(value):
     p = start([0.8, 0.2])
     before = p.copy()
-    assert grid_kernels.update(p, 0, 801, np.full(801, value), np.empty((2, 801))) == -np.inf
+    assert grid.weigh(p, 0, 801, np.full(801, value), np.empty((2, 801))) == -np.inf
     assert p == pytest.approx(before)
 
 
@@ -142,7 +143,7 @@ def test_the_smoother_is_the_sum_over_all_paths():
     sigma, log_likelihood = rng.uniform(0.4, 1.0, (T, M)), rng.normal(size=(T, G))
     total = np.zeros((T, M, G))
     states = [(i, g) for i in range(M) for g in range(G)]
-    walks = [[grid.walk_matrix(G, sigma[t, j]) for j in range(M)] for t in range(T)]
+    walks = [[walk_matrix(G, sigma[t, j]) for j in range(M)] for t in range(T)]
     for s0 in states:
         for s1 in states:
             for s2 in states:
@@ -155,18 +156,16 @@ def test_the_smoother_is_the_sum_over_all_paths():
                     for t in range(T):
                         total[t][path[t + 1]] += weight
     total /= total.sum(axis=(1, 2), keepdims=True)
-    density = grid.filter_densities(p0, ASYMMETRIC, sigma, log_likelihood).density
+    density = filter_densities(p0, ASYMMETRIC, sigma, log_likelihood).density
     assert density[-1] == pytest.approx(total[-1])
-    assert grid.smooth_densities(density, ASYMMETRIC, sigma, log_likelihood) == pytest.approx(
-        total
-    )
+    assert smooth_densities(density, ASYMMETRIC, sigma, log_likelihood) == pytest.approx(total)
 
 
 @pytest.mark.parametrize('sigma', [0.05, 0.3, 0.49])
 def test_a_walk_narrower_than_a_cell_keeps_its_variance(sigma):
-    W = grid.walk_matrix(9, sigma)
+    W = walk_matrix(9, sigma)
     place = np.arange(9) - 4
     assert W[4] @ np.square(place) == pytest.approx(sigma**2) and W[4].sum() == pytest.approx(1.0)
     out, scratch = np.empty(9), np.empty((7, 144))
-    grid_kernels.walk(np.eye(9)[4], 0, 9, sigma, scratch, out, 0, 9)
+    grid.walk(np.eye(9)[4], 0, 9, sigma, scratch, out, 0, 9)
     assert out == pytest.approx(W[4], abs=1e-15)

@@ -66,7 +66,7 @@ def bounded_shuffles(draw):
         )
         for stamp in stamps
     ]
-    sent.sort(key=lambda one: (one[0] + one[2], one[3]))
+    sent.sort(key=lambda entry: (entry[0] + entry[2], entry[3]))
     return window, [(stamp, key) for stamp, key, _, _ in sent]
 
 

@@ -20,9 +20,10 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from oracles.markov import stationary_law
 import pytest
 
-from sonar_imm.estimation import imm, imm_kernels, kalman, markov
+from sonar_imm.estimation import imm, imm_kernels, kalman
 from sonar_imm.estimation.adaptation import AdaptiveChain
 
 ENGINES = [imm, imm_kernels]
@@ -242,15 +243,15 @@ def test_one_model_is_the_kalman_filter(engine):
 @pytest.mark.parametrize('engine', ENGINES)
 def test_identical_models_are_one_filter_and_the_chain_runs_free(engine):
     rng = np.random.default_rng(6)
-    one = random_bank(rng, T=1, M=1)
-    bank = {key: np.repeat(one[key], 3, axis=0) for key in ('F', 'Q', 'B')}
-    H = np.repeat(one['H'], 3, axis=1)
+    alone = random_bank(rng, T=1, M=1)
+    bank = {key: np.repeat(alone[key], 3, axis=0) for key in ('F', 'Q', 'B')}
+    H = np.repeat(alone['H'], 3, axis=1)
     state = (
-        np.repeat(one['x'], 3, axis=1),
-        np.repeat(one['P'], 3, axis=1),
+        np.repeat(alone['x'], 3, axis=1),
+        np.repeat(alone['P'], 3, axis=1),
         np.array([[0.2, 0.5, 0.3]]),
     )
-    single = one['x'], one['P'], np.ones((1, 1))
+    single = alone['x'], alone['P'], np.ones((1, 1))
     law = np.array([0.2, 0.5, 0.3])
     for z in rng.normal(size=(200, 2)):
         *state, _, _ = cycle(
@@ -262,23 +263,23 @@ def test_identical_models_are_one_filter_and_the_chain_runs_free(engine):
             bank['B'],
             z,
             H[0],
-            one['R'][0],
+            alone['R'][0],
         )
         *single, _, _ = cycle(
             engine,
             *single,
             np.ones((1, 1, 1)),
-            one['F'] * 0.9,
-            one['Q'],
-            one['B'],
+            alone['F'] * 0.9,
+            alone['Q'],
+            alone['B'],
             z,
-            one['H'][0],
-            one['R'][0],
+            alone['H'][0],
+            alone['R'][0],
         )
         law = law @ ASYMMETRIC
         np.testing.assert_allclose(state[2][0], law, atol=1e-11)
         np.testing.assert_allclose(state[0][0, 1], single[0][0, 0], rtol=1e-7, atol=1e-7)
-    np.testing.assert_allclose(state[2][0], markov.stationary_law(ASYMMETRIC), atol=1e-11)
+    np.testing.assert_allclose(state[2][0], stationary_law(ASYMMETRIC), atol=1e-11)
 
 
 @pytest.mark.parametrize('engine', ENGINES)
@@ -297,7 +298,7 @@ def test_missed_scans_move_the_chain_and_nothing_else(engine):
             bank['H'][0],
             bank['R'][0],
         )
-    np.testing.assert_allclose(state[2][0], markov.stationary_law(ASYMMETRIC), atol=1e-12)
+    np.testing.assert_allclose(state[2][0], stationary_law(ASYMMETRIC), atol=1e-12)
 
 
 @pytest.mark.parametrize('engine', ENGINES)

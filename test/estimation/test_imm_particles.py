@@ -17,9 +17,11 @@
 from pathlib import Path
 
 import numpy as np
+from oracles import imm_particles as oracle
+from oracles.markov import stationary_law
 import pytest
 
-from sonar_imm.estimation import imm_particles, imm_particles_kernels, markov, particles
+from sonar_imm.estimation import imm_particles, particles
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'bathymetry'
 ASYMMETRIC = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
@@ -34,42 +36,42 @@ def random_set(rng, M=3, n=2, N=50):
 
 
 class Kernels:
-    """The kernels with the signatures of `imm_particles`."""
+    """The kernels with the signatures of the oracle."""
 
     @staticmethod
-    def mix(x, w, mu, transition, uniform):
+    def resample(x, w, mu, transition, uniform):
         M, n, N = x.shape
         mixed, c = np.empty_like(x), np.empty(M)
-        scratch = imm_particles_kernels.MixScratch(
+        scratch = imm_particles.ResampleScratch(
             np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64)
         )
-        imm_particles_kernels.mix(x, w, mu, transition, uniform, scratch, mixed, c)
+        imm_particles.resample(x, w, mu, transition, uniform, scratch, mixed, c)
         return mixed, c
 
     @staticmethod
-    def predict(x, F, G, noise):
+    def propagate(x, F, G, noise):
         moved = np.empty_like(x)
         for j in range(len(x)):
-            imm_particles_kernels.predict(x[j], F[j], G[j], noise[j], moved[j])
+            imm_particles.propagate(x[j], F[j], G[j], noise[j], moved[j])
         return moved
 
     @staticmethod
-    def update(log_likelihood, c, w=None):
+    def weigh(log_likelihood, c, w=None):
         M, N = log_likelihood.shape
         w = np.full((M, N), 1.0 / N) if w is None else w.copy()
         mu, work = np.empty(M), np.empty((2, N))
-        log_sum = imm_particles_kernels.update(log_likelihood.copy(), c, w, mu, work)
-        return imm_particles.WeightUpdate(w, mu, log_sum, log_sum > -np.inf)
+        log_sum = imm_particles.weigh(log_likelihood.copy(), c, w, mu, work)
+        return oracle.WeightUpdate(w, mu, log_sum, log_sum > -np.inf)
 
     @staticmethod
-    def combine(x, w, mu):
+    def summarise(x, w, mu):
         n = x.shape[1]
         mean, covariance = np.empty(n), np.empty((n, n))
-        imm_particles_kernels.combine(x, w, mu, mean, covariance)
+        imm_particles.summarise(x, w, mu, mean, covariance)
         return mean, covariance
 
 
-engines = pytest.mark.parametrize('engine', [imm_particles, Kernels], ids=['numpy', 'kernels'])
+engines = pytest.mark.parametrize('engine', [oracle, Kernels], ids=['numpy', 'kernels'])
 
 
 @pytest.mark.parametrize('seed', range(20))
@@ -81,28 +83,28 @@ def test_kernels_give_the_bits_of_numpy(seed):
     log_likelihood = -rng.exponential(20.0, (3, 50))
     log_likelihood[0, :3] = np.nan, -np.inf, -5000.0
     results = []
-    for engine in (imm_particles, Kernels):
-        mixed, c = engine.mix(x, w, mu, ASYMMETRIC, uniform)
-        moved = engine.predict(mixed, F, G, noise)
-        step = engine.update(log_likelihood, c, w)
-        results.append([mixed, c, moved, *step, *engine.combine(moved, step.w, step.mu)])
-    for one, other in zip(*results):
-        assert np.array_equal(one, other)
+    for engine in (oracle, Kernels):
+        mixed, c = engine.resample(x, w, mu, ASYMMETRIC, uniform)
+        moved = engine.propagate(mixed, F, G, noise)
+        step = engine.weigh(log_likelihood, c, w)
+        results.append([mixed, c, moved, *step, *engine.summarise(moved, step.w, step.mu)])
+    for expected, found in zip(*results):
+        assert np.array_equal(expected, found)
 
 
 @engines
-def test_mixing_draws_from_the_exact_mixture(engine):
+def test_resampling_draws_from_the_exact_mixture(engine):
     rng = np.random.default_rng(3)
     x, w, mu = random_set(rng, n=1)
     runs = np.stack(
-        [engine.mix(x, w, mu, ASYMMETRIC, rng.random(3))[0].mean(axis=2) for _ in range(4000)]
+        [engine.resample(x, w, mu, ASYMMETRIC, rng.random(3))[0].mean(axis=2) for _ in range(4000)]
     )
     own = particles.mean(x, w)
     c = mu @ ASYMMETRIC
     expected = (ASYMMETRIC * mu[:, None]).T @ own / c[:, None]
     error = runs.std(axis=0) / np.sqrt(len(runs))
     assert (np.abs(runs.mean(axis=0) - expected) < 4.5 * error).all()
-    assert engine.mix(x, w, mu, ASYMMETRIC, rng.random(3))[1] == pytest.approx(c)
+    assert engine.resample(x, w, mu, ASYMMETRIC, rng.random(3))[1] == pytest.approx(c)
 
 
 @engines
@@ -110,7 +112,7 @@ def test_a_model_that_nothing_can_become_stays_finite(engine):
     rng = np.random.default_rng(4)
     x, w, mu = random_set(rng)
     closed = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
-    mixed, c = engine.mix(x, w, mu, closed, rng.random(3))
+    mixed, c = engine.resample(x, w, mu, closed, rng.random(3))
     assert c[2] == 0.0 and np.isfinite(mixed).all()
 
 
@@ -120,7 +122,7 @@ def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
     rng = np.random.default_rng(4)
     x, w, _ = random_set(rng)
     mu, uniform = np.array([0.4, 0.6, tiny]), rng.random(3)
-    results = [engine.mix(x, w, mu, np.eye(3), uniform) for engine in (imm_particles, Kernels)]
+    results = [engine.resample(x, w, mu, np.eye(3), uniform) for engine in (oracle, Kernels)]
     for mixed, c in results:
         assert c[2] == tiny
         # Copies of particles that were there: of the model's own, or of any model's.
@@ -129,14 +131,14 @@ def test_a_model_that_hardly_anything_can_become_stays_finite(tiny):
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf])
-def test_mixing_weights_that_are_not_finite_stays_in_its_arrays(value):
+def test_resampling_weights_that_are_not_finite_stays_in_its_arrays(value):
     rng = np.random.default_rng(5)
     x, w, mu = random_set(rng)
     w[1, 7] = value
     guarded = np.full(50 + 1 + 8, -7)
-    scratch = imm_particles_kernels.MixScratch(np.empty((3, 50)), np.empty(50), guarded[:51])
+    scratch = imm_particles.ResampleScratch(np.empty((3, 50)), np.empty(50), guarded[:51])
     mixed, c = np.empty_like(x), np.empty(3)
-    imm_particles_kernels.mix(x, w, mu, ASYMMETRIC, rng.random(3), scratch, mixed, c)
+    imm_particles.resample(x, w, mu, ASYMMETRIC, rng.random(3), scratch, mixed, c)
     assert (guarded[51:] == -7).all() and np.isin(mixed, x).all()
 
 
@@ -145,17 +147,17 @@ def test_without_likelihood_the_chain_finds_its_stationary_law(engine):
     rng = np.random.default_rng(5)
     x, w, mu = random_set(rng)
     for _ in range(300):
-        x, c = engine.mix(x, w, mu, ASYMMETRIC, rng.random(3))
-        step = engine.update(np.zeros((3, 50)), c)
+        x, c = engine.resample(x, w, mu, ASYMMETRIC, rng.random(3))
+        step = engine.weigh(np.zeros((3, 50)), c)
         w, mu = step.w, step.mu
-    assert mu == pytest.approx(markov.stationary_law(ASYMMETRIC), abs=1e-9)
+    assert mu == pytest.approx(stationary_law(ASYMMETRIC), abs=1e-9)
 
 
 @engines
 def test_likelihood_of_a_model_is_the_weighted_mean(engine):
     w = np.array([[0.9, 0.1], [0.5, 0.5]])
     q = np.array([[1.0, 3.0], [2.0, 6.0]])
-    step = engine.update(np.log(q), np.array([0.25, 0.75]), w)
+    step = engine.weigh(np.log(q), np.array([0.25, 0.75]), w)
     L = (w * q).sum(axis=1)
     assert step.mu == pytest.approx(np.array([0.25, 0.75]) * L / (0.25 * L[0] + 0.75 * L[1]))
     assert step.w == pytest.approx(w * q / L[:, None])
@@ -167,7 +169,7 @@ def test_likelihood_of_a_model_is_the_weighted_mean(engine):
 def test_the_prediction_is_kept_when_nothing_is_possible(engine, value):
     rng = np.random.default_rng(6)
     _, w, mu = random_set(rng)
-    step = engine.update(np.full((3, 50), value), mu, w)
+    step = engine.weigh(np.full((3, 50), value), mu, w)
     assert not step.ok and np.array_equal(step.w, w) and np.array_equal(step.mu, mu)
 
 
@@ -175,16 +177,16 @@ def test_the_prediction_is_kept_when_nothing_is_possible(engine, value):
 def test_a_model_whose_particles_are_impossible_loses_all_probability(engine):
     log_likelihood = np.zeros((2, 4))
     log_likelihood[1] = -np.inf
-    step = engine.update(log_likelihood, np.array([0.1, 0.9]))
+    step = engine.weigh(log_likelihood, np.array([0.1, 0.9]))
     assert step.mu.tolist() == [1.0, 0.0] and (step.w == 0.25).all()
 
 
 @engines
-def test_combine_is_the_moments_of_the_union(engine):
+def test_the_summary_is_the_moments_of_the_union(engine):
     rng = np.random.default_rng(7)
     x, w, mu = random_set(rng)
     union, weight = np.moveaxis(x, 1, 0).reshape(2, -1), (mu[:, None] * w).ravel()
-    mean, covariance = engine.combine(x, w, mu)
+    mean, covariance = engine.summarise(x, w, mu)
     assert mean == pytest.approx(particles.mean(union, weight))
     assert covariance == pytest.approx(particles.covariance(union, weight))
 
@@ -193,7 +195,7 @@ def test_effective_sample_size_is_the_mean_over_models():
     rng = np.random.default_rng(8)
     _, w, mu = random_set(rng)
     expected = mu @ particles.effective_sample_size(w)
-    assert imm_particles_kernels.effective_sample_size(w, mu) == pytest.approx(expected)
+    assert imm_particles.effective_sample_size(w, mu) == pytest.approx(expected)
 
 
 @pytest.fixture(scope='module')
@@ -211,10 +213,10 @@ def enumerated():
         x = np.stack([rng.normal(size=(2, N)), 0.1 * rng.normal(size=(2, N))], axis=1)
         w, mu = np.full((2, N), 1.0 / N), case['mu0']
         for k, z in enumerate(case['z']):
-            x, c = Kernels.mix(x, w, mu, case['Pi'], rng.random(2))
-            x = Kernels.predict(x, F, G, rng.normal(size=(2, 2, N)))
-            w, mu, *_ = Kernels.update(-0.5 * ((z - x[:, 0]) / case['so']) ** 2, c)
-            mean, covariance = Kernels.combine(x, w, mu)
+            x, c = Kernels.resample(x, w, mu, case['Pi'], rng.random(2))
+            x = Kernels.propagate(x, F, G, rng.normal(size=(2, 2, N)))
+            w, mu, *_ = Kernels.weigh(-0.5 * ((z - x[:, 0]) / case['so']) ** 2, c)
+            mean, covariance = Kernels.summarise(x, w, mu)
             answers[run, k] = *mean, mu[1], covariance[0, 0]
     exact = np.column_stack([case[key] for key in ('mean', 'slope', 'p_ncs', 'var')])
     return answers, exact

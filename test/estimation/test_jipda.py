@@ -21,15 +21,16 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
+from oracles import jipda as oracle
 import pytest
 
-from sonar_imm.estimation import imm, jipda, jipda_kernels
+from sonar_imm.estimation import imm, jipda
 
 VECTORS = np.load(
     Path(__file__).parents[1] / 'vectors' / 'diver_sea' / 'association.npz', allow_pickle=False
 )
 CASES = ('jipda_2x2', 'jipda_3x3', 'jipda_1x2', 'jipda_2x0')
-FORMS = (jipda.associate, jipda_kernels.associate)
+FORMS = (oracle.associate, jipda.associate)
 EVERYWHERE = 1.0
 
 
@@ -75,7 +76,7 @@ def test_the_sums_over_events_are_those_of_the_prototype(case, form):
 @pytest.mark.parametrize('case', CASES)
 def test_the_events_are_those_of_the_prototype(case):
     possible = VECTORS[f'{case}/ratio'] > 0.0
-    events = jipda._events(possible, list(range(len(possible))))
+    events = oracle._events(possible, list(range(len(possible))))
     assert np.array_equal(np.reshape(events, (-1, len(possible))), VECTORS[f'{case}/out_events'])
 
 
@@ -95,7 +96,7 @@ def test_both_forms_agree_with_brute_force_over_existence_and_pairings(seed):
 
 def test_one_track_in_a_scan_with_nothing_is_the_bayes_rule_of_a_miss():
     none = np.empty((1, 0))
-    _, _, after = jipda_kernels.associate(none, none, np.array([0.5]), np.array([0.7]), 9.0)
+    _, _, after = jipda.associate(none, none, np.array([0.5]), np.array([0.7]), 9.0)
     np.testing.assert_allclose(after, 0.5 * 0.3 / (0.5 * 0.3 + 0.5))
 
 
@@ -104,15 +105,15 @@ def test_a_cluster_with_too_many_events_gets_a_smaller_gate():
     rng = np.random.default_rng(3)
     ratio, nis = rng.gamma(2.0, 3.0, (8, 8)), rng.uniform(0.0, 13.0, (8, 8))
     existence, pd = np.full(8, 0.9), np.full(8, 0.9)
-    one, two = (form(ratio, nis, existence, pd, 13.8) for form in FORMS)
-    for ours, theirs in zip(one, two):
+    first, second = (form(ratio, nis, existence, pd, 13.8) for form in FORMS)
+    for ours, theirs in zip(first, second):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-14)
-    kept = nis[one[0] > 0.0].max()
+    kept = nis[first[0] > 0.0].max()
     gates = 13.8 * 0.7 ** np.arange(30)
     assert 0.0 < kept < 13.8
     gate = gates[gates >= kept].min()
-    assert len(jipda._events(nis <= gate, list(range(8)))) <= jipda.MOST_EVENTS
-    assert jipda._count(nis <= gate / 0.7, list(range(8))) > jipda.MOST_EVENTS
+    assert len(oracle._events(nis <= gate, list(range(8)))) <= oracle.MOST_EVENTS
+    assert oracle._count(nis <= gate / 0.7, list(range(8))) > oracle.MOST_EVENTS
 
 
 def test_a_cluster_of_equal_pairs_that_no_gate_divides_ends():
@@ -140,10 +141,12 @@ def test_the_update_is_that_of_the_prototype():
     X, P, mu, Z, R, beta, beta0, H = (VECTORS[f'imm_pda/{name}'] for name in names)
     h = X @ H.T
     big_R = np.tile(R, (len(Z), 1, 1))
-    ours = jipda.update(X, P, mu, Z[:, None] - h, np.tile(H, (3, 1, 1)), big_R, beta, float(beta0))
+    ours = oracle.update(
+        X, P, mu, Z[:, None] - h, np.tile(H, (3, 1, 1)), big_R, beta, float(beta0)
+    )
     arrays = (X, P, mu, h, np.tile(H, (3, 1, 1)))
-    kernel = jipda_kernels.update(
-        *(np.ascontiguousarray(one[None]) for one in arrays),
+    kernel = jipda.update(
+        *(np.ascontiguousarray(each[None]) for each in arrays),
         Z,
         big_R,
         beta[None],
@@ -158,18 +161,16 @@ def test_the_update_is_that_of_the_prototype():
 @pytest.mark.parametrize('seed', range(5))
 def test_both_forms_of_likelihoods_and_update_are_equal(seed):
     x, P, c, h, H, z, R = problem(seed)
-    ours = jipda.likelihoods(h, H, P, c, z, R)
-    mixture, nis = jipda_kernels.likelihoods(h, H, P, c, z, R)
+    ours = oracle.likelihoods(h, H, P, c, z, R)
+    mixture, nis = jipda.likelihoods(h, H, P, c, z, R)
     np.testing.assert_allclose(mixture, ours.mixture, rtol=1e-10)
     np.testing.assert_allclose(nis, ours.nis, rtol=1e-10)
     existence = np.full(3, 0.7)
-    beta, missed, after = jipda_kernels.associate(
-        mixture / 1e-3, nis, existence, np.full(3, 0.9), 13.8
-    )
+    beta, missed, after = jipda.associate(mixture / 1e-3, nis, existence, np.full(3, 0.9), 13.8)
     considered = np.array([False, False, seed % 2 == 1])
-    found = jipda_kernels.update(x, P, c, h, H, z, R, beta, missed, considered)
+    found = jipda.update(x, P, c, h, H, z, R, beta, missed, considered)
     for t in range(3):
-        single = jipda.update(
+        single = oracle.update(
             x[t],
             P[t],
             c[t],
@@ -180,14 +181,14 @@ def test_both_forms_of_likelihoods_and_update_are_equal(seed):
             missed[t] / after[t],
             considered,
         )
-        for one, other in zip(found, single):
-            np.testing.assert_allclose(one[t], other, rtol=1e-9, atol=1e-12)
+        for ours, other in zip(found, single):
+            np.testing.assert_allclose(ours[t], other, rtol=1e-9, atol=1e-12)
 
 
 def test_a_single_certain_detection_is_the_update_of_the_imm_filter():
     x, P, c, h, H, z, R = problem(7, T=2, D=1)
     beta, missed = np.ones((2, 1)), np.zeros(2)
-    found = jipda_kernels.update(x, P, c, h, H, z, R, beta, missed, np.zeros(3, bool))
+    found = jipda.update(x, P, c, h, H, z, R, beta, missed, np.zeros(3, bool))
     plain = imm.update(x, P, c, z[0] - h, H, R)
     for ours, theirs in zip(found, (plain.x, plain.P, plain.mu)):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
@@ -195,9 +196,7 @@ def test_a_single_certain_detection_is_the_update_of_the_imm_filter():
 
 def test_without_a_detection_nothing_changes():
     x, P, c, h, H, z, R = problem(8, D=0)
-    found = jipda_kernels.update(
-        x, P, c, h, H, z, R, np.empty((3, 0)), np.full(3, 0.4), np.zeros(3, bool)
-    )
+    found = jipda.update(x, P, c, h, H, z, R, np.empty((3, 0)), np.full(3, 0.4), np.zeros(3, bool))
     assert all(np.array_equal(ours, theirs) for ours, theirs in zip(found, (x, P, c)))
 
 
@@ -205,9 +204,9 @@ def test_pairs_outside_of_the_gate_are_left_out_alone():
     """With a threshold the kernel gives what it gives without, wherever the nis is below."""
     rng = np.random.default_rng(3)
     x, P, c, h, H, z, R = problem(rng)
-    every, nis = jipda_kernels.likelihoods(h, H, P, c, z, R)
+    every, nis = jipda.likelihoods(h, H, P, c, z, R)
     threshold = float(np.median(nis[np.isfinite(nis)]))
-    some, near = jipda_kernels.likelihoods(h, H, P, c, z, R, threshold)
+    some, near = jipda.likelihoods(h, H, P, c, z, R, threshold)
     inside = nis <= threshold
     assert inside.any() and not inside.all()
     np.testing.assert_array_equal(some[inside], every[inside])
@@ -222,7 +221,7 @@ def test_the_nearest_older_track():
     root = rng.normal(size=(T, 2, 2))
     covariance = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(2)
     ids, free, firm = rng.permutation(T), rng.uniform(size=T) < 0.8, rng.uniform(size=T) < 0.5
-    partner, distance = jipda_kernels.nearest_older(mean, covariance, ids, free, firm)
+    partner, distance = jipda.nearest_older(mean, covariance, ids, free, firm)
     for t in range(T):
         best = (np.inf, -1)
         for u in range(T):
@@ -235,6 +234,6 @@ def test_the_nearest_older_track():
 
 
 def test_log_odds():
-    found = jipda_kernels.log_odds(np.array([0.0, 0.2, 0.9, 1.0]))
+    found = jipda.log_odds(np.array([0.0, 0.2, 0.9, 1.0]))
     assert found[0] == -np.inf and np.isfinite(found[3])
     np.testing.assert_allclose(found[1:3], np.log([0.25, 9.0]))

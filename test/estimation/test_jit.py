@@ -14,12 +14,14 @@
 
 """Compiling: the cache is used when it can be, and is no condition."""
 
+import importlib
 import os
 from pathlib import Path
 import shutil
 import subprocess
 import sys
 
+from numba.core import caching
 import pytest
 
 from sonar_imm.estimation import imm_kernels, jit
@@ -29,7 +31,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_without_any_place_for_a_cache_a_kernel_still_works(monkeypatch):
     """What numba does in a container with a read-only installation and no home."""
-    monkeypatch.setattr(jit.CompileResultCacheImpl, '_locator_classes', [])
+    monkeypatch.setattr(caching.CompileResultCacheImpl, '_locator_classes', [])
 
     @jit.kernel
     def doubled(x):
@@ -68,26 +70,26 @@ def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path)
         shutil.copytree(ROOT / room, root / room, ignore=ignore)
     code = """
 import numpy as np
-from sonar_imm.estimation import imm_particles_kernels as imm
+from sonar_imm.estimation import imm_particles as imm
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 out = np.empty(1)
 sines_of(np.zeros(1), 0, level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5), np.empty((2, 1)), out)
-mixed, c = np.empty((2, 1, 1)), np.empty(2)
-scratch = imm.MixScratch(np.empty((2, 1)), np.empty(1), np.empty(2, np.int64))
-imm.mix(np.array([[[3.0]], [[4.0]]]), np.ones((2, 1)), np.array([1.0, 1e-9]), np.eye(2),
-        np.zeros(2), scratch, mixed, c)
-hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.mix))
-print(out[0], mixed[1, 0, 0], hits)
+drawn, c = np.empty((1, 1, 2)), np.empty(1)
+scratch = imm.ResampleScratch(np.empty((1, 2)), np.empty(2), np.empty(3, np.int64))
+imm.resample(np.array([[[3.0, 4.0]]]), np.full((1, 2), 0.5), np.ones(1), np.eye(1),
+             np.full(1, 0.6), scratch, drawn, c)
+hits = sum(sum(k.stats.cache_hits.values()) for k in (sines_of, imm.resample))
+print(out[0], drawn[0, 0, 0], hits)
 """
-    assert run(code, root, cache) == ['0.5', '4.0', '0']
-    assert run(code, root, cache) == ['0.5', '4.0', '2']
+    assert run(code, root, cache) == ['0.5', '3.0', '0']
+    assert run(code, root, cache) == ['0.5', '3.0', '2']
     callee = root / 'sonar_imm/acoustics/likelihood_kernels.py'
     edit(callee, 'out[i] = ratio * cos_tilt', 'out[i] = 3.0 * ratio * cos_tilt')
-    constant = root / 'sonar_imm/estimation/imm_particles.py'
-    edit(constant, 'LEAST_CHANCE = 1e-290', 'LEAST_CHANCE = 1e-3')
-    assert run(code, root, cache) == ['1.5', '3.0', '0']
-    assert run(code, root, cache) == ['1.5', '3.0', '2']
+    constant = root / 'sonar_imm/estimation/elementary.py'
+    edit(constant, 'ROUND = 1.5 * 2.0**52', 'ROUND = 0.0')
+    assert run(code, root, cache) == ['1.5', '4.0', '0']
+    assert run(code, root, cache) == ['1.5', '4.0', '2']
 
 
 def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
@@ -97,7 +99,7 @@ def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
     def doubled(x):
         return x + x
 
-    def compiled(digest='one'):
+    def compiled(digest='first'):
         monkeypatch.setattr(jit, 'digest_of', lambda path: digest)
         return jit.kernel(doubled)
 
@@ -105,12 +107,12 @@ def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
         folder = Path(function.stats.cache_path)
         return {path: path.read_bytes() for path in folder.glob('*doubled*.nbc')}
 
-    one, other = compiled(), compiled()
-    one._cache.flush()
-    assert one(2.0) == 4.0
-    first = files(one)
-    assert other(2) == 4 and compiled('two')(2.0) == 4.0
-    both = files(one)
+    mine, other = compiled(), compiled()
+    mine._cache.flush()
+    assert mine(2.0) == 4.0
+    first = files(mine)
+    assert other(2) == 4 and compiled('second')(2.0) == 4.0
+    both = files(mine)
     assert len(first) == 1 and len(both) == 3 and first.items() <= both.items()
     loaded = compiled()
     assert loaded(3.0) == 6.0 and type(loaded(3)) is int
@@ -145,13 +147,13 @@ def test_code_of_old_sources_is_removed_after_a_while(monkeypatch):
         return 3.0 * x
 
     kernels = []
-    for digest in ('one', 'two', 'three'):
+    for digest in ('first', 'second', 'third'):
         monkeypatch.setattr(jit, 'digest_of', lambda path, digest=digest: digest)
         kernels.append(jit.kernel(tripled))
         kernels[-1](1.0)
         folder = Path(kernels[-1].stats.cache_path)
         for path in folder.glob('*tripled*.nbc'):
-            if digest == 'one':
+            if digest == 'first':
                 os.utime(path, (0, 0))
     assert len(list(folder.glob('*tripled*.nbc'))) == 2
     kernels[-1]._cache.flush()
@@ -167,7 +169,7 @@ def test_code_with_and_without_bounds_checks_is_not_confused(tmp_path, monkeypat
     code = """
 import numpy as np
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 geometry = level_geometry(np.full(1, 2.0), 1.0, 0.0, 0.5)
 try:
     sines_of(np.zeros(1), 0, geometry, np.empty((1, 2)), np.empty(1)[:0])
@@ -185,8 +187,8 @@ except IndexError:
 def test_a_digest_follows_every_form_of_import(tmp_path):
     package = tmp_path / 'package'
     files = {
-        'caller.py': 'from .one import (\n    a,  # why\n    b as c,\n)\nfrom . import two as t\n',
-        'one.py': 'from .deep import four\nfrom os import path\n',
+        'caller.py': 'from .first import (\n    a,  # why\n    b as c,\n)\nfrom . import two\n',
+        'first.py': 'from .deep import four\nfrom os import path\n',
         'two.py': 'from .caller import loop\n',
         'deep/__init__.py': '',
         'deep/four.py': 'from ..five import e\n',
@@ -198,8 +200,6 @@ def test_a_digest_follows_every_form_of_import(tmp_path):
         (package / name).write_text(text)
 
     def digest():
-        jit.digest_of.cache_clear()
-        jit._read.cache_clear()
         return jit.digest_of(str(package / 'caller.py'))
 
     seen = {digest()}
@@ -207,8 +207,107 @@ def test_a_digest_follows_every_form_of_import(tmp_path):
         (package / name).write_text((package / name).read_text() + '# changed\n')
         assert (digest() in seen) == (name in {'apart.py'}), name
         seen.add(digest())
-    jit.digest_of.cache_clear()
-    jit._read.cache_clear()
+
+
+MODULE = """
+from sonar_imm.estimation.jit import kernel
+
+@kernel
+def scaled(x):
+    return 2.0 * x
+"""
+
+
+def test_compiled_code_is_valid_for_the_contents_of_files_whatever_their_dates(
+    tmp_path, monkeypatch
+):
+    """A copy with other dates, as a checkout or a wheel makes it, loads what was compiled."""
+    monkeypatch.delenv('NUMBA_CACHE_DIR', raising=False)
+    folder = tmp_path / 'first'
+    folder.mkdir()
+    (folder / 'module.py').write_text(MODULE)
+    os.utime(folder / 'module.py', (1e9, 1e9))
+    code = 'import module; print(module.scaled(1.0), sum(module.scaled.stats.cache_hits.values()))'
+
+    def run_in(folder):
+        environment = {**os.environ, 'PYTHONPATH': f'{folder}{os.pathsep}{ROOT}'}
+        command = [sys.executable, '-c', code]
+        return subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    assert run_in(folder) == ['2.0', '0']
+    copied = shutil.copytree(folder, tmp_path / 'copied', copy_function=shutil.copy)
+    assert (copied / 'module.py').stat().st_mtime > 1.1e9
+    assert run_in(copied) == ['2.0', '1']
+    edit(copied / 'module.py', '2.0', '3.0')
+    os.utime(copied / 'module.py', (1e9, 1e9))
+    assert run_in(copied) == ['3.0', '0']
+
+
+def test_a_module_that_is_edited_and_loaded_again_is_compiled_anew(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    path = tmp_path / 'edited_module.py'
+    path.write_text(MODULE)
+    import edited_module
+
+    assert edited_module.scaled(1.0) == 2.0
+    path.write_text(MODULE.replace('2.0', '-2.5'))
+    assert importlib.reload(edited_module).scaled(1.0) == -2.5
+
+
+def gone(monkeypatch):
+    monkeypatch.delattr(caching, 'FunctionCache')
+
+
+def without_files(monkeypatch):
+    class Other(caching.FunctionCache):
+        def __init__(self, function):
+            super().__init__(function)
+            del self._cache_file
+
+    monkeypatch.setattr(caching, 'FunctionCache', Other)
+
+
+def called_otherwise(monkeypatch):
+    class Files(caching.IndexDataCacheFile):
+        def save(self, key, data, compress):
+            super().save(key, data)
+
+    class Other(caching.FunctionCache):
+        def __init__(self, function):
+            super().__init__(function)
+            self._cache_file = Files('', '', '')
+
+    monkeypatch.setattr(caching, 'FunctionCache', Other)
+
+
+@pytest.mark.parametrize('change', [gone, without_files, called_otherwise])
+def test_with_another_numba_its_own_cache_is_used_and_a_warning_says_so(change, monkeypatch):
+    def quadrupled(x):
+        return 4.0 * x
+
+    with monkeypatch.context() as patch:
+        change(patch)
+        jit._warn_of_other_numba.cache_clear()
+        jit._check_verbs.cache_clear()
+        with pytest.warns(RuntimeWarning, match="numba's own cache is used") as warned:
+            compiled = [jit.kernel(quadrupled) for _ in range(2)]
+    assert len(warned) == 1 and warned[0].filename == __file__
+    assert compiled[0](2.0) == 8.0
+    folder = Path(compiled[0].stats.cache_path)
+    assert list(folder.glob('*quadrupled*.nbi'))
+    for path in folder.glob('*quadrupled*.nb?'):
+        path.unlink()
+
+
+def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkeypatch):
+    monkeypatch.setattr(caching.CompileResultCacheImpl, '_locator_classes', [])
+    monkeypatch.delattr(caching, 'FunctionCache')
+    jit._warn_of_other_numba.cache_clear()
+    with pytest.warns(RuntimeWarning):
+        tripled = jit.kernel(lambda x: 3.0 * x)
+    assert tripled(2.0) == 6.0 and tripled.stats.cache_path is None
 
 
 def test_warm_leaves_nothing_to_compile():

@@ -87,8 +87,8 @@ def test_a_batch_is_its_members(rng):
     updated = update(px, pP, nu, H, R)
     for t in range(5):
         for m in range(3):
-            one = update(*predict(x[t, m], P[t, m], F[m], Q[m])[:2], nu[t, m], H, R[t, 0])
-            for whole, single in zip(updated, one):
+            alone = update(*predict(x[t, m], P[t, m], F[m], Q[m])[:2], nu[t, m], H, R[t, 0])
+            for whole, single in zip(updated, alone):
                 np.testing.assert_allclose(whole[t, m], single, rtol=1e-9, atol=1e-12)
 
 

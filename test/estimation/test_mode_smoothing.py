@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.mode_smoothing import smooth_modes
+from sonar_imm.estimation.smoothing import smooth_modes
 
 P = np.array([[0.9, 0.07, 0.03], [0.3, 0.6, 0.1], [0.1, 0.2, 0.7]])
 

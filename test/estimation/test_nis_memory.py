@@ -50,12 +50,12 @@ def test_its_bounds_are_those_of_the_chi_square_of_the_same_variance():
 @pytest.mark.parametrize('factor, verdict', [(1.0, 0), (4.0, 1), (0.25, -1)])
 def test_true_words_are_believed_and_wrong_ones_are_not(factor, verdict):
     rng = np.random.default_rng(3)
-    memory, said = NisMemory(), []
+    memory, verdicts = NisMemory(), []
     for _ in range(5000):
         memory = memory.after(factor * rng.chisquare(2, 1), 2)
-        said.append(memory.verdict)
-    assert not any(said[:68])  # too few
-    assert set(said[200:]) == {verdict}
+        verdicts.append(memory.verdict)
+    assert not any(verdicts[:68])  # too few
+    assert set(verdicts[200:]) == {verdict}
     assert bool(memory.warnings('echoes', 'look')) == bool(verdict)
     if verdict:
         word = 'more' if verdict > 0 else 'less'

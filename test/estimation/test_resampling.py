@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.resampling import invert, SCHEMES
+from sonar_imm.estimation.particles import invert, SCHEMES
 
 W = np.array([0.05, 0.0, 0.4, 0.15, 0.3, 0.1])
 schemes = pytest.mark.parametrize('name', SCHEMES)
@@ -48,9 +48,9 @@ def test_indices_are_as_many_as_wanted_and_ascend(name):
 
 @schemes
 def test_scale_of_the_weights_does_not_matter(name):
-    one = SCHEMES[name](W, 50, np.random.default_rng(3))
+    first = SCHEMES[name](W, 50, np.random.default_rng(3))
     other = SCHEMES[name](1e-200 * W, 50, np.random.default_rng(3))
-    assert np.array_equal(one, other)
+    assert np.array_equal(first, other)
 
 
 @settings(max_examples=200, deadline=None)

@@ -17,7 +17,7 @@
 import numpy as np
 import pytest
 
-from sonar_imm.estimation.set_members import find_members
+from sonar_imm.estimation.set_filter import find_members
 
 
 def hills(*places):
@@ -71,5 +71,5 @@ def test_of_two_humps_the_greater_is_reported_with_its_own_spread():
 def test_one_hump_and_what_is_rare_beside_it_stay_whole():
     sums = hills((40, 0.9, 5.0), (52, 0.05, 3.0))
     with_modes = find_members(sums, 16, 1, 0.5, modes=True)
-    for one, other in zip(with_modes, find_members(sums, 16, 1, 0.5)):
-        assert np.array_equal(one, other)
+    for found, expected in zip(with_modes, find_members(sums, 16, 1, 0.5)):
+        assert np.array_equal(found, expected)

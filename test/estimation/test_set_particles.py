@@ -19,13 +19,14 @@ import math
 from pathlib import Path
 
 from attrs import evolve
+from helpers.set_cycle import cycle
 import numpy as np
+from oracles.set_particles import propagate, propose, start, weigh
 import pytest
 
 from benchmarks.fathometer_vectors import exact_hmm_model, EXACT_LOG_EVIDENCE
-from sonar_imm.estimation.set_filter import LagSmoother, SetFilter
-from sonar_imm.estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
-from sonar_imm.estimation.set_particles import propagate, propose, start, weigh
+from sonar_imm.estimation.set_filter import LagSmoother, SetFilter, Weighted
+from sonar_imm.estimation.set_model import banded_transition, gaussian_walk, SetModel, Sets
 from sonar_imm.estimation.set_shifts import Shift
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'fathometer'
@@ -47,9 +48,9 @@ def run(model, records, particles, seed, threads=1):
     tracker, before = SetFilter(model, particles, threads), None
     pmfs, intensities, evidence = [], [], 0.0
     for name, b in enumerate(records):
-        step = tracker.step(before, b, (seed, name))
+        step = cycle(tracker, before, b, (seed, name))
         before = step.after
-        pmf, sums = tracker.summary(step)
+        pmf, sums, _ = tracker.summarise(step)
         pmfs.append(pmf)
         intensities.append(sums[0])
         evidence += step.log_evidence
@@ -76,25 +77,25 @@ def test_the_error_falls_with_the_root_of_the_number_of_particles(model, exact):
 
 
 def test_proposals_change_how_many_particles_count_and_nothing_else(model, exact):
-    for shares in ({'birth_share': 0.0}, {'move_share': 0.5, 'birth_share': 0.5}):
+    for shares in ({'birth_share': 0.0}, {'walk_share': 0.5, 'birth_share': 0.5}):
         pmf, _, evidence = run(evolve(model, **shares), exact['B'], 20_000, seed=2)
         assert variation(pmf, exact) <= 0.012
         assert abs(evidence - EXACT_LOG_EVIDENCE) < 0.7
 
 
-@pytest.mark.parametrize('table', ['move_ratio', 'birth_ratio'])
+@pytest.mark.parametrize('table', ['walk_ratio', 'birth_ratio'])
 def test_without_its_ratio_a_proposal_is_wrong(model, exact, table, monkeypatch):
     from sonar_imm.estimation import set_filter
 
-    if table == 'move_ratio':
-        fill = set_filter.kernels.fill_moves
+    if table == 'walk_ratio':
+        fill = set_filter.kernels.fill_walks
 
         def unpaid(*arguments):
             fill(*arguments)
-            ratio = arguments[-1].move_ratio
+            ratio = arguments[-1].walk_ratio
             ratio[np.isfinite(ratio)] = 0.0
 
-        monkeypatch.setattr(set_filter.kernels, 'fill_moves', unpaid)
+        monkeypatch.setattr(set_filter.kernels, 'fill_walks', unpaid)
     else:
         births = set_filter.propose_births
         monkeypatch.setattr(
@@ -121,16 +122,16 @@ def test_amplitudes_that_are_not_drawn_anew_at_random_are_paid_for(model, exact)
 
 
 def test_threads_do_not_change_a_byte(model, exact):
-    one, four = (run(model, exact['B'][:10], 3001, seed=5, threads=n) for n in (1, 4))
-    assert one[0].tobytes() == four[0].tobytes()
-    assert one[1].tobytes() == four[1].tobytes()
+    single, four = (run(model, exact['B'][:10], 3001, seed=5, threads=n) for n in (1, 4))
+    assert single[0].tobytes() == four[0].tobytes()
+    assert single[1].tobytes() == four[1].tobytes()
 
 
 def test_a_record_has_random_numbers_of_its_own(model, exact):
     tracker = SetFilter(model, 500)
-    before = tracker.step(None, exact['B'][0], (3, 7)).after
-    again = [tracker.step(before, exact['B'][1], (3, 8)) for _ in range(2)]
-    other = tracker.step(before, exact['B'][1], (3, 9))
+    before = cycle(tracker, None, exact['B'][0], (3, 7)).after
+    again = [cycle(tracker, before, exact['B'][1], (3, 8)) for _ in range(2)]
+    other = cycle(tracker, before, exact['B'][1], (3, 9))
     assert again[0].w.tobytes() == again[1].w.tobytes() != other.w.tobytes()
 
 
@@ -138,7 +139,7 @@ def test_a_record_has_random_numbers_of_its_own(model, exact):
     'change',
     [
         {},
-        {'move_share': 0.0, 'birth_share': 0.0},
+        {'walk_share': 0.0, 'birth_share': 0.0},
         {'amplitude_prior': 'bic_half'},
         {'amplitude_prior': 'paper'},
         {'amplitude_memory': 0.9},
@@ -154,7 +155,8 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
     tracker, N = SetFilter(changed, 400), 400
     rng = np.random.default_rng(1)
     b = np.pad(exact['B'][3], changed.pad)
-    before = tracker._start(b, (1, 2))
+    record = tracker.record(b, (1, 2))
+    before = tracker.start(record)
     uniform = np.random.Generator(
         np.random.Philox(
             key=np.array([1, 2], np.uint64), counter=np.array([0, 0, 0, 1], np.uint64)
@@ -173,13 +175,12 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
         prior_mean=rng.uniform(-1.0, 3.0, before.sets.cell.shape),
         prior_variance=rng.uniform(0.5, 4.0, before.sets.cell.shape),
     )
-    moved, ratio = tracker._propagate(sets, b, np.random.default_rng(8))
-    expected, wanted = propagate(
-        changed,
-        propose(changed, b),
-        sets,
-        np.random.default_rng(8).random((N, changed.uniforms)),
+    uniform = np.random.Generator(np.random.Philox(key=np.array([1, 2], np.uint64))).random(
+        (N, changed.uniforms)
     )
+    propagated = tracker.propagate(Weighted(sets, np.zeros(N)), record)
+    moved, ratio = propagated.sets, propagated.log_weight
+    expected, wanted = propagate(changed, propose(changed, b), sets, uniform)
     assert np.array_equal(moved.order, expected.order)
     assert np.allclose(ratio, wanted)
     assert len(set(moved.order)) == 3
@@ -192,8 +193,8 @@ def test_the_compiled_form_does_what_the_readable_one_says(model, exact, change)
         if changed.amplitude_memory:
             assert np.array_equal(moved.prior_mean[i, :m], expected.prior_mean[i, :m])
 
-    weight = np.where(possible, 0.0, -np.inf)
-    amplitude = tracker._weigh(moved, b, weight, tracker._amplitudes)
+    step = tracker.weigh(Weighted(moved, np.where(possible, 0.0, -np.inf)), record)
+    weight, amplitude = step.after.log_weight, step.amplitude
     log_likelihood, mean = weigh(changed, b, moved.take(np.flatnonzero(possible)))
     assert np.allclose(weight[possible], log_likelihood)
     alive = np.isfinite(log_likelihood)
@@ -208,33 +209,22 @@ def test_what_is_kept_of_equal_sets_changes_no_bit(model, exact, change):
     changed = evolve(model, negative_probability=0.3, **change)
     tracker, N = SetFilter(changed, 600), 600
     b = np.pad(exact['B'][3], changed.pad)
-    sets = tracker._start(b, (1, 2)).sets.take(np.random.default_rng(0).integers(0, 90, N))
-    moved, ratio = tracker._propagate(sets, b, np.random.default_rng(3))
+    record = tracker.record(b, (1, 2))
+    sets = tracker.start(record).sets.take(np.random.default_rng(0).integers(0, 90, N))
     uniform = np.random.default_rng(3).random((N, changed.uniforms))
-    weight = np.zeros(N)
-    amplitude = tracker._weigh(moved, b, weight, tracker._amplitudes)
+    moved, ratio = tracker._drawn(sets, record, uniform)
+    step = tracker.weigh(Weighted(moved, np.zeros(N)), record)
     alone = SetFilter(changed, 1)
     for i in range(0, N, 7):
-        given = _Given(uniform[i : i + 1])
-        one, paid = alone._propagate(sets.take(np.array([i])), b, given)
-        assert paid[0] == ratio[i] and one.shift[0] == moved.shift[i]
-        assert one.cell[0].tobytes() == moved.cell[i].tobytes()
-        value = np.zeros(1)
-        found = alone._weigh(moved.take(np.array([i])), b, value, alone._amplitudes)
-        assert value[0] == weight[i]
-        if np.isfinite(value[0]):
-            assert found[0].tobytes() == amplitude[i].tobytes()
-
-
-class _Given:
-    """Random numbers that are told."""
-
-    def __init__(self, uniform):
-        self.uniform = uniform
-
-    def random(self, shape):
-        assert self.uniform.shape == shape
-        return self.uniform
+        own = alone.record(b, (1, 2))
+        single, paid = alone._drawn(sets.take(np.array([i])), own, uniform[i : i + 1])
+        assert paid[0] == ratio[i] and single.shift[0] == moved.shift[i]
+        assert single.cell[0].tobytes() == moved.cell[i].tobytes()
+        found = alone.weigh(Weighted(moved.take(np.array([i])), np.zeros(1)), own)
+        value = found.after.log_weight[0]
+        assert value == step.after.log_weight[i]
+        if np.isfinite(value):
+            assert found.amplitude[0].tobytes() == step.amplitude[i].tobytes()
 
 
 def test_the_likelihood_is_that_of_the_whole_record():
@@ -255,7 +245,7 @@ def test_the_likelihood_is_that_of_the_whole_record():
         separation=2,
         order_min=3,
         transition=[[1.0]],
-        move=gaussian_move(1.0),
+        walk=gaussian_walk(1.0),
         gram=gram,
         amplitude_prior='bic_half',
         independent_samples=1.0,
@@ -273,7 +263,7 @@ def test_marginal_amplitudes_are_integrated_out():
         separation=1,
         order_min=1,
         transition=[[1.0]],
-        move=gaussian_move(0.5),
+        walk=gaussian_walk(0.5),
         gram=np.eye(1, 5)[0],
         amplitude_std=2.0,
     )
@@ -291,14 +281,14 @@ def test_what_came_later_corrects_what_was_known(model, exact):
     right_then, right_later = [], []
     pmfs = []
     for name, b in enumerate(exact['B']):
-        step = tracker.step(before, b, (4, name))
+        step = cycle(tracker, before, b, (4, name))
         before = step.after
-        pmfs.append(tracker.summary(step)[0])
+        pmfs.append(tracker.summarise(step)[0])
         earlier = smoother.push(step)
         if earlier:
             assert earlier.w.sum() == pytest.approx(1.0)
             true = exact['true_m'][name - 3] - 1
-            right_later.append(tracker.summary(earlier)[0][true])
+            right_later.append(tracker.summarise(earlier)[0][true])
             right_then.append(pmfs[name - 3][true])
     assert np.mean(right_later) > np.mean(right_then) + 0.01
 
@@ -308,7 +298,7 @@ def test_nothing_is_corrected_across_a_record_that_nothing_explains(model, exact
     tracker, smoother, before = SetFilter(model, 20), LagSmoother(2), None
     found = []
     for name, b in enumerate([*exact['B'][:3], np.full(60, -5.0), *exact['B'][3:6]]):
-        step = tracker.step(before, b, (4, name))
+        step = cycle(tracker, before, b, (4, name))
         before = step.after if step.ok else None
         found.append(smoother.push(step) is not None)
     assert found == [False, False, True, False, False, False, True]
@@ -320,7 +310,7 @@ def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):
     tracker, N = SetFilter(model, 400), 400
     known, kept, drawn = None, 0, 0
     for name, b in enumerate(np.concatenate([0.3 * exact['B'], exact['B']])):
-        step = tracker.step(known, b, (6, name))
+        step = cycle(tracker, known, b, (6, name))
         assert step.effective == pytest.approx(1.0 / np.sum(step.w**2))
         if step.effective >= 0.5 * N:
             kept += 1
@@ -340,7 +330,7 @@ def test_sets_are_resampled_when_few_of_them_count_and_only_then(model, exact):
 
 
 def test_a_record_nothing_explains_is_said_so(model):
-    step = SetFilter(model, 100).step(None, np.full(60, -5.0), (0, 1))
+    step = cycle(SetFilter(model, 100), None, np.full(60, -5.0), (0, 1))
     assert not step.ok
     assert step.log_evidence == -math.inf
     assert step.w.sum() == pytest.approx(1.0)
@@ -352,7 +342,7 @@ def test_a_record_beyond_numbers_keeps_members_on_the_lattice(model, exact, valu
     for name, b in enumerate(exact['B'][:6]):
         b = b.copy()
         b[[0, 17, 59]] = value if name % 2 else b[[0, 17, 59]]
-        step = tracker.step(before, b, (1, name))
+        step = cycle(tracker, before, b, (1, name))
         before = step.after
         assert ((step.sets.cell >= 0) & (step.sets.cell < model.cells)).all()
 

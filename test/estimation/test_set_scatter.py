@@ -14,13 +14,13 @@
 
 """Volume scatter below the first member, against sums written out."""
 
+from helpers.set_cycle import cycle
 import numpy as np
+from oracles.set_particles import weigh
 import pytest
 
-from sonar_imm.estimation import set_amplitudes
-from sonar_imm.estimation.set_filter import SetFilter
-from sonar_imm.estimation.set_model import banded_transition, gaussian_move, SetModel, Sets
-from sonar_imm.estimation.set_particles import weigh
+from sonar_imm.estimation.set_filter import SetFilter, Weighted
+from sonar_imm.estimation.set_model import banded_transition, gaussian_walk, SetModel, Sets
 from sonar_imm.estimation.set_scatter import (
     decaying_profile,
     fit_scatter,
@@ -42,7 +42,7 @@ def model(**overrides):
         'separation': 4,
         'order_min': 1,
         'transition': banded_transition(4, 0.05),
-        'move': gaussian_move(0.9),
+        'walk': gaussian_walk(0.9),
         'gram': PULSE,
         'scatter': SCATTER,
     }
@@ -118,9 +118,10 @@ def test_the_kernel_weighs_as_the_readable_form():
         cells = np.sort(rng.choice(free, m, replace=False)) + (its.separation - 1) * np.arange(m)
         sets.cell[i, :m] = cells
     expected, amplitude = weigh(its, b, sets)
-    log_weight, found = np.zeros(N), np.zeros((N, 4))
+    filter_ = SetFilter(its, N)
+    step = filter_.weigh(Weighted(sets, np.zeros(N)), filter_.record(b, (1, 2)))
+    log_weight, found = step.after.log_weight, step.amplitude
     fit = fit_scatter(SCATTER, b)
-    set_amplitudes.weigh(0, N, b, SetFilter(its, 8)._amplitudes, fit, sets, log_weight, found)
     assert np.isfinite(expected).sum() > 20
     assert log_weight == pytest.approx(expected, rel=1e-9)
     good = np.isfinite(expected)
@@ -139,7 +140,7 @@ def test_the_filter_follows_a_floor_that_is_no_sum_of_echoes():
     before, right = None, []
     for record in range(40):
         first = 30 + round(6.0 * np.sin(record / 6.0))
-        step = its.step(before, diffuse(rng, first, level=6.0), (1, record))
+        step = cycle(its, before, diffuse(rng, first, level=6.0), (1, record))
         before = step.after if step.ok else None
         place = step.w @ step.sets.cell[:, 0]
         right.append(abs(place - first) <= 2.0)

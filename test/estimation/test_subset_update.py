@@ -18,9 +18,8 @@ from itertools import product
 
 from helpers.sea_vectors import vectors
 import numpy as np
+from oracles.subset_update import subset_update
 import pytest
-
-from sonar_imm.estimation.subset_update import subset_update
 
 
 def linear(h, value, variance):
@@ -40,7 +39,7 @@ def vector_case():
 def test_the_subsets_of_the_vectors():
     v, numbers, law = vector_case()
     got = subset_update(v['x'], v['P'], numbers, **law, prune=np.inf)
-    assert [one.good for one in got.explanations] == [tuple(s) for s in v['out_subsets'] == 1]
+    assert [each.good for each in got.explanations] == [tuple(s) for s in v['out_subsets'] == 1]
     np.testing.assert_allclose(got.probability, v['out_subset_prob'], atol=1e-9)
     assert got.log_evidence == pytest.approx(float(v['out_log_evidence']), abs=1e-9)
     np.testing.assert_allclose(got.x, v['out_x'], atol=1e-9)

@@ -174,11 +174,11 @@ def test_a_batch_is_its_members():
     x, P, z = rng.normal(size=(4, 3, 2)) * 10, covariance(rng, 4, 3, 2), rng.normal(size=(4, 3, 2))
     whole = unscented.update(x, P, z, range_bearing, np.eye(2), angles=RANGE_BEARING)
     for i in np.ndindex(4, 3):
-        for part, one in zip(
+        for part, alone in zip(
             whole,
             unscented.update(x[i], P[i], z[i], range_bearing, np.eye(2), angles=RANGE_BEARING),
         ):
-            np.testing.assert_allclose(part[i], one, rtol=1e-10, atol=1e-12)
+            np.testing.assert_allclose(part[i], alone, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(

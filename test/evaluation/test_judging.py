@@ -21,7 +21,6 @@ import pytest
 
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.evaluation.benches import benches_of
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions, Limit
 from sonar_imm_tools.offline.run_folder import read_measurements, read_truth, RunFolder
 from sonar_imm_tools.recordings.reader import BagError
@@ -49,12 +48,6 @@ def folder_of(tmp_path, estimates=(), **run):
 def test_every_system_has_a_judge_with_a_limit(system):
     module = import_module(SYSTEMS[system].judge)
     assert callable(module.judge) and isinstance(module.LIMIT, Limit)
-
-
-@pytest.mark.parametrize('system', SYSTEMS)
-def test_benches_have_names_of_their_own(system):
-    names = [bench.name for bench in benches_of(system)]
-    assert names and len(set(names)) == len(names) and 'node_ms' not in names
 
 
 def test_a_limit_is_met_or_missed():

@@ -20,6 +20,6 @@ from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTr
 def run(measurements, **parameters):
     tracker = FathometerTracker(FathometerConfig(**parameters))
     found = {}
-    for one in measurements:
-        found.update((each.stamp_ns, each) for each in tracker.process(one))
+    for item in measurements:
+        found.update((each.stamp_ns, each) for each in tracker.process(item))
     return tracker, found

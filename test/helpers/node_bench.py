@@ -61,9 +61,9 @@ class Bench:
 
     def listen(self, message_type, topic, qos=10):
         """Collect what comes on `topic`."""
-        heard = []
-        self.peer.create_subscription(message_type, topic, heard.append, qos)
-        return heard
+        received = []
+        self.peer.create_subscription(message_type, topic, received.append, qos)
+        return received
 
     def call(self, service_type, name, request):
         client = self.peer.create_client(service_type, name)

@@ -20,8 +20,8 @@ import numpy as np
 
 from sonar_imm.measurements import Navigation, Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.pose_queue import bin_stamps
-from sonar_imm.trackers.bathymetry.swath import ship_swath
+from sonar_imm.trackers.bathymetry.likelihood import ship_swath
+from sonar_imm.trackers.bathymetry.ping import bin_stamps
 from sonar_imm.trackers.navigation import NavigationBuffer
 
 VECTOR = Path(__file__).parents[1] / 'vectors' / 'bathymetry_sea' / 'motion_0.npz'
@@ -34,13 +34,13 @@ def motion_case():
 
 
 def sea_config(case, **values):
-    told = {
+    stated = {
         'sonar_lever': case['lever'].tolist(),
         'sonar_mount_rpy_deg': case['mount_deg'].tolist(),
         'tilt_deg': float(case['tilt_deg']),
         'side': str(case['side']),
     }
-    return BathymetryConfig.from_mapping({**told, **values})
+    return BathymetryConfig.from_mapping({**stated, **values})
 
 
 def navigation(case, *, late_s=0.0):
@@ -72,7 +72,7 @@ def swath_of(case, config, snapshot, *, late_s=0.0, pose_of='reception'):
     """The swath of one ping, right or with a mistake: `pose_of` all bins is that of
     ``transmission`` or of the ``middle`` of the ping."""
     poses = navigation(case, late_s=late_s)
-    buffer = NavigationBuffer(tuple(one.stamp_ns for one in poses), tuple(poses))
+    buffer = NavigationBuffer(tuple(each.stamp_ns for each in poses), tuple(poses))
     stamps = bin_stamps(snapshot, config)
     if pose_of == 'transmission':
         stamps = np.full_like(stamps, stamps[0])

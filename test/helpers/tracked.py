@@ -24,7 +24,7 @@ from sonar_imm.trackers.state_values import frozen_state
 from sonar_imm_tools.cli.common import load_config
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'

@@ -23,8 +23,8 @@ import numpy as np
 import msg_adapters.displays.bathymetry
 import msg_adapters.inputs.diver
 from sonar_imm.estimates import Estimate
-from sonar_imm.measurements import FrameGuard, Frames
-from sonar_imm.parameters import Config, parameter
+from sonar_imm.intake import KnownFrames
+from sonar_imm.parameters import Config, live, parameter
 from sonar_imm.trackers import System, SYSTEMS
 
 
@@ -32,15 +32,13 @@ from sonar_imm.trackers import System, SYSTEMS
 class WalkerConfig(Config):
     """A walker who stays where he is, and one that is slow or fast."""
 
-    sound_speed: float = parameter(
-        1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0, read_only=False
-    )
-    fast_share: float = parameter(0.25, 'share of fast', low=0.0, high=1.0, read_only=False)
-    slow_share: float = parameter(0.75, 'share of slow', low=0.0, high=1.0, read_only=False)
-    steps: int = parameter(3, 'steps', low=1, high=9)
-    mood: str = parameter('calm', 'mood', choices=('calm', 'hasty'), read_only=False)
-    weights: tuple = parameter((), 'weights', kind='float[]', low=0.0, high=1.0, read_only=False)
-    offsets: tuple = parameter((0.5, 1.5), 'offsets', unit='m', low=-9.0, high=9.0)
+    sound_speed: float = live(1500.0, 'm/s', 'speed of sound', range=(1300.0, 1700.0))
+    fast_share: float = live(0.25, '', 'share of fast', range=(0.0, 1.0))
+    slow_share: float = live(0.75, '', 'share of slow', range=(0.0, 1.0))
+    steps: int = parameter(3, '', 'steps', range=(1, 9))
+    mood: str = live('calm', '', 'mood', choices=('calm', 'hasty'))
+    weights: tuple = live((), '', 'weights', range=(0.0, 1.0), kind='float[]')
+    offsets: tuple = parameter((0.5, 1.5), 'm', 'offsets', range=(-9.0, 9.0))
 
     def check(self):
         if abs(self.fast_share + self.slow_share - 1.0) > 1e-9:
@@ -51,7 +49,7 @@ class WalkerConfig(Config):
 class WalkerTracker:
     """The running mean of the fixes, in the order of their stamps; late ones revise it."""
 
-    STATE = ('counts', 'fixes')
+    STATE = ('counts', 'fixes', 'frames')
 
     def __init__(self, config):
         self.config = config
@@ -61,7 +59,7 @@ class WalkerTracker:
 
     def reset(self):
         self.fixes = {}
-        self.frames = Frames(FrameGuard(), ())
+        self.frames = KnownFrames()
 
     def reconfigure(self, config):
         self.config = config
@@ -123,7 +121,8 @@ def register(set_item):
 
 
 def main():
-    from sonar_imm.nodes.base import run, TrackerNode
+    from sonar_imm.nodes.base import TrackerNode
+    from sonar_imm.nodes.running import run
 
     register(dict.__setitem__)
     return run(lambda: TrackerNode('walker'))

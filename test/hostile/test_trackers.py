@@ -33,7 +33,7 @@ from msg_adapters.inputs import inputs_of, made_inputs
 from sonar_imm.measurements import Fixes
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.recordings.own_parameters import write_own_parameters
+from sonar_imm_tools.recordings.own_files import write_own_parameters
 
 pytestmark = pytest.mark.filterwarnings('ignore::RuntimeWarning')
 

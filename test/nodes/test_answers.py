@@ -18,7 +18,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.table import decode_table
-from sonar_imm.nodes.answers import Answers
+from sonar_imm.nodes.outputs import ProcessedPublisher
 
 
 class Sent:
@@ -36,8 +36,8 @@ class Sent:
 
 def test_counts_beyond_32_bits_do_not_wrap():
     sent = Sent()
-    answers = Answers(sent)
+    answers = ProcessedPublisher(sent)
     for messages in (1, 2**32 + 7, 2**53 - 1):
-        answers.say({'messages': messages, 'refused': 0, 'estimates': messages - 1})
+        answers.publish({'messages': messages, 'refused': 0, 'estimates': messages - 1})
         assert int(sent.messages[-1]['messages'][0]) == messages
         assert int(sent.messages[-1]['estimates'][0]) == messages - 1

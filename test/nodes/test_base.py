@@ -167,7 +167,7 @@ def test_what_was_not_used_and_what_went_wrong_is_in_the_diagnostics(make_bench)
     rig.bench.call(SetBool, '/walker/enable', SetBool.Request(data=True))
     rig.node.tracker.explode = True
     rig.send(a_fix(7.0), a_fix(8.0), a_fix(9.0))
-    rig.node._keeper.trouble = 'the state cannot be saved'
+    rig.node._saved_state.trouble = 'the state cannot be saved'
     heard.clear()
 
     rig.bench.spin_until(lambda: any('cannot be saved' in one.status[1].message for one in heard))

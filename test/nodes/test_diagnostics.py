@@ -25,8 +25,7 @@ from rclpy.qos import DurabilityPolicy
 
 from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.diagnostics import Meter, Reporter
-from sonar_imm.nodes.health import summary
+from sonar_imm.nodes.diagnostics import Meter, Reporter, summary
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import latched_qos, output_qos
 

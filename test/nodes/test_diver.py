@@ -65,7 +65,7 @@ def an_estimate(ids, states):
 
 def test_confirmed_divers_are_shown_and_the_oldest_gives_the_probabilities(rig):
     bench, node, odometry, probabilities = rig
-    node.show(an_estimate([9, 3, 5, 2], [1, 2, 1, 0]))  # 2 is tentative, 3 coasts
+    node.show([an_estimate([9, 3, 5, 2], [1, 2, 1, 0])])  # 2 is tentative, 3 coasts
     bench.spin_until(lambda: len(odometry) == 3 and probabilities)
     assert [m.child_frame_id for m in odometry] == ['diver_9', 'diver_3', 'diver_5']
     assert odometry[1].twist.twist.linear.x == 6.0
@@ -77,9 +77,9 @@ def test_confirmed_divers_are_shown_and_the_oldest_gives_the_probabilities(rig):
 
 def test_nothing_is_shown_of_tentative_tracks_and_of_none(rig):
     bench, node, odometry, probabilities = rig
-    node.show(an_estimate([1], [0]))
-    node.show(an_estimate([], []))
-    node.show(an_estimate([1], [1]))
+    node.show([an_estimate([1], [0])])
+    node.show([an_estimate([], [])])
+    node.show([an_estimate([1], [1])])
     bench.spin_until(lambda: odometry and probabilities)
     assert len(odometry) == len(probabilities) == 1
 

@@ -20,8 +20,8 @@ import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Empty
 
-from sonar_imm.nodes.executor import EVENT_PERIOD, MessagesFirst
 from sonar_imm.nodes.qos import Endpoints, lockstep_qos, output_qos
+from sonar_imm.nodes.running import EVENT_PERIOD, MessagesFirst
 
 
 def test_messages_come_at_once_and_events_within_their_period(make_bench):

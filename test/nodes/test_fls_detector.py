@@ -24,7 +24,7 @@ from msg_adapters.detections import read_detections
 from msg_adapters.sonar_images import write_picture
 from msg_adapters.table import decode_table
 from sonar_imm.measurements import SonarImage
-from sonar_imm.nodes import fls_detector
+from sonar_imm.nodes import base
 from sonar_imm.nodes.fls_detector import FlsDetectorNode
 from sonar_imm.nodes.messages import make
 from sonar_imm.nodes.qos import latched_qos
@@ -125,7 +125,7 @@ def test_every_image_is_answered_and_a_bad_one_refused(make_bench):
 def test_images_of_another_sonar_are_refused(make_bench):
     node = FlsDetectorNode(context=make_bench(*PARAMETERS).context)
     for second, frame_id in ((100, 'sonar'), (101, 'stern_sonar'), (102, 'sonar')):
-        node.receive(picture(second, frame_id=frame_id))
+        node.receive('image', picture(second, frame_id=frame_id))
     assert node.refused == {'frame': 1} and node._published == 2
     node.destroy_node()
 
@@ -137,16 +137,16 @@ def test_without_images_the_node_waits_for_them(make_bench):
     bench.spin_until(lambda: told)
     assert told[0].status[0].level == told[0].status[1].level == DiagnosticStatus.STALE
     assert told[0].status[0].message == 'no message yet on /image'
-    node.receive(picture())
+    node.receive('image', picture())
     bench.spin_until(lambda: told[-1].status[0].message == 'receiving')
 
 
 def test_a_package_that_is_there_is_used(make_bench, monkeypatch):
     # The package is not installed here: any installed type subscribes, images are handed over.
     bench = make_bench()
-    known = fls_detector.message_class
+    known = base.message_class
     monkeypatch.setattr(
-        fls_detector,
+        base,
         'message_class',
         lambda name: known('sensor_msgs/msg/Image' if name.startswith('marine') else name),
     )
@@ -157,7 +157,7 @@ def test_a_package_that_is_there_is_used(make_bench, monkeypatch):
     bench.spin_until(lambda: answers and counts(answers[-1])['listeners'])
     message = projected()
     message.header.stamp = make('builtin_interfaces/msg/Time', sec=100, nanosec=5)
-    node.receive(message)
+    node.receive('image', message)
     bench.spin_until(lambda: heard)
     ping = read_detections(heard[0])
     assert ping.range == pytest.approx([31.0], abs=0.1)
@@ -173,9 +173,9 @@ def test_a_mistake_in_the_detector_ends_neither_node_nor_answers(make_bench, mon
         raise ZeroDivisionError
 
     monkeypatch.setattr(node._detector, 'process', broken)
-    node.receive(picture())
+    node.receive('image', picture())
     bench.spin_until(lambda: answers and counts(answers[-1])['messages'] == 1)
-    node.receive(picture(101))
+    node.receive('image', picture(101))
     bench.spin_until(lambda: counts(answers[-1])['messages'] == 2)
     assert counts(answers[-1])['estimates'] == 1
 

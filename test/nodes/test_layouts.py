@@ -26,7 +26,7 @@ import yaml
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.offline.tracking import OfflineRun
-from sonar_imm_tools.recordings.own_parameters import own_parameters
+from sonar_imm_tools.recordings.own_files import own_parameters
 from sonar_imm_tools.recordings.reader import BagReader
 from sonar_imm_tools.resources import shared_file
 from sonar_imm_tools.viewing.layouts import fitting_layouts, write_layout

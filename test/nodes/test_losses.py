@@ -24,8 +24,7 @@ import pytest
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64
 
-from sonar_imm.nodes.losses import SequenceGaps
-from sonar_imm.nodes.qos import Endpoints, input_qos, output_qos
+from sonar_imm.nodes.qos import Endpoints, input_qos, output_qos, SequenceGaps
 
 
 class Line:
@@ -39,7 +38,7 @@ class Line:
     def send(self, name='one', *, skip=0, received_ns=0):
         number = self.numbers.get(name, 0) + 1 + skip
         self.numbers[name] = number
-        return self.gaps.heard(
+        return self.gaps.count(
             {'publication_sequence_number': number, 'received_timestamp': received_ns}
         )
 
@@ -63,7 +62,7 @@ def test_a_publisher_that_starts_again_loses_nothing():
 def test_a_middleware_without_numbers_counts_nothing():
     gaps = SequenceGaps(lambda: 1)
     info = {'publication_sequence_number': None, 'received_timestamp': 1}
-    assert (gaps.heard(info), gaps.heard(info), gaps.lost, gaps.numbered) == (0, 0, 0, False)
+    assert (gaps.count(info), gaps.count(info), gaps.lost, gaps.numbered) == (0, 0, 0, False)
 
 
 @pytest.mark.parametrize('seed', range(20))
@@ -140,11 +139,11 @@ def test_a_middleware_without_numbers_is_believed_what_it_says_was_lost(make_ben
     endpoints = Endpoints(make_bench().peer)
     endpoints.subscribe(Float64, 'depth', lambda *_: None, input_qos(10))
     endpoints._lost('depth', SimpleNamespace(total_count=7))
-    endpoints._gaps['depth'].heard({'publication_sequence_number': None, 'received_timestamp': 1})
+    endpoints._gaps['depth'].count({'publication_sequence_number': None, 'received_timestamp': 1})
     assert endpoints.lost == {'depth': 7}
     for number in (1, 4):  # with numbers they count alone, since both may know of the same
         info = {'publication_sequence_number': number, 'received_timestamp': 1}
-        endpoints._gaps['depth'].heard(info)
+        endpoints._gaps['depth'].count(info)
     assert endpoints.lost == {'depth': 2}
 
 

@@ -135,12 +135,12 @@ def test_the_ball_tells_how_probable_a_collision_is(risk, colour):
 
 
 def test_confirmed_obstacles_are_shown_and_the_oldest_gives_the_probabilities(rig):
-    rig.node.show(an_estimate([9, 3, 5, 2], [1, 2, 1, 0]))
+    rig.node.show([an_estimate([9, 3, 5, 2], [1, 2, 1, 0])])
     rig.bench.spin_until(lambda: rig.poses and rig.markers and rig.probabilities)
     assert len(rig.poses[0].poses) == 3 and rig.poses[0].header.frame_id == 'odom'
     assert {marker.id for marker in rig.markers[0].markers} == {9, 3, 5}
     assert list(rig.probabilities[0].name) == ['above', 'below']
-    rig.node.show(an_estimate([2], [0]))
+    rig.node.show([an_estimate([2], [0])])
     rig.bench.spin_until(lambda: len(rig.poses) == 2 and len(rig.markers) == 2)
     assert not rig.poses[1].poses
     drawn = {(marker.ns, marker.id) for marker in rig.markers[0].markers}
@@ -150,7 +150,7 @@ def test_confirmed_obstacles_are_shown_and_the_oldest_gives_the_probabilities(ri
 
 
 def test_reset_deletes_all_markers(rig):
-    rig.node.show(an_estimate([1], [1]))
+    rig.node.show([an_estimate([1], [1])])
     assert rig.bench.call(Trigger, '/obstacle/reset', Trigger.Request()).success
     rig.bench.spin_until(lambda: len(rig.markers) == 2)
     assert [marker.action for marker in rig.markers[1].markers] == [Marker.DELETEALL]

@@ -22,9 +22,8 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
 from msg_adapters.table import encode_table
-from sonar_imm.nodes.answers import Answers
 from sonar_imm.nodes.messages import make
-from sonar_imm.nodes.tables import TablePublisher
+from sonar_imm.nodes.outputs import ProcessedPublisher, TablePublisher
 
 
 class Paper:
@@ -74,7 +73,7 @@ def test_what_arrives_is_what_was_published_whatever_came_before(repeat):
 
 
 def test_a_table_whose_bytes_are_not_understood_is_published_as_any_other_message(monkeypatch):
-    monkeypatch.setattr('sonar_imm.nodes.tables._STAMP', 8)
+    monkeypatch.setattr('sonar_imm.nodes.outputs._STAMP', 8)
     paper = Paper()
     publisher = TablePublisher(paper)
     for told in CASES:
@@ -84,14 +83,14 @@ def test_a_table_whose_bytes_are_not_understood_is_published_as_any_other_messag
 
 def test_every_answer_has_its_counts_and_its_stamp():
     paper = Paper()
-    answers = Answers(paper)
+    answers = ProcessedPublisher(paper)
     stamp = table().header.stamp
     for counts, when in (
         ({'a': 1, 'b': 2}, None),
         ({'a': 70000, 'b': 3}, stamp),
         ({'a': 1, 'b': 0}, None),
     ):
-        answers.say(counts, when)
+        answers.publish(counts, when)
         message = paper.message
         assert message.data == array.array('B', np.array([*counts.values()], '<f8').tobytes())
         assert [field.name for field in message.fields] == ['a', 'b']

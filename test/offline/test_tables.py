@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from sonar_imm_tools.cli import main
-from sonar_imm_tools.offline.tables import CsvTable, ParquetTable, ROWS_IN_A_GROUP
+from sonar_imm_tools.offline.run_folder import CsvTable, ParquetTable, ROWS_IN_A_GROUP
 
 ESTIMATES = single_run(count=20)[0]
 

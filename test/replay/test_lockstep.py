@@ -193,7 +193,7 @@ def test_lockstep_waits_for_an_input_that_is_found_late(link, start, stepping, m
         looks.append(publishers)
         return {p.topic_name for p in publishers if p.topic_name == '/fix' or len(looks) > 5}
 
-    monkeypatch.setattr(step, '_heard', heard)
+    monkeypatch.setattr(step, '_subscribed', heard)
     assert player._meet(15.0) == {'/fix', '/other'}
 
 

@@ -20,10 +20,10 @@ from std_msgs.msg import String
 
 from sonar_imm.nodes.qos import input_qos, latched_qos
 from sonar_imm_tools.recordings.messages import message_definition
-from sonar_imm_tools.replay import relay as relay_module
+from sonar_imm_tools.replay import listening
 from sonar_imm_tools.replay.harness import reserved_domain_id
 from sonar_imm_tools.replay.link import Link
-from sonar_imm_tools.replay.relay import Relay
+from sonar_imm_tools.replay.listening import Relay
 
 LIMIT = 300  # steps of 50 ms
 
@@ -39,7 +39,7 @@ class Rig:
             topics,
             appeared=lambda name, kind, text: self.offered.update({name: (kind, text)}),
             vanished=self.gone.append,
-            heard=lambda *message: self.heard.append(message),
+            received=lambda *message: self.heard.append(message),
             watched=self.watching.__contains__,
         )
 
@@ -54,7 +54,7 @@ class Rig:
 @pytest.fixture
 def make_rig(monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    monkeypatch.setattr(relay_module, 'LOOK', 0.05)
+    monkeypatch.setattr(listening, 'RELAY_LOOK', 0.05)
     with (
         reserved_domain_id() as domain,
         Link('talker', domain_id=domain) as talker,
@@ -117,7 +117,7 @@ def test_a_type_that_is_not_installed_is_said_once(make_rig, monkeypatch):
     ],
 )
 def test_a_definition_read_off_a_class_is_that_of_the_msg_files(name):
-    assert blocks(relay_module._definition(name)) == blocks(message_definition(name))
+    assert blocks(listening._definition(name)) == blocks(message_definition(name))
 
 
 def blocks(text):

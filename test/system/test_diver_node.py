@@ -25,7 +25,8 @@ import numpy as np
 import pytest
 
 from msg_adapters.fixes import write_fix
-from sonar_imm.measurements import Fix, FrameGuard, Rejection
+from sonar_imm.intake import KnownFrames
+from sonar_imm.measurements import Fix, Rejection
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm_tools.recordings.measurements import measurements_of
 from sonar_imm_tools.recordings.messages import ros_message
@@ -74,7 +75,7 @@ def offline(path, **parameters):
     """What the tracker makes of the bag without ROS."""
     system = SYSTEMS['diver']
     tracker = system.build(system.config_type()(**parameters))
-    guard, estimates = FrameGuard(), []
+    guard, estimates = KnownFrames(), []
     with BagReader(path) as reader:
         for heard in measurements_of(reader, 'diver'):
             try:

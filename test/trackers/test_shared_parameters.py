@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import Altitude, Detections, Navigation, Trace
-from sonar_imm.parameters import Config, ConfigError, inherited, parameter
+from sonar_imm.parameters import Config, ConfigError, inherited, live, parameter
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm.trackers.model_checks import chain_problems, matrix_problems
@@ -40,8 +40,8 @@ APART = {'sound_speed'}
 
 @frozen(kw_only=True, slots=False)
 class Left(Config):
-    first: float = parameter(1.0, 'first', low=0.0, high=5.0, read_only=False)
-    second: int = parameter(2, 'second')
+    first: float = live(1.0, '', 'first', range=(0.0, 5.0))
+    second: int = parameter(2, '', 'second')
 
     def check(self):
         return [*super().check(), *(['first is the largest'] if self.first > self.second else [])]
@@ -49,7 +49,7 @@ class Left(Config):
 
 @frozen(kw_only=True, slots=False)
 class Right(Config):
-    third: bool = parameter(True, 'third')
+    third: bool = parameter(True, '', 'third')
 
     def check(self):
         return [*super().check(), *([] if self.third else ['third is false'])]
@@ -57,8 +57,8 @@ class Right(Config):
 
 @frozen(kw_only=True)
 class Both(Left, Right):
-    own: str = parameter('x', 'own')
-    first: float = inherited(Left, 'first', 0.5, high=9.0)
+    own: str = parameter('x', '', 'own')
+    first: float = inherited(Left, 'first', 0.5, range=(0.0, 9.0))
 
 
 def test_an_inherited_parameter_keeps_its_place_and_what_was_not_changed():

@@ -77,7 +77,7 @@ def test_counters_that_two_share_stay_shared():
     run = tracked('diver_table1')
     tracker = run.system.build(run.config)
     restore(tracker, frozen_state(run.until(20)))
-    assert tracker.counts is tracker._stream.counts is tracker._placer._counts
+    assert tracker.counts is tracker._stream.counts is tracker._georeferencer._counts
     target = Counter(old=3)
     assert put(target, Counter(new=1)) is target and target == Counter(new=1)
 

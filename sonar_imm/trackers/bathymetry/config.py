@@ -22,11 +22,14 @@ from __future__ import annotations
 
 import math
 
-from attrs import frozen
+from attrs import evolve, frozen
 
 from ...acoustics.laplace import LIKELIHOODS
+from ...acoustics.rays import profile_problem
+from ...acoustics.sounding import ErrorBudget
+from ...parameters import live
 from ..model_checks import chain_problems
-from .sea_parameters import parameter, SeaParameters
+from ..shared_parameters import MountingParameters
 
 DEFAULT_SIGMAS = {
     'height_rw_ncs': (0.5, 1.0),
@@ -40,212 +43,164 @@ DEFAULT_SIGMAS_DEG = (0.1, 0.1, 2.0)
 MODEL_SETS = ('height_rw_ncs', 'height_two_rw', 'angle_two_rw', 'height_bank')
 SCALAR_SETS = ('height_two_rw', 'angle_two_rw', 'height_bank')
 """The sets of one state, which the grid engine can run."""
+NAVIGATION = ('auto', 'required', 'ignored')
 
 
 @frozen(kw_only=True)
-class BathymetryConfig(SeaParameters):
-    """Everything the bathymetry tracker can be told."""
+class BathymetryConfig(MountingParameters):
+    """All parameters of the bathymetry tracker."""
 
+    # fmt: off
     # -- which models ----------------------------------------------------------------------------
-    model_set: str = parameter(
-        'height_two_rw', 'terrain models run side by side', choices=MODEL_SETS
-    )
-    variant: str = parameter(
-        'corrected',
-        'corrected, or paper: the formulas as printed (see the docs for what is wrong), and what '
-        'the paper takes where nothing else is stated: sigmas 1 m and 1/m of height_rw_ncs, 0.01 '
-        'and 1 m of height_two_rw, stay_probability 0.98; neither shadow_gate nor angle_drift',
-        choices=('corrected', 'paper'),
-    )
-    sigmas: tuple[float, ...] = parameter(
-        (),
-        'noise of each model over a range bin, in the order of the set: m, but 1/m for ncs; '
-        'empty: values that suit most floors; any number for height_bank',
-        kind='float[]',
-        low=0.0,
-        high=1000.0,
-    )
-    sigmas_deg: tuple[float, ...] = parameter(
-        (),
-        'angle_two_rw: noise of the first model over a range bin, and of the second at the first '
-        'and at the last bin, linear between; empty: 0.1, 0.1, 2',
-        kind='float[]',
-        unit='deg',
-        low=0.0,
-        high=90.0,
-    )
-    sigma_reference_bin: float = parameter(
-        0.0,
-        'range bin at which the noises are stated, they grow with sqrt(bin / reference); '
-        '0: as stated whatever the bin',
-        unit='m',
-        low=0.0,
-        high=100.0,
-    )
-    rough_sigma: float = parameter(
-        0.07,
-        'height_bank: walks of at least this noise over a range bin are rough floor; undulations '
-        'and slopes of a smooth floor need up to 0.05',
-        unit='m',
-        low=0.0,
-        high=1000.0,
-    )
-    transition_matrix: tuple[float, ...] = parameter(
-        (),
+    model_set: str = live('height_two_rw', '',
+        'terrain models run side by side', choices=MODEL_SETS)
+    variant: str = live('corrected', '',
+        'formulas: corrected, or paper (as printed, see the docs for what is wrong). Where '
+        'nothing else is stated, paper takes sigmas 1 m and 1/m of height_rw_ncs, 0.01 and 1 m of '
+        'height_two_rw, stay_probability 0.98, and neither shadow_gate nor angle_drift',
+        choices=('corrected', 'paper'))
+    sigmas: tuple[float, ...] = live((), '',
+        'process noise of each model over a range bin, in the order of model_set: m, but 1/m for '
+        'ncs; empty: values that suit most floors; height_bank takes any number of values',
+        range=(0.0, 1000.0), kind='float[]')
+    sigmas_deg: tuple[float, ...] = live((), 'deg',
+        'angle_two_rw: process noise of the first model over a range bin, then of the second at '
+        'the first and at the last bin, linear between; empty: 0.1, 0.1, 2', range=(0.0, 90.0),
+        kind='float[]')
+    sigma_reference_bin: float = live(0.0, 'm',
+        'range bin for which sigmas and sigmas_deg are stated: they grow with sqrt(bin / '
+        'reference); 0: as stated, whatever the bin', range=(0.0, 100.0))
+    rough_sigma: float = live(0.07, 'm',
+        'height_bank: random walks with at least this noise over a range bin are rough floor; '
+        'undulations and slopes of a smooth floor need up to 0.05', range=(0.0, 1000.0))
+    transition_matrix: tuple[float, ...] = live((), '',
         'transition matrix over a range bin, row-major, row = from; empty: stay_probability',
-        kind='float[]',
-        low=0.0,
-        high=1.0,
-    )
-    stay_probability: float = parameter(
-        0.0,
-        'probability of keeping the model over a range bin, without transition_matrix; 0: 0.995, '
-        'or 0.998 in height_bank, or 0.98 in variant paper',
-        low=0.0,
-        high=1.0,
-    )
-    initial_probabilities: tuple[float, ...] = parameter(
-        (),
-        'model probabilities before the first bin; empty: uniform',
-        kind='float[]',
-        low=0.0,
-        high=1.0,
-    )
-    initial_mean: float = parameter(
-        0.0,
+        range=(0.0, 1.0), kind='float[]')
+    stay_probability: float = live(0.0, '',
+        'probability of keeping the model over a range bin, used without transition_matrix; 0: '
+        '0.995, or 0.998 in height_bank, or 0.98 in variant paper', range=(0.0, 1.0))
+    initial_probabilities: tuple[float, ...] = live((), '',
+        'model probabilities before the first bin; empty: uniform', range=(0.0, 1.0),
+        kind='float[]')
+    initial_mean: float = live(0.0, '',
         'state before the first bin: height of the floor in m, or angle in rad (see initial_std)',
-        low=-1000.0,
-        high=1000.0,
-    )
-    initial_std: float = parameter(
-        0.0,
-        'its standard deviation, m or rad; 0: 1 m, or 5 deg around the angle at which the '
-        'reference floor is first heard',
-        low=0.0,
-        high=1000.0,
-    )
-    initial_slope_std: float = parameter(
-        0.1, 'standard deviation of the slope before the first bin', low=0.0, high=100.0
-    )
-    redrawn_slope_std: float = parameter(
-        0.1,
-        'height_rw_ncs: standard deviation of the slope while the random walk holds, where it '
-        'means nothing; the paper has 0',
-        low=0.0,
-        high=100.0,
-    )
+        range=(-1000.0, 1000.0))
+    initial_std: float = live(0.0, '',
+        'standard deviation of the state before the first bin, m or rad; 0: 1 m, or 5 deg around '
+        'the angle of the first echo of the reference floor', range=(0.0, 1000.0))
+    initial_slope_std: float = live(0.1, '',
+        'standard deviation of the slope before the first bin', range=(0.0, 100.0))
+    redrawn_slope_std: float = live(0.1, '',
+        'height_rw_ncs: standard deviation of the slope while the random walk model holds, which '
+        'has no slope; the paper has 0', range=(0.0, 100.0))
 
-    angle_drift: bool = parameter(
-        True,
-        'angle_two_rw: the floor is predicted at constant height, not at constant angle; near '
-        'nadir it turns by degrees from bin to bin',
-    )
+    angle_drift: bool = live(True, '',
+        'angle_two_rw: predict the floor at constant height, not at constant angle; near nadir '
+        'the angle turns by degrees from bin to bin')
 
     # -- sonar -----------------------------------------------------------------------------------
-    sonar_height: float = parameter(
-        15.0,
-        'height of the sonar above the reference floor; with nav only where the filter starts, '
-        'see also sonar_height_std',
-        unit='m',
-        low=0.01,
-        high=12000.0,
-    )
-    side: str = parameter('starboard', 'side the array looks to', choices=('port', 'starboard'))
-    tilt_deg: float = parameter(
-        30.0, 'direction the array looks to, below the horizon', unit='deg', low=-90.0, high=90.0
-    )
-    element_spacing_wavelengths: float = parameter(
-        0.0,
+    sonar_height: float = live(15.0, 'm',
+        'height of the sonar above the reference floor; with nav used only where the filter '
+        'starts, see also sonar_height_std', range=(0.01, 12000.0))
+    side: str = live('starboard', '', 'side the array looks to', choices=('port', 'starboard'))
+    tilt_deg: float = live(30.0, 'deg',
+        'direction the array looks to, below the horizon', range=(-90.0, 90.0))
+    element_spacing_wavelengths: float = live(0.0, '',
         'distance between staves in wavelengths; 0: as the snapshot says, else 0.5',
-        low=0.0,
-        high=100.0,
-    )
-    conjugate: bool = parameter(
-        False, 'the phase of an echo from below broadside falls from stave to stave'
-    )
-    sound_speed: float = parameter(
-        1500.0,
-        'for snapshots that have times, and no sound speed of their own',
-        unit='m/s',
-        low=1300.0,
-        high=1700.0,
-    )
+        range=(0.0, 100.0))
+    conjugate: bool = live(False, '',
+        'true when the phase of an echo from below broadside falls from stave to stave')
+    sound_speed: float = live(1500.0, 'm/s',
+        'speed of sound for snapshots that hold times and state no sound speed',
+        range=(1300.0, 1700.0))
 
     # -- what is heard ---------------------------------------------------------------------------
-    likelihood: str = parameter(
-        'laplace', 'distribution of the samples of one bin', choices=LIKELIHOODS
-    )
-    noise_variance: float = parameter(
-        0.0,
-        'noise power at a stave, for snapshots that do not bring it; 0: from the water column, '
-        'or blindly where there is none',
-        low=0.0,
-        high=1e30,
-    )
-    shadow_gate: bool = parameter(
-        True, 'bins without a coherent echo are passed over by the smoothest model'
-    )
-    gate_false_alarm: float = parameter(
-        1e-3, 'probability of taking noise for an echo', low=1e-9, high=0.5
-    )
-    decorrelation: float = parameter(
-        0.0,
-        'share of the power of an echo that is not the same at all staves, as of a diffuse floor '
-        'under a wide aperture; acts as noise',
-        low=0.0,
-        high=0.95,
-    )
-    multipath: bool = parameter(
-        False, 'expect echoes by way of the surface, as noise from where they would come'
-    )
-    sonar_depth: float = parameter(
-        3.0, 'depth of the sonar below the surface, for multipath', unit='m', low=0.0, high=12000.0
-    )
-    multipath_level_db: float = parameter(
-        0.0, 'power of those echoes against the floor', unit='dB', low=-60.0, high=60.0
-    )
+    likelihood: str = live('laplace', '',
+        'distribution of the samples of one bin', choices=LIKELIHOODS)
+    noise_variance: float = live(0.0, '',
+        'noise power at a stave, for snapshots that do not state it; 0: estimated from the water '
+        'column, or blindly where there is none', range=(0.0, 1e30))
+    shadow_gate: bool = live(True, '',
+        'bridge bins without a coherent echo with the smoothest model')
+    gate_false_alarm: float = live(1e-3, '',
+        'probability that the test for a coherent echo (shadow_gate) takes noise for an echo',
+        range=(1e-9, 0.5))
+    decorrelation: float = live(0.0, '',
+        'share of the power of an echo that differs from stave to stave, as from a diffuse floor '
+        'under a wide aperture; it acts as noise', range=(0.0, 0.95))
+    multipath: bool = live(False, '',
+        'expect echoes by way of the surface, modelled as noise from their directions')
+    sonar_depth: float = live(3.0, 'm',
+        'depth of the sonar below the surface, for multipath', range=(0.0, 12000.0))
+    multipath_level_db: float = live(0.0, 'dB',
+        'multipath: power of echoes by way of the surface, relative to those of the floor',
+        range=(-60.0, 60.0))
 
     # -- computation -----------------------------------------------------------------------------
-    engine: str = parameter(
-        'auto',
-        'particles, or a grid: exact, without Monte Carlo noise, for sets of one state; auto: '
-        'grid for height_bank, else particles',
-        choices=('auto', 'particles', 'grid'),
-    )
-    particles_per_model: int = parameter(100, 'particles of each model', low=2, high=100_000)
-    grid_step: float = parameter(
-        0.0,
-        'distance of grid points, m or rad; 0: the smallest noise, 0.01 m or 0.05 deg at most; '
-        '0.01 m for height_bank',
-        low=0.0,
-        high=100.0,
-    )
-    grid_extent: float = parameter(
-        20.0,
-        'the grid reaches so far to both sides of the start, and at least 2 sonar_height_std '
-        '(angles: all that can be)',
-        unit='m',
-        low=0.1,
-        high=1000.0,
-    )
-    smoothing: str = parameter(
-        'auto',
-        'use the whole ping for each bin: modes (Kim: the model probabilities only), or states '
-        '(forward-backward on the grid: everything); auto: states for height_bank on the grid, '
-        'which finds nothing rough without, else none',
-        choices=('auto', 'none', 'modes', 'states'),
-    )
-    ping_coupling: float = parameter(
-        0.0,
-        'how strongly the labels of neighbouring pings lean on each other, 0 for not at all; 0.15 '
-        'to 0.35 suit most; needs smoothing; estimates come one ping late; heights are left alone',
-        low=0.0,
-        high=5.0,
-    )
-    seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
+    engine: str = live('auto', '',
+        'particles, or grid (exact, without Monte Carlo noise, for sets of one state); auto: grid '
+        'for height_bank, else particles', choices=('auto', 'particles', 'grid'))
+    particles_per_model: int = live(100, '',
+        'number of particles of each model', range=(2, 100_000))
+    grid_step: float = live(0.0, '',
+        'distance between grid points, m or rad; 0: the smallest noise, at most 0.01 m or 0.05 '
+        'deg; 0.01 m for height_bank', range=(0.0, 100.0))
+    grid_extent: float = live(20.0, 'm',
+        'distance that a grid of heights reaches to both sides of the start, at least 2 '
+        'sonar_height_std; a grid of angles holds all that are possible', range=(0.1, 1000.0))
+    smoothing: str = live('auto', '',
+        'use of the whole ping for each bin: none, modes (Kim: the model probabilities only) or '
+        'states (forward-backward on the grid: everything); auto: states for height_bank on the '
+        'grid, which finds nothing rough without, else none',
+        choices=('auto', 'none', 'modes', 'states'))
+    ping_coupling: float = live(0.0, '',
+        'strength with which the model labels of neighbouring pings influence each other; 0: not '
+        'at all, 0.15 to 0.35 suit most; needs smoothing; estimates come one ping late, heights '
+        'do not change', range=(0.0, 5.0))
+    seed: int = live(0, '', 'seed of the random number generator', range=(0, 2**63 - 1))
+
+    # -- the ship --------------------------------------------------------------------------------
+    navigation: str = live('auto', '',
+        'use of nav: auto (from its first message on; for a recording that has nav: required), '
+        'required (pings wait for nav), ignored (a level sonar at rest)', choices=NAVIGATION)
+    sonar_lever: tuple[float, ...] = live((0.0, 0.0, 0.0), 'm',
+        'vector from the navigation reference to the array: x forward, y port, z up (vehicle FLU)',
+        range=(-100.0, 100.0))
+    sonar_mount_rpy_deg: tuple[float, ...] = live((0.0, 0.0, 0.0), 'deg',
+        'roll, pitch, yaw of the array in the vehicle (FLU: pitch positive nose down), in '
+        'addition to side and tilt_deg', range=(-180.0, 180.0))
+    max_gap: float = live(1.0, 's',
+        'longest time between two poses of nav that is interpolated; pings in a longer gap are '
+        'skipped and counted', range=(0.01, 60.0))
+    max_extrapolation: float = live(0.0, 's',
+        'a ping is processed when its last bin lies no further than this beyond the newest pose '
+        'of nav, else it waits', range=(0.0, 10.0))
+
+    # -- the water -------------------------------------------------------------------------------
+    sound_speed_profile: tuple[float, ...] = live((), '',
+        'depth in m and sound speed in m/s in turn, linear between and constant beyond; empty: '
+        'straight rays; needs navigation', range=(-100.0, 12000.0), kind='float[]')
+    water_level: float = live(0.0, 'm',
+        'z of the water surface in the world: depth in sound_speed_profile is water_level - z',
+        range=(-12000.0, 12000.0))
+
+    # -- how well it is known --------------------------------------------------------------------
+    sonar_height_std: float = live(0.0, 'm',
+        'standard deviation of sonar_height; the filter then starts at the first return; 0: '
+        'sonar_height is exact, see initial_std', range=(0.0, 1000.0))
+    attitude_std_deg: float = live(0.05, 'deg',
+        'standard deviation of roll and pitch in nav', range=(0.0, 45.0))
+    heading_std_deg: float = live(0.1, 'deg',
+        'standard deviation of the heading in nav', range=(0.0, 180.0))
+    heave_std: float = live(0.05, 'm', 'standard deviation of z in nav', range=(0.0, 100.0))
+    position_std: float = live(0.1, 'm',
+        'standard deviation of x and of y in nav', range=(0.0, 10_000.0))
+    sound_speed_std: float = live(0.5, 'm/s',
+        'standard deviation of the sound speed', range=(0.0, 100.0))
+    # fmt: on
 
     def check(self) -> list[str]:
-        problems = super().check() + self._check_sigmas()
+        problems = super().check() + self._ship_problems() + self._check_sigmas()
         models = self.model_count()
         problems += chain_problems(
             self.transition_matrix, self.initial_probabilities, models, self.model_set
@@ -269,6 +224,21 @@ class BathymetryConfig(SeaParameters):
             )
         return problems
 
+    def _ship_problems(self) -> list[str]:
+        problems = [
+            f'{name} needs three values, got {len(getattr(self, name))}'
+            for name in ('sonar_lever', 'sonar_mount_rpy_deg')
+            if len(getattr(self, name)) != 3
+        ]
+        if self.sound_speed_profile:
+            if problem := profile_problem(self.sound_speed_profile):
+                problems.append(f'sound_speed_profile {problem}')
+            if self.navigation == 'ignored':
+                problems.append(
+                    'sound_speed_profile needs navigation: the depth of the sonar follows from it'
+                )
+        return problems
+
     def _check_sigmas(self) -> list[str]:
         if self.model_set == 'angle_two_rw':
             problems = ['angle_two_rw takes sigmas_deg, not sigmas'] if self.sigmas else []
@@ -289,6 +259,22 @@ class BathymetryConfig(SeaParameters):
                 f'{len(self.sigmas)}'
             )
         return problems
+
+    def for_inputs(self, inputs: frozenset[str]) -> BathymetryConfig:
+        """A recording says whether there is navigation: its first pings wait for it, too."""
+        if self.navigation != 'auto':
+            return self
+        return evolve(self, navigation='required' if 'nav' in inputs else 'ignored')
+
+    def budget(self) -> ErrorBudget:
+        """What soundings add to the variance of the filter."""
+        return ErrorBudget(
+            attitude=math.radians(self.attitude_std_deg),
+            heading=math.radians(self.heading_std_deg),
+            heave=self.heave_std,
+            position=self.position_std,
+            sound_speed=self.sound_speed_std,
+        )
 
     @property
     def runs_on_grid(self) -> bool:

@@ -12,13 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The particle filter along a block of range bins of one ping, compiled as one loop.
+"""The filters along the range bins of one ping, each compiled as one loop: particles and grid.
 
-Each verb is a kernel of its own room (`estimation.imm_particles_kernels`,
-`acoustics.likelihood_kernels`); here they are called bin after bin on arrays that stay in the
-cache.
+In `filter_block`, bin after bin, are the verbs of `estimation.imm_particles`:
 
-Shapes: T bins of a ping, M models, n states, k noises, N particles per model, P staves.
+    resample    the particles of each model, from those of all models that could become it
+    propagate   each model moves its particles to the next bin
+    weigh       each particle meets the snapshot (`acoustics.likelihood_kernels`)
+    summarise   one answer for the bin
+
+`filter_ping` and `smooth_ping` do the same on a grid, with the verbs of `estimation.grid`. What
+they work on stays in the cache.
+
+Shapes: T bins of a ping, M models, n states, k noises, N particles per model, G cells of the grid,
+P staves.
 """
 
 from __future__ import annotations
@@ -29,8 +36,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...acoustics import likelihood_kernels, rays
-from ...estimation import imm_particles_kernels as imm
-from ...estimation.arrays import BoolArray, ComplexArray, FloatArray
+from ...estimation import grid
+from ...estimation import imm_particles as imm
+from ...estimation.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from ...estimation.elementary import phasors
 from ...estimation.jit import kernel
 
@@ -66,14 +74,14 @@ class Geometry(NamedTuple):
 class PingLikelihood(NamedTuple):
     """The likelihood of the state in each of T bins.
 
-    ranges (T,) in metres; heard (T,): bins that say something; form (T, P), base (T,), spread
+    ranges (T,) in metres; echo (T,): bins with an echo; form (T, P), base (T,), spread
     (T, P), or (T, 0) in white noise, signal (T,) and table: see
     `likelihood_kernels.log_likelihoods`; noise (T,): the variance it was made for; constant (T,):
     what the kernels leave out of the log likelihood.
     """
 
     ranges: FloatArray
-    heard: BoolArray
+    echo: BoolArray
     form: ComplexArray
     base: FloatArray
     spread: ComplexArray
@@ -86,7 +94,7 @@ class PingLikelihood(NamedTuple):
 
 class Motion(NamedTuple):
     """How the models move: F (M, n, n), G (M, n, k) times scale (T, M); transition (M, M) of the
-    models; `coast` is the model that moves all particles through bins where nothing is heard;
+    models; `coast` is the model that moves all particles through bins without an echo;
     favour (T, M): see `models.TerrainModels`, (0, M) for none."""
 
     F: FloatArray
@@ -106,7 +114,7 @@ class Particles(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """Random numbers for B bins: uniform (B, 2, M) for mixing and resampling, standard normal
+    """Random numbers for B bins: uniform (B, 2, M) for resampling, standard normal
     noise (B, M, k, N)."""
 
     uniform: FloatArray
@@ -122,6 +130,29 @@ class Track(NamedTuple):
     probability: FloatArray
     log_likelihood: FloatArray
     sample_size: FloatArray
+
+
+class GridMotion(NamedTuple):
+    """How the models move on the grid: cells (G,), the states it is made of; transition (M, M) of
+    the models; sigma (T, M) of their walks, in cells; `coast` is the model that all follow through
+    bins without an echo; favour (T, M): see `models.TerrainModels`, (0, M) for none."""
+
+    cells: FloatArray
+    transition: FloatArray
+    sigma: FloatArray
+    coast: int
+    favour: FloatArray
+
+
+class Drift(NamedTuple):
+    """Where each cell goes if the floor keeps its height: `first` (G,), the cell before the one
+    that lies just before that place, and the weights (4, G) of that and the next three cells.
+
+    The weights are those of cubic interpolation, which keep the first four moments: splitting
+    between two cells would add noise at every bin."""
+
+    first: IntArray
+    weight: FloatArray
 
 
 @kernel
@@ -177,8 +208,8 @@ def drift(state: FloatArray, t: int, geometry: Geometry, out: FloatArray) -> Non
 
 
 @kernel
-def favoured(c: FloatArray, favour: FloatArray) -> None:
-    """Predicted probabilities c (M,) times what favours each model, as probabilities again."""
+def favour_models(c: FloatArray, favour: FloatArray) -> None:
+    """Predicted probabilities c (M,) times the factors of each model, as probabilities again."""
     total = 0.0
     for j in range(c.shape[0]):
         c[j] *= favour[j]
@@ -199,35 +230,35 @@ def filter_block(
 ) -> None:
     """Bins first, first + 1, ... of a ping, as many as `draws` last for.
 
-    `particles` are carried on, the answers go into `track`. Where nothing is heard the chain of
-    the models rests. `resample` resamples each model's particles after the update, before the
-    answer.
+    `particles` are carried on, the answers go into `track`. Without an echo the chain of the
+    models rests. `resample` resamples each model's own particles besides, after they are weighed
+    and before the summary.
     """
     x, w, mu = particles
     M, n, N = x.shape
     F, G, scale, noise = motion.F, motion.G, motion.scale, draws.noise
-    heard, geometry, table = ping.heard, ping.geometry, ping.table
+    echo, geometry, table = ping.echo, ping.geometry, ping.table
     form, base, spread, signal = ping.form, ping.base, ping.spread, ping.signal
-    scratch = imm.MixScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
+    scratch = imm.ResampleScratch(np.empty((M, N)), np.empty(N), np.empty(N + 1, np.int64))
     sines, value = np.empty(N), np.empty((M, N))
     mixed, work, c = np.empty((M, n, N)), np.empty((4, N)), np.empty(M)
     step, alone = np.empty((n, G.shape[2])), np.eye(M)
     for b in range(noise.shape[0]):
         t = first + b
-        if heard[t]:
-            imm.mix(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
+        if echo[t]:
+            imm.resample(x, w, mu, motion.transition, draws.uniform[b, 0], scratch, mixed, c)
             if motion.favour.shape[0] > 0:
-                favoured(c, motion.favour[t])
+                favour_models(c, motion.favour[t])
         for j in range(M):
-            model = j if heard[t] else motion.coast
+            model = j if echo[t] else motion.coast
             for a in range(n):
                 for k in range(G.shape[2]):
                     step[a, k] = G[model, a, k] * scale[t, model]
             if t >= geometry.drift_from:
-                before = mixed[j, 0] if heard[t] else x[j, 0]
+                before = mixed[j, 0] if echo[t] else x[j, 0]
                 drift(before, t, geometry, before)
-            if heard[t]:
-                imm.predict(mixed[j], F[model], step, noise[b, j], x[j])
+            if echo[t]:
+                imm.propagate(mixed[j], F[model], step, noise[b, j], x[j])
                 # Written out: a call that takes the whole of `ping` would cost 5 % of the ping.
                 sines_of(x[j, 0], t, geometry, work, sines)
                 likelihood_kernels.log_likelihoods(
@@ -244,19 +275,251 @@ def filter_block(
                 for s in range(N):
                     w[j, s] = 1.0 / N
             else:
-                imm.predict(x[j], F[model], step, noise[b, j], mixed[j])
+                imm.propagate(x[j], F[model], step, noise[b, j], mixed[j])
                 for a in range(n):
                     for s in range(N):
                         x[j, a, s] = mixed[j, a, s]
-        track.log_likelihood[t] = imm.update(value, c, w, mu, work[:2]) if heard[t] else 0.0
+        track.log_likelihood[t] = imm.weigh(value, c, w, mu, work[:2]) if echo[t] else 0.0
         track.sample_size[t] = imm.effective_sample_size(w, mu)
-        if resample and heard[t]:
-            imm.mix(x, w, mu, alone, draws.uniform[b, 1], scratch, mixed, c)
+        if resample and echo[t]:
+            imm.resample(x, w, mu, alone, draws.uniform[b, 1], scratch, mixed, c)
             for j in range(M):
                 for s in range(N):
                     w[j, s] = 1.0 / N
                     for a in range(n):
                         x[j, a, s] = mixed[j, a, s]
-        imm.combine(x, w, mu, track.mean[t], track.covariance[t])
+        imm.summarise(x, w, mu, track.mean[t], track.covariance[t])
         for j in range(M):
             track.probability[t, j] = mu[j]
+
+
+@kernel
+def find_drift(
+    cells: FloatArray,
+    low: int,
+    high: int,
+    t: int,
+    geometry: Geometry,
+    out: Drift,
+    work: FloatArray,
+) -> tuple[int, int]:
+    """The drift of the cells [low, high) from bin t - 1 to bin t; the window they reach. work (1
+    or more, G) is scratch."""
+    G, step = cells.shape[0], cells[1] - cells[0]
+    to = work[0, : high - low]
+    drift(cells[low:high], t, geometry, to)
+    new_low, new_high = G, 0
+    for g in range(low, high):
+        place = min(max((to[g - low] - cells[0]) / step, 1.0), G - 3.0)
+        k = min(int(place), G - 3)
+        f = place - k
+        out.first[g] = k - 1
+        out.weight[0, g] = -f * (f - 1.0) * (f - 2.0) / 6.0
+        out.weight[1, g] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
+        out.weight[2, g] = -(f + 1.0) * f * (f - 2.0) / 2.0
+        out.weight[3, g] = (f + 1.0) * f * (f - 1.0) / 6.0
+        new_low, new_high = min(new_low, k - 1), max(new_high, k + 3)
+    return new_low, new_high
+
+
+@kernel
+def push(
+    p: FloatArray, low: int, high: int, cells: Drift, out: FloatArray, to_low: int, to_high: int
+) -> None:
+    """Probability p (G,) on [low, high) carried along, into out (G,) on [to_low, to_high)."""
+    for g in range(to_low, to_high):
+        out[g] = 0.0
+    for g in range(low, high):
+        for i in range(4):
+            out[cells.first[g] + i] += cells.weight[i, g] * p[g]
+    for g in range(to_low, to_high):
+        out[g] = max(out[g], 0.0)
+
+
+@kernel
+def pull(
+    beta: FloatArray, low: int, high: int, cells: Drift, out: FloatArray, to_low: int, to_high: int
+) -> None:
+    """The adjoint of `push`: what the future says of where each cell of [low, high) goes, from
+    beta (G,) on [to_low, to_high), zero outside, into out (G,)."""
+    for g in range(low, high):
+        total = 0.0
+        for i in range(4):
+            k = cells.first[g] + i
+            if to_low <= k < to_high:
+                total += cells.weight[i, g] * beta[k]
+        out[g] = max(total, 0.0)
+
+
+@kernel
+def filter_ping(
+    p: FloatArray,
+    motion: GridMotion,
+    ping: PingLikelihood,
+    window: IntArray,
+    track: Track,
+    keep: bool,
+) -> FloatArray:
+    """All T bins from p (M, G), the joint probability before the first.
+
+    The windows [low, high) of the filtered densities go into window (T, 2), the answers into
+    `track`. With `keep` the densities themselves are returned, one after the other, M rows each;
+    else nothing (0,).
+    """
+    (M, G), T = p.shape, ping.ranges.shape[0]
+    cells, sigma, coast = motion.cells, motion.sigma, motion.coast
+    mixed, scratch = np.empty((M, G)), np.empty((7, max(G, 128) + 16))
+    work, value, sines = np.empty((4, G)), np.empty(G), np.empty(G)
+    kept, used = np.empty(4096 if keep else 0), 0
+    carried = Drift(np.empty(G, np.int64), np.empty((4, G)))
+    low, high = grid.trim(p, 0, G)
+    for t in range(T):
+        echo, reach = ping.echo[t], 0
+        if echo:
+            grid.mix(p, low, high, motion.transition, mixed)
+            if motion.favour.shape[0] > 0:
+                _favour_cells(mixed, low, high, motion.favour[t])
+        else:
+            for j in range(M):
+                for g in range(low, high):
+                    mixed[j, g] = p[j, g]
+        if t >= ping.geometry.drift_from:
+            to_low, to_high = find_drift(cells, low, high, t, ping.geometry, carried, work)
+            for j in range(M):
+                push(mixed[j], low, high, carried, p[j], to_low, to_high)
+                for g in range(to_low, to_high):
+                    mixed[j, g] = p[j, g]
+            low, high = to_low, to_high
+        for j in range(M):
+            reach = max(reach, grid.reach_of(sigma[t, j if echo else coast]))
+        new_low, new_high = max(low - reach, 0), min(high + reach, G)
+        for j in range(M):
+            width = sigma[t, j if echo else coast]
+            grid.walk(mixed[j], low, high, width, scratch, p[j], new_low, new_high)
+        low, high = grid.trim(p, new_low, new_high)
+        n = high - low
+        here = value[:n]
+        if echo:
+            _log_likelihoods(cells[low:high], ping, t, sines[:n], work, here)
+        else:
+            for g in range(n):
+                here[g] = 0.0
+        track.log_likelihood[t] = grid.weigh(p, low, high, here, work)
+        low, high = grid.trim(p, low, high)
+        window[t, 0], window[t, 1] = low, high
+        track.mean[t, 0], track.covariance[t, 0, 0] = grid.summarise(
+            p, low, high, cells, track.probability[t]
+        )
+        if keep:
+            needed = used + M * (high - low)
+            if needed > kept.shape[0]:
+                larger = np.empty(2 * needed)
+                for s in range(used):
+                    larger[s] = kept[s]
+                kept = larger
+            for j in range(M):
+                for g in range(low, high):
+                    kept[used] = p[j, g]
+                    used += 1
+    return kept
+
+
+@kernel
+def smooth_ping(
+    kept: FloatArray,
+    window: IntArray,
+    motion: GridMotion,
+    ping: PingLikelihood,
+    track: Track,
+) -> None:
+    """Forward-backward: what `filter_ping` kept, given the whole ping. The answers of all bins but
+    the last are written anew into `track`."""
+    cells, coast = motion.cells, motion.coast
+    M, G, T = motion.transition.shape[0], cells.shape[0], ping.ranges.shape[0]
+    beta, back, p = np.empty((M, G)), np.empty((M, G)), np.empty((M, G))
+    scratch, work = np.empty((7, max(G, 128) + 16)), np.empty((4, G))
+    value, sines = np.empty(G), np.empty(G)
+    carried = Drift(np.empty(G, np.int64), np.empty((4, G)))
+    end = 0
+    for t in range(T):
+        end += M * (window[t, 1] - window[t, 0])
+    low, high = window[T - 1, 0], window[T - 1, 1]
+    for j in range(M):
+        for g in range(low, high):
+            beta[j, g] = 1.0
+    end -= M * (high - low)
+    for t in range(T - 2, -1, -1):
+        echo = ping.echo[t + 1]
+        if echo:
+            n = high - low
+            _log_likelihoods(cells[low:high], ping, t + 1, sines[:n], work, value[:n])
+            grid.weigh(beta, low, high, value[:n], work)
+        new_low, new_high = window[t, 0], window[t, 1]
+        drifts = t + 1 >= ping.geometry.drift_from
+        to_low, to_high = new_low, new_high
+        if drifts:
+            to_low, to_high = find_drift(
+                cells, new_low, new_high, t + 1, ping.geometry, carried, work
+            )
+        for j in range(M):
+            width = motion.sigma[t + 1, j if echo else coast]
+            grid.walk(beta[j], low, high, width, scratch, back[j], to_low, to_high)
+            if drifts:
+                pull(back[j], new_low, new_high, carried, beta[j], to_low, to_high)
+                for g in range(new_low, new_high):
+                    back[j, g] = beta[j, g]
+        low, high = new_low, new_high
+        if echo:
+            if motion.favour.shape[0] > 0:
+                _favour_cells(back, low, high, motion.favour[t + 1])
+            grid.mix(back, low, high, motion.transition.T, beta)
+        else:
+            for j in range(M):
+                for g in range(low, high):
+                    beta[j, g] = back[j, g]
+        end -= M * (high - low)
+        total, s = 0.0, end
+        for j in range(M):
+            for g in range(low, high):
+                p[j, g] = kept[s] * beta[j, g]
+                total += p[j, g]
+                s += 1
+        for j in range(M):
+            for g in range(low, high):
+                p[j, g] /= total
+        track.mean[t, 0], track.covariance[t, 0, 0] = grid.summarise(
+            p, low, high, cells, track.probability[t]
+        )
+
+
+@kernel
+def _favour_cells(p: FloatArray, low: int, high: int, favour: FloatArray) -> None:
+    """Multiply each model's row of p (M, G) on [low, high) by its factor."""
+    for j in range(p.shape[0]):
+        for g in range(low, high):
+            p[j, g] *= favour[j]
+
+
+@kernel
+def _log_likelihoods(
+    state: FloatArray,
+    ping: PingLikelihood,
+    t: int,
+    sines: FloatArray,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Log likelihood of states (n,) given bin t into out (n,); sines (n,) and work (4, n or more)
+    are scratch."""
+    sines_of(state, t, ping.geometry, work, sines)
+    likelihood_kernels.log_likelihoods(
+        sines,
+        ping.geometry.spacing,
+        ping.form[t],
+        ping.base[t],
+        ping.spread[t],
+        ping.signal[t],
+        ping.table,
+        work,
+        out,
+    )

@@ -98,7 +98,7 @@ class TerrainModels:
 
     F (M, n, n), G (M, n, k); scale (T, M): noise of each model at each bin; transition (M, M);
     initial (M,) probabilities before the first bin; mean (n,) and std (n,) of the state then;
-    coast: the model that crosses bins where nothing is heard. rough (M,): models that mean rough
+    coast: the model that crosses bins without an echo. rough (M,): models that mean rough
     floor. start: the law of the first state where it is no normal one. favour (T, M): factors on
     the predicted probability of each model in each bin, from elsewhere; (0, M) for none.
     """

@@ -14,14 +14,17 @@
 
 """One ping, from the snapshot to the estimate: no ping needs another one, so these are functions.
 
-`look` says what is heard in each bin and which models there are, `run` runs the models along the
-ping, `estimate_of` makes a table of the answer. The same numbers come out wherever and whenever a
-ping is computed; a recording's pings can be shared out over processes.
+`look` says which bins hold an echo and which models there are, `run` runs the models along the
+ping, by particles or on a grid, and `summarise` makes the answer, a table and what to count. The
+same numbers come out wherever and whenever a ping is computed; a recording's pings can be shared
+out over processes. Particles and grid take the same models and the same likelihood, and give the
+same answer up to the Monte Carlo noise of the particles.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 import math
 from typing import NamedTuple
 
@@ -33,18 +36,48 @@ from ...acoustics.coherence import FEWEST_STAVES_ALONE
 from ...acoustics.geometry import Pose
 from ...acoustics.rays import profile_of
 from ...estimates import Estimate, places
-from ...estimation.arrays import BoolArray, FloatArray
-from ...estimation.mode_smoothing import smooth_modes
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.elementary import normals
+from ...estimation.smoothing import smooth_modes
 from ...measurements import Snapshot
 from ...soundings import SIDES
 from .config import BathymetryConfig
-from .consistency import residual_ratio
-from .engines import run_grid, run_particles
-from .kernels import PingLikelihood, Track
-from .likelihood import ping_likelihood, spacing_of, stated_noise
+from .kernels import (
+    Draws,
+    filter_block,
+    filter_ping,
+    GridMotion,
+    Motion,
+    Particles,
+    PingLikelihood,
+    smooth_ping,
+    Track,
+)
+from .likelihood import (
+    Floor,
+    level_swath,
+    ping_likelihood,
+    ship_swath,
+    spacing_of,
+    stated_noise,
+    Swath,
+)
 from .models import build_models, grid_cells, TerrainModels
-from .pose_queue import PosedPing, sound_speed_of
-from .swath import Floor, level_swath, ship_swath, Swath
+
+FEWEST_BINS = 100
+"""Of fewer bins `residual_ratio` says nothing."""
+# Random numbers are drawn for so many at a time, which still fit into the cache.
+_BLOCK = 32768
+
+
+class PosedPing(NamedTuple):
+    """A ping, the poses of the ship (T + 1,), ENU from FLU, when it was sent and when each bin was
+    received, the frame of the navigation, and the newest altitude, m, None when there is none."""
+
+    snapshot: Snapshot
+    poses: Pose
+    frame_id: str
+    altitude: float | None
 
 
 @frozen(eq=False)
@@ -76,14 +109,14 @@ class LoudBins(NamedTuple):
     """How many bins stand 20 dB above the noise, how many of them are passed over, and the share
     of their power that differs from stave to stave, NaN without any."""
 
-    count: int
+    bins: int
     silent: int
     decorrelation: float
 
 
 class Answer(NamedTuple):
     """The estimate of one ping, what to count of it, numbers for diagnostics, what its loud bins
-    show, and its `consistency.residual_ratio`, NaN where no noise is stated."""
+    show, and its `residual_ratio`, NaN where no noise is stated."""
 
     estimate: Estimate
     counts: Counter[str]
@@ -95,15 +128,15 @@ class Answer(NamedTuple):
 def track_ping(ping: Ping) -> Answer:
     """The whole way, for a ping by itself."""
     seen = look(ping)
-    return answer_of(seen, run(seen))
+    return summarise(seen, run(seen))
 
 
 def look(ping: Ping) -> Look:
-    """What is heard in each bin, and the models for it."""
+    """The likelihood of each bin, and the models for it."""
     config = ping.config
     swath, floor_below = _swath(ping)
     likelihood, loud = ping_likelihood(ping.snapshot, config, swath, floor_below)
-    first = int(np.argmax(likelihood.heard)) if likelihood.heard.any() else 0
+    first = int(np.argmax(likelihood.echo)) if likelihood.echo.any() else 0
     models = build_models(config, likelihood.ranges, likelihood.geometry, first, floor_below)
     return Look(ping, swath, models, likelihood, loud)
 
@@ -127,36 +160,110 @@ def run(seen: Look, favour: FloatArray | None = None) -> Track:
             resample=config.as_printed,
         )
     if config.smoothing_used == 'modes':
-        smoothed = smooth_modes(track.probability, models.transition, likelihood.heard)
+        smoothed = smooth_modes(track.probability, models.transition, likelihood.echo)
         track = track._replace(probability=smoothed)
     # They add up to one but for rounding: none may pass it for that.
     return track._replace(probability=np.minimum(track.probability, 1.0))
 
 
-def answer_of(seen: Look, track: Track) -> Answer:
+def run_particles(
+    models: TerrainModels,
+    ping: PingLikelihood,
+    count: int,
+    entropy: tuple[int, ...],
+    *,
+    resample: bool = False,
+    watch: Callable[[int, Particles], None] | None = None,
+) -> Track:
+    """The IMM particle filter along a ping, with `count` particles per model.
+
+    entropy: integers that name this ping; the same ones give the same bits, whatever other pings
+    there were. resample: resample each model after the update, as the paper's effective sample
+    size of always one demands. watch: called with each bin and its particles, for pictures.
+    """
+    seeds = np.random.SeedSequence(entropy).spawn(3)
+    start, draws, noises = (np.random.Generator(np.random.SFC64(seed)) for seed in seeds)
+    T, M = models.scale.shape
+    n, k = models.F.shape[1], models.G.shape[2]
+    x, w = models.draw(count, start), np.full((M, count), 1.0 / count)
+    particles = Particles(x, w, models.initial.copy())
+    motion = Motion(
+        models.F, models.G, models.scale, models.transition, models.coast, models.favour
+    )
+    track = _empty(T, M, n)
+    block = max(1, min(_BLOCK // (M * k * count), T))
+    size = M * k * count
+    uniform = np.empty(block * size + block * size % 2)
+    noise = np.empty_like(uniform)
+    for first in range(0, T, block):
+        bins = min(block, T - first)
+        noises.random(out=uniform)
+        normals(uniform, noise)
+        block_noise = noise[: bins * size].reshape(bins, M, k, count)
+        random = Draws(draws.random((bins, 2, M)), block_noise)
+        if watch is None:
+            filter_block(first, particles, motion, random, ping, resample, track)
+            continue
+        for b in range(bins):
+            single = Draws(random.uniform[b : b + 1], random.noise[b : b + 1])
+            filter_block(first + b, particles, motion, single, ping, resample, track)
+            watch(first + b, particles)
+    return _with_constants(track, ping)
+
+
+def run_grid(
+    models: TerrainModels, ping: PingLikelihood, cells: FloatArray, *, smooth: bool
+) -> Track:
+    """The exact filter along a ping for models of one state, on `cells` (G,), evenly spaced; with
+    `smooth` the exact smoother."""
+    T, M = models.scale.shape
+    track = _empty(T, M, 1)
+    track.sample_size[:] = np.nan
+    shape = models.density(cells)
+    p = models.initial[:, None] * (shape / shape.sum())
+    sigma = models.scale / (cells[1] - cells[0])
+    motion = GridMotion(cells, models.transition, sigma, models.coast, models.favour)
+    window = np.empty((T, 2), np.int64)
+    kept = filter_ping(p, motion, ping, window, track, smooth)
+    if smooth:
+        smooth_ping(kept, window, motion, ping, track)
+    return _with_constants(track, ping)
+
+
+def _empty(T: int, M: int, n: int) -> Track:
+    return Track(np.empty((T, n)), np.empty((T, n, n)), np.empty((T, M)), np.empty(T), np.empty(T))
+
+
+def _with_constants(track: Track, ping: PingLikelihood) -> Track:
+    """The same with log likelihoods of the samples, not only of what depends on the state."""
+    constant = np.where(ping.echo, ping.constant, 0.0)
+    return track._replace(log_likelihood=track.log_likelihood + constant)
+
+
+def summarise(seen: Look, track: Track) -> Answer:
     """The answer of a ping whose models were run."""
     snapshot, likelihood = seen.ping.snapshot, seen.likelihood
-    heard, usable = likelihood.heard, snapshot.usable
+    echo, usable = likelihood.echo, snapshot.usable
     counts = Counter(
         used=1,
         bins=len(snapshot),
         bins_unusable=int((~usable).sum()),
-        bins_silent=int((usable & ~heard).sum()),
+        bins_silent=int((usable & ~echo).sum()),
         bins_unexplained=int(np.isneginf(track.log_likelihood).sum()),
     )
     health = {
         'bins': len(snapshot),
-        'heard_share': float(heard.mean()),
+        'heard_share': float(echo.mean()),
         'effective_sample_size': float(track.sample_size.mean()),
-        'log_likelihood_mean': float(track.log_likelihood[heard].mean())
-        if heard.any()
+        'log_likelihood_mean': float(track.log_likelihood[echo].mean())
+        if echo.any()
         else math.nan,
         'noise_variance': float(np.median(likelihood.noise)),
     }
     loud = LoudBins(
         int(seen.loud.sum()),
-        int((seen.loud & ~heard).sum()),
-        variances.decorrelation(snapshot.iq, seen.loud & heard),
+        int((seen.loud & ~echo).sum()),
+        variances.decorrelation(snapshot.iq, seen.loud & echo),
     )
     health['decorrelation'] = loud.decorrelation
     health['residual_ratio'] = _residual(seen, track)
@@ -172,7 +279,7 @@ def _residual(seen: Look, track: Track) -> float:
         return math.nan
     sines = np.sin(floor_of(seen, track).angle)
     spacing = seen.swath.geometry.spacing
-    return residual_ratio(snapshot.iq, sines, spacing, likelihood.noise, likelihood.heard)
+    return residual_ratio(snapshot.iq, sines, spacing, likelihood.noise, likelihood.echo)
 
 
 def floor_of(seen: Look, track: Track) -> Floor:
@@ -192,7 +299,7 @@ def estimate_of(seen: Look, track: Track) -> Estimate:
     extras = {
         'range': ping.ranges,
         other[0]: other[1],
-        'valid': ping.heard.astype(np.uint8),
+        'valid': ping.echo.astype(np.uint8),
         'log_likelihood': track.log_likelihood,
         'label': label.astype(np.uint8),
         'label_probability': track.probability[np.arange(len(label)), label],
@@ -258,3 +365,48 @@ def array_height(config: BathymetryConfig, poses: Pose) -> float:
     """z of the array in the world, m, mean over the ping."""
     lever = poses.R @ np.array(config.sonar_lever)
     return float((poses.position + lever)[:, 2].mean())
+
+
+def residual_ratio(
+    iq: np.ndarray,
+    sines: FloatArray,
+    spacing: float,
+    noise: FloatArray,
+    chosen: BoolArray,
+) -> float:
+    """Whether the noise that a sonar states can be true: the mean of r over the bins `chosen`
+    (T,); NaN when they are less than `FEWEST_BINS`.
+
+    What is left of the P staves of a bin y beside the echo from the estimated direction,
+
+        r = (|y|^2 - |a^H y|^2 / P) / ((P - 1) sn2),
+
+    is noise in P - 1 directions, by the noise variance sn2 that is stated: its mean is 1 whatever
+    the floor sends back and whether or not its power fades (`acoustics.laplace`), and in n bins it
+    is known to sqrt(3 / n) or better. A second echo in a bin and staves that do not agree raise
+    it, a direction that is fitted to the noise lowers it by a few hundredths.
+
+    iq (T, P); sines (T,) of the estimated directions from broadside; spacing of the staves in
+    wavelengths; noise (T,) variance at a stave.
+    """
+    chosen = chosen & np.isfinite(sines)
+    if np.count_nonzero(chosen) < FEWEST_BINS:
+        return math.nan
+    y = np.asarray(iq[chosen], np.complex128)
+    staves = y.shape[1]
+    phase = 2.0 * math.pi * spacing * sines[chosen][:, None] * np.arange(staves)
+    beam = np.abs((y * np.exp(-1j * phase)).sum(axis=1))
+    left = np.square(np.abs(y)).sum(axis=1) - np.square(beam) / staves
+    return float(np.mean(left / ((staves - 1) * noise[chosen])))
+
+
+def sound_speed_of(snapshot: Snapshot, config: BathymetryConfig) -> float:
+    """The sound speed, m/s, that made the ranges of a snapshot."""
+    return snapshot.sound_speed or config.sound_speed
+
+
+def bin_stamps(snapshot: Snapshot, config: BathymetryConfig) -> IntArray:
+    """Stamps (T + 1,) ns: of the transmission, and of the reception of each bin."""
+    ranges: FloatArray = snapshot.ranges(config.sound_speed)
+    late = np.rint(2e9 * ranges / sound_speed_of(snapshot, config)).astype(np.int64)
+    return snapshot.stamp_ns + np.concatenate([[0], late])

@@ -14,22 +14,34 @@
 
 """The sea floor along the swath of a side-scan array, and which terrain model holds where.
 
-A ping of a multi-stave side-scan sonar is a row of snapshots, one a range bin. Each says, with
+A ping of a multi-stave side-scan sonar is a row of snapshots, one per range bin. Each says, with
 noise, from which direction the floor answered, and the floor goes on from bin to bin like one of a
 few terrain models (`models`). So the filter runs *along the ping*: range is its time.
 
     snapshot -> likelihood of each bin (`likelihood`)
-             -> mix, predict, update, combine, bin after bin (`engines`)
-             -> optional smoothing -> one row per bin
+             -> the cycle of the particle filter, bin after bin (`ping.run`, `kernels`)
+             -> optional smoothing -> one row per bin (`ping.summarise`)
+
+The cycle of the particle filter, for each bin with an echo (`kernels.filter_block`):
+
+    resample    particles of each model, from those of all models that could become it: the
+                interaction of the multiple models, and the only resampling that is needed
+    propagate   each particle by its terrain model to the next range
+    weigh       each particle by the likelihood of its direction; the models by their particles
+    summarise   height or angle, its covariance, and the probability of each model
+
+There is no rejuvenation step, `move`: the noise of every terrain model keeps copies of a particle
+apart. Through bins without an echo particles are only propagated. A model set of one state can run
+on a grid, whose verbs are the same, but for resampling, which cells do not need.
 
 Nothing is carried from one ping to the next: a floor that was taken over wrongly would do more
 harm than a floor that is taken over rightly does good. Late, shuffled or repeated pings therefore
 need no care; the random numbers of a ping come from its own stamp. Only the labels may lean on
-those of the neighbours (`coupling`).
+those of the neighbours (`Coupling`).
 
 On a ship that moves each bin has a pose of its own, and a ping waits until the navigation has
-covered its last bin (`pose_queue`). The state is then the height of the floor in the world, so
-that the models know of no attitude (`swath`).
+covered its last bin (`PoseQueue`). The state is then the height of the floor in the world, so
+that the models know of no attitude.
 
 Source: docs/bathymetry.md, after Saucan, Chonavel, Sintes, Le Caillec, *Interacting multiple model
 particle filters for side scan bathymetry*, OCEANS 2013.
@@ -38,18 +50,34 @@ particle filters for side scan bathymetry*, OCEANS 2013.
 from __future__ import annotations
 
 from collections import Counter, deque
-from typing import Any
+from collections.abc import Sequence
+import math
+from typing import Any, NamedTuple
 
-from attrs import evolve
+from attrs import evolve, frozen
 import numpy as np
 
 from ...estimates import Estimate
-from ...measurements import Altitude, Frames, Navigation, Snapshot
+from ...estimation.arrays import FloatArray
+from ...intake import KnownFrames
+from ...intake.stream import Stream, StreamRules
+from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
+from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
-from .consistency import noise_warnings
-from .coupling import Alone, Coupling, Favoured
-from .ping import Answer, answer_of, look, LoudBins, Ping, run, track_ping
-from .pose_queue import PoseQueue
+from .kernels import Track
+from .ping import (
+    Answer,
+    bin_stamps,
+    floor_of,
+    Look,
+    look,
+    LoudBins,
+    Ping,
+    PosedPing,
+    run,
+    summarise,
+    track_ping,
+)
 
 __all__ = ['BathymetryConfig', 'BathymetryTracker']
 
@@ -58,6 +86,16 @@ PINGS_JUDGED, FEWEST_LOUD = 100, 200
 """Warnings are drawn from the last pings, when they have so many loud bins."""
 SOME_DECORRELATION = 0.04
 """Noise, slopes and rough floor make neighbouring staves differ by so much in any case."""
+FEWEST_PINGS = 5
+NOISE_BOUNDS = 0.5, 2.0
+"""Between these ratios of its residual the noise is as stated, as far as the test goes."""
+NEIGHBOURS_NS = 5_000_000_000
+"""Pings of one side further apart in time are no neighbours."""
+KEPT_NS = 60_000_000_000
+_LONGEST_PAUSE_NS = 3_600_000_000_000
+_RESTART_AFTER = 5
+ALTITUDE_AGE_NS = 5_000_000_000
+"""An altitude older than this, seen from the ping, says nothing."""
 
 
 class BathymetryTracker:
@@ -79,8 +117,8 @@ class BathymetryTracker:
         self._residuals: deque[float] = deque(maxlen=PINGS_JUDGED)
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._queue.frames, (Navigation,))
+    def frames(self) -> KnownFrames:
+        return self._queue.frames
 
     def reconfigure(self, config: BathymetryConfig) -> None:
         self.config = config
@@ -112,23 +150,23 @@ class BathymetryTracker:
         track_ping(Ping(tracker.config, snapshot, None))
 
     def health(self) -> dict[str, float]:
-        """Numbers of the last ping: bins, share of bins heard, mean effective sample size of the
-        particles of a model (NaN for the grid), mean log likelihood of a bin, noise variance, what
-        is left beside the echo in stated noises (`consistency`); and how many pings wait for
-        navigation."""
+        """Numbers of the last ping: bins, share of bins with an echo, mean effective sample size
+        of the particles of a model (NaN for the grid), mean log likelihood of a bin, noise
+        variance, what is left beside the echo in stated noises (`ping.residual_ratio`); and how
+        many pings wait for navigation."""
         waiting = {'pings_waiting': len(self._queue)} if self._moving else {}
         held = {'pings_held': len(self._coupling)} if len(self._coupling) else {}
         return {**self._health, **waiting, **held}
 
     def warnings(self) -> list[str]:
         """What of the last pings makes most echoes useless, or more sure than they are."""
-        loud = sum(one.count for one in self._loud)
+        loud = sum(ping.bins for ping in self._loud)
         stated = noise_warnings(self._residuals)
         if loud < FEWEST_LOUD:
             return stated
-        silent = sum(one.silent for one in self._loud) / loud
-        differ = sum(one.count * one.decorrelation for one in self._loud if one.count) / loud
-        told, sentences = self.config.decorrelation, stated
+        silent = sum(ping.silent for ping in self._loud) / loud
+        differ = sum(ping.bins * ping.decorrelation for ping in self._loud if ping.bins) / loud
+        configured, sentences = self.config.decorrelation, stated
         if silent > 0.5:
             sentences.append(
                 f'{silent:.0%} of the bins that stand 20 dB above the quiet ones were passed '
@@ -136,10 +174,11 @@ class BathymetryTracker:
                 'tell echo from noise, check element_spacing_wavelengths, or say shadow_gate: '
                 'false'
             )
-        if differ > SOME_DECORRELATION + 2.0 * told:
+        if differ > SOME_DECORRELATION + 2.0 * configured:
             sentences.append(
                 f'{differ:.0%} of the power of loud echoes differs from stave to stave, where '
-                f'decorrelation says {told:.0%}: estimates are surer than they should be, or lost'
+                f'decorrelation says {configured:.0%}: estimates are surer than they should be, '
+                'or lost'
             )
         return sentences
 
@@ -148,7 +187,7 @@ class BathymetryTracker:
 
     def finish(self) -> list[Estimate]:
         """The estimates of pings that waited for the next one, when there will be none."""
-        return [self._counted(_again(one)) for one in self._coupling.finish()]
+        return [self._counted(_again(held)) for held in self._coupling.finish()]
 
     def tasks(self, measurement: Any) -> list[Ping]:
         """The pings that a measurement makes ready to be estimated, in the order in which they
@@ -183,7 +222,7 @@ class BathymetryTracker:
     def take(self, found: Answer | Alone) -> list[Estimate]:
         """The estimates that follow from what `work` found, pings in the order of `tasks`."""
         if isinstance(found, Alone):
-            return [self._counted(_again(one)) for one in self._coupling.add(found)]
+            return [self._counted(_again(held)) for held in self._coupling.add(found)]
         left = self.finish() if len(self._coupling) else []
         return [*left, self._counted(found)]
 
@@ -199,15 +238,222 @@ class BathymetryTracker:
     def _moving(self) -> bool:
         """Whether pings wait for poses."""
         use = self.config.navigation
-        return use == 'required' or (use == 'auto' and self._queue.heard)
+        return use == 'required' or (use == 'auto' and self._queue.has_poses)
 
     def _other_spacing(self, snapshot: Snapshot) -> bool:
         """True when the snapshot contradicts the spacing that was configured."""
-        told, said = self.config.element_spacing_wavelengths, snapshot.spacing_wavelengths
-        return told > 0.0 and said is not None and abs(said / told - 1.0) > SPACING_TOLERANCE
+        configured, stated = self.config.element_spacing_wavelengths, snapshot.spacing_wavelengths
+        if not configured > 0.0 or stated is None:
+            return False
+        return abs(stated / configured - 1.0) > SPACING_TOLERANCE
 
 
-def _again(one: Favoured) -> Answer:
+def _again(ping: Favoured) -> Answer:
     """The answer of a ping, given what its neighbours favour."""
-    seen, favour = one.alone.seen, one.favour
-    return answer_of(seen, one.alone.track if favour is None else run(seen, favour))
+    seen, favour = ping.alone.seen, ping.favour
+    return summarise(seen, ping.alone.track if favour is None else run(seen, favour))
+
+
+def noise_warnings(ratios: Sequence[float]) -> list[str]:
+    """What the ratios (`ping.residual_ratio`) of the last pings say of the stated noise, in
+    sentences. Only a mean that is wrong by 3 dB counts, and only when the median ping shows it."""
+    known = [ratio for ratio in ratios if math.isfinite(ratio)]
+    if len(known) < FEWEST_PINGS:
+        return []
+    typical = float(np.median(known))
+    if NOISE_BOUNDS[0] <= typical <= NOISE_BOUNDS[1]:
+        return []
+    advice = '' if typical < 1.0 else ', decorrelation and element_spacing_wavelengths'
+    return [
+        f'what the sensor states cannot be true: beside the echo the staves have {typical:.2g} '
+        f'times the noise that is stated; check noise_variance{advice}'
+    ]
+
+
+class PoseQueue:
+    """Poses and the pings that wait for them: until the navigation says how the ship lay from the
+    transmission of the ping to the reception of its last bin. A ping is skipped, and counted, when
+    the navigation has a gap there, and may be late by `KEPT_NS`: poses are kept that long.
+    counts: where to count what is not used."""
+
+    def __init__(self, counts: Counter[str]):
+        self.counts = counts
+        self.has_poses = False
+        rules = StreamRules(KEPT_NS, _LONGEST_PAUSE_NS, _RESTART_AFTER)
+        self._stream = Stream((Navigation,), rules, counts)
+        self._buffer = NavigationBuffer()
+        self._altitudes: list[Altitude] = []
+        self._waiting: list[Snapshot] = []
+
+    def __len__(self) -> int:
+        """How many pings wait."""
+        return len(self._waiting)
+
+    @property
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
+
+    def add_pose(self, sample: Navigation) -> None:
+        """Take one pose in. A clock that was set back forgets all poses."""
+        admitted = self._stream.admit(sample)
+        if admitted.restarted:
+            self.counts['navigation_gap'] += len(self._waiting)
+            self._buffer, self._altitudes, self._waiting = NavigationBuffer(), [], []
+        for pose in admitted.items:
+            self.has_poses = True
+            self.counts['poses'] += 1
+            self._buffer = self._buffer.inserted(pose)
+        if self._buffer.stamps:
+            self._buffer = self._buffer.since(self._buffer.stamps[-1] - KEPT_NS)
+
+    def add_altitude(self, altitude: Altitude) -> None:
+        self._altitudes = [*self._altitudes[-999:], altitude]
+
+    def add_ping(self, snapshot: Snapshot) -> None:
+        if len(self._waiting) == MOST_WAITING:
+            self._waiting.pop(0)
+            self.counts['navigation_missing'] += 1
+        self._waiting.append(snapshot)
+
+    def ready(self, config: BathymetryConfig) -> list[PosedPing]:
+        """The pings whose poses are known now, in the order in which they came."""
+        done, waiting = [], []
+        for snapshot in self._waiting:
+            stamps = bin_stamps(snapshot, config)
+            known = self._buffer.readiness(
+                int(stamps[0]),
+                int(stamps[-1]),
+                nanoseconds(config.max_gap),
+                nanoseconds(config.max_extrapolation),
+            )
+            if known == 'wait':
+                waiting.append(snapshot)
+            elif known == 'gap':
+                self.counts['navigation_gap'] += 1
+            else:
+                poses = self._buffer.poses(stamps)
+                altitude = self._altitude(int(stamps[-1]))
+                done.append(PosedPing(snapshot, poses, self._stream.frame_id, altitude))
+        self._waiting = waiting
+        return done
+
+    def _altitude(self, stamp_ns: int) -> float | None:
+        usable = [a for a in self._altitudes if 0 <= stamp_ns - a.stamp_ns <= ALTITUDE_AGE_NS]
+        return max(usable, key=lambda altitude: altitude.stamp_ns).altitude if usable else None
+
+
+@frozen(eq=False)
+class Alone:
+    """A ping estimated by itself, and its probability `rough` (n,) of rough floor by the distance
+    (n,) m from the array, increasing; bins whose place is not known are left out."""
+
+    seen: Look
+    track: Track
+    distance: FloatArray
+    rough: FloatArray
+
+    @classmethod
+    def of(cls, seen: Look, track: Track) -> Alone:
+        distance = seen.swath.distance(floor_of(seen, track))
+        known = np.flatnonzero(np.isfinite(distance))
+        order = known[np.argsort(distance[known], kind='stable')]
+        rough = track.probability[:, seen.models.rough].sum(axis=1)
+        return cls(seen, track, distance[order], np.clip(rough[order], 0.0, 1.0))
+
+    def kept(self) -> Ping:
+        """What a saved state has of it: the rest follows from the ping."""
+        return self.seen.ping
+
+    @classmethod
+    def from_kept(cls, ping: Ping) -> Alone:
+        seen = look(ping)
+        return cls.of(seen, run(seen))
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.seen.ping.snapshot.stamp_ns
+
+
+class Favoured(NamedTuple):
+    """A ping to be estimated again, and what its neighbours favour, see `run`; None when it
+    has no neighbours, so that its estimate by itself is final."""
+
+    alone: Alone
+    favour: FloatArray | None
+
+
+class Coupling:
+    """Labels of neighbouring pings lean on each other: rough patches are wider than a ping.
+
+    Each ping is first estimated by itself, smoothed forward-backward. Then it is estimated
+    again with a prior for each bin from the probability p of rough floor that its neighbours,
+    the ping before and the ping after, have at the same distance across the track, as
+    neighbours do in an Ising field of strength J (`ping_coupling`)::
+
+        L = sum over neighbours of log((p + (1 - p) e^-J) / ((1 - p) + p e^-J))
+
+    The predicted probability of rough models is multiplied by ``2 / (1 + e^-L)``, that of the
+    others by ``2 / (1 + e^L)``. p is that of a neighbour by itself, so that nothing goes round
+    in circles: an estimate depends on three pings and on no others.
+
+    Heights are not coupled: soundings of neighbouring pings have to stay independent, since
+    what makes a chart of them takes them to be.
+
+    A ping's estimate is therefore ready when the next one has come: `Coupling` holds the
+    newest ping of each side until then.
+    """
+
+    def __init__(self) -> None:
+        self._before: dict[str, Alone] = {}
+        self._held: dict[str, Alone] = {}
+
+    def __len__(self) -> int:
+        """How many pings are held."""
+        return len(self._held)
+
+    def add(self, alone: Alone) -> list[Favoured]:
+        """Take the next ping in; gives the one before it, if one was held."""
+        side = alone.seen.swath.side
+        held = self._held.get(side)
+        near = held is not None and 0 < alone.stamp_ns - held.stamp_ns <= NEIGHBOURS_NS
+        done = []
+        if held is not None:
+            done.append(self._favoured(side, held, alone if near else None))
+        self._before.pop(side, None)
+        if held is not None and near:
+            self._before[side] = held
+        self._held[side] = alone
+        return done
+
+    def finish(self) -> list[Favoured]:
+        """The pings still held, oldest first; nothing is held any more."""
+        left = sorted(self._held.items(), key=lambda item: item[1].stamp_ns)
+        done = [self._favoured(side, alone, None) for side, alone in left]
+        self._before, self._held = {}, {}
+        return done
+
+    def _favoured(self, side: str, held: Alone, after: Alone | None) -> Favoured:
+        around = [near for near in (self._before.get(side), after) if near is not None]
+        strength = held.seen.config.ping_coupling
+        return Favoured(held, favour_of(held, around, strength) if around else None)
+
+
+def favour_of(alone: Alone, neighbours: list[Alone], strength: float) -> FloatArray:
+    """What favours each model (T, M) in each bin of a ping, see `run`."""
+    seen, track = alone.seen, alone.track
+    distance = np.nan_to_num(seen.swath.distance(floor_of(seen, track)), nan=-1.0)
+    field = np.zeros(len(distance))
+    for near in neighbours:
+        if len(near.rough):
+            p = np.interp(distance, near.distance, near.rough, left=0.5, right=0.5)
+            field += _log_ratio(p, strength)
+    rough = seen.models.rough
+    favour = np.empty(track.probability.shape)
+    favour[:, rough] = (2.0 / (1.0 + np.exp(-field)))[:, None]
+    favour[:, ~rough] = (2.0 / (1.0 + np.exp(field)))[:, None]
+    return favour
+
+
+def _log_ratio(p: FloatArray, strength: float) -> FloatArray:
+    weak = math.exp(-strength)
+    return np.asarray(np.log((p + (1.0 - p) * weak) / ((1.0 - p) + p * weak)))

@@ -12,7 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where new divers may be: positions that the detections no track took can explain."""
+"""Where new divers may be, and how a track begins there.
+
+A track begins at a fix that no track took, at a position that the free rows of a ping can explain,
+or where somebody says that a diver is. Such a start is no measurement: it is believed, so its
+track is confirmed at once. Tracks without a name that it agrees with give way to it, or the diver
+would have two; with a single diver, all do.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +27,37 @@ from itertools import islice, product
 import math
 from typing import NamedTuple
 
+from attrs import evolve
 import numpy as np
 
 from ...acoustics import multistatic
-from ...estimation.arrays import FloatArray, IndexArray
-from ...measurements import Arrivals, NOBODY
+from ...acoustics.localisation import Localisation, localise
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray
+from ...estimation.association import CONFIRMED, gate_threshold, TENTATIVE
+from ...measurements import Arrivals, NOBODY, Start
 from .config import DiverConfig
-from .model_set import heights_of
-from .sensing import locate, Positions, spread, systematic_variance, toa_variance
+from .pings import begin_from_ping, FAR
+from .scan import (
+    bearing_variance,
+    name_of,
+    ping_measurements,
+    Positions,
+    spread,
+    systematic_variance,
+    toa_variance,
+)
+from .state import DiverState
+from .state_space import heights_of, Layout, ModelSet
+
+SEED_PAIRS = 3
+"""Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
+it."""
+
+MAX_COMBINATIONS = 200
+"""Combinations of echoes tried for one position."""
+
+MOST_FOUND = 10
+"""Positions found by combining the echoes of one ping; those of others are found in later ones."""
 
 
 class Birth(NamedTuple):
@@ -44,33 +73,24 @@ class Birth(NamedTuple):
     target_id: int = NOBODY
 
 
-SEED_PAIRS = 3
-"""Transmitter-receiver pairs whose echoes are combined to seed a position; others must confirm
-it."""
-
-MAX_COMBINATIONS = 200
-"""Combinations of echoes tried for one position."""
-
-MOST_FOUND = 10
-"""Positions found by combining the echoes of one ping; those of others are found in later ones."""
-
-
 def births_from_fixes(
-    group: Positions, free: np.ndarray, existence: FloatArray | None = None
+    fixes: Positions, free: BoolArray, existence: FloatArray | None
 ) -> list[Birth]:
-    """Every fix that is `free` (D,) is a place to begin a track; existence: (D,) of those."""
-    names = np.full(len(free), NOBODY) if group.target_id is None else group.target_id
-    known = np.full(len(free), math.nan) if existence is None else existence
-    return [
-        Birth(group.z[d], group.R[d], existence=float(known[d]), target_id=int(names[d]))
-        for d in np.flatnonzero(free)
-    ]
+    """Every fix that is `free` (D,) is a place to begin a track; existence (D,): of that track,
+    None where its hits will tell."""
+    births = []
+    for d in np.flatnonzero(free).tolist():
+        known = math.nan if existence is None else float(existence[d])
+        name = NOBODY if fixes.target_id is None else int(fixes.target_id[d])
+        births.append(Birth(fixes.z[d], fixes.R[d], existence=known, target_id=name))
+    return births
 
 
 def births_from_ping(
-    ping: Arrivals, free: np.ndarray, config: DiverConfig, factor: float
+    ping: Arrivals, free: BoolArray, config: DiverConfig, factor: float
 ) -> list[Birth]:
-    """Positions from the rows (n,) of a ping that are `free`.
+    """Positions from the rows (n,) of a ping that are `free`; factor: on the variances of arrival
+    times.
 
     With at most one echo for each transmitter-receiver pair this is one fix, with its ghosts,
     which live until later pings tell them apart. With several, combinations of echoes of a few
@@ -82,7 +102,7 @@ def births_from_ping(
         if not len(rows):
             break
         pairs = [rows] if ping.passive else _by_pair(ping, rows)
-        if ping.passive or max(len(one) for one in pairs) == 1:
+        if ping.passive or max(len(pair) for pair in pairs) == 1:
             return births + _fix(ping, rows, config, factor)[0]
         found, used = _best_combination(ping, pairs, config, factor)
         if not found:
@@ -92,30 +112,31 @@ def births_from_ping(
     return births
 
 
-def _by_pair(ping: Arrivals, rows: np.ndarray) -> list[np.ndarray]:
+def _by_pair(ping: Arrivals, rows: IndexArray) -> list[IndexArray]:
     pair = np.column_stack([ping.tx_id, ping.rx_id])[rows]
-    return [rows[(pair == one).all(axis=1)] for one in np.unique(pair, axis=0)]
+    return [rows[(pair == each).all(axis=1)] for each in np.unique(pair, axis=0)]
 
 
 def _fix(
-    ping: Arrivals, rows: np.ndarray, config: DiverConfig, factor: float
-) -> tuple[list[Birth], np.ndarray]:
+    ping: Arrivals, rows: IndexArray, config: DiverConfig, factor: float
+) -> tuple[list[Birth], IndexArray]:
     """The fix of `rows` and its alternatives, and the rows it used."""
     rows = spread(rows)
-    fix = locate(ping, rows, config, config.covariance_scale * factor)
+    fix = locate(ping, rows, config, factor)
     if fix is None:
         return [], rows[:0]
     used = rows[fix.used | fix.used_bearing]
-    return [
-        Birth(one.position, one.covariance, ping, used) for one in (fix, *fix.alternatives)
-    ], rows[fix.used]
+    name = name_of(ping)
+    places = [(fix.position, fix.covariance)]
+    places += [(place.position, place.covariance) for place in fix.alternatives]
+    return [Birth(*place, ping, used, target_id=name) for place in places], rows[fix.used]
 
 
 def _best_combination(
-    ping: Arrivals, pairs: Sequence[np.ndarray], config: DiverConfig, factor: float
-) -> tuple[list[Birth], np.ndarray]:
+    ping: Arrivals, pairs: Sequence[IndexArray], config: DiverConfig, factor: float
+) -> tuple[list[Birth], IndexArray]:
     """The fix that most pairs agree with, at least one more than seeded it."""
-    best: tuple[list[Birth], np.ndarray] = ([], np.empty(0, np.intp))
+    best: tuple[list[Birth], IndexArray] = ([], np.empty(0, np.intp))
     if len(pairs) <= SEED_PAIRS:
         return best
     seeding = sorted(pairs, key=len)[:SEED_PAIRS]
@@ -129,17 +150,135 @@ def _best_combination(
 
 
 def _agreeing(
-    ping: Arrivals, pairs: Sequence[np.ndarray], birth: Birth, config: DiverConfig, factor: float
-) -> np.ndarray:
+    ping: Arrivals, pairs: Sequence[IndexArray], birth: Birth, config: DiverConfig, factor: float
+) -> IndexArray:
     """Of each pair the echo nearest to what a target at `birth` causes, where within 3 sigma."""
     position, covariance = birth.position, birth.covariance
     height = float(np.mean(heights_of(config)))
     expected = multistatic.range_sum(position, ping.tx, ping.rx, height)
     slope = multistatic.range_sum_jacobian(position, ping.tx, ping.rx, height)
     variance = config.sound_speed**2 * (
-        toa_variance(ping, config, config.covariance_scale * factor)
-        + systematic_variance(ping, config)
+        toa_variance(ping, config, factor) + systematic_variance(ping, config)
     ) + np.einsum('na,ab,nb->n', slope, covariance, slope)
     nis = np.square(config.sound_speed * ping.toa - expected) / variance
     nearest = np.array([rows[np.argmin(nis[rows])] for rows in pairs])
     return nearest[nis[nearest] <= 9.0]
+
+
+def locate(
+    ping: Arrivals, rows: IndexArray, config: DiverConfig, factor: float
+) -> Localisation | None:
+    """The fix that `rows` of the ping give by themselves, None when they give none to believe.
+
+    With depth as a state it is the best of those at the heights where the models begin.
+    """
+    variance = toa_variance(ping, config, factor)[rows] + systematic_variance(ping, config)[rows]
+    best: Localisation | None = None
+    for height in heights_of(config):
+        fix = localise(
+            ping.rx[rows],
+            ping.toa[rows],
+            variance,
+            tx=ping.tx[rows],
+            bearing=ping.bearing[rows],
+            var_bearing=bearing_variance(ping, config)[rows],
+            target_z=height,
+            sound_speed=config.sound_speed,
+        )
+        if isinstance(fix, Localisation) and (best is None or fix.cost < best.cost):
+            best = fix
+    return best
+
+
+# -- tracks that begin ---------------------------------------------------------------------------
+
+
+def each_name_once(births: Sequence[Birth]) -> list[Birth]:
+    """Without a second birth of the same name."""
+    names: set[int] = set()
+    first = []
+    for birth in births:
+        if birth.target_id == NOBODY or birth.target_id not in names:
+            first.append(birth)
+        names.add(birth.target_id)
+    return first
+
+
+def new_tracks(
+    births: Sequence[Birth], models: ModelSet, layout: Layout, config: DiverConfig
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """x (B, M, n + q), P (B, M, n + q, n + q) and mu (B, M) of tracks that begin."""
+    plain = models.height < 0 and layout.size == models.n
+    if all(birth.ping is None for birth in births) or (plain and models.bias < 0):
+        position = np.array([birth.position for birth in births])
+        covariance = np.array([birth.covariance for birth in births])
+        x, P, mu = models.new_tracks(position, covariance)
+        return *layout.widened(x, P), mu
+    parts = [_new_track(birth, models, layout, config, plain) for birth in births]
+    x, P, mu = (np.concatenate(part) for part in zip(*parts))
+    return x, P, mu
+
+
+def _new_track(
+    birth: Birth, models: ModelSet, layout: Layout, config: DiverConfig, plain: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """x, P and mu of one track, with a row."""
+    where = birth.position[None]
+    if birth.ping is None or birth.rows is None or plain:
+        x, P, mu = models.new_tracks(where, birth.covariance[None], birth.ping is None)
+        return *layout.widened(x, P), mu
+    x, P, mu = models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
+    x, P = layout.widened(x, P)
+    factor = config.covariance_scale
+    ping = ping_measurements(birth.ping, birth.rows, config, factor, models, layout)
+    # All models of a copy begin alike: one of each is enough to ask.
+    M = len(models.names)
+    first = begin_from_ping(x[0, ::M], P[0, ::M], ping, birth.position, config, layout)
+    known = np.isfinite(first[2]).any()
+    share = np.exp(first[2] - first[2].max()) if known else np.ones(len(first[2]))
+    mu = mu * np.repeat(share / share.sum() * len(share), M)
+    return np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None], mu
+
+
+# -- starts --------------------------------------------------------------------------------------
+
+
+def make_room(
+    now: DiverState, start: Start, config: DiverConfig, E: FloatArray
+) -> tuple[DiverState, bool]:
+    """The tracks without those that give way to `start`, and whether there is room for its own; E
+    (M, 2, n): to the position."""
+    going = now.target_id == NOBODY
+    if config.max_tracks > 1 and len(going):
+        going &= _agree(now, start, config, E)
+    left = now.only(~going)
+    if int((left.life.status != TENTATIVE).sum()) < config.max_tracks:
+        return left, True
+    return now._replace(not_started=now.not_started + 1), False
+
+
+def confirmed(now: DiverState) -> DiverState:
+    """With its newest track confirmed."""
+    status = now.life.status.copy()
+    status[-1] = CONFIRMED
+    return now._replace(life=evolve(now.life, status=status))
+
+
+def no_room(now: DiverState, config: DiverConfig) -> list[str]:
+    """What a user has to know of starts that began no track."""
+    if not now.not_started:
+        return []
+    return [
+        f'{now.not_started} starts began no track: there are max_tracks '
+        f'({config.max_tracks}) confirmed ones'
+    ]
+
+
+def _agree(now: DiverState, start: Start, config: DiverConfig, E: FloatArray) -> BoolArray:
+    """Which tracks (T,) may be where the start is."""
+    mean, covariance = now.positions(E)
+    apart = start.position[:2] - mean
+    squared = np.einsum(
+        'ta,ta->t', apart, np.linalg.solve(covariance + start.covariance, apart[..., None])[..., 0]
+    )
+    return np.asarray(squared <= gate_threshold(config.gate_probability, 2))

@@ -16,14 +16,14 @@
 
 from __future__ import annotations
 
-from attrs import frozen
+import re
 
-from ...parameters import inherited, parameter
+from attrs import evolve, frozen
+
+from ...acoustics.geodesy import Origin
+from ...parameters import inherited, live, parameter
 from ..model_checks import chain_problems
 from ..shared_parameters import DetectionParameters, StreamParameters, TrackLifeParameters
-from .place_parameters import PlaceParameters
-from .scan_parameters import ScanParameters
-from .sea_parameters import SeaParameters
 
 MODEL_SETS = (
     'heading_speed',
@@ -38,224 +38,255 @@ BASELINES = {'cv': 1, 'cv_cv': 2, 'cv_ct': 3}
 """The single-direction sets and how many models they have."""
 
 ADAPTATIONS = ('counts', 'paper', 'ratio', 'fixed')
+SYSTEMATIC = ('mixed', 'consider', 'estimate')
+ASSOCIATIONS = ('gnn', 'jipda')
+NAMED_TRACKS = ('share', 'alone')
+VESSELS = ('moving', 'fixed')
+RELATIVE_AXES = ('flu', 'frd', 'enu', 'ned')
+SENSOR_NUMBERS = ('fix_std', 'detection_probability', 'clutter_density')
+"""Parameters that may differ from sensor to sensor."""
+
+_WORD = re.compile(r'[A-Za-z0-9_]+')
 
 
 @frozen(kw_only=True)
-class DiverConfig(
-    SeaParameters,
-    ScanParameters,
-    PlaceParameters,
-    DetectionParameters,
-    TrackLifeParameters,
-    StreamParameters,
-):
-    """Everything the diver tracker can be told. The defaults are the `heading_speed` set of the
+class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
+    """All parameters of the diver tracker. The defaults are the `heading_speed` set of the
     docs."""
 
+    # fmt: off
     # -- which models ----------------------------------------------------------------------------
-    model_set: str = parameter(
-        'heading_speed', 'motion models run side by side', choices=MODEL_SETS
-    )
-    directions: int = parameter(16, 'headings of the multi-direction sets', low=4, high=64)
-    hover: bool = parameter(True, 'add a model for standing still (heading_speed sets)')
-    reference_step: float = parameter(
-        1.0,
-        'time step at which probabilities and noises below are stated; other steps are '
-        'derived from it',
-        unit='s',
-        low=1e-3,
-        high=3600.0,
-    )
-    longest_step: float = parameter(
-        2.0,
-        'longer gaps are crossed in steps of this, so that the diver may turn inside them',
-        unit='s',
-        low=1e-3,
-        high=3600.0,
-    )
-    stay_probability: float = parameter(
-        0.86, 'probability of keeping the heading over a reference step', low=0.0, high=1.0
-    )
-    heading_concentration: float = parameter(
-        3.0,
-        'a turn by a goes with probability proportional to exp(kappa cos a); 0 turns anywhere',
-        low=0.0,
-        high=50.0,
-    )
-    hover_enter: float = parameter(
-        0.02, 'probability of stopping over a reference step', low=0.0, high=1.0
-    )
-    hover_stay: float = parameter(
-        0.9, 'probability of staying stopped over a reference step', low=0.0, high=1.0
-    )
-    transition_matrix: tuple[float, ...] = parameter(
-        (),
-        'the whole transition matrix at the reference step, row-major, row = '
-        'from; empty: built from the probabilities above',
-        kind='float[]',
-        low=0.0,
-        high=1.0,
-    )
-    initial_probabilities: tuple[float, ...] = parameter(
-        (), 'model probabilities of a new track; empty: uniform', kind='float[]', low=0.0, high=1.0
-    )
-    adaptation: str = parameter(
-        'counts',
-        'how the data correct the transition matrix: counts (Dirichlet), eq. 1 of the paper '
-        'as a product (paper) or as a ratio (ratio), both guarded, or fixed',
-        choices=ADAPTATIONS,
-    )
-    adaptation_prior: float = parameter(
-        2.0, 'counts: weight of the prior matrix, in transitions a row', low=1e-3, high=1e6
-    )
-    adaptation_guard: float = parameter(
-        0.7,
-        'paper, ratio: share of the prior matrix kept at each step; below 0.3 they degenerate',
-        low=0.0,
-        high=1.0,
-    )
+    model_set: str = parameter('heading_speed', '',
+        'motion models run side by side', choices=MODEL_SETS)
+    directions: int = parameter(16, '',
+        'number of headings of the multi-direction sets', range=(4, 64))
+    hover: bool = parameter(True, '', 'add a model for standing still (heading_speed sets)')
+    reference_step: float = parameter(1.0, 's',
+        'time step for which the probabilities and noises of the models are stated; values for '
+        'other steps are derived from them', range=(1e-3, 3600.0))
+    longest_step: float = parameter(2.0, 's',
+        'longer gaps are crossed in steps of this length, so that the diver may turn within them',
+        range=(1e-3, 3600.0))
+    stay_probability: float = parameter(0.86, '',
+        'probability of keeping the heading over a reference step', range=(0.0, 1.0))
+    heading_concentration: float = parameter(3.0, '',
+        'kappa: a turn by an angle a has a probability proportional to exp(kappa cos a); 0: all '
+        'turns are alike', range=(0.0, 50.0))
+    hover_enter: float = parameter(0.02, '',
+        'probability of stopping over a reference step', range=(0.0, 1.0))
+    hover_stay: float = parameter(0.9, '',
+        'probability of staying stopped over a reference step', range=(0.0, 1.0))
+    transition_matrix: tuple[float, ...] = parameter((), '',
+        'whole transition matrix over a reference step, row-major, row = from; empty: built from '
+        'stay_probability, heading_concentration, hover_enter and hover_stay, or '
+        'baseline_stay_probability', range=(0.0, 1.0), kind='float[]')
+    initial_probabilities: tuple[float, ...] = parameter((), '',
+        'model probabilities of a new track; empty: uniform', range=(0.0, 1.0), kind='float[]')
+    adaptation: str = parameter('counts', '',
+        'correction of the transition matrix by the data: counts (Dirichlet), eq. 1 of the paper '
+        'as a product (paper) or as a ratio (ratio), both guarded, or fixed (none)',
+        choices=ADAPTATIONS)
+    adaptation_prior: float = parameter(2.0, '',
+        'adaptation counts: weight of the prior matrix, in transitions per row', range=(1e-3, 1e6))
+    adaptation_guard: float = parameter(0.7, '',
+        'adaptation paper and ratio: share of the prior matrix kept at each step; below 0.3 they '
+        'degenerate', range=(0.0, 1.0))
 
     # -- how divers move -------------------------------------------------------------------------
-    speed_mean: float = parameter(
-        0.75, 'speed expected of a new track (heading_speed sets)', unit='m/s', low=0.0, high=20.0
-    )
-    speed_std: float = parameter(0.4, 'its standard deviation', unit='m/s', low=1e-3, high=20.0)
-    velocity_std: float = parameter(
-        0.7,
-        'velocity of a new track on each axis, around zero (sets with a velocity state)',
-        unit='m/s',
-        low=1e-3,
-        high=20.0,
-    )
-    speed_noise: float = parameter(
-        0.005,
-        'speed random walk over a reference step (heading_speed sets)',
-        unit='m/s',
-        low=0.0,
-        high=10.0,
-    )
-    lateral_noise: float = parameter(
-        0.24,
-        'sideways wander over a reference step (heading_speed sets)',
-        unit='m',
-        low=0.0,
-        high=10.0,
-    )
-    lateral_speed_std: float = parameter(
-        0.2,
-        'spread of the lateral velocity of heading_speed_lateral',
-        unit='m/s',
-        low=0.0,
-        high=10.0,
-    )
-    lateral_speed_time: float = parameter(
-        10.0,
-        'time in which the lateral velocity of heading_speed_lateral fades',
-        unit='s',
-        low=1e-2,
-        high=1e5,
-    )
-    hover_noise: float = parameter(
-        0.05, 'position wander over a reference step while stopped', unit='m', low=0.0, high=10.0
-    )
-    fixed_speed: float = parameter(1.0, 'speed of world_headings', unit='m/s', low=0.0, high=20.0)
-    velocity_noise: float = parameter(
-        0.19,
-        'velocity noise over a reference step of world_headings and relative_headings',
-        unit='m/s',
-        low=0.0,
-        high=10.0,
-    )
-    acceleration_noise: tuple[float, ...] = parameter(
-        (),
-        'acceleration noise of each model of cv, cv_cv or cv_ct over a reference step; empty: '
-        'values tuned for divers',
-        kind='float[]',
-        unit='m/s^2',
-        low=0.0,
-        high=100.0,
-    )
-    turn_rate_deg: float = parameter(
-        20.0, 'turn rate of the two CT models of cv_ct', unit='deg/s', low=0.0, high=180.0
-    )
+    speed_mean: float = parameter(0.75, 'm/s',
+        'speed expected of a new track (heading_speed sets)', range=(0.0, 20.0))
+    speed_std: float = parameter(0.4, 'm/s',
+        'standard deviation of the speed of a new track around speed_mean (heading_speed sets)',
+        range=(1e-3, 20.0))
+    velocity_std: float = parameter(0.7, 'm/s',
+        'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
+        'velocity state)', range=(1e-3, 20.0))
+    speed_noise: float = parameter(0.005, 'm/s',
+        'random walk of the speed over a reference step (heading_speed sets)', range=(0.0, 10.0))
+    lateral_noise: float = parameter(0.24, 'm',
+        'random walk sideways over a reference step (heading_speed sets)', range=(0.0, 10.0))
+    lateral_speed_std: float = parameter(0.2, 'm/s',
+        'heading_speed_lateral: standard deviation of the lateral velocity', range=(0.0, 10.0))
+    lateral_speed_time: float = parameter(10.0, 's',
+        'heading_speed_lateral: time over which the lateral velocity is correlated',
+        range=(1e-2, 1e5))
+    hover_noise: float = parameter(0.05, 'm',
+        'random walk of the position over a reference step while stopped', range=(0.0, 10.0))
+    fixed_speed: float = parameter(1.0, 'm/s',
+        'world_headings: speed of every heading', range=(0.0, 20.0))
+    velocity_noise: float = parameter(0.19, 'm/s',
+        'world_headings and relative_headings: velocity noise over a reference step',
+        range=(0.0, 10.0))
+    acceleration_noise: tuple[float, ...] = parameter((), 'm/s^2',
+        'cv, cv_cv and cv_ct: acceleration noise of each model over a reference step; empty: '
+        'values tuned for divers', range=(0.0, 100.0), kind='float[]')
+    turn_rate_deg: float = parameter(20.0, 'deg/s',
+        'cv_ct: turn rate of the two CT models', range=(0.0, 180.0))
 
-    baseline_stay_probability: float = parameter(
-        0.85,
-        'probability of keeping the model over a reference step (cv_cv, cv_ct)',
-        low=0.0,
-        high=1.0,
-    )
+    baseline_stay_probability: float = parameter(0.85, '',
+        'cv_cv and cv_ct: probability of keeping the model over a reference step',
+        range=(0.0, 1.0))
 
     # -- measurements ----------------------------------------------------------------------------
-    fix_std: float = parameter(
-        1.0,
+    fix_std: float = live(1.0, 'm',
         'standard deviation on each axis of a fix that comes without covariance',
-        unit='m',
-        low=1e-4,
-        high=1e5,
-        read_only=False,
-    )
-    covariance_scale: float = parameter(
-        1.0,
-        'measurement covariances are multiplied by this before use',
-        low=1e-4,
-        high=1e4,
-        read_only=False,
-    )
-    estimate_covariance_scale: bool = parameter(
-        False,
-        'learn a further factor from the innovations, for sensors whose stated '
-        'covariances are optimistic',
-    )
-    sound_speed: float = parameter(
-        1500.0,
-        'speed of sound for arrival times',
-        unit='m/s',
-        low=1300.0,
-        high=1700.0,
-        read_only=False,
-    )
-    toa_std: float = parameter(
-        1e-3,
-        'standard deviation of an arrival time that comes without variance',
-        unit='s',
-        low=1e-7,
-        high=10.0,
-        read_only=False,
-    )
-    bearing_std_deg: float = parameter(
-        2.0,
-        'standard deviation of a bearing that comes without variance',
-        unit='deg',
-        low=1e-3,
-        high=90.0,
-        read_only=False,
-    )
-    target_z: float = parameter(
-        0.0,
-        'z of the diver assumed when arrival times are used',
-        unit='m',
-        low=-12000.0,
-        high=12000.0,
-        read_only=False,
-    )
-    fixes_are_scans: bool = parameter(
-        True,
-        'fixes of one stamp are a whole scan: a diver without one was missed. Off for '
-        'transponders polled in turn',
-        read_only=False,
-    )
+        range=(1e-4, 1e5))
+    covariance_scale: float = live(1.0, '',
+        'factor by which measurement covariances are multiplied before use', range=(1e-4, 1e4))
+    estimate_covariance_scale: bool = parameter(False, '',
+        'estimate a further factor of the measurement covariances from the innovations, for '
+        'sensors whose stated covariances are optimistic')
+    sound_speed: float = live(1500.0, 'm/s',
+        'speed of sound with which arrival times become distances', range=(1300.0, 1700.0))
+    toa_std: float = live(1e-3, 's',
+        'standard deviation of an arrival time that comes without variance', range=(1e-7, 10.0))
+    bearing_std_deg: float = live(2.0, 'deg',
+        'standard deviation of a bearing that comes without variance', range=(1e-3, 90.0))
+    target_z: float = live(0.0, 'm',
+        'z of the diver that is assumed when arrival times are used', range=(-12000.0, 12000.0))
+    fixes_are_scans: bool = live(True, '',
+        'fixes of one stamp are a whole scan, in which a diver without a fix was missed; false '
+        'for transponders polled in turn')
 
     # -- tracks ----------------------------------------------------------------------------------
-    max_tracks: int = inherited(
-        TrackLifeParameters,
-        'max_tracks',
-        20,
-        description='most divers at once; 1 means a single diver is known to be there',
-    )
+    max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 20,
+        description='largest number of divers tracked at once; 1 means that a single diver is '
+        'known to be there')
+
+    # -- outliers --------------------------------------------------------------------------------
+    outlier_probability: float = live(0.02, '',
+        'probability that an arrival time is an outlier: late by a reflection, or of something '
+        'else', range=(1e-6, 0.5))
+
+    # -- depth -----------------------------------------------------------------------------------
+    dimensions: int = parameter(2, '',
+        'number of coordinates estimated: 2 (the diver is at target_z) or 3 (depth is a state, '
+        'from arrivals)', range=(2, 3))
+    depth_min: float = parameter(0.0, 'm',
+        'least depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
+    depth_max: float = parameter(20.0, 'm',
+        'greatest depth of a diver, positive down (dimensions 3)', range=(-1e3, 1.1e4))
+    vertical_speed_std: float = parameter(0.1, 'm/s',
+        'standard deviation of the vertical speed (dimensions 3)', range=(1e-4, 10.0))
+    vertical_speed_time: float = parameter(10.0, 's',
+        'time over which the vertical speed is correlated (dimensions 3)', range=(1e-2, 1e5))
+
+    # -- systematic errors of instruments --------------------------------------------------------
+    receiver_position_std: float = parameter(0.0, 'm',
+        'standard deviation on each horizontal axis of the stated positions of receivers; a '
+        'receiver at the place of the transmitter has no such error', range=(0.0, 1e3))
+    receiver_clock_std: float = parameter(0.0, 's',
+        "standard deviation of the error of a receiver's clock", range=(0.0, 1.0))
+    sound_speed_std: float = parameter(0.0, 'm/s',
+        'standard deviation of sound_speed', range=(0.0, 100.0))
+    systematic_errors: str = parameter('mixed', '',
+        'treatment of the errors of receiver_position_std, receiver_clock_std and '
+        'sound_speed_std: consider (in the covariance, never estimated), estimate, or mixed '
+        '(receiver positions considered, clocks and sound speed estimated)', choices=SYSTEMATIC)
+
+    # -- errors of fixes that last ---------------------------------------------------------------
+    fix_bias_std: float = parameter(0.0, 'm',
+        'standard deviation on each axis of a lasting error of the fixes, on top of their '
+        'covariance', range=(0.0, 1e4))
+    fix_bias_time: float = parameter(60.0, 's',
+        'time over which the lasting error of the fixes (fix_bias_std) is correlated',
+        range=(1e-2, 1e6))
+
+    # -- association -----------------------------------------------------------------------------
+    association: str = parameter('gnn', '',
+        'pairing of fixes and tracks: gnn (the most likely pairing, tracks confirmed by hits) or '
+        'jipda (all pairings weighed, tracks confirmed by their probability of existence, for '
+        'divers that cross in clutter)', choices=ASSOCIATIONS)
+    birth_density: float = live(1.2e-5, '1/m^2',
+        'jipda: number of new divers expected in a scan, per square metre', range=(1e-12, 1.0))
+    survival_time: float = live(500.0, 's',
+        'jipda: time for which a diver is expected to stay', range=(1.0, 1e7))
+
+    # -- names -----------------------------------------------------------------------------------
+    tags: tuple[str, ...] = parameter((), '',
+        'names of tags or divers: what comes on <name>/fix or <name>/relative, or in a frame of '
+        'that name, belongs to this diver and goes to his own track without association',
+        kind='str[]')
+    named_tracks: str = parameter('share', '',
+        'what a track with a known name does with fixes without a name: share (it takes part in '
+        'the association, and a track beside it that is never seen together with it is the same '
+        'diver) or alone (it takes only its own)', choices=NAMED_TRACKS)
+    repeat_time: float = parameter(5.0, 's',
+        'time within which the same values again are a repeated poll, which is left out and '
+        'counted; 0: use them', range=(0.0, 3600.0))
+
+    # -- sensors ---------------------------------------------------------------------------------
+    sensors: tuple[str, ...] = parameter((), '',
+        'names of sensors with parameters of their own (sensor_...): they apply to what comes on '
+        '<name>/fix, <name>/fixes or <name>/relative, or in a frame of that name', kind='str[]')
+    sensor_fix_std: tuple[float, ...] = parameter((), 'm',
+        'fix_std of each of the sensors; empty: as fix_std', range=(1e-4, 1e5), kind='float[]')
+    sensor_detection_probability: tuple[float, ...] = parameter((), '',
+        'detection_probability of each of the sensors; empty: as detection_probability',
+        range=(0.01, 0.9999), kind='float[]')
+    sensor_clutter_density: tuple[float, ...] = parameter((), '1/m^2',
+        'clutter_density of each of the sensors; empty: as clutter_density', range=(1e-12, 1e4),
+        kind='float[]')
+
+    # -- latitude and longitude ------------------------------------------------------------------
+    origin_latitude: float = parameter(0.0, 'deg',
+        'latitude of the origin of the frame of the tracks; with both latitude and longitude 0: '
+        'the first position given in latitude and longitude', range=(-90.0, 90.0))
+    origin_longitude: float = parameter(0.0, 'deg',
+        'longitude of the origin of the frame of the tracks, see origin_latitude',
+        range=(-360.0, 360.0))
+    origin_height: float = parameter(0.0, 'm',
+        'height of the origin of the frame of the tracks above the ellipsoid',
+        range=(-12000.0, 12000.0))
+    map_frame: str = parameter('map', '',
+        'name of the frame of positions that come as latitude and longitude')
+
+    # -- relative to a transceiver ---------------------------------------------------------------
+    vessel: str = parameter('moving', '',
+        'what carries the transceiver of relative fixes: moving (a vessel whose pose comes by '
+        'nav, or by nav_fix and heading) or fixed (it lies at the origin, x east, and '
+        'transceiver_lever says where the transceiver is)', choices=VESSELS)
+    transceiver_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
+        'vector from the reference of nav, or the antenna of nav_fix, to the transceiver: x '
+        'forward, y port, z up', range=(-1e4, 1e4))
+    transceiver_lever_std: float = parameter(0.0, 'm',
+        'standard deviation of transceiver_lever on each axis', range=(0.0, 100.0))
+    transceiver_mount_rpy_deg: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg',
+        'roll, pitch, yaw of the transceiver on the vessel (forward, port, up: pitch positive '
+        'nose down)', range=(-180.0, 180.0))
+    relative_axes: str = parameter('flu', '',
+        'axes of relative fixes whose message does not say: flu (forward, port, up of the '
+        'transceiver), frd (forward, starboard, down), enu or ned (of the world, by its own '
+        'compass)', choices=RELATIVE_AXES)
+    relative_range_std: float = live(0.5, 'm',
+        'standard deviation of the range of a relative fix that comes without covariance',
+        range=(1e-4, 1e4))
+    relative_angle_std_deg: float = live(2.0, 'deg',
+        'standard deviation, across in each direction, of the direction of a relative fix that '
+        'comes without covariance', range=(1e-3, 45.0))
+    vessel_position_std: float = live(1.0, 'm',
+        "standard deviation on each axis of the vessel's position where its message states none",
+        range=(0.0, 1e4))
+    vessel_heading_std_deg: float = live(1.0, 'deg',
+        "standard deviation of the vessel's heading where its message states none",
+        range=(0.0, 45.0))
+    vessel_attitude_std_deg: float = live(0.5, 'deg',
+        "standard deviation of the vessel's roll and pitch where its message states none",
+        range=(0.0, 45.0))
+    vessel_max_gap: float = parameter(2.0, 's',
+        'longest time between two poses of the vessel that is interpolated; relative fixes in a '
+        'longer gap are left out and counted', range=(0.01, 600.0))
+    vessel_max_extrapolation: float = parameter(0.0, 's',
+        'a relative fix is used when it is no further than this beyond the newest pose of the '
+        'vessel, else it waits for the next one', range=(0.0, 60.0))
+    # fmt: on
 
     def check(self) -> list[str]:
-        problems = super().check()
+        problems = super().check() + self._place_problems() + self._sensor_problems()
+        if self.depth_min > self.depth_max:
+            problems.append(
+                f'depth_min ({self.depth_min:g}) cannot exceed depth_max ({self.depth_max:g})'
+            )
         models = self.model_count()
         if self.model_set in BASELINES and len(self.acceleration_noise) not in (0, models):
             problems.append(
@@ -266,6 +297,49 @@ class DiverConfig(
             self.transition_matrix, self.initial_probabilities, models, self.model_set
         )
         return problems
+
+    def _place_problems(self) -> list[str]:
+        return [
+            f'{name} needs three values, got {len(getattr(self, name))}'
+            for name in ('transceiver_lever', 'transceiver_mount_rpy_deg')
+            if len(getattr(self, name)) != 3
+        ]
+
+    def _sensor_problems(self) -> list[str]:
+        problems = []
+        for name in SENSOR_NUMBERS:
+            given = getattr(self, f'sensor_{name}')
+            if len(given) not in (0, len(self.sensors)):
+                problems.append(
+                    f'sensor_{name} needs one value for each of the {len(self.sensors)} sensors, '
+                    f'got {len(given)}'
+                )
+        for name in ('tags', 'sensors'):
+            if bad := [word for word in getattr(self, name) if not _WORD.fullmatch(word)]:
+                problems.append(
+                    f"{name}: '{bad[0]}' cannot be part of a topic; letters, digits and _ can"
+                )
+        return problems
+
+    def origin(self) -> Origin | None:
+        """The origin that is stated, None for none."""
+        if self.origin_latitude == 0.0 and self.origin_longitude == 0.0:
+            return None
+        return Origin(self.origin_latitude, self.origin_longitude, self.origin_height)
+
+    def of_sensor(self, sensor: str) -> DiverConfig:
+        """These parameters with those of a sensor in place."""
+        if sensor not in self.sensors:
+            return self
+        place = self.sensors.index(sensor)
+        return evolve(
+            self,
+            **{
+                name: values[place]
+                for name in SENSOR_NUMBERS
+                if (values := getattr(self, f'sensor_{name}'))
+            },
+        )
 
     def model_count(self) -> int:
         """Number of models in the set these parameters describe."""

@@ -12,10 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a fix does to its track, compiled: many fixes are few numbers each.
+"""What fixes do to their tracks, compiled: many fixes are few numbers each.
 
-All floats are float64, all arrays C-contiguous; T tracks of M models with n states. `warm`
-compiles or loads every kernel.
+All floats are float64, all arrays C-contiguous; T tracks of M models with n states. No kernel
+changes its arguments. `warm` compiles or loads every kernel.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ import math
 import numpy as np
 
 from ...estimation import imm_kernels
-from ...estimation.adaptation_kernels import row_sum
+from ...estimation.adaptation import row_sum
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.consistency import FARTHEST
 from ...estimation.jit import kernel
 
 Sums = tuple[float, float, float, float, float]
-"""Those of `fix_consistency.FixConsistency`."""
+"""The fields of `state.FixConsistency`."""
 
 
 @kernel
@@ -63,7 +63,7 @@ def finite(x: FloatArray, P: FloatArray) -> BoolArray:
 
 
 @kernel
-def take(
+def update(
     x: FloatArray,
     P: FloatArray,
     mu: FloatArray,
@@ -75,11 +75,12 @@ def take(
     detection: IntArray,
     nis: FloatArray,
     nis_dof: np.ndarray,
-) -> int:
-    """Update `tracks` (t,), each with its `detection` (t,) of z (D, 2), R (D, 2, 2), in place: x
-    (T, M, n), P (T, M, n, n), mu (T, M); h (T, M, 2) expected. Adds to nis and nis_dof (T,); gives
-    how many covariances were repaired."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
+    """Update `tracks` (t,), each with its `detection` (t,) of z (D, 2), R (D, 2, 2): x (T, M, n),
+    P (T, M, n, n), mu (T, M); h (T, M, 2) expected. Gives x, P, mu, nis (T,) and nis_dof (T,) of
+    all tracks, and how many covariances were repaired."""
     M = x.shape[1]
+    x, P, mu, nis, nis_dof = x.copy(), P.copy(), mu.copy(), nis.copy(), nis_dof.copy()
     innovation = np.empty((len(tracks), M, 2))
     for k in range(len(tracks)):
         for j in range(M):
@@ -94,27 +95,29 @@ def take(
         if ok[k]:
             nis[t] += nis1[k]
             nis_dof[t] += 2
-    return int(repaired.sum())
+    return x, P, mu, nis, nis_dof, int(repaired.sum())
 
 
 @kernel
-def keep_score(
+def scores(
     score: FloatArray,
     fit: FloatArray,
     chosen: IntArray,
-    named: BoolArray,
+    excluded: BoolArray,
     missed: float,
     gain: float,
     log_clutter: float,
-) -> None:
-    """Add to score (T,), in place: ln of P_D N(nu; 0, S) / clutter for a hit, ln of 1 - P_D, which
-    is `missed`, for a miss; gain: ln of P_D / (1 - P_D). Not for tracks that are `named` (T,)."""
+) -> FloatArray:
+    """The score (T,) with ln of P_D N(nu; 0, S) / clutter for a hit, ln of 1 - P_D, which is
+    `missed`, for a miss; gain: ln of P_D / (1 - P_D). Not for tracks that are `excluded` (T,)."""
+    score = score.copy()
     for t in range(len(score)):
-        if not named[t]:
+        if not excluded[t]:
             score[t] += missed
         if chosen[t] >= 0:
             score[t] += fit[t, chosen[t]] + gain
             score[t] -= log_clutter
+    return score
 
 
 @kernel
@@ -138,16 +141,17 @@ def watch(
     white: FloatArray,
     sums: Sums,
     memory: float,
-) -> Sums:
+) -> tuple[FloatArray, Sums]:
     """Whiten the innovations that the mixture of each of `tracks` (t,) sees in its `detection`
-    (t,), into white (T, 2), in place. Gives the sums with those of confirmed tracks, of which
-    about the last `memory` count; tentative (T,), the rest as in `take`.
+    (t,). Gives white (T, 2) with them, and the sums with those of confirmed tracks, of which about
+    the last `memory` count; tentative (T,), the rest as in `update`.
 
     An innovation longer than `FARTHEST` allows is a sharp turn and says nothing of noise: in the
     sums it is shortened to that."""
     mean, covariance = imm_kernels.combine(x[tracks], P[tracks], mu[tracks], H[0])
-    one, other = np.empty((len(tracks), 2)), np.empty((len(tracks), 2))
+    firm, paired = np.empty((len(tracks), 2)), np.empty((len(tracks), 2))
     count, pairs = 0, 0
+    white = white.copy()
     for k in range(len(tracks)):
         t, row = tracks[k], detection[k]
         # The inverse of the Cholesky factor of 2 x 2, written out.
@@ -158,23 +162,23 @@ def watch(
         second = (z[row, 1] - mean[k, 1] - b * first) / c
         if not tentative[t] and math.isfinite(first) and math.isfinite(second):
             kept = _shortening(first, second)
-            one[count, 0], one[count, 1] = kept * first, kept * second
+            firm[count, 0], firm[count, 1] = kept * first, kept * second
             count += 1
             if math.isfinite(white[t, 0]) and math.isfinite(white[t, 1]):
                 kept = _shortening(white[t, 0], white[t, 1])
-                other[pairs, 0], other[pairs, 1] = kept * white[t, 0], kept * white[t, 1]
+                paired[pairs, 0], paired[pairs, 1] = kept * white[t, 0], kept * white[t, 1]
                 # Those that have a partner come first.
-                one[count - 1], one[pairs] = one[pairs].copy(), one[count - 1].copy()
+                firm[count - 1], firm[pairs] = firm[pairs].copy(), firm[count - 1].copy()
                 pairs += 1
         white[t, 0], white[t, 1] = first, second
     if not count:
-        return sums
-    now, before = one.ravel(), other.ravel()
+        return white, sums
+    now, before = firm.ravel(), paired.ravel()
     square, cross = now[: 2 * count] ** 2, now[: 2 * pairs] * before[: 2 * pairs]
     both = square[: 2 * pairs] + before[: 2 * pairs] ** 2
     total = sums[0] + count
     kept = memory / total if total > memory else 1.0
-    return (
+    return white, (
         total * kept,
         (sums[1] + 0.5 * row_sum(square)) * kept,
         (sums[2] + pairs) * kept,
@@ -187,8 +191,8 @@ def warm() -> None:
     """Run the kernels once on tiny input: compiled or loaded from the cache."""
     x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
     H, z, R, first = P.copy(), np.zeros((1, 2)), np.eye(2)[None], np.zeros(1, np.int64)
-    take(x, P, mu, expected(x, H), H, z, R, first, first, np.zeros(1), np.zeros(1, np.uint16))
+    update(x, P, mu, expected(x, H), H, z, R, first, first, np.zeros(1), np.zeros(1, np.uint16))
     no, sums = np.zeros(1, np.bool_), (0.0, 0.0, 0.0, 0.0, 0.0)
     watch(x, P, mu, H, z, R, first, first, no, np.full((1, 2), np.nan), sums, 1.0)
-    keep_score(np.zeros(1), z, first, no, 0.0, 0.0, 0.0)
+    scores(np.zeros(1), z, first, no, 0.0, 0.0, 0.0)
     finite(x, P)

@@ -14,12 +14,13 @@
 
 """Tracks whose name is known, and what to do when a diver is also seen without one.
 
-A named track takes its part of the fixes that have no name (`fix_scans`), so that a diver with a
-transponder on a sonar is one track. A second track can stand beside it all the same: the sonar may
-have seen the diver before the transponder was heard. Two divers that swim together are seen
-together, now and then at least; one diver never is. So a nameless track that stays beside a named
-one, for so many scans that two divers would have been seen together once but for a probability of
-`MISTAKEN`, is the same diver: the confirmed or older of the two goes on, with the name.
+A named track takes its part of the fixes that have no name (`named_tracks: share`), so that a
+diver with a transponder on a sonar is one track. A second track can stand beside it all the same:
+the sonar may have seen the diver before the transponder was heard. Two divers that swim together
+are seen together, now and then at least; a single diver never is. So a nameless track that stays
+beside a named one, for so many scans that two divers would have been seen together once but for a
+probability of `MISTAKEN`, is the same diver: the confirmed or older of the two goes on, with the
+name.
 
 A name lasts as long as something says it: after `max_coast` without a fix of its own a track that
 still is seen goes on without its name.
@@ -30,18 +31,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 import math
 
-from attrs import evolve
 import numpy as np
 
-from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold, TrackStatus
-from ...measurements import Arrivals, Measurement, NOBODY
-from .births import Birth, births_from_ping
-from .config import DiverConfig
-from .pings import ping_numbers
-from .scan import Scan
-from .sensing import Positions
+from ...measurements import NOBODY
+from .scan import Positions
 from .state import DiverState
 
 BESIDE = 4.0
@@ -56,100 +51,49 @@ def patience(detection_probability: float) -> int:
     return math.ceil(math.log(MISTAKEN) / math.log1p(-(detection_probability**2)))
 
 
-def hear_named(scan: Scan, ping: Arrivals, config: DiverConfig, factor: float) -> list[Birth]:
-    """Give a tag's ping to the track of its name; without one it is where one begins."""
-    name = int(ping.tx_id[0])
-    tracks = np.flatnonzero(scan.before.target_id == name)
-    if not len(tracks):
-        free = np.ones(len(ping), bool)
-        found = births_from_ping(ping, free, config, factor)
-        return [birth._replace(target_id=name) for birth in found]
-    scan.instruments = scan.instruments.heard(ping, config)
-    scan.layout = scan.instruments.layout(config, scan.models.n)
-    scan.x, scan.P = scan.layout.widened(scan.x, scan.P)
-    whole = config.covariance_scale * factor
-    rows = np.arange(len(ping))
-    numbers = ping_numbers(ping, rows, config, whole, scan.models, scan.layout)
-    if numbers.pairs > 1:
-        scan.accept(int(tracks[0]), numbers, whole)
-    return []
-
-
-def pings_of(items: Iterable[Measurement]) -> list[Arrivals]:
-    """The pings of a stamp, each with its rows in order; of tags one for each tag."""
-    pings: list[Arrivals] = []
-    for item in items:
-        if isinstance(item, Arrivals):
-            ping = item.in_order()
-            ids = np.unique(ping.tx_id) if ping.passive else ping.tx_id[:1]
-            pings += [ping.only(ping.tx_id == one) for one in ids] if len(ids) > 1 else [ping]
-    return pings
-
-
-def is_named(ping: Arrivals) -> bool:
-    """Whether a ping is that of a tag whose number is known."""
-    return ping.passive and int(ping.tx_id[0]) != 0
-
-
-def remembered(
-    now: DiverState, before: DiverState, said: Iterable[int], max_coast: float
-) -> DiverState:
-    """With the names that were said at this stamp, and without those that are said no more."""
-    last = dict(before.said)
-    last.update((name, now.stamp_ns) for name in said)
+def remembered(now: DiverState, names: Iterable[int], max_coast: float) -> DiverState:
+    """With the `names` of this stamp, and without those that nothing has said for `max_coast`."""
+    last = dict(now.last_named)
+    last.update((name, now.stamp_ns) for name in names)
     tracked = set(now.target_id.tolist())
     last = {
-        name: at
-        for name, at in last.items()
-        if now.stamp_ns - at <= max_coast * 1e9 and (name in tracked or at == now.stamp_ns)
+        name: stamp_ns
+        for name, stamp_ns in last.items()
+        if now.stamp_ns - stamp_ns <= max_coast * 1e9
+        and (name in tracked or stamp_ns == now.stamp_ns)
     }
-    if not last and not before.said:
-        return now
     known = np.isin(now.target_id, np.array(list(last), np.int64))
-    return evolve(now, said=tuple(last.items()), target_id=np.where(known, now.target_id, NOBODY))
-
-
-def names_said(groups: Sequence[Positions], pings: Sequence[Arrivals]) -> list[int]:
-    """The names in the fixes and pings of a stamp."""
-    own = [group.target_id for group in groups if group.target_id is not None]
-    return [int(name) for names in own for name in names] + [
-        int(ping.tx_id[0]) for ping in pings if is_named(ping)
-    ]
+    target_id = np.where(known, now.target_id, NOBODY)
+    return now._replace(last_named=tuple(last.items()), target_id=target_id)
 
 
 def merged(
-    now: DiverState,
-    before: DiverState,
-    groups: Sequence[Positions],
-    config: DiverConfig,
-    E: FloatArray,
+    now: DiverState, before: DiverState, fixes: Sequence[Positions], E: FloatArray
 ) -> DiverState:
     """Without the tracks that are divers with a name once more, and that name where it belongs.
 
-    groups: the fixes of this scan; E (M, 2, n): to the position.
+    before: the state before any track of this scan ended; fixes: of this scan; E (M, 2, n): to the
+    position.
     """
-    seen = [group for group in groups if group.target_id is None and group.whole]
-    named, nameless = (np.flatnonzero((now.target_id != NOBODY) == one) for one in (True, False))
-    if config.named_tracks != 'share' or not seen or not len(named) or not len(nameless):
+    seen = [group for group in fixes if group.target_id is None and group.whole]
+    nameless, named = (np.flatnonzero((now.target_id == NOBODY) == free) for free in (True, False))
+    if not seen or not len(named) or not len(nameless):
         return now
-    n = E.shape[-1]
-    x, P = np.ascontiguousarray(now.x[..., :n]), np.ascontiguousarray(now.P[..., :n, :n])
-    mean, covariance = imm_kernels.combine(x, P, now.mu, np.ascontiguousarray(E))
+    mean, covariance = now.positions(E)
     apart = mean[nameless][:, None] - mean[named][None]
     distance = _squared(apart, covariance[nameless][:, None] + covariance[named][None])
     ids = now.life.track_id.astype(np.int64)
     ago = dict(zip(before.life.track_id.tolist(), zip(before.near_to, before.near_for)))
-    limit = max(patience(config.of_sensor(group.sensor).detection_probability) for group in seen)
-    near_to, near_for, target_id, existence = (
-        one.copy() for one in (now.near_to, now.near_for, now.target_id, now.existence)
-    )
+    limit = max(patience(group.config.detection_probability) for group in seen)
+    near_to, near_for = now.near_to.copy(), now.near_for.copy()
+    target_id, existence = now.target_id.copy(), now.existence.copy()
     going_on = np.ones(len(ids), bool)
     for row, place in zip(nameless.tolist(), distance.argmin(axis=1).tolist()):
         other = int(named[place])
         if distance[nameless == row, place].min() > BESIDE or not going_on[other]:
             continue
         pair = [row, other]
-        if sum(_near(group, mean[pair], covariance[pair], config) for group in seen) > 1:
+        if sum(_near(group, mean[pair], covariance[pair]) for group in seen) > 1:
             continue
         partner, count = ago.get(int(ids[row]), (0, 0))
         near_to[row], near_for[row] = ids[other], 1 + (count if partner == ids[other] else 0)
@@ -158,8 +102,10 @@ def merged(
         stays, goes = (row, other) if _prefer(now, row, other) else (other, row)
         target_id[stays], existence[stays], going_on[goes] = target_id[other], math.nan, False
         near_to[stays] = near_for[stays] = 0
-    now = evolve(now, near_to=near_to, near_for=near_for, target_id=target_id, existence=existence)
-    return now if going_on.all() else evolve(now.rows(going_on), life=now.life.only(going_on))
+    now = now._replace(
+        near_to=near_to, near_for=near_for, target_id=target_id, existence=existence
+    )
+    return now.only(going_on)
 
 
 def _prefer(now: DiverState, row: int, other: int) -> bool:
@@ -171,11 +117,11 @@ def _prefer(now: DiverState, row: int, other: int) -> bool:
     return bool(now.life.track_id[row] < now.life.track_id[other])
 
 
-def _near(group: Positions, mean: FloatArray, covariance: FloatArray, config: DiverConfig) -> int:
+def _near(fixes: Positions, mean: FloatArray, covariance: FloatArray) -> int:
     """How many fixes of a scan are near one of two tracks: mean (2, 2), covariance (2, 2, 2)."""
-    apart = group.z[:, None] - mean[None]
-    distance = _squared(apart, covariance[None] + group.R[:, None])
-    threshold = gate_threshold(config.gate_probability, 2)
+    apart = fixes.z[:, None] - mean[None]
+    distance = _squared(apart, covariance[None] + fixes.R[:, None])
+    threshold = gate_threshold(fixes.config.gate_probability, 2)
     return int((distance.min(axis=1) <= threshold).sum())
 
 

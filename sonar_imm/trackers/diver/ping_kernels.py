@@ -12,12 +12,21 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The update of one diver by one ping over all subsets of its arrivals, compiled.
+"""The measurements of one ping and the M models of one diver, compiled.
 
-The mathematics is that of `estimation.subset_update`, for numbers that exclude or follow each
-other. Numbers of one *node*, the echoes of a transmitter-receiver pair, exclude each other: an
-explanation takes one of them as good, or none, which costs ``eps u`` for each. A number with a
-*parent*, the bearing that came with an echo, is asked only where the echo is taken.
+*What is expected*: likelihood, residuals and their covariance under the mixture of the models.
+
+*All subsets* (`subset_ping`): the mathematics of `oracles.subset_update` of the tests, for
+measurements that exclude or follow each other. Measurements of one *node*, the echoes of a
+transmitter-receiver pair, exclude each other: an explanation takes one of them as good, or none,
+which costs ``eps u`` for each. A measurement with a *parent*, the bearing that came with an echo,
+is asked only where the echo is taken.
+
+*Heavy tails* (`student_t_ping`): that of `oracles.student_t`, for many arrivals at once. Every
+model starts from its own prediction and from the positions that the ping suggests by itself, so
+that many good arrivals outvote any prior and no prior gates a ping away.
+
+In all of them x is (M, n), P (M, n, n), mu (M,); height: z of the diver where z is no state.
 """
 
 from __future__ import annotations
@@ -27,22 +36,34 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics.arrivals_3d import BEARING, observe
+from ...acoustics.arrivals_3d import BEARING, EMISSION, observe, ONE_WAY, X, Y
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.consider import consider_scalar
 from ...estimation.jit import kernel
-from ...estimation.subset_update import PRUNE
+from ...estimation.small_matrices import cholesky, cholesky_with_jitter, whitened_square
+
+PRUNE = 14.0
+"""An explanation whose log-probability is this much below the best one's is dropped."""
 
 MOST_EXPLANATIONS = 128
 """Explanations of a model at once; beyond, the worst give way."""
 
+DEGREES = 4.0
+"""Degrees of freedom of the Student-t density of a residual."""
 
-class Numbers(NamedTuple):
-    """The C numbers of one ping, sorted by node, parents before their children.
+MOST_ITERATIONS = 60
 
-    node (C,): numbers of one node exclude each other; parent (C,): index of the number this one
-    came with, -1 for none; kind (C,): see `acoustics.arrivals_3d`; value, variance (C,); density
-    (C,): of a wild value, per unit; tx, rx (C, 3) m; columns (C, 7): see `arrivals_3d.observe`.
+SMALLEST_GAIN = 1e-7
+"""Gain in log-density that ends a search: far below what a model probability could show."""
+
+
+class PingMeasurements(NamedTuple):
+    """The C measurements of one ping, sorted by node, parents before their children.
+
+    node (C,): measurements of one node exclude each other; parent (C,): index of the measurement
+    that this one came with, -1 for none; kind (C,): see `acoustics.arrivals_3d`; value, variance
+    (C,); density (C,): of a wild value, per unit; tx, rx (C, 3) m; columns (C, 7): see
+    `arrivals_3d.observe`.
     """
 
     node: IntArray
@@ -54,6 +75,94 @@ class Numbers(NamedTuple):
     tx: FloatArray
     rx: FloatArray
     columns: IntArray
+
+
+@kernel
+def _residual(
+    x: FloatArray, measured: PingMeasurements, c: int, height: float, g: FloatArray
+) -> float:
+    """Measurement c less what a diver at x (n,) causes, bearings within half a turn; its gradient
+    goes into g (n,)."""
+    residual = measured.value[c] - observe(
+        measured.kind[c], x, measured.columns[c], height, measured.tx[c], measured.rx[c], g
+    )
+    if measured.kind[c] == BEARING:
+        residual -= 2.0 * math.pi * math.floor(residual / (2.0 * math.pi) + 0.5)
+    return residual
+
+
+@kernel
+def fit_measurements(
+    x: FloatArray, P: FloatArray, mu: FloatArray, height: float, measured: PingMeasurements
+) -> tuple[FloatArray, FloatArray]:
+    """Log-likelihood (C,) of each measurement under the mixture of the models, and its least NIS
+    (C,) of any model."""
+    M, n = x.shape
+    C = len(measured.value)
+    likelihood, least = np.zeros(C), np.full(C, np.inf)
+    g = np.empty(n)
+    for c in range(C):
+        for j in range(M):
+            nu = _residual(x[j], measured, c, height, g)
+            S = measured.variance[c]
+            for a in range(n):
+                if g[a] != 0.0:
+                    for b in range(n):
+                        S += g[a] * P[j, a, b] * g[b]
+            nis = nu * nu / S
+            least[c] = min(least[c], nis)
+            likelihood[c] += mu[j] * math.exp(-0.5 * nis) / math.sqrt(2.0 * math.pi * S)
+        likelihood[c] = math.log(max(likelihood[c], 1e-300))
+    return likelihood, least
+
+
+@kernel
+def expect_residuals(
+    x: FloatArray, mu: FloatArray, height: float, measured: PingMeasurements
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (C,), value less the one that the mixture expects, and those of each model
+    (M, C)."""
+    M, n = x.shape
+    C = len(measured.value)
+    residual, nu, g = np.zeros(C), np.empty((M, C)), np.empty(n)
+    for j in range(M):
+        for c in range(C):
+            nu[j, c] = _residual(x[j], measured, c, height, g)
+            residual[c] += mu[j] * nu[j, c]
+    return residual, nu
+
+
+@kernel
+def expect_measurements(
+    x: FloatArray, P: FloatArray, mu: FloatArray, height: float, measured: PingMeasurements
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (C,), value less the one that the mixture expects, and the covariance (C, C) of
+    what is expected, without the variances of the measurements."""
+    M, n = x.shape
+    C = len(measured.value)
+    covariance, G, GP = np.zeros((C, C)), np.empty((C, n)), np.empty(n)
+    residual, nu = expect_residuals(x, mu, height, measured)
+    for j in range(M):
+        if mu[j] == 0.0:
+            continue
+        for c in range(C):
+            _residual(x[j], measured, c, height, G[c])
+        for c in range(C):
+            for a in range(n):
+                GP[a] = 0.0
+                for b in range(n):
+                    GP[a] += G[c, b] * P[j, b, a]
+            for d in range(c + 1):
+                value = 0.0
+                for a in range(n):
+                    value += GP[a] * G[d, a]
+                covariance[c, d] += mu[j] * value
+    for c in range(C):
+        for d in range(c + 1):
+            for j in range(M):
+                covariance[c, d] += mu[j] * (nu[j, c] - residual[c]) * (nu[j, d] - residual[d])
+            covariance[d, c] = covariance[c, d]
+    return residual, covariance
 
 
 @kernel
@@ -72,7 +181,7 @@ def _place(
     where it is the worst itself."""
     slot = count
     if count == len(weights):
-        slot = np.argmin(weights)
+        slot = int(np.argmin(weights))
         if weights[slot] >= weight:
             return -1
     X[slot, :] = x
@@ -88,18 +197,18 @@ def subset_ping(
     P: FloatArray,
     estimated: BoolArray,
     height: float,
-    numbers: Numbers,
+    measured: PingMeasurements,
     outlier_probability: float,
     most: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Update the M models of a diver, x (M, n), P (M, n, n), by the `numbers` of a ping.
+    """Update the models of a diver by all subsets of what a ping measured.
 
-    estimated (n,): False for what is only considered; height: z of the diver where z is no state.
-    Gives x, P, the log-evidence (M,) of the ping and the probability (M, C) that each number is
-    good.
+    estimated (n,): False for what is only considered; most: explanations of a model at once.
+    Gives x, P, the log-evidence (M,) of the ping and the probability (M, C) that each measurement
+    is good.
     """
     M, n = x.shape
-    C = len(numbers.value)
+    C = len(measured.value)
     x1, P1 = np.zeros((M, n)), np.zeros((M, n, n))
     evidence, taken = np.empty(M), np.zeros((M, C))
     X, Ps = np.empty((2, most, n)), np.empty((2, most, n, n))
@@ -116,11 +225,11 @@ def subset_ping(
         weights[0, 0] = 0.0
         while first < C:
             last, wild = first, 0.0
-            while last < C and numbers.node[last] == numbers.node[first]:
-                wild += numbers.density[last]
+            while last < C and measured.node[last] == measured.node[first]:
+                wild += measured.density[last]
                 last += 1
             then, grown = 1 - now, 0
-            parent = numbers.parent[first]
+            parent = measured.parent[first]
             for b in range(count):
                 weight = weights[now, b]
                 if weight < best - PRUNE:
@@ -146,20 +255,9 @@ def subset_ping(
                 for c in range(first, last):
                     x_c[:] = X[now, b]
                     P_c[:, :] = Ps[now, b]
-                    innovation = numbers.value[c] - observe(
-                        numbers.kind[c],
-                        x_c,
-                        numbers.columns[c],
-                        height,
-                        numbers.tx[c],
-                        numbers.rx[c],
-                        gradient,
-                    )
-                    if numbers.kind[c] == BEARING:
-                        turns = math.floor(innovation / (2.0 * math.pi) + 0.5)
-                        innovation -= 2.0 * math.pi * turns
+                    innovation = _residual(x_c, measured, c, height, gradient)
                     fit = consider_scalar(
-                        x_c, P_c, gradient, numbers.variance[c], innovation, estimated, scratch
+                        x_c, P_c, gradient, measured.variance[c], innovation, estimated, scratch
                     )
                     if parent >= 0:
                         fit -= math.log(wild)
@@ -208,3 +306,203 @@ def subset_ping(
                 P1[j, k, a] = P1[j, a, k]
         evidence[j] = best + math.log(total)
     return x1, P1, evidence, taken
+
+
+@kernel
+def _log_density(
+    x: FloatArray,
+    mean: FloatArray,
+    L: FloatArray,
+    measured: PingMeasurements,
+    height: float,
+    degrees: float,
+    g: FloatArray,
+    w: FloatArray,
+) -> float:
+    """Up to a constant that no state and no model changes."""
+    total = -0.5 * whitened_square(L, x - mean, w)
+    for c in range(len(measured.value)):
+        r = _residual(x, measured, c, height, g)
+        total -= 0.5 * (degrees + 1.0) * math.log1p(r * r / measured.variance[c] / degrees)
+    return total
+
+
+@kernel
+def _weighted(
+    at: FloatArray,
+    mean: FloatArray,
+    P: FloatArray,
+    estimated: BoolArray,
+    measured: PingMeasurements,
+    height: float,
+    degrees: float,
+    widen: float,
+    x: FloatArray,
+    Px: FloatArray,
+    weights: FloatArray,
+) -> None:
+    """The weighted Kalman update of the prior, linearised `at` a state, into x, Px and weights."""
+    g, w = np.empty(len(x)), np.empty(len(x))
+    x[:] = mean
+    Px[:, :] = P
+    for c in range(len(measured.value)):
+        r = _residual(at, measured, c, height, g)
+        weights[c] = (degrees + 1.0) / (degrees + r * r / measured.variance[c])
+        innovation = r
+        for a in range(len(x)):
+            innovation -= g[a] * (x[a] - at[a])
+        R = widen * measured.variance[c] / weights[c]
+        consider_scalar(x, Px, g, R, innovation, estimated, w)
+
+
+@kernel
+def climb(
+    start: FloatArray,
+    mean: FloatArray,
+    P: FloatArray,
+    L: FloatArray,
+    measured: PingMeasurements,
+    height: float,
+    degrees: float,
+) -> tuple[FloatArray, float]:
+    """The maximum uphill of `start` (n,), and its log-density; L the Cholesky factor of P."""
+    n, C = len(mean), len(measured.value)
+    g, w, weights = np.empty(n), np.empty(n), np.empty(C)
+    Px, every = np.empty((n, n)), np.ones(n, np.bool_)
+    x, trial, target = start.copy(), np.empty(n), np.empty(n)
+    value = _log_density(x, mean, L, measured, height, degrees, g, w)
+    for _ in range(MOST_ITERATIONS):
+        _weighted(x, mean, P, every, measured, height, degrees, 1.0, target, Px, weights)
+        length, gain = 1.0, -1.0
+        while length > 1e-3:
+            trial[:] = x + length * (target - x)
+            new = _log_density(trial, mean, L, measured, height, degrees, g, w)
+            gain = new - value
+            if gain >= 0.0:
+                break
+            length *= 0.5
+        if gain > 0.0:
+            x[:] = trial
+            value += gain
+        if not gain > SMALLEST_GAIN:
+            break
+    return x, value
+
+
+@kernel
+def _moved(
+    mean: FloatArray, position: FloatArray, measured: PingMeasurements, height: float
+) -> FloatArray:
+    """A state like `mean` at another position (2,), the emission, if any, at its median."""
+    x = mean.copy()
+    columns = measured.columns[0]
+    x[columns[X]], x[columns[Y]] = position[0], position[1]
+    if columns[EMISSION] >= 0:
+        late, g = np.empty(len(measured.value)), np.empty(len(mean))
+        x[columns[EMISSION]] = 0.0
+        count = 0
+        for c in range(len(measured.value)):
+            if measured.kind[c] == ONE_WAY:
+                late[count] = _residual(x, measured, c, height, g)
+                count += 1
+        if count:
+            x[columns[EMISSION]] = np.median(late[:count])
+    return x
+
+
+@kernel
+def student_t_maxima(
+    mean: FloatArray,
+    P: FloatArray,
+    positions: FloatArray,
+    measured: PingMeasurements,
+    height: float,
+    degrees: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Where the search ends that starts at each of `positions` (S, 2): states (S, n), and their
+    log-densities (S,), for one prior `mean` (n,), P (n, n)."""
+    S, n = len(positions), len(mean)
+    found, value, L = np.empty((S, n)), np.full(S, -np.inf), np.zeros((n, n))
+    if cholesky(P, L):
+        for s in range(S):
+            start = _moved(mean, positions[s], measured, height)
+            found[s], value[s] = climb(start, mean, P, L, measured, height, degrees)
+    return found, value
+
+
+@kernel
+def student_t_ping(
+    x: FloatArray,
+    P: FloatArray,
+    estimated: BoolArray,
+    height: float,
+    measured: PingMeasurements,
+    positions: FloatArray,
+    degrees: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Update the models of a diver by all that a ping measured at once, with heavy tails.
+
+    positions (S, 2): where to start besides the prediction; estimated (n,): False for what is only
+    considered. Gives x, P, the log-evidence (M,) up to a constant common to the models, and the
+    weights (M, C).
+    """
+    M, n = x.shape
+    C = len(measured.value)
+    x1, P1, evidence = x.copy(), P.copy(), np.full(M, -np.inf)
+    weights = np.zeros((M, C))
+    L, Lc = np.zeros((n, n)), np.zeros((n, n))
+    state = np.empty(n)
+    every = np.ones(n, np.bool_)
+    widen = (degrees + 3.0) / (degrees + 1.0)
+    for j in range(M):
+        if not cholesky(P[j], L):
+            continue
+        at, best = climb(
+            _moved(x[j], x[j][measured.columns[0][X : Y + 1]], measured, height),
+            x[j],
+            P[j],
+            L,
+            measured,
+            height,
+            degrees,
+        )
+        for s in range(len(positions)):
+            start = _moved(x[j], positions[s], measured, height)
+            other, value = climb(start, x[j], P[j], L, measured, height, degrees)
+            if value > best + SMALLEST_GAIN:
+                at, best = other, value
+        _weighted(at, x[j], P[j], every, measured, height, degrees, 1.0, state, P1[j], weights[j])
+        if not cholesky_with_jitter(P1[j], Lc):
+            P1[j, :, :] = P[j]
+            continue
+        evidence[j] = best
+        for a in range(n):
+            evidence[j] += math.log(Lc[a, a] / L[a, a])
+        # The mean is that of the plain weights, the covariance that of the wider ones.
+        _weighted(
+            at,
+            x[j],
+            P[j],
+            estimated,
+            measured,
+            height,
+            degrees,
+            1.0,
+            x1[j],
+            P1[j],
+            weights[j],
+        )
+        _weighted(
+            at,
+            x[j],
+            P[j],
+            estimated,
+            measured,
+            height,
+            degrees,
+            widen,
+            state,
+            P1[j],
+            weights[j],
+        )
+    return x1, P1, evidence, weights

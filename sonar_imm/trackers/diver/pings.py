@@ -12,42 +12,51 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A ping as numbers, and what one diver's models become by it.
+"""What becomes of the divers by a ping: which measurements are whose, and the update by them.
 
 Echoes of up to `MOST_SUBSETS` transmitter-receiver pairs are explained by all their inlier and
-outlier subsets (`ping_kernels`), more of them by heavy tails (`robust_kernels`). So are the
-arrivals of a tag, however few: its time of emission is unknown, so that among three or four
-receivers no subset is refuted by the others, and what decides is whether the whole lies where the
-ping by itself would put it.
+outlier subsets, more of them by heavy tails (`ping_kernels`). So are the arrivals of a tag,
+however few: its time of emission is unknown, so that among three or four receivers no subset is
+refuted by the others, and what decides is whether the whole lies where the ping by itself would
+put it.
 
-Rows come in the order of their content (`Arrivals.in_order`): the order in which the arrivals of a
-ping were sent changes no bit.
+A track takes the measurements that its best explanation calls good. So association and update are
+one step here: an `Explanation` says what each track that takes part becomes, and
+`with_takings` is the state in which that has happened.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics.arrivals_3d import BEARING, ELEVATION, EMISSION, HEIGHT, ONE_WAY, PATH
-from ...estimation.arrays import BoolArray, FloatArray, IntArray
-from ...estimation.small_matrices import lift_all
-from ...estimation.student_t import DEGREES
-from ...measurements import Arrivals
+from ...acoustics.arrivals_3d import EMISSION
+from ...acoustics.multistatic import difference_projection
+from ...estimation import imm_kernels
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
+from ...estimation.small_matrices import add_jitter_all
+from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
-from .expectation_kernels import expect_numbers, expect_residuals, fit_numbers
-from .instruments import Layout
-from .model_set import heights_of, ModelSet
-from .ping_kernels import MOST_EXPLANATIONS, Numbers, subset_ping
-from .robust_kernels import student_t_maxima, student_t_ping
-from .sensing import bearing_variance, MOST_NUMBERS, spread, toa_variance
+from .ping_kernels import (
+    DEGREES,
+    expect_measurements,
+    expect_residuals,
+    fit_measurements,
+    MOST_EXPLANATIONS,
+    PingMeasurements,
+    student_t_maxima,
+    student_t_ping,
+    subset_ping,
+)
+from .scan import MOST_MEASUREMENTS, name_of, Ping, ping_measurements
+from .state import ARRIVALS, DiverState, learnt_scale
+from .state_space import heights_of, Layout, ModelSet
 
 MOST_SUBSETS = 6
 """Most transmitter-receiver pairs heard whose subsets are all tried."""
-
-OUTLIER_DENSITY = 1.0 / 50.0
-"""Density of a wild path length, 1/m: late by anything up to 50 m."""
 
 EMISSION_STD = 1e3
 """Standard deviation of a tag's emission, m of path, about where the arrivals put it: flat beside
@@ -63,53 +72,25 @@ OPTIMA = 3
 """Best positions of the ping by itself from which every model starts too."""
 
 DISTINCT = 1.0
-"""Metres within which two of them are one."""
+"""Metres within which two of them are the same."""
 
+NEAR = 28.0
+"""NIS of an echo that may be a track's: beyond, it weighs less than the least explanation kept by
+`ping_kernels`."""
 
-class Ping(NamedTuple):
-    """The `numbers` of a ping in the order of their content; row (C,): the row of the ping each
-    stands in; passive: a tag's; pairs: transmitter-receiver pairs heard."""
+TAKEN = 0.5
+"""Probability of being good from which a measurement counts as a track's."""
 
-    numbers: Numbers
-    row: IntArray
-    passive: bool
-    pairs: int
+EXCLUDED = -1
+"""Rank of a track that takes no part in a message."""
 
-    def only(self, keep: BoolArray) -> Ping:
-        """The numbers `keep` (C,), without those whose parent is not kept."""
-        keep = self.kept(keep)
-        place = np.cumsum(keep) - 1
-        left = Numbers(*(np.ascontiguousarray(column[keep]) for column in self.numbers))
-        left = left._replace(parent=np.where(left.parent >= 0, place[left.parent], -1))
-        pairs = len(np.unique(left.node[left.kind <= ONE_WAY]))
-        return Ping(left, self.row[keep], self.passive, pairs)
-
-    def kept(self, keep: BoolArray) -> BoolArray:
-        """`keep` (C,) without those whose parent is not kept."""
-        parent = self.numbers.parent
-        orphaned = (parent >= 0) & ~keep[parent]
-        return np.asarray(keep & ~orphaned)
-
-    def compared(self, keep: BoolArray) -> Ping:
-        """As `only`, but at most `MOST_NUMBERS`, evenly chosen."""
-        if np.count_nonzero(keep) > MOST_NUMBERS:
-            keep = np.isin(np.arange(len(keep)), spread(np.flatnonzero(keep)))
-        return self.only(keep)
-
-    @property
-    def nodes(self) -> IntArray:
-        """Numbers of the pairs heard."""
-        return np.unique(self.numbers.node[self.echo])
-
-    @property
-    def echo(self) -> BoolArray:
-        """(C,) True for path lengths, which are what tells that a diver is there."""
-        return np.asarray(self.numbers.kind <= ONE_WAY)
+Mixture = tuple[FloatArray, FloatArray, FloatArray]
+"""x (M, n), P (M, n, n) and mu (M,) of one diver."""
 
 
 class PingUpdate(NamedTuple):
-    """A diver after a ping: x (M, n), P (M, n, n), mu (M,); good (C,): how sure each number is
-    this diver's; log_evidence, comparable between divers of the same ping; repairs: covariances
+    """A diver after a ping: x (M, n), P (M, n, n), mu (M,); good (C,): how sure each measurement
+    is this diver's; log_evidence, comparable between divers of the same ping; repairs: covariances
     repaired (`estimation.covariance`)."""
 
     x: FloatArray
@@ -120,77 +101,261 @@ class PingUpdate(NamedTuple):
     repairs: int
 
 
-def ping_numbers(
+class Taking(NamedTuple):
+    """What a track becomes by the measurements of a ping that it takes: after; good (C,): those;
+    nis of dof of them, 0 for too few; residual (m,), covariance and stated (m, m): of the
+    arrivals, to learn their scale, None where that is not asked."""
+
+    after: PingUpdate
+    good: BoolArray
+    nis: float
+    dof: int
+    scale: tuple[FloatArray, FloatArray, FloatArray] | None
+
+
+class Explanation(NamedTuple):
+    """What a ping is to the tracks: takings by track, in the order in which they chose; taken
+    (C,): the measurements that are a track's; score (T,)."""
+
+    takings: dict[int, Taking]
+    taken: BoolArray
+    score: FloatArray
+
+
+# -- all tracks ----------------------------------------------------------------------------------
+
+
+def associate_and_update(
+    now: DiverState,
     ping: Arrivals,
-    rows: IntArray,
     config: DiverConfig,
     factor: float,
     models: ModelSet,
+) -> tuple[DiverState, BoolArray]:
+    """The tracks after a ping, `factor` on the variances of its arrival times, and the rows (n,)
+    that are no track's. A tag whose name is known has a track of its own or begins one."""
+    name, rows, free = name_of(ping), np.arange(len(ping)), np.ones(len(ping), bool)
+    own = np.flatnonzero(now.target_id == name) if name != NOBODY else rows[:0]
+    if name != NOBODY and not len(own):
+        return now, free
+    instruments = now.instruments.with_receivers(ping, config)
+    layout = instruments.layout(config, models)
+    x, P = layout.widened(now.x, now.P)
+    now = now._replace(x=x, P=P, instruments=instruments)
+    seen = ping_measurements(ping, rows, config, factor, models, layout)
+    if not len(x) or seen.pairs <= int(ping.passive):
+        return now, free & (name == NOBODY)
+    if name != NOBODY:
+        taking = _taking(now, int(own[0]), seen, config, layout, factor)
+        takings = {} if taking is None else {int(own[0]): taking}
+        return with_takings(now, takings), ~free
+    explain = _explain_tag if ping.passive else _explain_echoes
+    takings, taken, score = explain(now, seen, config, layout, factor)
+    free[seen.row[taken & seen.echo]] = False
+    if ping.passive and not free.all():
+        free[:] = False  # all are of one track, also those that were not used
+    return with_takings(now, takings)._replace(score=score), free
+
+
+def with_takings(now: DiverState, takings: dict[int, Taking]) -> DiverState:
+    """The state in which tracks have taken what they take."""
+    if not takings:
+        return now
+    x, P, mu = now.x.copy(), now.P.copy(), now.mu.copy()
+    nis, nis_dof, scale, repairs = now.nis.copy(), now.nis_dof.copy(), now.scale, now.repairs
+    for track, taking in takings.items():
+        x[track], P[track], mu[track] = taking.after.x, taking.after.P, taking.after.mu
+        nis[track] += taking.nis
+        nis_dof[track] += np.uint16(taking.dof)
+        repairs += taking.after.repairs
+        if taking.scale is not None:
+            scale = learnt_scale(scale, ARRIVALS, *(part[None] for part in taking.scale))
+    return now._replace(x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, scale=scale, repairs=repairs)
+
+
+def _mixture(now: DiverState, track: int) -> Mixture:
+    return now.x[track], now.P[track], now.mu[track]
+
+
+def _explain_echoes(
+    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+) -> Explanation:
+    """Which tracks take which echoes of one transmission.
+
+    Tracks that can explain more of the pairs choose first, and among those the confirmed ones: a
+    ghost fits the echoes it was made of, but only those. A track that ends up with fewer than half
+    of the pairs is not what the ping shows; for it nothing happened.
+    """
+    fits = [
+        fit_measurements(*_mixture(now, track), config.target_z, ping.measured)
+        for track in range(len(now.x))
+    ]
+    fit, nis = (np.array(column) for column in zip(*fits))
+    near = (nis < NEAR) & ping.echo
+    pairs = [np.flatnonzero((ping.measured.node == node) & ping.echo) for node in ping.nodes]
+    explained = np.sum([near[:, members].any(axis=1) for members in pairs], axis=0)
+    rank = 2 * (len(pairs) - explained) + (now.life.status == TENTATIVE)
+    first, hits = _by_rank(now, ping, config, layout, factor, rank, fit, near, pairs)
+    doubtful = (hits > 0) & (2 * hits < len(pairs))
+    if not doubtful.any():
+        return first
+    rank = np.where(doubtful, EXCLUDED, rank)
+    return _by_rank(now, ping, config, layout, factor, rank, fit, near, pairs)[0]
+
+
+def _by_rank(
+    now: DiverState,
+    ping: Ping,
+    config: DiverConfig,
     layout: Layout,
-) -> Ping:
-    """The usable `rows` of a ping in order as numbers; factor: on the variances of arrival
-    times."""
-    usable = rows[np.isfinite(ping.toa[rows])]
-    if not ping.passive:
-        usable = usable[np.isfinite(ping.tx[usable]).all(axis=1)]
-    if ping.passive:
-        usable = spread(usable[np.argsort(ping.rx_id[usable], kind='stable')])
-    speed = config.sound_speed
-    first = ping.toa[usable].min(initial=np.inf) if ping.passive else 0.0
-    variance = toa_variance(ping, config, factor)[usable] * speed**2
-    deep = models.height >= 0
-    table: list[tuple[int, int, int, float, float, float, int]] = []
-    if deep:
-        span = max(config.depth_max - config.depth_min, 1.0)
-        for value, noise, row in _depth_reports(ping, usable):
-            table.append((0, -1, HEIGHT, -value, noise, 1.0 / span, row))
-    pair = np.column_stack([ping.tx_id, ping.rx_id])[usable].astype(np.int64)
-    if ping.passive:
-        pair[:, 0] = 0
-    new = np.ones(len(usable), bool)
-    new[1:] = (pair[1:] != pair[:-1]).any(axis=1)
-    node = np.cumsum(new)
-    var_bearing = bearing_variance(ping, config)
-    kind = ONE_WAY if ping.passive else PATH
-    for at in range(1, int(node[-1]) + 1 if len(node) else 1):
-        members = np.flatnonzero(node == at)
-        parents = []
-        for k in members.tolist():
-            parents.append(len(table))
-            path = speed * (ping.toa[usable[k]] - first)
-            table.append((4 * at, -1, kind, path, variance[k], OUTLIER_DENSITY, int(usable[k])))
-        for parent, row in zip(parents, usable[members].tolist()):
-            if np.isfinite(ping.bearing[row]):
-                entry = (BEARING, ping.bearing[row], var_bearing[row], 0.5 / np.pi)
-                table.append((len(table) + 10**6, parent, *entry, row))
-            if deep and np.isfinite(ping.elevation[row]) and ping.var_elevation[row] > 0.0:
-                entry = (ELEVATION, ping.elevation[row], ping.var_elevation[row], 1.0 / np.pi)
-                table.append((len(table) + 10**6, parent, *entry, row))
-    columns = [np.array(column) for column in zip(*table)] if table else [np.empty(0)] * 7
-    row = columns[6].astype(np.intp)
-    numbers = Numbers(
-        node=columns[0].astype(np.int64),
-        parent=columns[1].astype(np.int64),
-        kind=columns[2].astype(np.int64),
-        value=columns[3].astype(np.float64),
-        variance=columns[4].astype(np.float64),
-        density=columns[5].astype(np.float64),
-        tx=np.ascontiguousarray(ping.tx[row]),
-        rx=np.ascontiguousarray(ping.rx[row]),
-        columns=layout.columns(models, ping.rx_id[row], ping.passive),
-    )
-    return Ping(numbers, row, ping.passive, int(new.sum()))
+    factor: float,
+    rank: IntArray,
+    fit: FloatArray,
+    near: BoolArray,
+    pairs: list[IndexArray],
+) -> tuple[Explanation, IntArray]:
+    """Let the tracks choose by `rank` (T,); also how many pairs each track (T,) took one of."""
+    p = config.detection_probability
+    taken, hits = np.zeros(len(ping.row), bool), np.zeros(len(rank), np.int64)
+    takings: dict[int, Taking] = {}
+    score = now.score + len(pairs) * np.log1p(-p)
+    gain = np.log(p / (1.0 - p))
+    gain -= 0.5 * np.log(config.clutter_density)
+    for turn in np.unique(rank[rank != EXCLUDED]):
+        tracks = np.flatnonzero(rank == turn)
+        owner = _owners(tracks, fit, near & ~taken, pairs, config)
+        found = np.zeros(len(taken), bool)
+        for track in tracks.tolist():
+            mine = ping.kept(~taken & ~found & ((owner < 0) | (owner == track)))
+            index = np.flatnonzero(mine)
+            taking = _taking(now, track, ping.only(mine), config, layout, factor)
+            if taking is not None:
+                takings[track] = taking
+                index = index[taking.good]
+                found[index] = True
+                echoes = index[ping.echo[index]]
+                hits[track] = len(echoes)
+                score[track] += fit[track, echoes].sum() + gain * len(echoes)
+        taken |= found
+    return Explanation(takings, taken, score), hits
 
 
-def _depth_reports(ping: Arrivals, rows: IntArray) -> list[tuple[float, float, int]]:
-    """The different depth reports of a ping: depth, variance and the first row of each. The same
-    report stands beside every arrival; it is one measurement."""
-    told: dict[tuple[float, float], int] = {}
-    for row in rows.tolist():
-        depth, variance = float(ping.depth[row]), float(ping.var_depth[row])
-        if np.isfinite(depth) and variance > 0.0:
-            told.setdefault((depth, variance), row)
-    return [(*report, told[report]) for report in sorted(told)]
+def _owners(
+    tracks: IndexArray,
+    fit: FloatArray,
+    near: BoolArray,
+    pairs: list[IndexArray],
+    config: DiverConfig,
+) -> IntArray:
+    """The track each measurement (C,) is kept for, -1 for none: where several tracks choose at
+    once, each pair's echoes are assigned from the prediction."""
+    owner = np.full(fit.shape[1], -1)
+    if len(tracks) > 1:
+        for members in pairs:
+            inside = near[np.ix_(tracks, members)]
+            target, detection = np.nonzero(inside)
+            likelihood = fit[np.ix_(tracks, members)][target, detection]
+            cost = association_cost(
+                likelihood, config.detection_probability, math.sqrt(config.clutter_density)
+            )
+            chosen = assign(target, detection, cost, len(tracks), len(members))
+            hit = np.flatnonzero(chosen >= 0)
+            owner[members[chosen[hit]]] = tracks[hit]
+    return owner
+
+
+def _explain_tag(
+    now: DiverState, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+) -> Explanation:
+    """Which track takes a tag's ping, all of it.
+
+    A single diver known to be there is given every ping. Otherwise it is the track that explains
+    the ping best of those that need not jump for it. Confirmed tracks come first; others are asked
+    where less than half of the arrivals fit the one chosen.
+    """
+    score = now.score + np.log1p(-config.detection_probability)
+    takings: dict[int, Taking] = {}
+    tentative = now.life.status == TENTATIVE
+    for turn in (~tentative, tentative):
+        best = _best_for_tag(now, np.flatnonzero(turn), ping, config, layout)
+        if best is not None:
+            track, after = best
+            taking = taking_of(_mixture(now, track), after, ping, config, factor)
+            takings[track] = taking
+            score[track] += float(taking.good.sum())
+            if 2 * taking.good.sum() >= len(taking.good):
+                return Explanation(takings, np.ones(len(ping.row), bool), score)
+    return Explanation(takings, np.zeros(len(ping.row), bool), score)
+
+
+def _best_for_tag(
+    now: DiverState, tracks: IndexArray, ping: Ping, config: DiverConfig, layout: Layout
+) -> tuple[int, PingUpdate] | None:
+    """Which of `tracks` explains a tag's ping best, and what becomes of it."""
+    best: tuple[int, PingUpdate] | None = None
+    for track in tracks.tolist():
+        before = _mixture(now, track)
+        after = update_by_ping(*before, ping, config, layout)
+        if after is None or not (config.max_tracks == 1 or _allowed(before, after, config)):
+            continue
+        if best is None or after.log_evidence > best[1].log_evidence:
+            best = track, after
+    return best
+
+
+def _allowed(before: Mixture, after: PingUpdate, config: DiverConfig) -> bool:
+    """Whether the diver after a ping is where the prediction allows it to be."""
+    M, n = before[0].shape
+    E = np.zeros((M, 2, n))
+    E[:, 0, 0] = E[:, 1, 1] = 1.0
+    x, P, mu = before
+    mean, covariance = imm_kernels.combine(x[None], P[None], mu[None], E)
+    there, _ = imm_kernels.combine(after.x[None], after.P[None], after.mu[None], E)
+    gap = there[0] - mean[0]
+    distance = float(gap @ np.linalg.solve(covariance[0], gap))
+    return distance <= gate_threshold(config.gate_probability, 2)
+
+
+# -- one track -----------------------------------------------------------------------------------
+
+
+def _taking(
+    now: DiverState, track: int, ping: Ping, config: DiverConfig, layout: Layout, factor: float
+) -> Taking | None:
+    """What a track takes of the measurements it may have; None where no model can explain them."""
+    before = _mixture(now, track)
+    after = update_by_ping(*before, ping, config, layout) if ping.echo.any() else None
+    return None if after is None else taking_of(before, after, ping, config, factor)
+
+
+def taking_of(
+    before: Mixture, after: PingUpdate, ping: Ping, config: DiverConfig, factor: float
+) -> Taking:
+    """What a track takes, `before` it and after."""
+    good = np.asarray(after.good > TAKEN)
+    nis, dof, scale = 0.0, 0, None
+    if (good & ping.echo).sum() > int(ping.passive):
+        own = ping.compared(good)
+        residual, covariance, dof = residuals(*before, own, config.target_z)
+        S = covariance + np.diag(own.measured.variance)
+        nis = float(residual @ np.linalg.solve(S, residual))
+    if config.estimate_covariance_scale and (good & ping.echo).any():
+        scale = _for_scale(after, ping.compared(good & ping.echo), config, factor)
+    return Taking(after, good, nis, dof, scale)
+
+
+def _for_scale(
+    after: PingUpdate, ping: Ping, config: DiverConfig, factor: float
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Residuals of the arrivals that a track took, their covariance and what is stated of it."""
+    residual, covariance, dof = residuals(after.x, after.P, after.mu, ping, config.target_z)
+    stated = np.diag(ping.measured.variance / factor)
+    if ping.passive and dof:
+        # The emission is unknown: differences, whitened by what is stated.
+        projection = difference_projection(ping.measured.variance / factor)
+        residual, stated = projection @ residual, np.eye(dof)
+        covariance = projection @ covariance @ projection.T
+    return (residual, covariance, stated) if dof else None
 
 
 def update_by_ping(
@@ -204,44 +369,47 @@ def update_by_ping(
     """One diver, x (M, n + q), P (M, n + q, n + q), mu (M,), updated by all of a ping; None where
     no model can be.
 
-    Of more than `MOST_NUMBERS` those are used that are nearest to what is expected; the others
-    are good where they fit what became of the diver.
+    Of more than `MOST_MEASUREMENTS` those are used that are nearest to what is expected; the
+    others are good where they fit what became of the diver.
     """
-    if len(ping.row) > MOST_NUMBERS:
-        _, nis = fit_numbers(x, P, mu, config.target_z, ping.numbers)
+    if len(ping.row) > MOST_MEASUREMENTS:
+        _, nis = fit_measurements(x, P, mu, config.target_z, ping.measured)
         keep = np.zeros(len(nis), bool)
-        keep[np.argsort(nis, kind='stable')[:MOST_NUMBERS]] = True
+        keep[np.argsort(nis, kind='stable')[:MOST_MEASUREMENTS]] = True
         keep = ping.kept(keep)
         after = update_by_ping(x, P, mu, ping.only(keep), config, layout)
         if after is None:
             return None
-        _, nis = fit_numbers(after.x, after.P, after.mu, config.target_z, ping.numbers)
+        _, nis = fit_measurements(after.x, after.P, after.mu, config.target_z, ping.measured)
         good = 1.0 / (1.0 + nis / GOOD_RESIDUAL**2)
         good[keep] = after.good
         return after._replace(good=good)
-    n, numbers, mask = x.shape[-1], ping.numbers, layout.mask
+    n, measured, mask = x.shape[-1], ping.measured, layout.mask
     if ping.passive:
         x, P, mask = _with_emission(x, P, mu, ping, mask, config.target_z)
     if ping.passive or ping.pairs > MOST_SUBSETS:
         starts = optima(ping, config)
-        after = student_t_ping(x, P, mask, config.target_z, numbers, starts, DEGREES)
-        squared = (DEGREES + 1.0) / np.maximum(after[3], 1e-300) - DEGREES
+        x, P, evidence, weights = student_t_ping(
+            x, P, mask, config.target_z, measured, starts, DEGREES
+        )
+        squared = (DEGREES + 1.0) / np.maximum(weights, 1e-300) - DEGREES
         good = 1.0 / (1.0 + squared / GOOD_RESIDUAL**2)
     else:
         eps = config.outlier_probability
-        after = subset_ping(x, P, mask, config.target_z, numbers, eps, MOST_EXPLANATIONS)
-        good = after[3]
+        x, P, evidence, good = subset_ping(
+            x, P, mask, config.target_z, measured, eps, MOST_EXPLANATIONS
+        )
     with np.errstate(divide='ignore'):
-        weight = np.log(mu) + after[2]
+        weight = np.log(mu) + evidence
     best = weight.max(initial=-np.inf)
     if not np.isfinite(best):
         return None
     share = np.exp(weight - best)
     updated = share / share.sum()
-    P = np.ascontiguousarray(after[1][:, :n, :n])
-    repairs = lift_all(P)
+    P = np.ascontiguousarray(P[:, :n, :n])
+    repairs = add_jitter_all(P)
     return PingUpdate(
-        np.ascontiguousarray(after[0][:, :n]),
+        np.ascontiguousarray(x[:, :n]),
         P,
         updated,
         updated @ good,
@@ -266,68 +434,68 @@ def begin_from_ping(
         uniform = np.full(len(x), 1.0 / len(x))
         x, P, mask = _with_emission(x, P, uniform, ping, mask, config.target_z)
     at, covariance, evidence, _ = student_t_ping(
-        x, P, mask, config.target_z, ping.numbers, position[None], DEGREES
+        x, P, mask, config.target_z, ping.measured, position[None], DEGREES
     )
     covariance = np.ascontiguousarray(covariance[:, :n, :n])
-    lift_all(covariance)
+    add_jitter_all(covariance)
     return at[:, :n], covariance, evidence
 
 
 def residuals(
     x: FloatArray, P: FloatArray, mu: FloatArray, ping: Ping, height: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Residuals (C,) of a diver's numbers, the covariance (C, C) expected of them without their
-    own variances, and how many of them are independent."""
+    """Residuals (C,) of a diver's measurements, the covariance (C, C) expected of them without
+    their own variances, and how many of them are independent."""
     if ping.passive:
         x, P, _ = _with_emission(x, P, mu, ping, np.ones(x.shape[-1], bool), height)
-    residual, covariance = expect_numbers(x, P, mu, height, ping.numbers)
+    residual, covariance = expect_measurements(x, P, mu, height, ping.measured)
     return residual, covariance, len(residual) - int(ping.passive)
 
 
 def optima(ping: Ping, config: DiverConfig) -> FloatArray:
     """The best positions (k, 2) of the ping by itself, with heavy tails and no prior."""
-    echo = ping.only(ping.echo).numbers
+    echo = ping.only(ping.echo).measured
     columns = np.full_like(echo.columns, -1)
     columns[:, 0], columns[:, 1] = 0, 1
     if ping.passive:
         columns[:, EMISSION] = 2
-    numbers = echo._replace(columns=columns)
-    starts = _starts(numbers, ping.passive)
+    measured = echo._replace(columns=columns)
+    starts = _starts(measured, ping.passive)
     size = 3 if ping.passive else 2
     mean = np.zeros(size)
-    mean[:2] = numbers.rx[:, :2].mean(axis=0)
+    mean[:2] = measured.rx[:, :2].mean(axis=0)
     spread = np.diag([FAR**2, FAR**2, (10.0 * FAR) ** 2][:size])
     height = float(np.mean(heights_of(config)))
-    found, value = student_t_maxima(mean, spread, starts, numbers, height, DEGREES)
+    found, value = student_t_maxima(mean, spread, starts, measured, height, DEGREES)
     kept: list[FloatArray] = []
     for k in np.argsort(-value, kind='stable'):
         place = found[k, :2]
-        if all(np.hypot(*(place - one)) > DISTINCT for one in kept):
+        if all(np.hypot(*(place - other)) > DISTINCT for other in kept):
             kept.append(place)
         if len(kept) == OPTIMA:
             break
     return np.array(kept)
 
 
-def _starts(numbers: Numbers, passive: bool) -> FloatArray:
+def _starts(measured: PingMeasurements, passive: bool) -> FloatArray:
     """Eleven positions (11, 2): round the earliest receivers, or round the ellipse of the shortest
     path."""
-    order = np.argsort(numbers.value, kind='stable')
+    order = np.argsort(measured.value, kind='stable')
     if passive:
-        near = numbers.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
+        near = measured.rx[order[[0, min(1, len(order) - 1), min(2, len(order) - 1)]], :2]
         centre = near.mean(axis=0)
         reach = 20.0 + 0.5 * np.hypot(*(near - centre).T).max()
         angle = 2.0 * np.pi * np.arange(7) / 7.0
         ring = centre + reach * np.column_stack([np.cos(angle), np.sin(angle)])
         return np.vstack([near, centre, ring])
-    one = order[0]
-    baseline = numbers.tx[one, :2] - numbers.rx[one, :2]
+    early = order[0]
+    baseline = measured.tx[early, :2] - measured.rx[early, :2]
     apart = float(np.hypot(*baseline))
-    path = max(float(numbers.value[one]), 1.0001 * apart + 1e-3)
+    path = max(float(measured.value[early]), 1.0001 * apart + 1e-3)
     major = baseline / apart if apart > 0.0 else np.array([1.0, 0.0])
     minor = np.array([-major[1], major[0]])
     angle = 2.0 * np.pi * np.arange(11) / 11.0
-    middle = 0.5 * (numbers.tx[one, :2] + numbers.rx[one, :2])
+    middle = 0.5 * (measured.tx[early, :2] + measured.rx[early, :2])
     along = 0.5 * path * np.cos(angle)[:, None] * major
     across = 0.5 * np.sqrt(path**2 - apart**2) * np.sin(angle)[:, None] * minor
     return middle + along + across
@@ -346,7 +514,7 @@ def _with_emission(
     M, n = x.shape
     wide, covariance = np.zeros((M, n + 1)), np.zeros((M, n + 1, n + 1))
     wide[:, :n], covariance[:, :n, :n] = x, P
-    residual, _ = expect_residuals(wide, mu, height, ping.numbers)
+    residual, _ = expect_residuals(wide, mu, height, ping.measured)
     wide[:, n] = np.median(residual[ping.echo]) if ping.echo.any() else 0.0
     covariance[:, n, n] = EMISSION_STD**2
     return wide, covariance, np.append(mask, True)

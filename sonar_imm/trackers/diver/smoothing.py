@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from attrs import evolve, field, frozen
+from attrs import field, frozen
 import numpy as np
 
 from ...estimates import Estimate
@@ -49,9 +49,8 @@ class _Pass:
 
     def add(self, scan: int | None, *step: Any) -> None:
         """Append a step: x (M, n), P (M, n, n), mu (M,), transition (M, M), dt."""
-        for column, value in zip(
-            (self.scans, self.x, self.P, self.mu, self.transition, self.dt), (scan, *step)
-        ):
+        columns: tuple[list[Any], ...] = self.x, self.P, self.mu, self.transition, self.dt
+        for column, value in zip((self.scans, *columns), (scan, *step)):
             column.append(value)
 
 
@@ -84,30 +83,30 @@ class SmoothingDiverTracker(DiverTracker):
         if not self._passed:
             return []
         newest = self._passed[max(self._passed)]
-        layout = newest.instruments.layout(self.config, self.models.n)
+        layout = newest.instruments.layout(self.config, self.models)
         scans = []
         for stamp in sorted(self._passed):
             scan = self._passed[stamp]
             x, P = layout.widened(scan.x, scan.P)
-            scans.append(evolve(scan, x=x, P=P, instruments=newest.instruments))
+            scans.append(scan._replace(x=x, P=P, instruments=newest.instruments))
         smooth = [
-            evolve(scan, x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
+            scan._replace(x=scan.x.copy(), P=scan.P.copy(), mu=scan.mu.copy()) for scan in scans
         ]
-        for track_id, one in self._passes(scans):
-            x, P, mu = self._smooth(one)
-            for k, scan in enumerate(one.scans):
-                if scan is not None:
-                    row = np.flatnonzero(scans[scan].life.track_id == track_id)[0]
-                    smooth[scan].x[row], smooth[scan].P[row] = x[k], P[k]
-                    smooth[scan].mu[row] = mu[k]
+        for track_id, forward in self._passes(scans):
+            x, P, mu = self._smooth(forward)
+            for k, number in enumerate(forward.scans):
+                if number is not None:
+                    row = np.flatnonzero(scans[number].life.track_id == track_id)[0]
+                    smooth[number].x[row], smooth[number].P[row] = x[k], P[k]
+                    smooth[number].mu[row] = mu[k]
         return [self._estimate(scan) for scan in smooth]
 
-    def _smooth(self, one: _Pass) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _smooth(self, forward: _Pass) -> tuple[FloatArray, FloatArray, FloatArray]:
         """x (K, M, n), P (K, M, n, n), mu (K, M) of a pass, smoothed copy by copy: copies do not
         switch, so that what each weighs at the end it weighs all along."""
-        x, P, mu = np.stack(one.x), np.stack(one.P), np.stack(one.mu)
+        x, P, mu = np.stack(forward.x), np.stack(forward.P), np.stack(forward.mu)
         M = len(self.models.names)
-        moves = self._moves(one, x.shape[-1])
+        moves = self._moves(forward, x.shape[-1])
         for copy in range(self.models.copies):
             own = slice(copy * M, (copy + 1) * M)
             total = mu[:, own].sum(axis=1, keepdims=True)
@@ -115,7 +114,7 @@ class SmoothingDiverTracker(DiverTracker):
                 mu[:, own] = 0.0
                 continue
             weight = mu[:, own] / total if self.models.copies > 1 else mu
-            transition = np.stack(one.transition)
+            transition = np.stack(forward.transition)
             result = imm_smooth(x[:, own], P[:, own], weight, transition, *moves)
             self._smoothed_repairs += int(result.repaired.sum())
             x[:, own], P[:, own] = result.x, result.P
@@ -147,9 +146,9 @@ class SmoothingDiverTracker(DiverTracker):
                 )
         return passes
 
-    def _moves(self, one: _Pass, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _moves(self, forward: _Pass, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F, Q (K, M, size, size) and B (K, M, size): the motion, and constants that stay."""
-        moves = [self.models.motion(dt) for dt in one.dt]
+        moves = [self.models.motion(dt) for dt in forward.dt]
         F, Q, B = (np.stack(parts) for parts in zip(*moves))
         n = B.shape[-1]
         if size == n:

@@ -20,7 +20,6 @@ from collections.abc import Iterator, Mapping
 import math
 from typing import Any, NamedTuple
 
-from attrs import evolve, frozen
 import numpy as np
 
 from ...estimation import imm_kernels
@@ -28,41 +27,119 @@ from ...estimation.adaptation import AdaptiveChain
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.association import Tracks
 from ...estimation.consistency import NisMemory
-from .fix_consistency import FixConsistency
-from .instruments import Instruments
-from .model_set import ModelSet, Motion
+from .state_space import Instruments, ModelSet, Motion
+
+FIXES, ARRIVALS = 0, 1
+"""Rows of the learnt scale."""
 
 SCALE_PRIOR = 20.0
-"""Numbers measured that the stated covariances are worth when their scale is being learnt."""
+"""Values measured that the stated covariances are worth when their scale is being learnt."""
+
+SCALE_MEMORY = 400.0
+"""Values measured over which the learnt scale forgets."""
+
+MEMORY = 50.0
+"""Fixes over which `FixConsistency` is gathered and forgotten."""
+
+OPTIMISTIC, PESSIMISTIC, CORRELATED = 1.7, 0.5, 0.3
+"""Mean NIS for each coordinate above and below which, and lag-1 correlation above which, a
+covariance is not what it says. Of `MEMORY` fixes with true covariances the mean has a standard
+deviation of 0.14, so that the first is five sigmas away: motion takes up a part of errors that are
+larger than stated, and leaves a mean of about 2 however much larger they are."""
 
 MOST_STEPS = 300
 """A gap is crossed in no more steps than this, however long it is."""
 
-LIFE = ('existence', 'evidence', 'target_id', 'near_to', 'near_for')
-"""What is known of the life of a track beside `Tracks`, by the names in `DiverState`."""
-
-ROWS = ('x', 'P', 'mu', 'learnt', 'nis', 'nis_dof', 'score', 'white', *LIFE)
+ROWS = (
+    'x',
+    'P',
+    'mu',
+    'learnt',
+    'nis',
+    'nis_dof',
+    'score',
+    'white',
+    'existence',
+    'evidence',
+    'target_id',
+    'near_to',
+    'near_for',
+)
 """What of `DiverState` has a row for each track."""
 
 
-@frozen(eq=False, kw_only=True)
-class DiverState:
+class FixConsistency(NamedTuple):
+    """When a stated covariance of fixes cannot be true, and what innovations cannot tell: sums
+    over the last fixes of confirmed tracks.
+
+    number of fixes; nis, for each coordinate; pairs of successive fixes, their cross product and
+    mean square of whitened innovations.
+
+    Innovations of a filter with true covariances have a mean NIS of their number of coordinates
+    (2) and are white; one beyond three sigmas for each coordinate is a sharp turn and counts as
+    that. Larger: the covariances are optimistic, and may be scaled up. Smaller, or correlated from
+    fix to fix: the source filters its output, so that its errors last, or its covariances are
+    pessimistic. These two look the same. And a source that states only the white part of errors
+    that last looks perfect: from one sensor, a bias slower than the motion is not in the
+    innovations. So a covariance is never scaled down on this evidence; `warnings` says what the
+    user has to state.
+    """
+
+    number: float = 0.0
+    nis: float = 0.0
+    pairs: float = 0.0
+    cross: float = 0.0
+    square: float = 0.0
+
+    @property
+    def sums(self) -> tuple[float, float, float, float, float]:
+        """All of them, as `fix_kernels.watch` takes and gives them."""
+        return self.number, self.nis, self.pairs, self.cross, self.square
+
+    @property
+    def mean_nis(self) -> float:
+        """For each coordinate, 1 where all is well; NaN without a fix."""
+        return self.nis / self.number if self.number else float('nan')
+
+    @property
+    def lag_1(self) -> float:
+        """Correlation of successive whitened innovations; NaN without a pair."""
+        return self.cross / self.square if self.square else float('nan')
+
+    def warnings(self, bias_stated: bool) -> list[str]:
+        """Sentences on covariances that cannot be true, once `MEMORY` fixes were seen."""
+        if self.number < 0.99 * MEMORY:
+            return []
+        if self.mean_nis > OPTIMISTIC:
+            return [
+                f'fixes miss by more than they state: mean NIS {self.mean_nis:.2g} for each '
+                'coordinate, 1 is due; raise covariance_scale or the noise of the motion'
+            ]
+        if not bias_stated and (self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED):
+            return [
+                f'the errors of the fixes last, or their covariances are too large (mean NIS '
+                f'{self.mean_nis:.2g} for each coordinate, correlation {self.lag_1:.2g} from fix '
+                'to fix); the data cannot tell which: state fix_bias_std and fix_bias_time'
+            ]
+        return []
+
+
+class DiverState(NamedTuple):
     """All that is known after a scan: T tracks with M models of n states, the errors of the
     `instruments` heard so far among them.
 
     x (T, M, n), P (T, M, n, n), mu (T, M); learnt: what corrects the transitions; nis, nis_dof
     (T,): of this scan, NaN and 0 without a hit; score (T,): how much better than clutter the
-    track explained the last ten scans or so, a log-likelihood ratio; scale (2, 2): for fixes and
-    for arrivals the sum of squared residuals in units of their stated variance, and their number;
-    white (T, 2): whitened innovation of the last fix, NaN for none; fixes, arrivals: what
-    innovations say of the stated covariances of either; existence (T,): probability that there
-    is a diver, NaN where hits are counted instead; evidence (T,): sum of the probabilities of its
-    detections; target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for
-    (T,): the older track it is near, 0 for none, and for how many scans (`soft`, `names`);
-    said: names and when each was said last, ns; broken: tracks ended so far because their numbers
-    were not finite; not_started:
-    starts so far for which there was no room; repairs: covariances repaired so far
-    (`estimation.covariance`).
+    track explained the last ten scans or so, a log-likelihood ratio; white (T, 2): whitened
+    innovation of the last fix, NaN for none; existence (T,): probability that there is a diver,
+    NaN where hits are counted instead; evidence (T,): sum of the probabilities of its detections;
+    target_id (T,): whose track it is, `NOBODY` where not known; near_to, near_for (T,): the older
+    track it is near, 0 for none, and for how many scans (`jipda`, `names`); scale (2, 2): for
+    fixes and for arrivals the sum of squared residuals in units of their stated variance, and
+    their number; fixes, arrivals: what innovations say of the stated covariances of either;
+    last_named: names and the stamp of each one's last measurement; broken: tracks ended so far
+    because their numbers were not finite; not_started: starts so far for which there was no room;
+    repairs: covariances repaired so far (`estimation.covariance`).
     """
 
     stamp_ns: int
@@ -74,41 +151,91 @@ class DiverState:
     nis: FloatArray
     nis_dof: np.ndarray
     score: FloatArray
-    scale: FloatArray
+    white: FloatArray
     existence: FloatArray
     evidence: FloatArray
     target_id: IntArray
     near_to: IntArray
     near_for: IntArray
-    white: FloatArray
-    fixes: FixConsistency
+    scale: FloatArray
+    fixes: FixConsistency = FixConsistency()
     arrivals: NisMemory = NisMemory()
+    instruments: Instruments = Instruments()
+    last_named: tuple[tuple[int, int], ...] = ()
     broken: int = 0
     not_started: int = 0
     repairs: int = 0
-    instruments: Instruments = Instruments()
-    said: tuple[tuple[int, int], ...] = ()
 
-    def factor(self) -> FloatArray:
-        """(2,) by what the covariances of fixes and of arrivals have to be multiplied."""
-        return np.asarray((SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1]))
-
-    def rows(self, kept: BoolArray, **changes: Any) -> DiverState:
-        """With `changes`, those of `ROWS` for all tracks, and then only the tracks where `kept`
-        (T,) is True; `life` is left to the caller."""
-        if not kept.all():
-            index = np.flatnonzero(kept)
-            for name in ROWS:
-                changes[name] = changes.get(name, getattr(self, name)).take(index, axis=0)
-        return evolve(self, **changes)
-
-    def with_rows(self, life: Tracks, new: Mapping[str, FloatArray | IntArray]) -> DiverState:
-        """With more tracks, `life` is that of all: `new` holds an array for each of `ROWS`."""
-        return evolve(
-            self,
+    @classmethod
+    def of_nobody(cls, life: Tracks, models: ModelSet, learnt: FloatArray) -> DiverState:
+        """The state without a track; `life` and `learnt` have none, but the next identity."""
+        M, n = len(models.E), models.n
+        return cls(
+            stamp_ns=0,
             life=life,
-            **{name: np.concatenate([getattr(self, name), new[name]]) for name in ROWS},
+            x=np.empty((0, M, n)),
+            P=np.empty((0, M, n, n)),
+            mu=np.empty((0, M)),
+            learnt=learnt,
+            nis=np.empty(0),
+            nis_dof=np.empty(0, np.uint16),
+            score=np.empty(0),
+            white=np.empty((0, 2)),
+            existence=np.empty(0),
+            evidence=np.empty(0),
+            target_id=np.empty(0, np.int64),
+            near_to=np.empty(0, np.int64),
+            near_for=np.empty(0, np.int64),
+            scale=np.zeros((2, 2)),
         )
+
+    def factor(self) -> tuple[float, float]:
+        """By what the covariances of fixes and of arrivals have to be multiplied."""
+        factor = (SCALE_PRIOR + self.scale[:, 0]) / (SCALE_PRIOR + self.scale[:, 1])
+        return float(factor[0]), float(factor[1])
+
+    def rows(self, kept: BoolArray, life: Tracks) -> DiverState:
+        """The tracks where `kept` (T,) is True; `life` is that of those."""
+        if kept.all():
+            return self._replace(life=life)
+        index = np.flatnonzero(kept)
+        parts: dict[str, Any] = {name: getattr(self, name).take(index, axis=0) for name in ROWS}
+        return self._replace(life=life, **parts)
+
+    def only(self, kept: BoolArray) -> DiverState:
+        """The tracks where `kept` (T,) is True."""
+        return self if kept.all() else self.rows(kept, self.life.only(kept))
+
+    def with_rows(self, life: Tracks, new: Mapping[str, np.ndarray]) -> DiverState:
+        """With more tracks, `life` is that of all: `new` holds an array for each of `ROWS`."""
+        parts: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), new[name]]) for name in ROWS
+        }
+        return self._replace(life=life, **parts)
+
+    def positions(self, E: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (T, q) and covariance (T, q, q) of the outputs E (M, q, n) of the motion."""
+        x, P, n = self.x, self.P, E.shape[-1]
+        if x.shape[-1] > n:
+            x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
+        return imm_kernels.combine(x, P, self.mu, E)
+
+
+def learnt_scale(
+    scale: FloatArray,
+    kind: int,
+    residual: FloatArray,
+    covariance: FloatArray,
+    stated: FloatArray,
+) -> FloatArray:
+    """`scale` after residuals (t, m) were compared with the `stated` covariance (t, m, m):
+    E[r r' + H P H'] = R after the update, where R is right. kind: `FIXES` or `ARRIVALS`."""
+    spread = residual[:, :, None] * residual[:, None, :] + covariance
+    total = float(np.trace(np.linalg.solve(stated, spread), axis1=-2, axis2=-1).sum())
+    row = scale[kind] + (total, residual.size)
+    scale = scale.copy()
+    scale[kind] = row * min(1.0, SCALE_MEMORY / row[1])
+    return scale
 
 
 class Step(NamedTuple):

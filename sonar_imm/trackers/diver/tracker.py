@@ -16,12 +16,13 @@
 
 A diver swims slowly and turns often. The tracker runs one motion model for each of sixteen
 headings (`models`) in an interacting multiple model filter, and lets the data correct the
-probabilities of turning. A scan of the world goes through
+probabilities of turning. The measurements of a stamp, a `Scan`, go through
 
-    predict -> fixes: gate, associate, update; pings: explain -> learn -> prune -> spawn
+    predict -> associate -> update -> prune -> spawn
 
 and the whole of what is known after it is one value, `DiverState`, so that a late measurement is
-put in its place by computing the scans after it again (`trackers.stream`).
+put in its place by computing the scans after it again (`intake.stream`). Positions that are not
+metres in the frame of the tracks are brought into it first (`georeferencing`).
 
 Source: docs/diver.md, after 'multi-directional motion fusion model for diver tracking'.
 """
@@ -29,83 +30,118 @@ Source: docs/diver.md, after 'multi-directional motion fusion model for diver tr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
+import math
+from operator import itemgetter
+from typing import cast, NamedTuple
 
 from attrs import evolve
 import numpy as np
 
 from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
-from ...estimation import adaptation_kernels, association_kernels, imm_kernels, jipda_kernels
-from ...estimation.adaptation import AdaptiveChain
-from ...estimation.arrays import FloatArray
-from ...estimation.association import Tracks
-from ...estimation.association_kernels import TENTATIVE
-from ...measurements import Arrivals, Fix, Fixes, Frames, Measurement, NOBODY, Start
+from ...estimation import adaptation, association, imm_kernels
+from ...estimation import jipda as joint_association
+from ...estimation.adaptation import AdaptiveChain, Form
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
+from ...estimation.consider import consider_models
+from ...estimation.consistency import NisMemory
+from ...estimation.small_matrices import add_jitter_all
+from ...intake import KnownFrames
+from ...intake.stream import ReplayStream, StreamRules
+from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
 from ..model_checks import track_rules
-from ..stream import ReplayStream, StreamRules
-from . import fix_kernels, soft
-from .births import Birth, births_from_ping
+from . import births, fix_kernels, jipda, names, pings
+from .births import Birth
 from .config import DiverConfig
-from .fix_consistency import FixConsistency
-from .fix_scans import each_name_once, shows_all, take_fixes
-from .instruments import Layout
+from .georeferencing import Georeferencer
 from .models import build_models
-from .names import hear_named, is_named, merged, names_said, pings_of, remembered
-from .pings import begin_from_ping, FAR, ping_numbers
-from .placing import Placer
-from .scan import Scan
-from .sensing import position_groups
-from .starts import confirmed, make_room, no_room, starts_of
-from .state import DiverState
+from .scan import Positions, Scan
+from .state import cross, DiverState, FixConsistency, FIXES, learnt_scale, MEMORY, Step
+from .state_space import Instruments, Layout
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
 
+SCORE_MEMORY = 0.9
+"""Share of its score a track keeps from scan to scan."""
+
+
+class Association(NamedTuple):
+    """Which fixes of a group are of which tracks: tracks, detection (t,): pairs; expected
+    (T, M, 2): the fix that each model expects; score (T,): of the tracks; free (D,): where a track
+    may begin; existence (D,): of that track, None where its hits will tell; weights: of all pairs,
+    where these and not the pairs update the tracks."""
+
+    tracks: IndexArray
+    detection: IntArray
+    expected: FloatArray
+    score: FloatArray
+    free: BoolArray
+    existence: FloatArray | None = None
+    weights: jipda.JointWeights | None = None
+
 
 class DiverTracker:
-    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`."""
+    """The tracker of `trackers.Tracker` for divers: `process` takes `Fix`, `Fixes`, `Arrivals`,
+    `Start`, and what `georeferencing` makes fixes of."""
 
-    STATE = ('_stream', '_placer')
+    STATE = ('_stream', '_georeferencer')
 
     def __init__(self, config: DiverConfig):
-        self.config = config
         self.models = build_models(config)
+        self._position = np.ascontiguousarray(self.models.E[:, :2])
         self._chain = AdaptiveChain(
             self.models.chain,
-            config.adaptation,
+            cast(Form, config.adaptation),
             weight=config.adaptation_prior,
             guard=config.adaptation_guard,
         )
+        self._settle(config)
         self.reset()
+
+    def _settle(self, config: DiverConfig) -> None:
+        """What follows from the parameters, once and not in every scan."""
+        self.config = config
+        self.rules = track_rules(config)
+        self._layout = lru_cache(maxsize=16)(self._layout_of)
+
+    def _layout_of(self, instruments: Instruments) -> Layout:
+        return instruments.layout(self.config, self.models)
 
     def reset(self) -> None:
         self._stream = ReplayStream(
             (Fix, Fixes, Arrivals, Start),
             StreamRules.of(self.config),
-            step=self._scan,
-            initial=self._nobody(Tracks.none(track_rules(self.config))),
+            step=self._step,
+            initial=self._nobody(Tracks.none(self.rules)),
             survivor=lambda state: self._nobody(state.life.none_left()),
         )
         self.counts = self._stream.counts
-        self._placer = Placer(self.config, self.counts)
+        self._georeferencer = Georeferencer(self.config, self.counts)
+
+    def _nobody(self, life: Tracks) -> DiverState:
+        return DiverState.of_nobody(life, self.models, self._chain.fresh(0))
 
     @property
     def origin(self) -> Origin | None:
         """Where the frame of the tracks lies on Earth, None when that is not known."""
-        return self._placer.origin
+        return self._georeferencer.origin
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: DiverConfig) -> None:
         self.config.require_changeable(config)
-        self.config = self._placer.config = config
+        self._settle(config)
+        self._georeferencer.config = config
 
     def warm(self) -> None:
         imm_kernels.warm()
-        jipda_kernels.warm()
-        adaptation_kernels.warm()
-        association_kernels.warm()
+        joint_association.warm()
+        adaptation.warm()
+        association.warm()
         fix_kernels.warm()
         # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
         tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
@@ -145,17 +181,20 @@ class DiverTracker:
             'fixes_mean_nis': now.fixes.mean_nis,
             'fixes_lag_1': now.fixes.lag_1,
             'arrivals_mean_nis': now.arrivals.mean,
-            'waiting_for_vessel': len(self._placer),
-            'scale_fixes': float(now.factor()[0]),
-            'scale_arrivals': float(now.factor()[1]),
+            'waiting_for_vessel': len(self._georeferencer),
+            'scale_fixes': now.factor()[0],
+            'scale_arrivals': now.factor()[1],
         }
 
     def warnings(self) -> list[str]:
         """What of the input cannot be true or used, in sentences for the user."""
         state, advice = self._stream.state, 'check var_toa, var_bearing and toa_std'
-        lasting = state.fixes.warnings(self.config.fix_bias_std > 0.0)
-        heard = state.arrivals.warnings('arrivals', advice)
-        return [*self._placer.warnings(), *lasting, *heard, *no_room(state, self.config)]
+        return [
+            *self._georeferencer.warnings(),
+            *state.fixes.warnings(self.config.fix_bias_std > 0.0),
+            *state.arrivals.warnings('arrivals', advice),
+            *births.no_room(state, self.config),
+        ]
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         return [self._estimate(state) for _, state in self._revise(measurement)]
@@ -163,87 +202,169 @@ class DiverTracker:
     def _revise(self, measurement: Measurement) -> list[tuple[int, DiverState]]:
         """The stamps and states that are new or changed, oldest first."""
         revised: dict[int, DiverState] = {}
-        for one in self._placer.place(measurement):
-            revised.update(self._stream.revise(one))
-        return [(stamp_ns, revised[stamp_ns]) for stamp_ns in sorted(revised)]
-
-    def _nobody(self, life: Tracks) -> DiverState:
-        """The state without a track; `life` has none, but the next identity."""
-        M, n = self.models.copies * len(self.models.names), self.models.n
-        return DiverState(
-            stamp_ns=0,
-            life=life,
-            x=np.empty((0, M, n)),
-            P=np.empty((0, M, n, n)),
-            mu=np.empty((0, M)),
-            learnt=self._chain.fresh(0),
-            nis=np.empty(0),
-            nis_dof=np.empty(0, np.uint16),
-            score=np.empty(0),
-            white=np.empty((0, 2)),
-            fixes=FixConsistency(),
-            scale=np.zeros((2, 2)),
-            existence=np.empty(0),
-            evidence=np.empty(0),
-            target_id=np.empty(0, np.int64),
-            near_to=np.empty(0, np.int64),
-            near_for=np.empty(0, np.int64),
-        )
+        for ready in self._georeferencer.georeference(measurement):
+            revised.update(self._stream.revise(ready))
+        return sorted(revised.items(), key=itemgetter(0))
 
     # -- one scan ------------------------------------------------------------------------------
 
-    def _scan(self, before: DiverState, stamp_ns: int, items: Sequence[Measurement]) -> DiverState:
+    def _step(self, before: DiverState, stamp_ns: int, items: Sequence[Measurement]) -> DiverState:
         """The state after all measurements of one stamp. Pure."""
-        factor = before.factor() if self.config.estimate_covariance_scale else np.ones(2)
-        scan = self._predict(before, stamp_ns)
-        births: list[Birth] = []
-        fix_factor = float(self.config.covariance_scale * factor[0])
-        groups = position_groups(items, self.config, fix_factor)
-        for group in groups:
-            births += take_fixes(scan, group)
-        pings = pings_of(items)
-        for ping in pings:
-            if is_named(ping):
-                births += hear_named(scan, ping, self.config, float(factor[1]))
-                continue
-            taken = scan.take_ping(ping, float(self.config.covariance_scale * factor[1]))
-            births += births_from_ping(ping, ~taken, self.config, float(factor[1]))
-        said = names_said(groups, pings)
-        learnt = scan.learn()
-        if pings and not groups:
-            sure = (learnt.nis_dof > 0) & (learnt.life.status != TENTATIVE)
-            heard = before.arrivals.after(learnt.nis[sure], learnt.nis_dof[sure])
-            learnt = evolve(learnt, arrivals=heard)
-        now = self._prune(remembered(learnt, before, said, self.config.max_coast), items)
-        now = merged(now, before, groups, self.config, self.models.E[:, :2])
-        now = self._spawn(now, births, scan.layout)
-        for start in starts_of(items):
-            now = self._start(now, start, scan.layout)
+        scan = self._scan(before, items)
+        now, step = self._predict(before, stamp_ns)
+        found: list[Birth] = []
+        for fixes in scan.fixes:
+            association = self._associate(now, fixes)
+            now = self._update(now, fixes, association)
+            if association.free.any():
+                found += births.births_from_fixes(fixes, association.free, association.existence)
+        for ping in scan.pings:
+            now, free = pings.associate_and_update(
+                now, ping, self.config, scan.factor, self.models
+            )
+            found += births.births_from_ping(ping, free, self.config, scan.factor)
+        now = self._learn(before, now, step, scan)
+        now = self._prune(now, scan)
+        return self._spawn(now, found, scan.starts)
+
+    def _scan(self, before: DiverState, items: Sequence[Measurement]) -> Scan:
+        stated = self.config.covariance_scale
+        if not self.config.estimate_covariance_scale:
+            return Scan.of(items, self.config, (stated, stated))
+        fixes, arrivals = before.factor()
+        return Scan.of(items, self.config, (stated * fixes, stated * arrivals))
+
+    def _predict(self, before: DiverState, stamp_ns: int) -> tuple[DiverState, Step]:
+        """The tracks as this scan should show them, and the step that led there."""
+        dt = (stamp_ns - before.stamp_ns) * 1e-9 if before.stamp_ns else 0.0
+        steps = list(cross(self.models, self._chain, before, dt, self.config.longest_step))
+        last, count = steps[-1], len(before.x)
+        if len(steps) > 1:
+            whole = np.linalg.matrix_power(last.transition, len(steps))
+            repairs = sum(step.repairs for step in steps)
+            last = last._replace(transition=whole, repairs=repairs)
+        # The error of the sound speed has its place in the state before any ping.
+        x, P = self._layout(before.instruments).widened(last.x, last.P)
+        now = before._replace(
+            stamp_ns=stamp_ns,
+            x=x,
+            P=P,
+            mu=last.mu,
+            nis=np.zeros(count),
+            nis_dof=np.zeros(count, np.uint16),
+            score=SCORE_MEMORY * before.score,
+            existence=before.existence * math.exp(-dt / self.config.survival_time),
+            repairs=before.repairs + last.repairs,
+        )
+        return now, last._replace(dt=dt)
+
+    def _associate(self, now: DiverState, fixes: Positions) -> Association:
+        """Which fixes are of which tracks; of several tracks the confirmed ones choose first. A
+        fix that says whose it is goes to the track of that name."""
+        config, H = fixes.config, self._layout(now.instruments).H
+        expected = fix_kernels.expected(now.x, H)
+        if fixes.target_id is not None:
+            tracks, row = np.nonzero(now.target_id[:, None] == fixes.target_id[None])
+            free = ~np.isin(np.arange(len(fixes.z)), row)
+            return Association(tracks, row, expected, now.score, free)
+        excluded = now.target_id != NOBODY
+        if config.named_tracks == 'share':
+            excluded = np.zeros(len(excluded), bool)
+        if config.association == 'jipda':
+            weights = jipda.joint_weights(now, fixes, expected, H, excluded)
+            claimed = weights.beta.sum(axis=0)
+            existence = jipda.birth_existence(config, claimed)
+            tracks, likeliest = weights.likeliest()
+            free = claimed < 0.5
+            return Association(tracks, likeliest, expected, now.score, free, existence, weights)
+        threshold = gate_threshold(config.gate_probability, 2)
+        fit = imm_kernels.gate(expected, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+        fit[excluded] = -np.inf
+        p, clutter = config.detection_probability, config.clutter_density
+        chosen = assign_fits(fit, now.life.status == TENTATIVE, p, clutter)
+        logs = np.log1p(-p), np.log(p / (1.0 - p)), np.log(clutter)
+        score = fix_kernels.scores(now.score, fit, chosen, excluded, *logs)
+        tracks = np.flatnonzero(chosen >= 0)
+        free = np.ones(len(fixes.z), bool)
+        free[chosen[tracks]] = False
+        return Association(tracks, chosen[tracks], expected, score, free)
+
+    def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
+        """The tracks after the fixes that are theirs."""
+        tracks, detection, h = association.tracks, association.detection, association.expected
+        layout = self._layout(now.instruments)
+        white, consistency = now.white, now.fixes
+        if len(tracks):
+            innovations = now.x, now.P, now.mu, layout.H, fixes.z, fixes.R, tracks, detection
+            tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
+            white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
+            consistency = FixConsistency(*sums)
+        now = now._replace(white=white, fixes=consistency, score=association.score)
+        if association.weights is not None:
+            weights, considered = association.weights, ~layout.mask
+            return jipda.update_jointly(now, fixes, weights, tracks, h, layout.H, considered)
+        if not len(tracks):
+            return now
+        if layout.mask.all():
+            predicted = now.x, now.P, now.mu, h, layout.H, fixes.z, fixes.R, tracks, detection
+            after = fix_kernels.update(*predicted, now.nis, now.nis_dof)
+        else:
+            after = _considered_update(now, fixes, tracks, detection, h, layout)
+        x, P, mu, nis, nis_dof, repairs = after
+        now = now._replace(
+            x=x, P=P, mu=mu, nis=nis, nis_dof=nis_dof, repairs=now.repairs + repairs
+        )
+        if self.config.estimate_covariance_scale:
+            now = self._with_scale(now, fixes, tracks, detection)
         return now
 
-    def _predict(self, before: DiverState, stamp_ns: int) -> Scan:
-        return Scan(self.config, self.models, self._chain, before, stamp_ns)
+    def _with_scale(
+        self, now: DiverState, fixes: Positions, tracks: IndexArray, detection: IntArray
+    ) -> DiverState:
+        """With the scale of the stated covariances learnt from the fixes of `tracks`."""
+        E = self._layout(now.instruments).H[0]
+        mean, covariance = imm_kernels.combine(now.x[tracks], now.P[tracks], now.mu[tracks], E)
+        residual, stated = fixes.z[detection] - mean, fixes.R[detection] / fixes.factor
+        scale = learnt_scale(now.scale, FIXES, residual, covariance, stated)
+        return now._replace(scale=scale)
 
-    def _prune(self, now: DiverState, items: Sequence[Measurement]) -> DiverState:
-        """End the tracks that are over, broken, or too many."""
-        config = self.config
-        sound = fix_kernels.finite(now.x, now.P)
-        broken = now.broken + int((~sound).sum())
+    def _learn(self, before: DiverState, now: DiverState, step: Step, scan: Scan) -> DiverState:
+        """What the hits say of the transitions, and of the stated variances of arrivals where no
+        fix says the same."""
         hit = now.nis_dof > 0
-        looked = any(shows_all(item, config) for item in items) & (now.target_id == NOBODY)
-        by_existence = np.isfinite(now.existence)
-        life, kept = now.life.scan(
-            hit, now.stamp_ns, track_rules(config), looked=looked & ~by_existence
+        learnt = self._chain.learn(
+            before.learnt,
+            step.transition,
+            self.models.by_model(before.mu),
+            self.models.by_model(now.mu),
+            step.dt,
+            np.flatnonzero(hit),
         )
-        near = {'near_to': now.near_to, 'near_for': now.near_for}
+        nis, arrivals = np.where(hit, now.nis, np.nan), NisMemory()
+        if scan.pings and not scan.fixes:
+            sure = hit & (now.life.status != TENTATIVE)
+            arrivals = before.arrivals.after(nis[sure], now.nis_dof[sure])
+        return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
+
+    def _prune(self, now: DiverState, scan: Scan) -> DiverState:
+        """End the tracks that are over, broken, there twice, or too many."""
+        config, before = self.config, now
+        if scan.names or now.last_named:
+            now = names.remembered(now, scan.names, config.max_coast)
+        alive = fix_kernels.finite(now.x, now.P)
+        if not alive.all():
+            now = now._replace(broken=now.broken + int((~alive).sum()))
+        hit, looked = now.nis_dof > 0, scan.complete & (now.target_id == NOBODY)
+        by_existence = np.isfinite(now.existence)
+        life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked & ~by_existence)
         if by_existence.any():
-            judged = soft.judge(now, hit, looked, self.models.E[:, :2])
+            judged = jipda.judge(now, hit, looked, self._position)
             status = np.where(by_existence[kept], judged.status[kept], life.status)
             life = evolve(life, status=status)
-            near = {'near_to': judged.near_to, 'near_for': judged.near_for}
-            sound = sound & (judged.alive | ~by_existence)
-        if not sound.all():
-            life, kept = life.only(sound[kept]), kept & sound
+            now = now._replace(near_to=judged.near_to, near_for=judged.near_for)
+            alive = alive & (judged.alive | ~by_existence)
+        if not alive.all():
+            life, kept = life.only(alive[kept]), kept & alive
         confirmed = np.flatnonzero(life.status != TENTATIVE)
         if len(confirmed) > config.max_tracks:
             known = np.where(now.target_id == NOBODY, now.score, np.inf)[kept][confirmed]
@@ -252,21 +373,34 @@ class DiverTracker:
             room[confirmed[best]] = True
             kept[kept] = room
             life = life.only(room)
-        return now.rows(kept, life=life, broken=broken, **near)
+        now = now.rows(kept, life)
+        if config.named_tracks == 'share' and now.last_named:
+            now = names.merged(now, before, scan.fixes, self._position)
+        return now
 
-    def _spawn(self, now: DiverState, births: list[Birth], layout: Layout) -> DiverState:
-        """Begin a tentative track at each birth, as long as there is room."""
+    def _spawn(self, now: DiverState, found: list[Birth], starts: list[Start]) -> DiverState:
+        """Begin a tentative track at each birth, as long as there is room, and a confirmed one
+        where somebody says that a diver is."""
         config = self.config
-        births = each_name_once(births)[: max(0, 10 + 5 * config.max_tracks - len(now.life))]
-        return self._append(now, births, layout) if births else now
+        if found:
+            room = max(0, 10 + 5 * config.max_tracks - len(now.life))
+            now = self._with_tracks(now, births.each_name_once(found)[:room])
+        for start in starts:
+            now, free = births.make_room(now, start, config, self._position)
+            if free:
+                birth = Birth(start.position[:2], start.covariance)
+                now = births.confirmed(self._with_tracks(now, [birth]))
+        return now
 
-    def _append(self, now: DiverState, births: list[Birth], layout: Layout) -> DiverState:
+    def _with_tracks(self, now: DiverState, found: list[Birth]) -> DiverState:
         """With a track for each birth."""
-        config = self.config
-        x, P, mu = self._new_tracks(births, layout)
-        count = len(births)
+        count = len(found)
+        if not count:
+            return now
+        layout = self._layout(now.instruments)
+        x, P, mu = births.new_tracks(found, self.models, layout, self.config)
         return now.with_rows(
-            now.life.born(count, now.stamp_ns, track_rules(config)),
+            now.life.born(count, now.stamp_ns, self.rules),
             {
                 'x': x,
                 'P': P,
@@ -276,90 +410,62 @@ class DiverTracker:
                 'nis_dof': np.zeros(count, np.uint16),
                 'score': np.zeros(count),
                 'white': np.full((count, 2), np.nan),
-                'existence': np.array([birth.existence for birth in births]),
+                'existence': np.array([birth.existence for birth in found]),
                 'evidence': np.ones(count),
-                'target_id': np.array([birth.target_id for birth in births]),
+                'target_id': np.array([birth.target_id for birth in found]),
                 'near_to': np.zeros(count, np.int64),
                 'near_for': np.zeros(count, np.int64),
             },
         )
 
-    def _start(self, now: DiverState, start: Start, layout: Layout) -> DiverState:
-        """Begin a confirmed track where somebody says that a diver is, when there is room."""
-        now, room = make_room(now, start, self.config, self.models.E[:, :2])
-        if not room:
-            return now
-        birth = Birth(start.position[:2], start.covariance)
-        return confirmed(self._append(now, [birth], layout))
-
-    def _new_tracks(
-        self, births: list[Birth], layout: Layout
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x, P and mu of tracks that begin."""
-        plain = self.models.height < 0 and layout.size == self.models.n
-        if all(birth.ping is None for birth in births) or (plain and self.models.bias < 0):
-            position = np.array([birth.position for birth in births])
-            covariance = np.array([birth.covariance for birth in births])
-            x, P, mu = self.models.new_tracks(position, covariance)
-            return *layout.widened(x, P), mu
-        parts = [self._new_track(birth, layout, plain) for birth in births]
-        x, P, mu = (np.concatenate(one) for one in zip(*parts))
-        return x, P, mu
-
-    def _new_track(
-        self, birth: Birth, layout: Layout, plain: bool
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x, P and mu of one track, with a row."""
-        where = birth.position[None]
-        if birth.ping is None or birth.rows is None or plain:
-            x, P, mu = self.models.new_tracks(where, birth.covariance[None], birth.ping is None)
-            return *layout.widened(x, P), mu
-        x, P, mu = self.models.new_tracks(where, np.eye(2)[None] * FAR**2, False)
-        x, P = layout.widened(x, P)
-        factor = self.config.covariance_scale
-        ping = ping_numbers(birth.ping, birth.rows, self.config, factor, self.models, layout)
-        # All models of a copy begin alike: one of each is enough to ask.
-        M = len(self.models.names)
-        first = begin_from_ping(x[0, ::M], P[0, ::M], ping, birth.position, self.config, layout)
-        known = np.isfinite(first[2]).any()
-        share = np.exp(first[2] - first[2].max()) if known else np.ones(len(first[2]))
-        mu = mu * np.repeat(share / share.sum() * len(share), M)
-        return np.repeat(first[0], M, axis=0)[None], np.repeat(first[1], M, axis=0)[None], mu
-
     def _estimate(self, state: DiverState) -> Estimate:
-        n, shown = self.models.n, soft.published(state.existence)
-        if not shown.all():
-            state = state.rows(shown, life=state.life.only(shown))
-        x, P = state.x, state.P
-        if x.shape[-1] > n:
-            x, P = np.ascontiguousarray(x[..., :n]), np.ascontiguousarray(P[..., :n, :n])
-        mean, covariance = imm_kernels.combine(x, P, state.mu, self.models.E)
+        # Of tracks whose hits are counted the existence is NaN.
+        state = state.only(~(state.existence <= jipda.PUBLISHES))
+        mean, covariance = state.positions(self.models.E)
         depth = np.full(len(mean), self.config.target_z)
         if self.models.height >= 0:
             depth = mean[:, 2]
+        xyz = np.column_stack([mean[:, :2], depth])
+        extras: dict[str, np.ndarray] = {
+            'track_id': state.life.track_id,
+            'track_state': state.life.status,
+            'nis': state.nis,
+            'nis_dof': state.nis_dof,
+            'existence': state.existence,
+            'target_id': state.target_id.astype(np.int32),
+        }
+        if self.origin is not None:
+            place = self.origin.geodetic(xyz)
+            extras |= {'latitude': place[:, 0], 'longitude': place[:, 1]}
         return Estimate(
             stamp_ns=state.stamp_ns,
             frame_id=self._stream.frame_id,
-            xyz=np.column_stack([mean[:, :2], depth]),
+            xyz=xyz,
             state_names=self.models.outputs,
             state=mean,
             covariance=covariance,
             model_names=self.models.names,
             probabilities=self.models.by_model(state.mu),
-            extras={
-                'track_id': state.life.track_id,
-                'track_state': state.life.status,
-                'nis': state.nis,
-                'nis_dof': state.nis_dof,
-                'existence': state.existence,
-                'target_id': state.target_id.astype(np.int32),
-                **self._on_earth(mean, depth),
-            },
+            extras=extras,
         )
 
-    def _on_earth(self, mean: FloatArray, height: FloatArray) -> dict[str, FloatArray]:
-        """Columns with latitude and longitude, degrees, where the origin is known."""
-        if self.origin is None:
-            return {}
-        place = self.origin.geodetic(np.column_stack([mean[:, :2], height]))
-        return {'latitude': place[:, 0], 'longitude': place[:, 1]}
+
+def _considered_update(
+    now: DiverState,
+    fixes: Positions,
+    tracks: IndexArray,
+    detection: IntArray,
+    h: FloatArray,
+    layout: Layout,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
+    """As `fix_kernels.update`, where the state holds constants that are only considered."""
+    x, P, mu, nis, nis_dof = (part.copy() for part in (now.x, now.P, now.mu, now.nis, now.nis_dof))
+    innovation = fixes.z[detection][:, None, :] - h[tracks]
+    x1, P1, mu1, nis1, ok = consider_models(
+        x[tracks], P[tracks], mu[tracks], innovation, layout.H[0], fixes.R[detection], layout.mask
+    )
+    repairs = sum(add_jitter_all(covariance) for covariance in P1)
+    x[tracks], P[tracks], mu[tracks] = x1, P1, mu1
+    nis[tracks] += np.where(ok, nis1, 0.0)
+    nis_dof[tracks] += np.where(ok, 2, 0).astype(np.uint16)
+    return x, P, mu, nis, nis_dof, repairs

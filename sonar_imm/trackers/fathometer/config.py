@@ -16,18 +16,14 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from attrs import frozen
 
 from ...acoustics.fathometer import OUTPUTS, PROCESSORS
 from ...acoustics.spectra import WINDOWS
 from ...estimation.set_model import PRIORS
-from ...parameters import inherited, parameter
+from ...parameters import inherited, live, parameter
 from ..model_checks import matrix_problems
 from ..shared_parameters import StampParameters
-
-live = partial(parameter, read_only=False)
 
 PULSES = ('band', 'processor', 'envelope', 'gaussian', 'file')
 PROPOSALS = ('data', 'prior')
@@ -40,268 +36,177 @@ MAX_DECAYS = 8
 
 @frozen(kw_only=True)
 class FathometerConfig(StampParameters):
-    """Everything the fathometer tracker can be told."""
+    """All parameters of the fathometer tracker."""
 
+    # fmt: off
     # -- array and sound --------------------------------------------------------------------------
-    phones: int = parameter(
-        32, 'hydrophones of the array; 0: as many as the first record has', low=0, high=256
-    )
-    element_spacing: float = parameter(
-        0.18, 'distance between hydrophones', unit='m', low=1e-4, high=100.0
-    )
-    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
-    array_depth: float = parameter(
-        0.0,
+    phones: int = parameter(32, '',
+        'number of hydrophones of the array; 0: as many as the first record has', range=(0, 256))
+    element_spacing: float = parameter(0.18, 'm',
+        'distance between hydrophones', range=(1e-4, 100.0))
+    sound_speed: float = parameter(1500.0, 'm/s',
+        'speed of sound in the water', range=(1300.0, 1700.0))
+    array_depth: float = parameter(0.0, 'm',
         'depth of the deepest hydrophone, where neither the record nor a companion instrument '
-        'tells; 0: depths are counted from it',
-        unit='m',
-        low=0.0,
-        high=12000.0,
-    )
-    array_depth_age: float = live(
-        30.0, 'a depth from the companion is used so long', unit='s', low=0.0, high=86400.0
-    )
-    array_depth_std: float = live(
-        0.03,
-        'error of the depth of the array as it is told, a part of the error of every reflector; '
-        '0: depths are judged as seen from the array',
-        unit='m',
-        low=0.0,
-        high=1000.0,
-    )
+        'states it; 0: depths are counted from that hydrophone', range=(0.0, 12000.0))
+    array_depth_age: float = live(30.0, 's',
+        'largest time between a record and the depth of a companion instrument that is used for '
+        'it', range=(0.0, 86400.0))
+    array_depth_std: float = live(0.03, 'm',
+        'standard deviation of the stated depth of the array, a part of the error of every '
+        'reflector; 0: depths are judged as seen from the array', range=(0.0, 1000.0))
 
-    heave: str = parameter(
-        'none',
-        'whether the error of the told depth, of standard deviation array_depth_std, is a state '
-        'that all reflectors share: none; independent, wrong anew in each record; memory, by '
-        'heave_memory',
-        choices=HEAVES,
-    )
-    heave_memory: float = parameter(
-        0.9, 'memory: how much of the error stays from record to record', low=0.01, high=0.99
-    )
+    heave: str = parameter('none', '',
+        'whether the error of the stated depth of the array (array_depth_std) is a state that all '
+        'reflectors share: none; independent (a new error in each record); memory (correlated by '
+        'heave_memory)', choices=HEAVES)
+    heave_memory: float = parameter(0.9, '',
+        'heave memory: share of the error of the array depth that stays from record to record',
+        range=(0.01, 0.99))
 
     # -- from pressure to cross-spectra -----------------------------------------------------------
-    snapshot_seconds: float = parameter(
-        0.0,
-        'length of a snapshot; 0: as the depths to be tracked and the number of hydrophones need, '
-        'of cross-spectra one over the spacing of their frequencies',
-        unit='s',
-        low=0.0,
-        high=1000.0,
-    )
-    overlap: float = parameter(0.5, 'share that snapshots have in common', low=0.0, high=0.95)
-    window: str = parameter('hann', 'window of a snapshot', choices=WINDOWS)
-    record_seconds: float = parameter(
-        89.6, 'pressure averaged for one record', unit='s', low=1e-3, high=86400.0
-    )
-    preview_seconds: float = parameter(
-        0.0,
-        'an estimate that is not committed, from the sliding average, so often; 0: none',
-        unit='s',
-        low=0.0,
-        high=86400.0,
-    )
+    snapshot_seconds: float = parameter(0.0, 's',
+        'length of a snapshot; 0: what the depths to be tracked and the number of hydrophones '
+        'need, or for cross-spectra one over the spacing of their frequencies',
+        range=(0.0, 1000.0))
+    overlap: float = parameter(0.5, '',
+        'share that successive snapshots have in common', range=(0.0, 0.95))
+    window: str = parameter('hann', '', 'window function applied to a snapshot', choices=WINDOWS)
+    record_seconds: float = parameter(89.6, 's',
+        'length of pressure averaged for one record', range=(1e-3, 86400.0))
+    preview_seconds: float = parameter(0.0, 's',
+        'time between previews, which are estimates from the sliding average that are not '
+        'committed; 0: none', range=(0.0, 86400.0))
 
     # -- from cross-spectra to a depth response ---------------------------------------------------
-    processor: str = parameter('mvdr', 'how the array looks up and down', choices=PROCESSORS)
-    output: str = parameter(
-        'coherence',
-        'what is made of both beams: their coherence; their correlation, which red noise spoils; '
-        'or printed, equations (2) and (4) of the paper to the letter: for mvdr the echoes lie '
-        'above the array then',
-        choices=OUTPUTS,
-    )
-    envelope: bool = parameter(
-        False, 'of arrays: the envelope of the response, as the paper has it, in place of it'
-    )
-    loading: float = live(
-        1e-2,
-        'mvdr: diagonal loading, in units of the mean power of a hydrophone',
-        low=0.0,
-        high=1e6,
-    )
-    white_noise_gain_db: float = live(
-        -3.0,
-        'white_noise: least gain, against the most there is',
-        unit='dB',
-        low=-60.0,
-        high=-0.01,
-    )
-    frequency_min: float = parameter(50.0, 'lower edge of the band', unit='Hz', low=0.0, high=1e6)
-    frequency_max: float = parameter(
-        4000.0, 'upper edge of the band', unit='Hz', low=1.0, high=1e6
-    )
-    depth_min: float = parameter(
-        0.0,
+    processor: str = parameter('mvdr', '', 'beamformer that looks up and down', choices=PROCESSORS)
+    output: str = parameter('coherence', '',
+        'response made of the beams up and down: coherence; correlation, which red noise spoils; '
+        'or printed, equations (2) and (4) of the paper to the letter, which for mvdr puts the '
+        'echoes above the array', choices=OUTPUTS)
+    envelope: bool = parameter(False, '',
+        'for arrays: use the envelope of the response, as the paper does, in place of the '
+        'response')
+    loading: float = live(1e-2, '',
+        'processor mvdr: diagonal loading, in units of the mean power of a hydrophone',
+        range=(0.0, 1e6))
+    white_noise_gain_db: float = live(-3.0, 'dB',
+        'processor white_noise: least white noise gain, relative to the largest possible',
+        range=(-60.0, -0.01))
+    frequency_min: float = parameter(50.0, 'Hz',
+        'lower edge of the frequency band that is used', range=(0.0, 1e6))
+    frequency_max: float = parameter(4000.0, 'Hz',
+        'upper edge of the frequency band that is used', range=(1.0, 1e6))
+    depth_min: float = parameter(0.0, 'm',
         'least depth of a reflector; 0 together with depth_max: the whole trace, or 10 m to 110 m '
-        'below the array',
-        unit='m',
-        low=0.0,
-        high=12000.0,
-    )
-    depth_max: float = parameter(
-        0.0, 'greatest depth of a reflector', unit='m', low=0.0, high=12000.0
-    )
-    depth_step: float = parameter(
-        0.0,
-        'distance of the depths that are told apart; 0: as the trace has it, or a sixth of the '
-        'shortest half wavelength',
-        unit='m',
-        low=0.0,
-        high=100.0,
-    )
-    noise_depth_min: float = live(
-        180.0,
-        'noise is measured between this depth and noise_depth_max, where no reflectors are; over '
-        'the whole trace when it does not reach there. 0 together with noise_depth_max, and with '
-        'automatic snapshots that are too short for it: where the depths tracked have their '
-        'mirror image at the array, or in what reflectors leave of a trace',
-        unit='m',
-        low=0.0,
-        high=12000.0,
-    )
-    noise_depth_max: float = live(
-        300.0, 'end of the depths where noise is measured', unit='m', low=0.0, high=12000.0
-    )
-    noise_sigma: float = live(
-        0.0,
-        'standard deviation of the noise; 0: as the trace says, else measured',
-        low=0.0,
-        high=1e30,
-    )
-    remove_background: bool = live(
-        False, 'take the median of the noise off the trace first: for envelopes'
-    )
+        'below the array', range=(0.0, 12000.0))
+    depth_max: float = parameter(0.0, 'm',
+        'greatest depth of a reflector; 0 together with depth_min: see there',
+        range=(0.0, 12000.0))
+    depth_step: float = parameter(0.0, 'm',
+        'distance between the depths of the grid; 0: as the trace has it, or a sixth of the '
+        'shortest half wavelength', range=(0.0, 100.0))
+    noise_depth_min: float = live(180.0, 'm',
+        'upper end of the depths where noise is measured, down to noise_depth_max, where no '
+        'reflectors are; the whole trace when it does not reach there. 0 together with '
+        'noise_depth_max, and with automatic snapshots that are too short for it: where the '
+        'depths tracked have their mirror image at the array, or in what reflectors leave of a '
+        'trace', range=(0.0, 12000.0))
+    noise_depth_max: float = live(300.0, 'm',
+        'lower end of the depths where noise is measured, see noise_depth_min',
+        range=(0.0, 12000.0))
+    noise_sigma: float = live(0.0, '',
+        'standard deviation of the noise of a trace; 0: as the trace says, else measured',
+        range=(0.0, 1e30))
+    remove_background: bool = live(False, '',
+        'for envelopes: subtract the median of the noise from the trace first')
 
     # -- pulse ------------------------------------------------------------------------------------
-    pulse: str = parameter(
-        'band',
-        'what one reflector leaves on the response: that of a flat band; what the mvdr processor '
-        'makes of each record of an array (of other records, band); that of the envelope of a '
-        'band; a Gaussian; or from a file',
-        choices=PULSES,
-    )
-    pulse_width: float = parameter(
-        0.5, 'gaussian: its standard deviation', unit='m', low=1e-4, high=100.0
-    )
-    pulse_file: str = parameter(
-        '', 'file: a CSV of two columns, distance in m from 0 on, and value'
-    )
+    pulse: str = parameter('band', '',
+        'shape that one reflector leaves in the response: band (of a flat band), processor (what '
+        'mvdr makes of each record of an array; for other records as band), envelope (of the '
+        'envelope of a band), gaussian or file', choices=PULSES)
+    pulse_width: float = parameter(0.5, 'm',
+        'pulse gaussian: standard deviation of the pulse', range=(1e-4, 100.0))
+    pulse_file: str = parameter('', '',
+        'pulse file: path of a CSV of two columns, distance in m from 0 on, and value')
 
     # -- volume scatter ---------------------------------------------------------------------------
-    scatter_decay: tuple[float, ...] = parameter(
-        (),
-        'volume scatter below the first reflector, for envelopes: the depths over which it may '
-        'fall to 1/e, tried in each record; empty: no volume scatter',
-        kind='float[]',
-        unit='m',
-        low=0.01,
-        high=1000.0,
-    )
-    scatter_spread: float = parameter(
-        0.4,
-        'scatter_decay: standard deviation of the scatter over its mean',
-        low=0.01,
-        high=2.0,
-    )
+    scatter_decay: tuple[float, ...] = parameter((), 'm',
+        'for envelopes: depths over which the volume scatter below the first reflector may fall '
+        'to 1/e, all tried in each record; empty: no volume scatter', range=(0.01, 1000.0),
+        kind='float[]')
+    scatter_spread: float = parameter(0.4, '',
+        'volume scatter (scatter_decay): standard deviation of the scatter over its mean',
+        range=(0.01, 2.0))
 
     # -- sediment ---------------------------------------------------------------------------------
-    sediment_sound_speed: float = live(
-        0.0,
-        'speed of sound just below the bottom, for sediment_depth; 0: as in the water',
-        unit='m/s',
-        low=0.0,
-        high=8000.0,
-    )
-    sediment_sound_speed_std: float = live(
-        0.0, 'error of sediment_sound_speed', unit='m/s', low=0.0, high=2000.0
-    )
-    sediment_sound_speed_gradient: float = live(
-        0.0,
-        'growth of the speed of sound with the depth below the bottom',
-        unit='1/s',
-        low=0.0,
-        high=10.0,
-    )
+    sediment_sound_speed: float = live(0.0, 'm/s',
+        'speed of sound just below the bottom, for the column sediment_depth; 0: as in the water',
+        range=(0.0, 8000.0))
+    sediment_sound_speed_std: float = live(0.0, 'm/s',
+        'standard deviation of sediment_sound_speed', range=(0.0, 2000.0))
+    sediment_sound_speed_gradient: float = live(0.0, '1/s',
+        'growth of the speed of sound in the sediment with the depth below the bottom',
+        range=(0.0, 10.0))
 
     # -- the set of reflectors --------------------------------------------------------------------
-    order_min: int = parameter(1, 'least number of reflectors', low=0, high=64)
-    order_max: int = parameter(12, 'greatest number of reflectors', low=1, high=64)
-    order_switch_probability: float = parameter(
-        0.05, 'that a record has one reflector more, and one less', low=0.0, high=0.5
-    )
-    order_transition_matrix: tuple[float, ...] = parameter(
-        (),
+    order_min: int = parameter(1, '', 'least number of reflectors that is possible', range=(0, 64))
+    order_max: int = parameter(12, '',
+        'greatest number of reflectors that is possible', range=(1, 64))
+    order_switch_probability: float = parameter(0.05, '',
+        'probability that a record has one reflector more than the last, and as large a '
+        'probability of one less', range=(0.0, 0.5))
+    order_transition_matrix: tuple[float, ...] = parameter((), '',
         'transition matrix of the number of reflectors, row-major, row = from; empty: '
-        'order_switch_probability',
-        kind='float[]',
-        low=0.0,
-        high=1.0,
-    )
-    depth_std: float = parameter(
-        0.1, 'how far a reflector moves from record to record', unit='m', low=1e-4, high=100.0
-    )
-    min_separation: float = parameter(
-        0.4, 'least distance of two reflectors', unit='m', low=1e-4, high=1000.0
-    )
-    polarity: str = parameter(
-        'positive',
-        'sign of the reflectors looked for: where the impedance grows with depth they are '
-        'positive; envelopes (remove_background) have no negative ones',
-        choices=POLARITIES,
-    )
-    negative_probability: float = parameter(
-        0.05, 'polarity both: that a new reflector is negative', low=1e-6, high=0.999
-    )
-    amplitude_prior: str = parameter(
-        'marginal',
-        'amplitudes integrated out, or the best ones with a penalty of log(N)/2 or log(N) each',
-        choices=PRIORS,
-    )
-    amplitude_std_sigmas: float = parameter(
-        7.5,
-        'marginal: standard deviation of amplitudes, in units of the noise',
-        low=0.01,
-        high=1e6,
-    )
-    amplitude_memory: float = parameter(
-        0.0,
-        'marginal: how much of its amplitude a reflector keeps from record to record; 0: none',
-        low=0.0,
-        high=0.9999,
-    )
+        'order_switch_probability', range=(0.0, 1.0), kind='float[]')
+    depth_std: float = parameter(0.1, 'm',
+        'standard deviation of the change of the depth of a reflector from record to record',
+        range=(1e-4, 100.0))
+    min_separation: float = parameter(0.4, 'm',
+        'least distance between two reflectors', range=(1e-4, 1000.0))
+    polarity: str = parameter('positive', '',
+        'sign of the reflectors looked for: positive where the impedance grows with depth; '
+        'envelopes (remove_background) have no negative ones', choices=POLARITIES)
+    negative_probability: float = parameter(0.05, '',
+        'polarity both: probability that a new reflector is negative', range=(1e-6, 0.999))
+    amplitude_prior: str = parameter('marginal', '',
+        'treatment of amplitudes: marginal (integrated out), or the best ones with a penalty of '
+        'log(N)/2 (bic_half) or log(N) (paper) for each', choices=PRIORS)
+    amplitude_std_sigmas: float = parameter(7.5, '',
+        'amplitude_prior marginal: standard deviation of amplitudes, in units of the noise',
+        range=(0.01, 1e6))
+    amplitude_memory: float = parameter(0.0, '',
+        'amplitude_prior marginal: share of its amplitude that a reflector keeps from record to '
+        'record; 0: none', range=(0.0, 0.9999))
 
     # -- computation ------------------------------------------------------------------------------
-    particles: int = parameter(20_000, 'sets of reflectors tried', low=2, high=10_000_000)
-    proposal: str = parameter(
-        'data',
-        'where particles go: where the record has peaks, or blindly (the bootstrap filter)',
-        choices=PROPOSALS,
-    )
-    threads: int = parameter(
-        1, 'processor cores used; the result does not depend on it', low=1, high=256
-    )
-    seed: int = parameter(0, 'of the random numbers', low=0, high=2**63 - 1)
-    smoothing_lag: int = parameter(0, 'revise the estimate so many records later', low=0, high=100)
+    particles: int = parameter(20_000, '',
+        'number of particles, each a set of reflectors', range=(2, 10_000_000))
+    proposal: str = parameter('data', '',
+        'where particles are proposed: data (where the record has peaks) or prior (blindly, the '
+        'bootstrap filter)', choices=PROPOSALS)
+    threads: int = parameter(1, '',
+        'number of processor cores used; the result does not depend on it', range=(1, 256))
+    seed: int = parameter(0, '', 'seed of the random number generator', range=(0, 2**63 - 1))
+    smoothing_lag: int = parameter(0, '',
+        'number of records after which an estimate is revised with what came since; 0: never',
+        range=(0, 100))
 
     # -- output -----------------------------------------------------------------------------------
-    existence_min: float = live(
-        0.5, 'least probability with which a reflector is reported', low=0.0, high=1.0
-    )
-    multiples: str = live(
-        'mark',
-        'whether reflectors get a probability of being multiples of others, by depths from the '
-        'surface; they are never left out',
-        choices=MULTIPLES,
-    )
-    track_memory: int = live(
-        5, 'a reflector not seen for so many records gets a new id', low=0, high=10_000
-    )
+    existence_min: float = live(0.5, '',
+        'least probability of existence with which a reflector is reported', range=(0.0, 1.0))
+    multiples: str = live('mark', '',
+        'whether reflectors get a probability of being multiples of others, from their depths '
+        'below the surface: mark or off; they are never left out', choices=MULTIPLES)
+    track_memory: int = live(5, '',
+        'number of records after which a reflector that was not seen gets a new id',
+        range=(0, 10_000))
 
     # -- time -------------------------------------------------------------------------------------
     max_gap: float = inherited(StampParameters, 'max_gap', 30.0 * 86_400.0)
     restart_after: int = inherited(StampParameters, 'restart_after', 3)
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check()

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From blocks of pressure, as they come, to records of cross-spectra.
+"""From blocks of pressure, as they come, to records of cross-spectra; and how deep the array was.
 
 Blocks may have any length; snapshots run on across them. Between blocks that do not meet the
 snapshot that was being filled is given up, and what was averaged before goes on to count; after a
@@ -20,10 +20,13 @@ gap longer than a record, it does not.
 
 Where the length of a snapshot is not given, it follows from the deepest depth that is tracked and
 from how many snapshots the array needs (`automatic_snapshot`).
+
+The depth of the array comes with the blocks, or from a companion instrument (`CompanionDepths`).
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 import math
 from typing import NamedTuple
@@ -38,22 +41,26 @@ from ...acoustics.spectra import (
     SlidingAverage,
     SnapshotStream,
 )
-from ...measurements import CrossSpectra, Pressure, Rejection
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection
 from ...measurements.fathometer import MAX_FREQUENCIES
 from .config import FathometerConfig
 
 LEAST_REACH, MOST_REACH = 10.0, 12_000.0
-"""m below the array for which automatic snapshots are made, whatever depths are told."""
+"""m below the array for which automatic snapshots are made, whatever depths are tracked."""
 MAX_BYTES = 1 << 30
 """Of what waits for the end of a record: samples, cross-spectra, snapshots of the preview."""
 _SAMPLES_AT_ONCE = 1 << 24
 _MOST_WAYS, _LEAST_WAYS, _SNAPSHOTS_PER_PHONE = 7.0, 5.0, 2.5
+MOST_HEAVE = 0.05
+"""Standard deviation of the depth within a record, m, above which it is said: a sinusoid of so
+much leaves 0.62 of an echo in 50 Hz to 4 kHz (the mean of J0(2 k A), A its amplitude)."""
+_DEPTHS_KEPT = 10_000
 
 
 class Collected(NamedTuple):
     """Cross-spectra of a record; snapshots: how many independent ones they are worth; seconds:
-    length of a snapshot of pressure; depth_std: how much the told depth of the array varied
-    between the blocks, m, 0 when not told."""
+    length of a snapshot of pressure; depth_std: how much the depth that came with the blocks
+    varied, m, 0 when none did."""
 
     spectra: CrossSpectra
     snapshots: float
@@ -61,15 +68,16 @@ class Collected(NamedTuple):
     depth_std: float = 0.0
 
 
-class _Depths:
-    """Mean and standard deviation of told depths, each counted as often as it has samples."""
+class _BlockDepths:
+    """Mean and standard deviation of the depths that come with blocks, each counted as often as it
+    has samples."""
 
     def __init__(self) -> None:
-        self._told = True
+        self._stated = True
         self._first, self._sums = 0.0, np.zeros(3)
 
     def add(self, depth: float | None, samples: int) -> None:
-        self._told &= depth is not None
+        self._stated &= depth is not None
         if depth is not None:
             if not self._sums[0]:
                 self._first = depth
@@ -78,8 +86,8 @@ class _Depths:
 
     @property
     def mean(self) -> float | None:
-        """None when a block did not tell one."""
-        if not self._told or not self._sums[0]:
+        """None when a block came without."""
+        if not self._stated or not self._sums[0]:
             return None
         return self._first + float(self._sums[1] / self._sums[0])
 
@@ -114,6 +122,8 @@ class PressureStream:
         self.counts = counts
         self._shape: tuple[int, float] | None = None
         self._next_ns = 0
+        self._alive: NDArray[np.bool_] = np.ones(0, np.bool_)
+        self._depths = _BlockDepths()
 
     def push(self, block: Pressure, reach: float) -> tuple[list[Collected], list[Collected]]:
         """Records and previews that `block` completes, each with the stamp of the block. reach: m
@@ -123,16 +133,17 @@ class PressureStream:
         self._follow(block, reach)
         self._alive &= block.alive
         self._depths.add(block.reference_depth, len(block))
-        records, previews = [], []
+        records: list[Collected] = []
+        previews: list[Collected] = []
         size = max(self._snapshots.length, _SAMPLES_AT_ONCE // block.hydrophones)
         for first in range(0, len(block), size):
             spectra = self._snapshots.push(block.pressure[first : first + size])
-            records += [self._record(one, block) for one in self._blocks.push(spectra)]
+            records += [self._record(average, block) for average in self._blocks.push(spectra)]
             sliding = self._sliding.push(spectra) if self._sliding else []
-            previews = [self._record(one, block) for one in sliding[-1:]] or previews
+            previews = [self._record(average, block) for average in sliding[-1:]] or previews
         if records:
             self._alive = block.alive.copy()
-            self._depths = _Depths()
+            self._depths = _BlockDepths()
         return records, [] if records else previews
 
     @property
@@ -185,8 +196,8 @@ class PressureStream:
         self._snapshots = SnapshotStream(length, hop, slice(first, last + 1), config.window)
         self._blocks = BlockAverage(count, straddling)
         self._sliding = SlidingAverage(count, min(step, count)) if step else None
-        self._alive: NDArray[np.bool_] = np.ones(block.hydrophones, np.bool_)
-        self._depths = _Depths()
+        self._alive = np.ones(block.hydrophones, np.bool_)
+        self._depths = _BlockDepths()
         self._shape = block.hydrophones, rate
 
     def _check_memory(self, phones: int, length: int, rows: int, kept: int) -> None:
@@ -215,3 +226,39 @@ class PressureStream:
         config = self.config
         worth = effective_snapshots(config.window, config.overlap, average.snapshots)
         return Collected(spectra, worth, 1.0 / self._spacing, self._depths.std)
+
+
+class CompanionDepths:
+    """The newest depths of the array, as a companion instrument has them, by stamp."""
+
+    def __init__(self) -> None:
+        self._depths: list[tuple[int, float]] = []
+
+    def add(self, depth: ArrayDepth) -> None:
+        insort(self._depths, (depth.stamp_ns, depth.depth))
+        del self._depths[:-_DEPTHS_KEPT]
+
+    def over(self, stamp_ns: int, span_ns: int, config: FathometerConfig) -> float | None:
+        """The mean depth, m, over `span_ns` before the stamp; else `nearest`."""
+        within = self._within(stamp_ns, span_ns)
+        return float(np.mean(within)) if within else self.nearest(stamp_ns, config)
+
+    def nearest(self, stamp_ns: int, config: FathometerConfig) -> float | None:
+        """The depth, m, nearest in time; None when there is none that is recent enough."""
+        place = bisect_right(self._depths, (stamp_ns, np.inf))
+        near = self._depths[max(0, place - 1) : place + 1]
+        if near:
+            stamp, depth = min(near, key=lambda entry: abs(entry[0] - stamp_ns))
+            if abs(stamp - stamp_ns) <= config.array_depth_age * 1e9:
+                return depth
+        return None
+
+    def spread(self, stamp_ns: int, span_ns: int) -> float:
+        """Standard deviation of the depth over `span_ns` before the stamp, m; 0 of nothing."""
+        within = self._within(stamp_ns, span_ns)
+        return float(np.std(within)) if within else 0.0
+
+    def _within(self, stamp_ns: int, span_ns: int) -> list[float]:
+        low = bisect_left(self._depths, (stamp_ns - span_ns, -np.inf))
+        high = bisect_right(self._depths, (stamp_ns, np.inf))
+        return [depth for _, depth in self._depths[low:high]]

@@ -12,16 +12,27 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Reflectors as they are reported: depth, amplitude, identity.
+"""Reflectors as they are reported: depth, amplitude, identity, and which are multiples.
 
-The filter knows sets; who is who from record to record is decided here, after it. A reflector
-found near one of the record before takes over its id, the nearest pair first; one that was missed
-is waited for `track_memory` records, and ids are never used again.
+**Identity.** The filter knows sets; who is who from record to record is decided here, after it. A
+reflector found near one of the record before takes over its id, the nearest pair first; one that
+was missed is waited for `track_memory` records, and ids are never used again.
+
+**Multiples** are echoes that were reflected more than once. By depths from the surface, in which
+every way is counted once: a surface multiple lies at ``z_i + z_j``, its amplitude has the sign of
+``-a_i a_j``; a peg-leg, reflected down once more by a layer k above j and q, lies at ``z_j + z_q -
+z_k`` with the sign of ``-a_j a_q a_k``.
+
+How far a track is from such a place, record by record, is small for a multiple; for a primary it
+begins anywhere and walks, since layers move each for themselves. Both are Gaussian with a
+twentieth of outliers, without which one wrong association would decide. What pairs and triples
+there are share the prior probability evenly. A multiple is marked, never deleted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 from attrs import evolve, frozen
@@ -32,15 +43,17 @@ from ...acoustics.fathometer import sediment_thickness
 from ...acoustics.pulse import gram, Pulse
 from ...acoustics.spectra import window_overlap
 from ...estimates import Estimate
-from ...estimation.arrays import FloatArray
-from ...estimation.set_members import Members
+from ...estimation.arrays import FloatArray, IntArray
+from ...estimation.set_filter import Members
 from .config import FathometerConfig
-from .multiples import Seen
 from .response import Lattice, Response
 
 IdArray = NDArray[np.uint32]
 _REACH, BOTTOM_REACH = 4.0, 12.0
 """How many `depth_std` a reflector, and the first return in scatter, may jump and keep its id."""
+PRIOR, OUTLIERS, RECORDS = 0.25, 0.05, 30
+MOST_WAYS = 200
+_NEAR = 6.0
 
 
 class Identified(NamedTuple):
@@ -72,9 +85,9 @@ class Identities:
         ids[new] = self.next_id + np.arange(len(new))
         seen = [Identified(int(i), float(z), 0) for i, z in zip(ids, depth)]
         missed = [
-            one._replace(missed=one.missed + 1)
-            for one in self.reflectors
-            if one.track_id not in ids and one.missed < config.track_memory
+            known._replace(missed=known.missed + 1)
+            for known in self.reflectors
+            if known.track_id not in ids and known.missed < config.track_memory
         ]
         if config.scatter_decay and len(depth) and not bottom_id:
             bottom_id = _id_of_bottom(ids, is_bottom)
@@ -92,7 +105,7 @@ class Identities:
         row = int(np.argmax(is_bottom))
         if not is_bottom[row] > 0.5:
             return self.bottom_id
-        before = next((one for one in self.reflectors if one.track_id == self.bottom_id), None)
+        before = next((each for each in self.reflectors if each.track_id == self.bottom_id), None)
         if before is None:
             return int(ids[row])
         steps = abs(depth[row] - before.depth) / np.sqrt(1.0 + before.missed) / config.depth_std
@@ -115,7 +128,7 @@ def _id_of_bottom(ids: IdArray, is_bottom: FloatArray) -> int:
 def nearest_ids(
     depth: FloatArray, earlier: Sequence[Identified], config: FathometerConfig
 ) -> IdArray:
-    """Ids (K,) for reflectors at `depth` (K,): those of the `earlier` ones that are near enough,
+    """Ids (K,) for reflectors at `depth` (K,): those of those `earlier` that are near enough,
     the most probable pairs first; 0: none.
 
     A reflector walks by `depth_std` a record: of those seen equally long ago the nearest is the
@@ -126,8 +139,8 @@ def nearest_ids(
     taken = np.zeros(len(earlier), np.bool_)
     if not len(depth) or not earlier:
         return ids
-    distance = np.abs(depth[:, None] - np.array([one.depth for one in earlier]))
-    records = 1.0 + np.array([one.missed for one in earlier])
+    distance = np.abs(depth[:, None] - np.array([known.depth for known in earlier]))
+    records = 1.0 + np.array([known.missed for known in earlier])
     reach = np.maximum(config.min_separation, _REACH * config.depth_std * np.sqrt(records))
     surprise = np.square(distance / config.depth_std) / records + np.log(records)
     for place in np.argsort(surprise, axis=None, kind='stable'):
@@ -141,7 +154,7 @@ def nearest_ids(
 class Reflectors:
     """K reflectors of one record, by depth: depth (K,) m, amplitude (K,) of the response,
     covariance (K, 2, 2) of both, existence (K,), is_bottom (K,): the probability that nothing lies
-    above it; heave and heave_std: told minus true depth of the array, m, 0 where it is no state.
+    above it; heave and heave_std: stated minus true depth of the array, m, 0 where it is no state.
     """
 
     depth: FloatArray
@@ -171,8 +184,8 @@ def reflectors_of(
     covariance[:, 1, 1] += _conditional_variance(depth, members.prior_variance, pulse, config)
     scale = np.stack([np.full(len(depth), lattice.step), sigma], axis=-1)
     covariance *= scale[:, :, None] * scale[:, None, :]
-    # The particles know depths as they follow from the depth told with this record: it alone fixes
-    # them to some centimetres, so that the errors of earlier records have no say.
+    # The particles know depths as they follow from the depth stated with this record: it alone
+    # fixes them to some centimetres, so that the errors of earlier records have no say.
     # Where it is a state, the places of the particles are spread by what is not known of it.
     if heave is None:
         covariance[:, 0, 0] += config.array_depth_std**2
@@ -250,7 +263,7 @@ def write_estimate(
     row whose depth is NaN, for the PMF's sake."""
     rows = max(1, len(ids))
     state, covariance = np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
-    extras = {
+    extras: dict[str, np.ndarray] = {
         'track_id': np.zeros(rows, np.uint32),
         'existence': np.zeros(rows),
         'relative_amplitude': np.full(rows, np.nan),
@@ -290,3 +303,155 @@ def write_estimate(
         probabilities=np.tile(pmf, (rows, 1)),
         extras=extras,
     )
+
+
+class Seen(NamedTuple):
+    """The reflectors of one record, by depth: track_id (K,), depth (K,) m, variance (K,) of the
+    depth without the error of the array's, sign (K,), datum: variance of the array's depth."""
+
+    track_id: NDArray[np.uint32]
+    depth: FloatArray
+    variance: FloatArray
+    sign: FloatArray
+    datum: float
+
+
+class Ways(NamedTuple):
+    """Ways by which sound could come from where a reflector seems to be: member (H, 3) of the
+    reflectors above, factor (H, 3) of their depths, datum (H,) how often the error of the array's
+    depth is left, sign (H,) of the amplitude."""
+
+    member: IntArray
+    factor: FloatArray
+    datum: FloatArray
+    sign: FloatArray
+
+
+@frozen
+class Multiples:
+    """The reflectors of the last records. A value: `after` makes a new one."""
+
+    seen: tuple[Seen, ...] = ()
+
+    def after(self, record: Seen) -> Multiples:
+        return evolve(self, seen=(*self.seen, record)[-RECORDS:])
+
+    def probabilities(self, record: Seen, config: FathometerConfig, span: float) -> FloatArray:
+        """Probability (K,) that each reflector of `record` is a multiple of others; span: of the
+        depths that are tracked, m."""
+        K, found = len(record.depth), np.zeros(len(record.depth))
+        if not K:
+            return found
+        past = (*self.seen, record)[-RECORDS:]
+        depth, variance = _histories(past, record.track_id)
+        datum = np.array([record.datum for record in past])
+        for target in range(1, K):
+            ways = ways_above(record.depth, record.sign, target)
+            off = _offsets(depth[-1:], variance[-1:], datum[-1:], ways, target)
+            reach = _NEAR * np.sqrt(off[1][0]) + config.depth_std
+            near = np.flatnonzero(np.abs(off[0][0]) <= reach)
+            if len(near) > MOST_WAYS:
+                near = near[np.argsort(np.abs(off[0][0][near]), kind='stable')[:MOST_WAYS]]
+            if not len(near):
+                continue
+            close = Ways(ways.member[near], ways.factor[near], ways.datum[near], ways.sign[near])
+            odds = np.exp(
+                np.minimum(_log_odds(depth, variance, datum, close, target, config, span), 300.0)
+            )
+            if config.negative_share:
+                odds *= _sign_odds(close.sign == record.sign[target], record.sign[target], config)
+            total = PRIOR / (1.0 - PRIOR) * float(odds.sum()) / len(ways.sign)
+            found[target] = total / (1.0 + total)
+        return found
+
+
+def ways_above(depth: FloatArray, sign: FloatArray, target: int) -> Ways:
+    """Pairs and triples of the reflectors above `target`; depth (K,) ascending, sign (K,)."""
+    member, factor, datum = _combinations(target)
+    signs = sign[member]
+    product = -signs[:, 0] * signs[:, 1] * np.where(factor[:, 2] != 0.0, signs[:, 2], 1.0)
+    return Ways(member, factor, datum, product)
+
+
+@cache
+def _combinations(count: int) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Members, factors and share in the datum of `Ways`, of the first `count` reflectors."""
+    first, second = np.triu_indices(count)
+    # k above j and q: every pair has as many triples as there are reflectors above its upper one.
+    upper = np.repeat(np.arange(len(first)), first)
+    above = np.concatenate([np.arange(j) for j in first]) if len(first) else np.arange(0)
+    pairs = np.column_stack([first, second, np.zeros_like(first)])
+    triples = np.column_stack([first[upper], second[upper], above])
+    member = np.concatenate([pairs, triples]).astype(np.int64)
+    factor = np.repeat([[1.0, 1.0, 0.0], [1.0, 1.0, -1.0]], [len(pairs), len(triples)], axis=0)
+    datum = np.repeat([1.0, 0.0], [len(pairs), len(triples)])
+    return member, factor, datum
+
+
+def _offsets(
+    depth: FloatArray, variance: FloatArray, datum: FloatArray, ways: Ways, target: int
+) -> tuple[FloatArray, FloatArray]:
+    """How far (T, H) the target is from the end of each way, and its variance (T, H) if it were
+    there, NaN where one of them was not seen."""
+    # A way that is gone twice has twice the error.
+    twice = (ways.member[:, 0] == ways.member[:, 1])[:, None] * [[1.0, 1.0, 0.0]]
+    square = np.square(ways.factor) + twice
+    used = ways.factor != 0.0
+    parts = np.where(used, depth[:, ways.member] * ways.factor, 0.0)
+    errors = np.where(used, variance[:, ways.member] * square, 0.0)
+    off = depth[:, target, None] - parts.sum(axis=2)
+    return off, variance[:, target, None] + errors.sum(axis=2) + datum[:, None] * ways.datum
+
+
+def _log_odds(
+    depth: FloatArray,
+    variance: FloatArray,
+    datum: FloatArray,
+    ways: Ways,
+    target: int,
+    config: FathometerConfig,
+    span: float,
+) -> FloatArray:
+    """Log likelihood ratio (H,) of a multiple to a primary."""
+    off, spread = _offsets(depth, variance, datum, ways, target)
+    walk = config.depth_std**2 * (1.0 + np.square(ways.factor).sum(axis=1))
+    seen = np.isfinite(off)
+    # The last record before, at which the target and its way were seen; -1 for none.
+    record = np.arange(len(off))[:, None]
+    last = np.maximum.accumulate(np.where(seen, record, -1), axis=0)
+    last = np.concatenate([np.full_like(last[:1], -1), last[:-1]])
+    there, way = np.maximum(last, 0), np.arange(off.shape[1])
+    walked = spread + spread[there, way] + (record - last) * walk
+    # Before the first a primary can be anywhere.
+    primary = np.where(last >= 0, _density(off - off[there, way], walked, span), 1.0 / span)
+    ratio = np.log(_density(off, spread, span)) - np.log(primary)
+    # Summed up in the order of the records, whatever the number of ways.
+    return np.asarray(np.cumsum(np.where(seen, ratio, 0.0), axis=0)[-1])
+
+
+def _histories(past: Sequence[Seen], track_id: NDArray[np.uint32]) -> tuple[FloatArray, ...]:
+    """Depth and variance (T, K) of the reflectors `track_id` (K,) in `past` records, NaN where
+    they were not seen."""
+    found = np.full((2, len(past), len(track_id)), np.nan)
+    every = np.concatenate([record.track_id for record in past])
+    row = np.repeat(np.arange(len(past)), [len(record.track_id) for record in past])
+    order = np.argsort(track_id)
+    place = np.minimum(np.searchsorted(track_id, every, sorter=order), len(track_id) - 1)
+    column = order[place]
+    use = track_id[column] == every
+    for values, name in zip(found, ('depth', 'variance')):
+        values[row[use], column[use]] = np.concatenate([getattr(record, name) for record in past])[
+            use
+        ]
+    return tuple(found)
+
+
+def _density(x: FloatArray, variance: FloatArray, span: float) -> FloatArray:
+    normal = np.exp(-0.5 * np.square(x) / variance) / np.sqrt(2.0 * np.pi * variance)
+    return np.asarray((1.0 - OUTLIERS) * normal + OUTLIERS / span)
+
+
+def _sign_odds(agrees: NDArray[np.bool_], sign: float, config: FathometerConfig) -> FloatArray:
+    """How much more probable the sign is for a multiple, a twentieth of whose signs are wrong."""
+    share = config.negative_share
+    return np.asarray(np.where(agrees, 0.95, 0.05) / (share if sign < 0.0 else 1.0 - share))

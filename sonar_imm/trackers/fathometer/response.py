@@ -12,25 +12,43 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From what an array or a profiler heard to one row of numbers: the depth response of a record.
+"""From the record of an array or a profiler to one row of numbers: its depth response.
 
 A `Lattice` of depths is laid out at the first record and kept. Every record, wherever the array
-was, is put onto it: its `Response` is what the particles see.
+was, is put onto it: its `Response` is what the particles are weighed by. Traces come as they are;
+of an array the cross-spectra are looked at upward and downward at once, and correlated.
+
+An envelope, such as sub-bottom profilers record, has the pulse of an envelope, is never negative,
+and stands in the volume scatter of the floor. How wide the pulse is and what noise there is depend
+on the instrument; the rest is common (`envelope_parameters`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from attrs import evolve, field, frozen
 import numpy as np
+from numpy.typing import NDArray
 
 from ...acoustics import fathometer
-from ...acoustics.pulse import band_pulse, envelope_pulse, gaussian_pulse, measured_pulse, Pulse
+from ...acoustics.pulse import (
+    band_pulse,
+    envelope_pulse,
+    gaussian_pulse,
+    independent_samples,
+    measured_pulse,
+    Pulse,
+    SampledPulse,
+)
+from ...acoustics.spectra import noise_taper
 from ...estimation.arrays import FloatArray
-from ...estimation.set_model import move_reach
+from ...estimation.set_model import walk_reach
+from ...estimation.set_scatter import decaying_profile, Scatter
 from ...estimation.set_shifts import Shift
-from ...measurements import Rejection, Trace
+from ...measurements import CrossSpectra, Rejection, Trace
 from ...parameters import ConfigError
 from .config import FathometerConfig
 
@@ -43,6 +61,9 @@ LOUDEST = 1e100
 """Of a trace, whatever its unit: squares of what is louder are beyond numbers."""
 LEAST_NOISE_SAMPLES = 50
 _SINGULAR = 'the cross-spectral matrices are singular: use more loading or more snapshots'
+DECAYS = (2.0, 4.0, 8.0, 16.0)
+"""Depths, m, over which the scatter of an envelope may fall to 1/e: silt with gas to sand."""
+MAX_SCATTER_CELLS = 10_000
 
 
 @frozen
@@ -55,7 +76,7 @@ class Lattice:
 
     @property
     def depth(self) -> FloatArray:
-        return self.first + self.step * np.arange(self.cells)
+        return self.first + self.step * np.arange(self.cells, dtype=np.float64)
 
     def padded(self, cells: int) -> Lattice:
         """With so many more cells at either end."""
@@ -129,6 +150,44 @@ def depths_wanted(config: FathometerConfig, reference_depth: float) -> tuple[flo
     return _window(config, (reference_depth + 10.0, reference_depth + 110.0))
 
 
+def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:
+    wanted = (high - first) / step + 1.0 + 1e-6
+    if not wanted >= 2.0:
+        raise Rejection('other_depths', 'the record does not reach the depths to be tracked')
+    # With heave the record is needed further up and down.
+    padded = wanted + (9.0 * config.array_depth_std / step if config.heave != 'none' else 0.0)
+    if padded > MAX_CELLS:
+        raise Rejection(
+            'too_large',
+            f'the depths to be tracked make {padded:.0f} steps of {step:g} m; {MAX_CELLS} at most',
+        )
+    reach = walk_reach(config.depth_std / step)
+    if padded * (2.0 * reach + 1.0) > MAX_MOVES:
+        raise Rejection(
+            'too_large',
+            f'{padded:.0f} steps of {step:g} m, from each of which a reflector can move by '
+            f'{reach:.0f} (depth_std {config.depth_std:g} m), are '
+            f'{padded * (2.0 * reach + 1.0):.3g} moves; {MAX_MOVES} at most: use a greater '
+            'depth_step or fewer depths',
+        )
+    return Lattice(first, step, int(wanted))
+
+
+def _window(config: FathometerConfig, otherwise: tuple[float, float]) -> tuple[float, float]:
+    return (config.depth_min, config.depth_max) if config.depth_max else otherwise
+
+
+def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
+    """The heave as a shift in cells of `step` m: on a grid that is finer than reflectors move and
+    than the heave changes."""
+    if config.heave == 'none':
+        return None
+    memory = config.heave_memory if config.heave == 'memory' else 0.0
+    std = config.array_depth_std / step
+    fine = min(config.depth_std / step / 3.0, 0.5 * std * np.sqrt(1.0 - memory**2))
+    return Shift(std=std, memory=memory, step=int(max(1.0, fine, np.ceil(4.0 * std / 200.0))))
+
+
 def trace_response(
     trace: Trace, lattice: Lattice, config: FathometerConfig, reference_depth: float
 ) -> Response:
@@ -177,9 +236,9 @@ def _loudest_noise(trace: Trace) -> float:
 def residual_sigma(response: Response, fitted: FloatArray) -> Response:
     """`response` with the noise that is left where the reflectors' own response `fitted` (n,) is
     taken off; as it was when that has no noise."""
-    heard = response.amplitude != 0.0
+    reached = response.amplitude != 0.0
     try:
-        sigma = measured_sigma((response.amplitude - fitted)[heard])
+        sigma = measured_sigma((response.amplitude - fitted)[reached])
     except Rejection:
         return response
     return evolve(response, sigma=np.full(len(response.depth), sigma))
@@ -195,39 +254,233 @@ def measured_sigma(quiet: FloatArray) -> float:
     return sigma
 
 
-def _window(config: FathometerConfig, otherwise: tuple[float, float]) -> tuple[float, float]:
-    return (config.depth_min, config.depth_max) if config.depth_max else otherwise
+def array_response(
+    record: CrossSpectra,
+    lattice: Lattice,
+    config: FathometerConfig,
+    reference_depth: float,
+    *,
+    mirrored: bool = False,
+) -> Response:
+    """Look up and down with the array and correlate. mirrored: noise is measured in the mirror
+    window even where depths are configured for it. Raises `Rejection` ('bad_band',
+    'bad_frequency', 'singular', 'no_noise')."""
+    coherence = array_coherence(record, config)
+    gamma, first, spacing, aperture = coherence[:4]
+    seconds = config.snapshot_seconds or 1.0 / spacing
+    pulse = None
+    if config.pulse == 'processor' and config.processor == 'mvdr':
+        pulse = processor_pulse(coherence, lattice, config.sound_speed)
+
+    def at(low: float, step: float, count: int, *, envelope: bool = False) -> FloatArray:
+        return fathometer.depth_response(
+            gamma,
+            first,
+            spacing,
+            (low, step, count),
+            reference_depth,
+            config.sound_speed,
+            envelope=envelope,
+        )
+
+    def taper(depth: FloatArray) -> FloatArray:
+        way = 2.0 * (depth - reference_depth) / config.sound_speed
+        return noise_taper(config.window, config.overlap, way / seconds)
+
+    # The noise of an envelope is that of the response: its own scatter is less.
+    b = at(lattice.first, lattice.step, lattice.cells, envelope=config.envelope)
+    # Nearer than its own length the array hears itself.
+    b[lattice.depth - reference_depth < aperture] = 0.0
+    sigma = np.full(lattice.cells, config.noise_sigma)
+    if not config.noise_sigma and (mirrored or config.noise_from_mirror):
+        sigma[:] = mirror_sigma(at, lattice, reference_depth, aperture)
+    elif not config.noise_sigma:
+        span = config.noise_depth_max - config.noise_depth_min
+        step = max(lattice.step, span / MAX_CELLS)
+        low = max(config.noise_depth_min, reference_depth + 2.0 * aperture)
+        quiet = Lattice(low, step, max(int(span / step), LEAST_NOISE_SAMPLES))
+        # The deeper, the less is left of the noise, too: it is measured deeper than it is needed.
+        flat = at(quiet.first, quiet.step, quiet.cells) / taper(quiet.depth)
+        sigma = measured_sigma(flat) * taper(lattice.depth)
+    return Response(
+        record.stamp_ns,
+        record.frame_id,
+        lattice.depth,
+        b,
+        sigma,
+        reference_depth,
+        aperture,
+        seconds,
+        pulse,
+    )
 
 
-def heave_shift(config: FathometerConfig, step: float) -> Shift | None:
-    """The heave as a shift in cells of `step` m: on a grid that is finer than reflectors move and
-    than the heave changes."""
-    if config.heave == 'none':
+def processor_pulse(coherence: ArrayCoherence, lattice: Lattice, sound_speed: float) -> Pulse:
+    """The pulse that the processor leaves of a reflector, by its spectrum: a table over all lags
+    of the lattice, four to a cell."""
+    step, count = 0.25 * lattice.step, 4 * lattice.cells
+    spectrum = np.where(np.isfinite(coherence.gamma), coherence.weight, np.nan).astype(
+        np.complex128
+    )
+    value = fathometer.depth_response(
+        spectrum, coherence.first, coherence.spacing, (0.0, step, count), 0.0, sound_speed
+    )
+    return SampledPulse(step * np.arange(count, dtype=np.float64), value / value[0])
+
+
+def mirror_sigma(
+    at: Callable[[float, float, int], FloatArray],
+    lattice: Lattice,
+    reference_depth: float,
+    aperture: float,
+) -> float:
+    """Noise of a response where it holds no echo: at the lags of the lattice, negative, that is at
+    the depths 2 reference_depth - z. It fades there as it does on the lattice. Left out: what is
+    nearer than the aperture. at(first, step, count): the response."""
+    # A short lattice is made longer.
+    count = max(lattice.cells, 4 * LEAST_NOISE_SAMPLES)
+    first = 2.0 * reference_depth - lattice.first - lattice.step * (count - 1)
+    depth = first + lattice.step * np.arange(count)
+    quiet = reference_depth - depth >= aperture
+    if np.count_nonzero(quiet) < LEAST_NOISE_SAMPLES:
+        raise Rejection('no_noise', 'nothing of the mirrored depths is free of the array itself')
+    noise = at(first, lattice.step, count)[quiet]
+    # The noise of a coherence has mean zero: no median of it is taken off.
+    return measured_sigma(np.append(noise, -noise))
+
+
+class ArrayCoherence(NamedTuple):
+    """gamma (F,) at the frequencies ``first + spacing * row``, NaN where there is none; first and
+    spacing in Hz; aperture: length of the array, m; weight (F,): the spectrum of an echo, NaN as
+    gamma."""
+
+    gamma: NDArray[np.complexfloating]
+    first: float
+    spacing: float
+    aperture: float
+    weight: FloatArray
+
+
+def array_coherence(record: CrossSpectra, config: FathometerConfig) -> ArrayCoherence:
+    """What the array hears from above and below at once. Raises `Rejection`."""
+    rows = np.flatnonzero(
+        (record.frequency >= config.frequency_min - 1e-6)
+        & (record.frequency <= config.frequency_max + 1e-6)
+    )
+    if len(rows) < 2:
+        raise Rejection(
+            'bad_band',
+            f'{len(rows)} frequencies lie between {config.frequency_min:g} Hz and '
+            f'{config.frequency_max:g} Hz; 2 are needed',
+        )
+    index, spacing = _comb(record.frequency[rows])
+    use = record.usable[rows]
+    if not use.any():
+        raise Rejection('nan', 'no frequency of the band has only finite, positive powers')
+    if config.processor == 'mvdr' and config.loading < 1e-9 and rank_deficient(record):
+        raise Rejection('singular', _SINGULAR)
+    alive = np.flatnonzero(record.alive)
+    heights = config.element_spacing * alive
+    csdm = record.csdm[rows[use]][:, alive[:, None], alive]
+    w = fathometer.steering(record.frequency[rows[use]], heights, config.sound_speed)
+    try:
+        found, power = _both_beams(csdm, w, config)
+    except np.linalg.LinAlgError:
+        found, power = np.full(len(csdm), np.nan), np.full(len(csdm), np.nan)
+    if config.output == 'coherence':
+        # A coherence above one is rounding: nothing was left of the matrix.
+        found[np.abs(found) > 1.0 + 1e-6] = np.nan
+    if not np.isfinite(found).any():
+        raise Rejection('singular', _SINGULAR)
+    gamma = np.full(index[-1] + 1, np.nan, np.complex128)
+    gamma[index[use]] = found
+    weight, there = np.full(len(gamma), np.nan), np.isfinite(found)
+    frequency = record.frequency[rows[use]]
+    weight[index[use][there]] = fathometer.echo_spectrum(
+        csdm[there], frequency[there], power[there]
+    )
+    aperture = float(heights[-1] - heights[0])
+    return ArrayCoherence(gamma, float(record.frequency[rows[0]]), spacing, aperture, weight)
+
+
+def _both_beams(
+    csdm: NDArray[np.complexfloating], w: NDArray[np.complexfloating], config: FathometerConfig
+) -> tuple[NDArray[np.complexfloating], FloatArray]:
+    """The output of the processor (F,), and the root of the powers of its beams (F,)."""
+    if config.output == 'printed':
+        found = fathometer.printed_correlation(csdm, w, config.processor, loading=config.loading)
+        return found, np.ones(len(found))
+    gamma, power = fathometer.coherence_and_power(
+        csdm, w, config.processor, loading=config.loading, gain_db=config.white_noise_gain_db
+    )
+    return (gamma if config.output == 'coherence' else gamma * power), power
+
+
+def rank_deficient(record: CrossSpectra) -> bool:
+    """True when the matrix in the middle of the band says less than its size: fewer snapshots than
+    hydrophones, or hydrophones that hear the same."""
+    middle = np.flatnonzero(record.usable)[record.usable.sum() // 2]
+    values = np.linalg.eigvalsh(record.csdm[middle][np.ix_(record.alive, record.alive)])
+    return bool(values[0] < 1e-6 * values[-1])
+
+
+def _comb(frequency: FloatArray) -> tuple[NDArray[np.int64], float]:
+    """Whole numbers (F,), from 0 on, and the spacing they multiply."""
+    apart = np.diff(frequency)
+    steps = np.round(apart / np.min(apart))
+    # The smallest of many distances in single precision is too small: round twice.
+    steps = np.round(apart / (apart[steps == 1.0].mean()))
+    index = np.append(0, np.cumsum(steps)).astype(np.int64)
+    spacing = float(frequency[-1] - frequency[0]) / float(index[-1])
+    if index[-1] > 1_000_000 or (
+        np.abs(frequency - frequency[0] - spacing * index).max() > 0.01 * spacing
+    ):
+        raise Rejection('bad_frequency', 'the frequencies are no multiples of one spacing')
+    return index, spacing
+
+
+def envelope_parameters(pulse_width: float, noise_sigma: float) -> dict[str, Any]:
+    """Parameters of the tracker by name, for a pulse of standard deviation `pulse_width`, m, and
+    noise of `noise_sigma`, in the units of the record."""
+    return {
+        'pulse': 'gaussian',
+        'pulse_width': pulse_width,
+        'noise_sigma': noise_sigma,
+        'scatter_decay': DECAYS,
+        # Two pulses nearer than that make one hump.
+        'min_separation': 3.0 * pulse_width,
+        # Records come several a second and the floor slopes; 1.4 m a record can be followed.
+        'depth_std': 0.35,
+        'order_max': 6,
+    }
+
+
+def scatter_of(config: FathometerConfig, lattice: Lattice) -> Scatter | None:
+    """The background below the first reflector, on the cells of a record. Raises ValueError for
+    too many of them."""
+    if not config.scatter_decay:
         return None
-    memory = config.heave_memory if config.heave == 'memory' else 0.0
-    std = config.array_depth_std / step
-    fine = min(config.depth_std / step / 3.0, 0.5 * std * np.sqrt(1.0 - memory**2))
-    return Shift(std=std, memory=memory, step=int(max(1.0, fine, np.ceil(4.0 * std / 200.0))))
-
-
-def _checked(first: float, step: float, high: float, config: FathometerConfig) -> Lattice:
-    wanted = (high - first) / step + 1.0 + 1e-6
-    if not wanted >= 2.0:
-        raise Rejection('other_depths', 'the record does not reach the depths to be tracked')
-    # With heave the record is looked at further up and down.
-    heard = wanted + (9.0 * config.array_depth_std / step if config.heave != 'none' else 0.0)
-    if heard > MAX_CELLS:
-        raise Rejection(
-            'too_large',
-            f'the depths to be tracked make {heard:.0f} steps of {step:g} m; {MAX_CELLS} at most',
+    pulse, step = pulse_of(config), lattice.step
+    shift = heave_shift(config, step)
+    cells = lattice.cells + (2 * shift.pad if shift else 0)
+    if cells > MAX_SCATTER_CELLS:
+        raise ValueError(
+            f'volume scatter is looked for on up to {MAX_SCATTER_CELLS} steps of depth, not '
+            f'{cells}: use a greater depth_step or fewer depths'
         )
-    reach = move_reach(config.depth_std / step)
-    if heard * (2.0 * reach + 1.0) > MAX_MOVES:
-        raise Rejection(
-            'too_large',
-            f'{heard:.0f} steps of {step:g} m, from each of which a reflector can move by '
-            f'{reach:.0f} (depth_std {config.depth_std:g} m), are '
-            f'{heard * (2.0 * reach + 1.0):.3g} moves; {MAX_MOVES} at most: use a greater '
-            'depth_step or fewer depths',
+    independent = independent_samples(pulse, step * cells, 0.25 * step) / cells
+    decays = np.asarray(config.scatter_decay) / step
+    profile = decaying_profile(pulse(step * np.arange(cells, dtype=np.float64)), decays)
+    # Wide enough to take out a pulse: twice what of it is above one half.
+    half = (
+        float(
+            np.count_nonzero(pulse(0.01 * step * np.arange(100 * cells, dtype=np.float64)) > 0.5)
         )
-    return Lattice(first, step, int(wanted))
+        / 100.0
+    )
+    return Scatter(
+        profile=profile,
+        spread=config.scatter_spread,
+        share=min(1.0, independent),
+        window=2 * int(np.ceil(2.0 * half)) + 1,
+    )

@@ -16,8 +16,18 @@
 
     pressure -> cross-spectra (`pressure`)
              -> depth response (`response`): traces come in here
-             -> multiple-model particle filter (`estimation.set_filter`)
+             -> multiple-model particle filter (`estimation.set_filter`), whose particles are
+                sets of reflectors
              -> reflectors with ids (`reflectors`) -> one estimate per record
+
+The cycle of the particle filter, for each record (`FathometerTracker._cycle`):
+
+    propagate   each set: heave of the array, deaths, walks in depth, births
+    weigh       each set by how well it explains the depth response
+    resample    sets by their weights, where few of them count
+    move        heave and depths of each set together, where the array's heave is a state: records
+                tell their sum only
+    summarise   the number of reflectors (order), and where they are
 
 Records are minutes of averaging apart, so that each is taken in once and for good: one that is
 late or repeated is counted and dropped. The random numbers of a record come from its own stamp.
@@ -42,22 +52,18 @@ import numpy as np
 from ...acoustics.pulse import independent_samples
 from ...estimates import Estimate
 from ...estimation.arrays import FloatArray
-from ...estimation.set_filter import LagSmoother, SetFilter, SetStep, Weighted
-from ...estimation.set_members import find_members
-from ...estimation.set_model import banded_transition, gaussian_move, SetModel
-from ...measurements import ArrayDepth, CrossSpectra, Frames, Pressure, Rejection, Trace
-from ..stream import OnceStream, StreamRules
-from .array_depths import array_warnings, MOST_HEAVE, ToldDepths
-from .array_response import array_response, rank_deficient
+from ...estimation.set_filter import find_members, LagSmoother, SetFilter, SetStep, Weighted
+from ...estimation.set_model import banded_transition, gaussian_walk, SetModel
+from ...intake import KnownFrames
+from ...intake.stream import OnceStream, StreamRules
+from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from .config import FathometerConfig
-from .envelopes import scatter_of
-from .fit import Fit
-from .multiples import Multiples
-from .pressure import Collected, PressureStream
+from .pressure import Collected, CompanionDepths, MOST_HEAVE, PressureStream
 from .reflectors import (
     IdArray,
     Identified,
     Identities,
+    Multiples,
     nearest_ids,
     Reflectors,
     reflectors_of,
@@ -65,6 +71,7 @@ from .reflectors import (
     write_estimate,
 )
 from .response import (
+    array_response,
     depths_wanted,
     heave_shift,
     Lattice,
@@ -72,12 +79,17 @@ from .response import (
     lattice_of_trace,
     MAX_SIGMAS,
     pulse_of,
+    rank_deficient,
     residual_sigma,
     Response,
+    scatter_of,
     trace_response,
 )
 
 __all__ = ['FathometerConfig', 'FathometerTracker']
+
+_RECORDS, _LEAST = 100, 10
+_FULL, _UNEXPLAINED, _NEGATIVE = 0.5, 0.05, 1e-9
 
 
 @frozen(eq=False)
@@ -122,7 +134,7 @@ class FathometerTracker:
         self.counts = self._stream.counts
         self.response: Response | None = None
         self._ids = Identities()
-        self._depths = ToldDepths()
+        self._depths = CompanionDepths()
         self._forget()
 
     def _forget(self) -> None:
@@ -132,7 +144,7 @@ class FathometerTracker:
         self._ids = self._ids.forget()
         self._multiples = Multiples()
         self._lattice: Lattice | None = None
-        self._heard: Lattice | None = None
+        self._padded: Lattice | None = None
         self._filter: SetFilter | None = None
         self._before: Weighted | None = None
         self._smoother = LagSmoother(self.config.smoothing_lag)
@@ -146,8 +158,8 @@ class FathometerTracker:
             self._begin(self._lattice)
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: FathometerConfig) -> None:
         self.config.require_changeable(config)
@@ -180,11 +192,22 @@ class FathometerTracker:
 
     def warnings(self) -> list[str]:
         """What of the input leads to estimates that are worse than they say, in sentences."""
-        return [*array_warnings(self.counts), *self._fit.warnings(self.config)]
+        found = []
+        if few := self.counts.get('few_snapshots'):
+            found.append(
+                f'{few} records average fewer independent snapshots than the array has '
+                'hydrophones: make them longer (record_seconds), or track less deep (depth_max)'
+            )
+        if heaving := self.counts.get('heave_within_record'):
+            found.append(
+                f'in {heaving} records the array heaves by more than {MOST_HEAVE:g} m: their '
+                'echoes are weaker than they should be'
+            )
+        return [*found, *self._fit.warnings(self.config)]
 
     def process(self, measurement: Any) -> list[Estimate]:
         if isinstance(measurement, ArrayDepth):
-            self._depths.hear(measurement)
+            self._depths.add(measurement)
             self.counts['array_depths'] += 1
             return []
         admitted = self._stream.admit(measurement)
@@ -205,17 +228,21 @@ class FathometerTracker:
             depth = self._array_depth(item, 0)
             if self._lattice is None:
                 self._begin(lattice_of_trace(item, self.config))
-            assert self._heard is not None
+            assert self._padded is not None
             reference = math.nan if depth is None else depth
-            return self._record(trace_response(item, self._heard, self.config, reference))
+            return self._record(trace_response(item, self._padded, self.config, reference))
         self._count_hydrophones(item)
         if isinstance(item, CrossSpectra):
-            return self._record(self._hear(Collected(item, item.snapshots), 0))
+            return self._record(self._array_response(Collected(item, item.snapshots), 0))
         records, previews = self._pressure.push(item, self._reach(item))
         self.counts['blocks'] += 1
         span_ns = round(self.config.record_seconds * 1e9)
-        estimates = [one for each in records for one in self._record(self._hear(each, span_ns))]
-        return estimates + [self._preview(self._hear(each, span_ns)) for each in previews]
+        made = []
+        for record in records:
+            made += self._record(self._array_response(record, span_ns))
+        for record in previews:
+            made.append(self._preview(self._array_response(record, span_ns)))
+        return made
 
     def _reach(self, block: Pressure) -> float:
         """From hydrophone 0 to the deepest depth that is tracked, m."""
@@ -247,9 +274,9 @@ class FathometerTracker:
             depth = self.config.array_depth or None
         return depth
 
-    # -- one record -------------------------------------------------------------------------------
+    # -- a record ---------------------------------------------------------------------------------
 
-    def _hear(self, collected: Collected, span_ns: int) -> Response:
+    def _array_response(self, collected: Collected, span_ns: int) -> Response:
         record = collected.spectra
         if rank_deficient(record):
             self.counts['rank_deficient'] += 1
@@ -259,13 +286,13 @@ class FathometerTracker:
         depth = self._array_depth(record, span_ns) or 0.0
         if self._lattice is None:
             self._begin(lattice_of_array(depth, self.config))
-        assert self._heard is not None
+        assert self._padded is not None
         # Lags beyond half a snapshot are those of the other side: automatic snapshots of pressure
         # can be too short for the depths of noise.
         way = 2.0 * (self.config.noise_depth_max - depth) / self.config.sound_speed
         folded = span_ns > 0 and not self.config.snapshot_seconds
         folded = folded and way > 0.5 * collected.seconds
-        return array_response(record, self._heard, self.config, depth, mirrored=folded)
+        return array_response(record, self._padded, self.config, depth, mirrored=folded)
 
     def _begin(self, lattice: Lattice) -> None:
         try:
@@ -275,21 +302,22 @@ class FathometerTracker:
         except ValueError as error:
             raise Rejection('too_crowded', str(error)) from None
         self._lattice = lattice
-        self._heard = lattice.padded(self._filter.model.pad)
+        self._padded = lattice.padded(self._filter.model.pad)
 
-    def _try(self, response: Response) -> tuple[Response, SetStep]:
+    def _filtered(self, response: Response) -> tuple[Response, SetStep]:
         """What this record would change. Where its noise is not known, it is measured in what the
         reflectors of a first round leave."""
-        step = self._step(response)
+        step = self._cycle(response)
         if response.noise_unknown:
-            found, _ = self._reflectors(step, response)
+            found, _ = self._summarise(step, response)
             away = response.depth[:, None] - (found.depth + found.heave)
             response = residual_sigma(response, self.pulse(away) @ found.amplitude)
-            step = self._step(response)
+            step = self._cycle(response)
         self.response = response
         return response, step
 
-    def _step(self, response: Response) -> SetStep:
+    def _cycle(self, response: Response) -> SetStep:
+        """The particle filter over one record; what is kept of it is decided by the caller."""
         assert self._filter is not None
         # Beyond a million sigmas the numbers say nothing more, and their squares would overflow.
         with np.errstate(over='ignore', divide='ignore', invalid='ignore'):
@@ -298,16 +326,22 @@ class FathometerTracker:
         key, gram = (self.config.seed, response.stamp_ns), None
         if response.pulse is not None:
             assert self._lattice is not None
-            lags = self._lattice.step * np.arange(self._lattice.cells)
+            lags = self._lattice.step * np.arange(self._lattice.cells, dtype=np.float64)
             gram = np.ascontiguousarray(response.pulse(lags))
-        return self._filter.step(self._before, b, key, gram)
+        particles = self._filter
+        record = particles.record(b, key, gram)
+        before = self._before or particles.start(record)
+        sets = particles.propagate(before, record)
+        step = particles.weigh(sets, record)
+        step = particles.resample(step, record)
+        return particles.move(step, record)
 
     def _record(self, response: Response) -> list[Estimate]:
-        response, step = self._try(response)
+        response, step = self._filtered(response)
         self._before = step.after if step.ok else None
         self.counts['used'] += 1
         self.counts['unexplained'] += not step.ok
-        reflectors, pmf = self._reflectors(step, response)
+        reflectors, pmf = self._summarise(step, response)
         self._ids, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self._taken.append(_Taken(response, self._ids.reflectors))
         self._health.update(
@@ -322,8 +356,8 @@ class FathometerTracker:
         return [*self._smoothed(step), newest]
 
     def _preview(self, response: Response) -> Estimate:
-        response, step = self._try(response)
-        reflectors, pmf = self._reflectors(step, response)
+        response, step = self._filtered(response)
+        reflectors, pmf = self._summarise(step, response)
         _, ids = self._ids.name(reflectors.depth, reflectors.is_bottom, self.config)
         self.counts['previews'] += 1
         return self._write(reflectors, ids, pmf, response, preview=True)
@@ -334,11 +368,11 @@ class FathometerTracker:
         if step is None:
             return []
         response = self._taken[0].response
-        reflectors, pmf = self._reflectors(step, response)
+        reflectors, pmf = self._summarise(step, response)
         # A reflector that only smoothing finds so early has its id from a later record.
         ids = np.zeros(len(reflectors.depth), np.uint32)
         for taken in self._taken:
-            free = [one for one in taken.named if one.track_id not in ids]
+            free = [named for named in taken.named if named.track_id not in ids]
             missing = np.flatnonzero(ids == 0)
             ids[missing] = nearest_ids(reflectors.depth[missing], free, self.config)
         return [self._write(reflectors, ids, pmf, response)]
@@ -362,21 +396,66 @@ class FathometerTracker:
             reflectors, ids, pmf, multiple, response, self.config, preview=preview
         )
 
-    def _reflectors(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
-        """Those of the most probable number, and the PMF (orders,) of the number."""
+    def _summarise(self, step: SetStep, response: Response) -> tuple[Reflectors, FloatArray]:
+        """The reflectors of the most probable order, and the PMF (orders,) of the order."""
         assert self._filter is not None and self._lattice is not None
-        pmf, sums = self._filter.summary(step)
+        pmf, sums, shift = self._filter.summarise(step)
         most = self.config.order_min + int(np.argmax(pmf))
         separation = self._filter.model.separation
         modes = bool(self.config.scatter_decay)
         members = find_members(sums, separation, most, self.config.existence_min, modes=modes)
         heave = None
-        if self._filter.model.shift:
-            mean, std = self._filter.shift(step)
-            heave = self._lattice.step * mean, self._lattice.step * std
+        if shift:
+            heave = self._lattice.step * shift[0], self._lattice.step * shift[1]
         pulse = response.pulse or self.pulse
         found = reflectors_of(members, response, self._lattice, pulse, self.config, heave)
         return found, pmf
+
+
+class Fit:
+    """Whether the last records go with what is configured.
+
+    A filter with another pulse, or a noise that is too low, does not fail: it fills the record
+    with reflectors up to its limit, or finds no set that explains the record. Kept are whether a
+    set explained each record, how probable the greatest number of reflectors was, and whether it
+    has negative samples."""
+
+    def __init__(self) -> None:
+        self._explained: deque[bool] = deque(maxlen=_RECORDS)
+        self._full: deque[float] = deque(maxlen=_RECORDS)
+        self._found: deque[int] = deque(maxlen=_RECORDS)
+        self._signed: deque[bool] = deque(maxlen=_RECORDS)
+
+    def add(self, ok: bool, reflectors: Reflectors, response: Response, full: float) -> None:
+        """One record; full: the probability of the greatest number of reflectors."""
+        self._explained.append(ok)
+        self._full.append(full)
+        self._found.append(len(reflectors.depth))
+        self._signed.append(bool(np.min(response.amplitude) < -_NEGATIVE))
+
+    def warnings(self, config: FathometerConfig) -> list[str]:
+        """What is wrong, with the parameters that it may come from."""
+        if len(self._full) < _LEAST:
+            return []
+        envelope = not any(self._signed)
+        advice = 'noise_sigma, pulse and order_max may not fit'
+        if envelope and (config.pulse == 'band' or not config.scatter_decay):
+            advice = 'the records are never negative: envelopes need pulse gaussian or file, '
+            advice += 'pulse_width and scatter_decay'
+        sentences = []
+        full = float(np.mean(self._full))
+        if config.orders > 1 and full > _FULL:
+            sentences.append(
+                f'{np.mean(self._found):.1f} reflectors a record against a limit of '
+                f'{config.order_max}, which is reached with probability {full:.2f}; {advice}'
+            )
+        unexplained = 1.0 - float(np.mean(self._explained))
+        if unexplained > _UNEXPLAINED:
+            sentences.append(
+                f'no set of reflectors explains {100.0 * unexplained:.0f} % of the records; '
+                f'{advice}'
+            )
+        return sentences
 
 
 def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
@@ -391,8 +470,8 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         separation=max(1, math.ceil(config.min_separation / step - 1e-6)),
         order_min=config.order_min,
         transition=transition,
-        move=gaussian_move(config.depth_std / step),
-        gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells))),
+        walk=gaussian_walk(config.depth_std / step),
+        gram=np.ascontiguousarray(pulse(step * np.arange(lattice.cells, dtype=np.float64))),
         amplitude_prior=config.amplitude_prior,
         amplitude_std=config.amplitude_std_sigmas,
         independent_samples=independent_samples(pulse, step * lattice.cells, 0.25 * step),
@@ -400,5 +479,5 @@ def set_model(config: FathometerConfig, lattice: Lattice) -> SetModel:
         negative_probability=config.negative_share,
         shift=heave_shift(config, step),
         scatter=scatter_of(config, lattice),
-        **({'move_share': 0.0, 'birth_share': 0.0} if blind else {}),
+        **({'walk_share': 0.0, 'birth_share': 0.0} if blind else {}),
     )

@@ -28,7 +28,7 @@ import numpy as np
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.elementary import gaussians
 from ...estimation.jit import kernel
-from ...estimation.lanes import lanes_for, roots, turn_of
+from ...estimation.small_matrices import lanes_for, semidefinite_roots, turn_of
 from .behaviour_kernels import COMMON
 from .kernels import KAPPA, NEGLIGIBLE
 from .sigma_kernels import beside, fan, PLACED, PLACES, places, product, turned, weighted
@@ -102,7 +102,7 @@ def relative(
                 y[a, k] = own * x[t, j, a]
                 for b in range(a + 1):
                     S[a, b, k] = own * P[t, j, a, b]
-        roots(S, F, scratch[0, 0])
+        semidefinite_roots(S, F, scratch[0, 0])
         for a in range(size):
             for b in range(PLACED):
                 for k in range(lanes):
@@ -361,7 +361,7 @@ def _gather(
     for a in (3, 4):
         for k in range(lanes):
             work.S[a, a, k] += safety.std * safety.std
-    roots(work.S, work.L, work.moments[0])
+    semidefinite_roots(work.S, work.L, work.moments[0])
     reach = math.sqrt(SIZE + KAPPA)
     for a in range(SIZE):
         for b in range(a + 1):

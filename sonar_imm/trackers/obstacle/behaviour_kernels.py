@@ -30,8 +30,13 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray, IntArray
 from ...estimation.jit import kernel
-from ...estimation.lanes import lanes_for, roots, turn_of, unsound
-from ...estimation.small_matrices import add_jitter
+from ...estimation.small_matrices import (
+    add_jitter,
+    lanes_for,
+    not_psd,
+    semidefinite_roots,
+    turn_of,
+)
 from .kernels import KAPPA
 from .sigma_kernels import beside, echoes, fan, PLACES, places, product, turned, weighted
 
@@ -196,7 +201,7 @@ def advance(
         _gather(x, P, motion, some, work)
         _look(step, work)
         _spread(step, work)
-        unsound(work.S, work.F, work.centre, bad)
+        not_psd(work.S, work.F, work.centre, bad)
         for k in range(lanes):
             t, j = some[k]
             n = size if motion.prior[j] > 0.0 else COMMON
@@ -230,7 +235,7 @@ def _gather(x: FloatArray, P: FloatArray, motion: Motion, which: IntArray, work:
         work.motion[0, k], work.motion[1, k] = motion.keep[j], motion.step[j]
         work.motion[2, k], work.motion[3, k] = motion.push[j], motion.noise[j]
     reach = work.scratch[0, 0]
-    roots(work.S, work.F, reach)
+    semidefinite_roots(work.S, work.F, reach)
     for k in range(lanes):
         reach[k] = math.sqrt(0.5 / work.apart[k])
     for a in range(size):

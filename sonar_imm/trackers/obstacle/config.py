@@ -16,21 +16,17 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from attrs import frozen
 
 from ...acoustics.geometry import AZIMUTH_MODELS
 from ...measurements import BEAM_AXES
-from ...parameters import inherited, parameter
+from ...parameters import inherited, live, parameter
 from ..shared_parameters import (
     DetectionParameters,
     MountingParameters,
     StreamParameters,
     TrackLifeParameters,
 )
-
-live = partial(parameter, read_only=False)
 
 METHODS = ('gaussian_sum', 'seafloor', 'landmark')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
@@ -40,224 +36,136 @@ BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 class ObstacleConfig(
     DetectionParameters, TrackLifeParameters, MountingParameters, StreamParameters
 ):
-    """Everything the obstacle tracker can be told. The defaults fit a Blueview P450 on a survey
+    """All parameters of the obstacle tracker. The defaults fit a Blueview P450 on a survey
     AUV."""
 
-    method: str = parameter(
-        'gaussian_sum',
-        'how the vertical offset is treated: estimated by a Gaussian sum over depth slices, '
-        'assumed on the sea floor (the paper), or estimated by one filter in world coordinates',
-        choices=METHODS,
-    )
-    components: int = parameter(9, 'depth slices of gaussian_sum', low=1, high=201)
+    # fmt: off
+    method: str = parameter('gaussian_sum', '',
+        'treatment of the vertical offset: gaussian_sum (estimated, over depth slices), seafloor '
+        '(assumed on the sea floor, as in the paper) or landmark (estimated by one filter in '
+        'world coordinates)', choices=METHODS)
+    components: int = parameter(9, '', 'number of depth slices of gaussian_sum', range=(1, 201))
 
     # -- what an obstacle may do, gaussian_sum only ----------------------------------------------
-    behaviours: tuple[str, ...] = parameter(
-        BEHAVIOURS,
-        'what gaussian_sum holds possible of an obstacle: fixed, swaying on its mooring, moving, '
-        'lying on the sea floor; the last is left out while no altitude is known, and needs '
-        'another beside it',
-        choices=BEHAVIOURS,
-    )
-    sway_std: float = parameter(
-        0.5, 'swaying: standard deviation along each axis', unit='m', low=0.001, high=100.0
-    )
-    sway_time: float = parameter(
-        20.0, 'swaying: time over which it forgets where it was', unit='s', low=0.1, high=3600.0
-    )
-    max_speed: float = parameter(
-        1.5,
-        'moving: twice the standard deviation of the velocity along each axis before anything is '
-        'known of it',
-        unit='m/s',
-        low=0.01,
-        high=50.0,
-    )
-    speed_noise: float = parameter(
-        0.05, 'moving: random walk of the velocity', unit='m/s/sqrt(s)', low=0.0, high=10.0
-    )
-    behaviour_time: float = parameter(
-        1000.0,
-        'mean time for which an obstacle keeps its behaviour',
-        unit='s',
-        low=1.0,
-        high=1e6,
-    )
-    seabed_std: float = parameter(
-        1.0,
-        'seabed: error of the depth of the sea floor at the obstacle, against below the vehicle',
-        unit='m',
-        low=0.01,
-        high=100.0,
-    )
+    behaviours: tuple[str, ...] = parameter(BEHAVIOURS, '',
+        'behaviours of an obstacle that gaussian_sum considers: fixed, swaying (on its mooring), '
+        'moving, seabed (lying on the sea floor); seabed is left out while no altitude is known, '
+        'and needs another beside it', choices=BEHAVIOURS)
+    sway_std: float = parameter(0.5, 'm',
+        'behaviour swaying: standard deviation of the position along each axis',
+        range=(0.001, 100.0))
+    sway_time: float = parameter(20.0, 's',
+        'behaviour swaying: time over which the position is correlated', range=(0.1, 3600.0))
+    max_speed: float = parameter(1.5, 'm/s',
+        'behaviour moving: twice the standard deviation of the velocity along each axis before '
+        'anything is known of it', range=(0.01, 50.0))
+    speed_noise: float = parameter(0.05, 'm/s/sqrt(s)',
+        'behaviour moving: random walk of the velocity', range=(0.0, 10.0))
+    behaviour_time: float = parameter(1000.0, 's',
+        'mean time for which an obstacle keeps its behaviour', range=(1.0, 1e6))
+    seabed_std: float = parameter(1.0, 'm',
+        'behaviour seabed: standard deviation of the depth of the sea floor at the obstacle, '
+        'relative to that below the vehicle', range=(0.01, 100.0))
 
     # -- where the sonar sits and how things are written -----------------------------------------
-    sonar_lever: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        'from the navigation reference to the sonar, x forward, y port, z up (vehicle FLU)',
-        unit='m',
-        low=-100.0,
-        high=100.0,
-    )
-    sonar_mount_rpy_deg: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
+    sonar_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
+        'vector from the navigation reference to the sonar: x forward, y port, z up (vehicle FLU)',
+        range=(-100.0, 100.0))
+    sonar_mount_rpy_deg: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg',
         'roll, pitch, yaw of the sonar in the vehicle (FLU: pitch positive nose down)',
-        unit='deg',
-        low=-180.0,
-        high=180.0,
-    )
-    azimuth_model: str = parameter(
-        'plane',
-        'what a bearing is: of the vertical plane of the echo, or of the cone a linear array '
-        'measures',
-        choices=AZIMUTH_MODELS,
-    )
-    bearing_positive: str = parameter(
-        'port',
-        'side to which bearings of detections count up once read as their message defines',
-        choices=('port', 'starboard'),
-    )
-    beam_axes: str = parameter(
-        'auto',
+        range=(-180.0, 180.0))
+    azimuth_model: str = parameter('plane', '',
+        'what a bearing is: the angle of the vertical plane of the echo (plane), or of the cone '
+        'that a linear array measures (cone)', choices=AZIMUTH_MODELS)
+    bearing_positive: str = parameter('port', '',
+        'side to which the bearings of detections count up, once they are read as their message '
+        'defines', choices=('port', 'starboard'))
+    beam_axes: str = parameter('auto', '',
         'axes of the beam vectors of SonarRanges and sonar images: marine (z forward, y to '
         'starboard, as their definition says), rep103 (x forward, y to port), or by which of the '
-        'two the beams point along',
-        choices=BEAM_AXES,
-    )
-    nav_twist_frame: str = parameter(
-        'child',
-        'axes of the twist of the navigation: those of the vehicle, as Odometry defines it, or '
-        'those of the world',
-        choices=('child', 'world'),
-    )
-    ping_timing: str = parameter(
-        'instant',
-        'instant: an echo belongs to the pose at its stamp; two_way: bearing belongs to the pose '
-        'when the echo arrived, range to the mean of both ways',
-        choices=('instant', 'two_way'),
-    )
-    sound_speed: float = parameter(
-        1500.0,
-        'speed of sound: for two_way, and for travel times that come without one',
-        unit='m/s',
-        low=1300.0,
-        high=1700.0,
-    )
-    depth_is_absolute: bool = parameter(
-        True, "the navigation's vertical is zero at the sea surface: nothing lies higher than that"
-    )
+        'two the beams point along', choices=BEAM_AXES)
+    nav_twist_frame: str = parameter('child', '',
+        'axes of the twist of nav: of the vehicle (child), as Odometry defines it, or of the '
+        'world', choices=('child', 'world'))
+    ping_timing: str = parameter('instant', '',
+        'pose to which an echo belongs: instant (the pose at its stamp) or two_way (bearing: the '
+        'pose when the echo arrived; range: the mean of both ways)',
+        choices=('instant', 'two_way'))
+    sound_speed: float = parameter(1500.0, 'm/s',
+        'speed of sound for ping_timing two_way, and for travel times that come without a sound '
+        'speed', range=(1300.0, 1700.0))
+    depth_is_absolute: bool = parameter(True, '',
+        'z of nav is zero at the sea surface, so that no obstacle lies higher than z = 0')
 
     # -- what the sonar measures -----------------------------------------------------------------
-    range_std: float = live(
-        0.15, 'error of a range that comes without variance', unit='m', low=1e-6, high=100.0
-    )
-    bearing_std_deg: float = live(
-        0.25, 'error of a bearing that comes without variance', unit='deg', low=1e-6, high=45.0
-    )
-    range_step: float = live(
-        0.17, 'sampling step of such a range, adds step^2 / 12', unit='m', low=0.0, high=100.0
-    )
-    bearing_step_deg: float = live(
-        0.18, 'sampling step of such a bearing, adds step^2 / 12', unit='deg', low=0.0, high=45.0
-    )
-    max_range: float = parameter(
-        100.0, 'range to which the sonar sees', unit='m', low=1.0, high=10000.0
-    )
-    horizontal_fov_deg: float = parameter(
-        45.0, 'full width of the sector', unit='deg', low=1.0, high=170.0
-    )
-    vertical_fov_deg: float = parameter(
-        15.0, 'full height of the beam', unit='deg', low=0.5, high=90.0
-    )
-    vertical_beam_width_deg: float = parameter(
-        0.0,
-        'the intensity of detections tells the elevation by a beam this high (-3 dB, one way); 0: '
-        'it is not used. Worth it where the sonar tilts by degrees and the width is known to a '
-        'tenth; gaussian_sum only',
-        unit='deg',
-        low=0.0,
-        high=90.0,
-    )
-    fading_db: float = live(
-        6.4, 'by which echoes fade from ping to ping', unit='dB', low=0.1, high=40.0
-    )
-    intensity_weight: float = live(
-        0.5,
-        'power to which the likelihood of an intensity is raised: fading lasts, patterns are not '
-        'known well',
-        low=0.0,
-        high=1.0,
-    )
+    range_std: float = live(0.15, 'm',
+        'standard deviation of a range that comes without variance', range=(1e-6, 100.0))
+    bearing_std_deg: float = live(0.25, 'deg',
+        'standard deviation of a bearing that comes without variance', range=(1e-6, 45.0))
+    range_step: float = live(0.17, 'm',
+        'sampling step of a range that comes without variance, adds step^2 / 12',
+        range=(0.0, 100.0))
+    bearing_step_deg: float = live(0.18, 'deg',
+        'sampling step of a bearing that comes without variance, adds step^2 / 12',
+        range=(0.0, 45.0))
+    max_range: float = parameter(100.0, 'm', 'range to which the sonar sees', range=(1.0, 10000.0))
+    horizontal_fov_deg: float = parameter(45.0, 'deg',
+        'full width of the sector that the sonar sees', range=(1.0, 170.0))
+    vertical_fov_deg: float = parameter(15.0, 'deg',
+        'full height of the beam of the sonar', range=(0.5, 90.0))
+    vertical_beam_width_deg: float = parameter(0.0, 'deg',
+        'gaussian_sum: height of the beam (-3 dB, one way) by which the intensity of detections '
+        'shows the elevation; 0: intensity is not used. Useful where the sonar tilts by degrees '
+        'and the width is known to a tenth', range=(0.0, 90.0))
+    fading_db: float = live(6.4, 'dB',
+        'vertical_beam_width_deg: standard deviation of the level of echoes, which fade from ping '
+        'to ping', range=(0.1, 40.0))
+    intensity_weight: float = live(0.5, '',
+        'vertical_beam_width_deg: power to which the likelihood of an intensity is raised, '
+        'because fading lasts and beam patterns are not known well', range=(0.0, 1.0))
     gate_probability: float = inherited(DetectionParameters, 'gate_probability', 0.9995)
-    clutter_density: float = inherited(
-        DetectionParameters,
-        'clutter_density',
-        0.05,
-        description='false detections of a ping for each metre of range and radian of bearing',
-        unit='1/(m rad)',
-        low=1e-9,
-    )
-    outlier_probability: float = live(
-        0.02, 'that a detection inside the gate is not the obstacle', low=0.0, high=0.5
-    )
+    clutter_density: float = inherited(DetectionParameters, 'clutter_density', 0.05,
+        description='number of false detections expected in a ping, per metre of range and '
+        'radian of bearing', unit='1/(m rad)', range=(1e-9, 1e4))
+    outlier_probability: float = live(0.02, '',
+        'probability that a detection inside the gate is not the obstacle', range=(0.0, 0.5))
     # -- what is believed of depth and navigation ------------------------------------------------
-    max_offset: float = parameter(
-        0.0,
-        'largest vertical offset believed of a new obstacle; 0: what beam, surface and altitude '
-        'allow',
-        unit='m',
-        low=0.0,
-        high=1000.0,
-    )
-    altitude_std: float = live(
-        0.1, 'error of an altitude that comes without variance', unit='m', low=1e-6, high=100.0
-    )
-    max_altitude_age: float = live(
-        5.0, 'age to which an altitude is used', unit='s', low=0.0, high=3600.0
-    )
-    scale_std: float = parameter(
-        0.003,
-        "scale error of the navigation's horizontal distances against sonar ranges",
-        low=0.0,
-        high=0.2,
-    )
-    range_scale_std: float = live(
-        0.001,
-        'scale error of ranges, from the speed of sound that the sonar believes in: no ping tells '
-        'it, so it is added to the covariance of range, offset and place',
-        low=0.0,
-        high=0.2,
-    )
-    position_noise: float = parameter(
-        0.01, 'random walk of the horizontal position', unit='m/sqrt(s)', low=0.0, high=10.0
-    )
-    yaw_noise_deg: float = parameter(
-        0.02, 'random walk of the yaw', unit='deg/sqrt(s)', low=0.0, high=10.0
-    )
-    depth_noise: float = parameter(
-        0.01, 'random walk of the depth', unit='m/sqrt(s)', low=0.0, high=10.0
-    )
+    max_offset: float = parameter(0.0, 'm',
+        'largest vertical offset of a new obstacle; 0: what beam, surface and altitude allow',
+        range=(0.0, 1000.0))
+    altitude_std: float = live(0.1, 'm',
+        'standard deviation of an altitude that comes without variance', range=(1e-6, 100.0))
+    max_altitude_age: float = live(5.0, 's',
+        'age up to which an altitude is used', range=(0.0, 3600.0))
+    scale_std: float = parameter(0.003, '',
+        'standard deviation of the scale error of the horizontal distances of nav against sonar '
+        'ranges', range=(0.0, 0.2))
+    range_scale_std: float = live(0.001, '',
+        'standard deviation of the scale error of ranges, from the sound speed that the sonar '
+        'assumes; no ping reveals it, so it is added to the covariance of range, offset and '
+        'position', range=(0.0, 0.2))
+    position_noise: float = parameter(0.01, 'm/sqrt(s)',
+        'random walk of the error of the horizontal position in nav', range=(0.0, 10.0))
+    yaw_noise_deg: float = parameter(0.02, 'deg/sqrt(s)',
+        'random walk of the error of the yaw in nav', range=(0.0, 10.0))
+    depth_noise: float = parameter(0.01, 'm/sqrt(s)',
+        'random walk of the error of the depth in nav', range=(0.0, 10.0))
 
     # -- avoidance -------------------------------------------------------------------------------
-    safety_radius: float = live(
-        3.0, 'collision: nearer than this horizontally', unit='m', low=0.01, high=1000.0
-    )
-    safety_height: float = live(
-        2.0, 'collision: and less than this above or below', unit='m', low=0.01, high=1000.0
-    )
-    cpa_horizon: float = live(
-        120.0, 'time ahead that is looked at', unit='s', low=1.0, high=3600.0
-    )
-    course_window: float = parameter(
-        10.0,
-        'time over which positions of the vehicle make its course',
-        unit='s',
-        low=1.0,
-        high=600.0,
-    )
-    course_std: float = live(
-        0.05, 'error of the velocity along the course, each axis', unit='m/s', low=0.0, high=5.0
-    )
+    safety_radius: float = live(3.0, 'm',
+        'collision: an obstacle passed nearer than this horizontally, and less than safety_height '
+        'above or below', range=(0.01, 1000.0))
+    safety_height: float = live(2.0, 'm',
+        'collision: an obstacle passed less than this above or below, and nearer than '
+        'safety_radius horizontally', range=(0.01, 1000.0))
+    cpa_horizon: float = live(120.0, 's',
+        'time ahead for which collisions are predicted', range=(1.0, 3600.0))
+    course_window: float = parameter(10.0, 's',
+        'length of the latest positions of the vehicle from which its course is estimated',
+        range=(1.0, 600.0))
+    course_std: float = live(0.05, 'm/s',
+        'standard deviation of the velocity of the vehicle along its course, on each axis',
+        range=(0.0, 5.0))
 
     # -- tracks ----------------------------------------------------------------------------------
     max_tracks: int = inherited(TrackLifeParameters, 'max_tracks', 40)
@@ -266,24 +174,18 @@ class ObstacleConfig(
     delete_misses: int = inherited(TrackLifeParameters, 'delete_misses', 10)
 
     # -- time ------------------------------------------------------------------------------------
-    max_navigation_gap: float = parameter(
-        1.0,
-        'longest time between two poses that is interpolated; pings in longer gaps are skipped',
-        unit='s',
-        low=0.001,
-        high=3600.0,
-    )
-    max_extrapolation: float = parameter(
-        0.0,
-        'time by which a ping may be newer than the newest pose and still be used at once; 0: it '
-        'waits for the next pose',
-        unit='s',
-        low=0.0,
-        high=10.0,
-    )
+    max_navigation_gap: float = parameter(1.0, 's',
+        'longest time between two poses of nav that is interpolated; pings in longer gaps are '
+        'skipped', range=(0.001, 3600.0))
+    max_extrapolation: float = parameter(0.0, 's',
+        'time by which a ping may be newer than the newest pose of nav and still be used at once; '
+        '0: it waits for the next pose', range=(0.0, 10.0))
     history: float = inherited(StreamParameters, 'history', 5.0)
     max_gap: float = inherited(StreamParameters, 'max_gap', 600.0)
-    seed: int = parameter(0, 'of random numbers; this tracker draws none', low=0, high=2**31 - 1)
+    seed: int = parameter(0, '',
+        'seed of the random number generator; this tracker draws no random numbers',
+        range=(0, 2**31 - 1))
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check()

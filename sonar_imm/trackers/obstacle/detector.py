@@ -39,119 +39,80 @@ SCALES = ('amplitude', 'power', 'decibel')
 class DetectorConfig(Config):
     """How images are read and echoes found in them. The defaults fit a Blueview P450."""
 
+    # fmt: off
     # -- how images are written ------------------------------------------------------------------
-    image_order: str = parameter(
-        'range_major',
-        'how samples lie: all beams of a range together, or all ranges of a beam',
-        choices=IMAGE_ORDERS,
-    )
-    image_scale: str = parameter(
-        'amplitude',
-        'what a sample is: an amplitude, a power, or a level in steps of decibel_step',
-        choices=SCALES,
-    )
-    decibel_step: float = parameter(
-        0.5, 'of image_scale decibel: one count', unit='dB', low=1e-3, high=100.0
-    )
-    beam_axes: str = parameter(
-        'auto',
-        'axes of the beam vectors: marine (z forward, y to starboard), rep103 (x forward, '
-        'y to port), or by which of the two the beams point along',
-        choices=BEAM_AXES,
-    )
-    sound_speed: float = parameter(
-        1500.0, 'of raw images that state none', unit='m/s', low=1300.0, high=1700.0
-    )
-    image_near_range: float = parameter(
-        0.0,
-        'nearest range of images that do not say theirs (sensor_msgs/Image, SonoptixECHO)',
-        unit='m',
-        low=0.0,
-        high=1e4,
-    )
-    image_far_range: float = parameter(
-        0.0, 'farthest range of such images; 0: unknown', unit='m', low=0.0, high=1e4
-    )
-    image_fov_deg: float = parameter(
-        0.0, 'sector of such images; 0: unknown', unit='deg', low=0.0, high=360.0
-    )
-    image_first_beam: str = parameter(
-        'port', 'side on which the first column of such images lies', choices=SIDES
-    )
-    image_first_range: str = parameter(
-        'near', 'end at which the first row of such images lies', choices=ENDS
-    )
+    image_order: str = parameter('range_major', '',
+        'order of the samples of an image: all beams of a range together (range_major), or all '
+        'ranges of a beam (beam_major)', choices=IMAGE_ORDERS)
+    image_scale: str = parameter('amplitude', '',
+        'what a sample of an image is: an amplitude, a power, or a level in steps of decibel_step '
+        '(decibel)', choices=SCALES)
+    decibel_step: float = parameter(0.5, 'dB',
+        'image_scale decibel: level of one count', range=(1e-3, 100.0))
+    beam_axes: str = parameter('auto', '',
+        'axes of the beam vectors: marine (z forward, y to starboard), rep103 (x forward, y to '
+        'port), or by which of the two the beams point along', choices=BEAM_AXES)
+    sound_speed: float = parameter(1500.0, 'm/s',
+        'speed of sound for raw images that state none', range=(1300.0, 1700.0))
+    image_near_range: float = parameter(0.0, 'm',
+        'nearest range of images that do not state it (sensor_msgs/Image, SonoptixECHO)',
+        range=(0.0, 1e4))
+    image_far_range: float = parameter(0.0, 'm',
+        'farthest range of images that do not state it (sensor_msgs/Image, SonoptixECHO); 0: '
+        'unknown', range=(0.0, 1e4))
+    image_fov_deg: float = parameter(0.0, 'deg',
+        'width of the sector of images that do not state it (sensor_msgs/Image, SonoptixECHO); 0: '
+        'unknown', range=(0.0, 360.0))
+    image_first_beam: str = parameter('port', '',
+        'side on which the first column lies of images that do not state bearings '
+        '(sensor_msgs/Image, SonoptixECHO)', choices=SIDES)
+    image_first_range: str = parameter('near', '',
+        'end at which the first row lies of images that do not state ranges (sensor_msgs/Image, '
+        'SonoptixECHO)', choices=ENDS)
 
     # -- how echoes are found --------------------------------------------------------------------
-    beam_width_deg: float = parameter(
-        1.0, '-3 dB width of a beam; no less than a column', unit='deg', low=0.01, high=90.0
-    )
-    range_resolution: float = parameter(
-        0.3,
-        '-3 dB width of the echo of a point; no less than a row',
-        unit='m',
-        low=1e-3,
-        high=100.0,
-    )
-    training: int = parameter(
-        16, 'rows before and behind an echo that tell the noise', low=2, high=1000
-    )
-    training_beams: int = parameter(
-        25, 'columns around an echo that tell the noise', low=1, high=1000
-    )
-    guard: int = parameter(4, 'rows around an echo that are not noise', low=0, high=100)
-    false_alarm: float = parameter(
-        1e-6, 'that a cell of Rayleigh noise is taken for an echo', low=1e-15, high=0.1
-    )
-    threshold_margin_db: float = parameter(
-        0.5,
-        'that much higher, beside what the roughness of the sea floor asks for',
-        unit='dB',
-        low=0.0,
-        high=30.0,
-    )
-    growth_false_alarm: float = parameter(
-        1e-3, 'the same of the cells around that belong to the echo', low=1e-15, high=0.5
-    )
-    sidelobe_db: float = parameter(
-        17.0,
-        'cells that much below the loudest of their range are its sidelobes',
-        unit='dB',
-        low=0.0,
-        high=200.0,
-    )
-    join_distance: float = parameter(
-        1.5, 'what comes nearer to each other is one obstacle', unit='m', low=0.0, high=100.0
-    )
-    min_range: float = parameter(
-        1.0,
-        'echoes from nearer are the vehicle; none are found either in the first rows of an image, '
-        'half of training and guard, where no nearer ones tell the noise',
-        unit='m',
-        low=0.0,
-        high=1e4,
-    )
-    max_detections: int = parameter(100, 'of a ping, the strongest', low=1, high=10_000)
+    beam_width_deg: float = parameter(1.0, 'deg',
+        '-3 dB width of a beam; no less than a column', range=(0.01, 90.0))
+    range_resolution: float = parameter(0.3, 'm',
+        '-3 dB width of the echo of a point; no less than a row', range=(1e-3, 100.0))
+    training: int = parameter(16, '',
+        'number of rows before and behind an echo from which the noise is estimated',
+        range=(2, 1000))
+    training_beams: int = parameter(25, '',
+        'number of columns around an echo from which the noise is estimated', range=(1, 1000))
+    guard: int = parameter(4, '',
+        'number of rows around an echo that are left out of the estimate of the noise',
+        range=(0, 100))
+    false_alarm: float = parameter(1e-6, '',
+        'probability that a cell of Rayleigh noise is taken for an echo', range=(1e-15, 0.1))
+    threshold_margin_db: float = parameter(0.5, 'dB',
+        'margin added to the detection threshold, beyond what the roughness of the sea floor asks '
+        'for', range=(0.0, 30.0))
+    growth_false_alarm: float = parameter(1e-3, '',
+        'probability that a cell of Rayleigh noise beside an echo is taken for a part of the echo',
+        range=(1e-15, 0.5))
+    sidelobe_db: float = parameter(17.0, 'dB',
+        'level below the loudest cell of a range under which cells are taken for its sidelobes',
+        range=(0.0, 200.0))
+    join_distance: float = parameter(1.5, 'm',
+        'distance below which echoes are joined to one obstacle', range=(0.0, 100.0))
+    min_range: float = parameter(1.0, 'm',
+        'range below which echoes are taken for the vehicle; none are found either in the first '
+        'rows of an image, half of training and guard, where there are no nearer rows to estimate '
+        'the noise from', range=(0.0, 1e4))
+    max_detections: int = parameter(100, '',
+        'largest number of detections of a ping, the strongest', range=(1, 10_000))
 
     # -- a scanning sonar ------------------------------------------------------------------------
-    sweep_sector_deg: float = parameter(
-        120.0,
-        'directions of a scanning sonar this far around ahead are gathered, the others are not',
-        unit='deg',
-        low=1.0,
-        high=360.0,
-    )
-    sweep_max_gap: float = parameter(
-        2.0, 'a longer silence ends a sweep', unit='s', low=0.01, high=600.0
-    )
-    sweep_speed: float = parameter(
-        1.5,
-        'by which ranges may change while a sweep lasts: a direction taken earlier or later than '
-        'the middle has an error of this for each second',
-        unit='m/s',
-        low=0.0,
-        high=50.0,
-    )
+    sweep_sector_deg: float = parameter(120.0, 'deg',
+        'scanning sonar: full width of the sector around ahead whose directions are used, the '
+        'others are not', range=(1.0, 360.0))
+    sweep_max_gap: float = parameter(2.0, 's',
+        'scanning sonar: time without a beam that ends a sweep', range=(0.01, 600.0))
+    sweep_speed: float = parameter(1.5, 'm/s',
+        'scanning sonar: speed by which ranges may change during a sweep; a direction taken '
+        'earlier or later than the middle has an error of this for each second', range=(0.0, 50.0))
+    # fmt: on
 
     def rules(self) -> EchoRules:
         return EchoRules(

@@ -39,7 +39,7 @@ def mounted(
 ) -> tuple[FloatArray, FloatArray]:
     """Position (3,) and rotation (3, 3), NED and FRD, of a sensor at `lever` (3,) of a vehicle at
     `position`, turned by R, itself turned by `turned` (3, 3), all of these ENU and FLU
-    (`geometry.mounted`, `geometry.flip_pose`)."""
+    (`geometry.mounted`, `geometry.flip_rotation`)."""
     there, look = np.empty(3), np.empty((3, 3))
     for a in range(3):
         i, sign = (1 - a, 1.0) if a < 2 else (2, -1.0)

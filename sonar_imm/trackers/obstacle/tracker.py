@@ -23,7 +23,7 @@ way (`filters`). A ping goes through
 
 Navigation and pings arrive in any order. All that is known is one value, `ObstacleState`, and a
 step from stamp to stamp: a pose completes the pings that waited for it. So a late message is put
-in its place by taking the steps after it again (`trackers.stream`).
+in its place by taking the steps after it again (`intake.stream`).
 
 Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daurade).
 """
@@ -39,12 +39,12 @@ from ...acoustics import geometry
 from ...estimates import Estimate, places
 from ...estimation import imm_kernels
 from ...estimation.arrays import FloatArray
-from ...estimation.association import assign_fits, gate_threshold, Tracks
-from ...estimation.association_kernels import TENTATIVE
-from ...measurements import Altitude, Detections, Frames, Measurement, nanoseconds, Navigation
+from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
+from ...intake import KnownFrames
+from ...intake.stream import ReplayStream, StreamRules
+from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
-from ..stream import ReplayStream, StreamRules
 from . import ping_kernels
 from .avoidance import closest_approach, course
 from .behaviours import behaviour_columns, build_filter, moving_alike
@@ -105,8 +105,8 @@ class ObstacleTracker:
         self.counts = self._stream.counts
 
     @property
-    def frames(self) -> Frames:
-        return Frames(self._stream.frames, self._stream.accepts)
+    def frames(self) -> KnownFrames:
+        return self._stream.frames
 
     def reconfigure(self, config: ObstacleConfig) -> None:
         self.config.require_changeable(config)

@@ -14,8 +14,8 @@
 
 """How runs of the bathymetry tracker are judged: the floor along each ping against the true floor.
 
-`profiles` pairs estimate and truth of each ping, `scoring` compares them. `summary` and `figures`
-present the result; `bench` measures the speed beside other filters (`peers`).
+`profiles` pairs estimate and truth of each ping, `scoring` compares them. `summary` and
+`figures` present the result.
 """
 
 from __future__ import annotations

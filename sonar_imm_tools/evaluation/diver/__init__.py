@@ -15,8 +15,8 @@
 """How runs of the diver tracker are judged: tracks of positions against true paths.
 
 `series` holds the estimates as flat arrays, `truth` the true paths, `matching` says which track
-belongs to which diver, `scoring` compares them. `summary` and `figures` present the result;
-`bench` measures the speed.
+belongs to which diver, `scoring` compares them. `summary` and `figures` present the
+result.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 import functools
+from itertools import chain
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from sonar_imm.measurements import Fix, Fixes
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.placing import Placer
+from sonar_imm.trackers.diver.georeferencing import Georeferencer
 
 from ...offline.run_folder import read_measurements, read_truth, RunFolder
 from ..judging import Check, Judgement, JudgeOptions, Limit, naming
@@ -55,9 +56,10 @@ def judge(folder: RunFolder, options: JudgeOptions) -> Judgement:
     with naming(folder.path):
         series = series_of(folder.read_estimates())
     truth = _truth(run, options)
-    placer = Placer(DiverConfig.from_mapping(run['parameters'], ignore_unknown=True), Counter())
-    placed = (fix for measurement in read_measurements(run) for fix in placer.place(measurement))
-    fixes = [fix for fix in placed if isinstance(fix, (Fix, Fixes))]
+    config = DiverConfig.from_mapping(run['parameters'], ignore_unknown=True)
+    georeferencer = Georeferencer(config, Counter())
+    placed = chain.from_iterable(map(georeferencer.georeference, read_measurements(run)))
+    fixes = [item for item in placed if isinstance(item, (Fix, Fixes))]
     raw = fix_series(fixes) if fixes else None
     cutoff = CUTOFF if options.cutoff is None else options.cutoff
     metrics = score(series, truth, fixes=raw, cutoff=cutoff)

@@ -15,7 +15,7 @@
 """How runs of the fathometer tracker are judged: sets of reflectors against true sets.
 
 `records` pairs estimates and truth, `scoring` compares numbers, depths and amplitudes of the
-reflectors. `summary` and `figures` present the result; `bench` measures the speed.
+reflectors. `summary` and `figures` present the result.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@
 `series` lays estimates end to end and says which track is which obstacle. `scoring` says how
 large the errors are and whether the stated uncertainty holds, `motion` the same of velocities,
 behaviours and collisions, `deferred` what the paper's deferred estimate would have been.
-`summary` and `figures` present it; `bench` measures the tracker.
+`summary` and `figures` present it.
 """
 
 from __future__ import annotations

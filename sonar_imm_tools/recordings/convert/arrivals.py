@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,7 @@ from msg_adapters.arrivals import write_arrivals
 from sonar_imm.measurements import Arrivals, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
+from ..convert_options import ArrivalsOptions
 from ..csv_table import BadRow, CsvOptions, CsvTable, Row
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
@@ -72,37 +73,25 @@ class _Arrival(NamedTuple):
 
 
 def convert_arrivals(
-    path: str | Path,
-    out: str | Path,
-    receivers: str | Path,
-    *,
-    transmitters: str | Path | None = None,
-    options: CsvOptions | None = None,
-    receiver_options: CsvOptions | None = None,
-    truth: str | Path | None = None,
-    truth_options: CsvOptions | None = None,
-    toa_std: float | None = None,
-    frame_id: str = 'map',
-    origin: tuple[float, ...] | None = None,
-    storage: str = 'mcap',
+    path: str | Path, out: str | Path, receivers: str | Path, **values: Any
 ) -> ConversionReport:
     """Convert a CSV of arrivals to the topic ``/arrivals``, one message per ping.
 
-    receivers: CSV with ``receiver`` and a position (``depth`` becomes negative z). transmitters:
-    the same for transmitters, which are looked up among the receivers by default. toa_std:
-    standard deviation [s] for rows that state none. truth: as in `convert_truth`.
-    receiver_options: for both position files. Raises `BagError`.
+    receivers: CSV with ``receiver`` and a position (``depth`` becomes negative z). values: as in
+    `ArrivalsOptions`; transmitters are looked up among the receivers by default, and
+    receiver_options are for both position files. Raises `BagError`.
     """
+    how = ArrivalsOptions(receivers=receivers, **values)
     report = ConversionReport(Path(out))
-    places, origin = _read_places(receivers, report, receiver_options, origin, 'receiver')
+    places, origin = _read_places(receivers, report, how.receiver_options, how.origin, 'receiver')
     senders = (
         places
-        if transmitters is None
-        else _read_places(transmitters, report, receiver_options, origin, 'transmitter')[0]
+        if how.transmitters is None
+        else _read_places(how.transmitters, report, how.receiver_options, origin, 'transmitter')[0]
     )
-    default = math.nan if toa_std is None else toa_std**2
+    default = math.nan if how.toa_std is None else how.toa_std**2
     pings: dict[tuple[object, str], list[_Arrival]] = {}
-    table = CsvTable(path, options)
+    table = CsvTable(path, how.options)
     passive = _is_passive(table)
     rows = report.read_rows(table, lambda row: _parse(row, passive, places, senders, default))
     for _, arrival in rows:
@@ -117,15 +106,15 @@ def convert_arrivals(
     for label, ping in pings.items():
         try:
             measurement = _one_ping(
-                ping, passive, places, senders, numbers, sender_numbers, frame_id
+                ping, passive, places, senders, numbers, sender_numbers, how.frame_id
             )
             records.append(
                 (measurement.stamp_ns, '/arrivals', write_arrivals(measurement, ros_message))
             )
         except Rejection as error:
             report.bad_row(table.path, f'ping {label[0]}', error)
-    if truth is not None and records:
-        records += truth_records(truth, report, truth_options, frame_id, origin)
+    if how.truth is not None and records:
+        records += truth_records(how.truth, report, how.truth_options, how.frame_id, origin)
     if any(name != str(number) for name, number in numbers.items()):
         report.notes['receivers'] = ', '.join(f'{name} = {numbers[name]}' for name in numbers)
     if passive:
@@ -135,7 +124,7 @@ def convert_arrivals(
         records,
         report,
         source=Path(path).name,
-        storage=storage,
+        storage=how.storage,
         parameters={'diver': origin_parameters(origin)},
     )
 

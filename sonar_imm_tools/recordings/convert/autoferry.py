@@ -23,7 +23,7 @@ converted. The targets are boats, not divers.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 import json
 import math
 from pathlib import Path
@@ -37,6 +37,7 @@ from sonar_imm.measurements import Fixes, Rejection
 from sonar_imm.truth import TrueTrack
 
 from ..conversion import ConversionReport, Record, write_bag
+from ..convert_options import AutoferryOptions
 from ..csv_table import BadRow
 from ..messages import ros_message
 from ..sources import BagError
@@ -46,38 +47,28 @@ from .truth import difference_velocity
 SENSORS = {'lidar': 1, 'radar': 2}
 
 
-def convert_autoferry(
-    path: str | Path,
-    out: str | Path,
-    *,
-    truth: str | Path | None = None,
-    sensors: Collection[str] = ('radar',),
-    std: float | None = None,
-    time_offset_ns: int | Mapping[str, int] = 0,
-    frame_id: str = 'map',
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_autoferry(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert the detections of a scenario (JSON) to the topic ``/fixes``, east-north-up; of two
     sensors to ``/radar/fixes`` and ``/lidar/fixes``, so that each may have numbers of its own.
 
-    truth: the scenario's ground truth (JSON) for ``/truth/estimate``, velocity by central
-    differences; sensors: of radar, lidar; std: standard deviation [m] on each axis to state in the
-    fixes, None to leave the covariance open, because the data set states none; time_offset_ns:
-    added to the stamps of the detections, not of the truth, of all sensors or of each by its name.
-    Raises `BagError` for a file of another kind.
+    values: as in `AutoferryOptions`. The truth goes to ``/truth/estimate``, with velocities by
+    central differences. Without std the fixes have no covariance, because the data set states
+    none. Raises `BagError` for a file of another kind.
     """
-    late = time_offset_ns if isinstance(time_offset_ns, Mapping) else {}
-    if unknown := [name for name in (*sensors, *late) if name not in SENSORS]:
+    how = AutoferryOptions(**values)
+    late = how.time_offset_ns
+    if not isinstance(late, Mapping):
+        late = dict.fromkeys(SENSORS, late)
+    if unknown := [name for name in (*how.sensors, *late) if name not in SENSORS]:
         raise BagError(f"there is no sensor '{unknown[0]}'; there are {' and '.join(SENSORS)}")
-    numbers = {SENSORS[name] for name in sensors}
+    numbers = {SENSORS[name] for name in how.sensors}
     names = {number: name for name, number in SENSORS.items()}
-    if not isinstance(time_offset_ns, Mapping):
-        time_offset_ns = dict.fromkeys(SENSORS, time_offset_ns)
-    offsets = {**dict.fromkeys(SENSORS, 0), **time_offset_ns}
+    offsets = {**dict.fromkeys(SENSORS, 0), **late}
     report = ConversionReport(
-        Path(out), notes={'sensors': ', '.join(sorted(sensors)), 'targets': 'boats, not divers'}
+        Path(out),
+        notes={'sensors': ', '.join(sorted(how.sensors)), 'targets': 'boats, not divers'},
     )
-    covariance = None if std is None else np.eye(2) * std**2
+    covariance = None if how.std is None else np.eye(2) * how.std**2
     records: list[Record] = []
     for index, record in enumerate(_json_list(path)):
         report.rows += 1
@@ -89,15 +80,15 @@ def convert_autoferry(
                 stamp_ns=_stamp_ns(record['time'], offsets[names[record['sensorID']]]),
                 position=np.column_stack([found, np.zeros(len(found))]),
                 covariance=None if covariance is None else np.tile(covariance, (len(found), 1, 1)),
-                frame_id=frame_id,
+                frame_id=how.frame_id,
             )
             topic = f'/{names[record["sensorID"]]}/fixes' if len(numbers) > 1 else '/fixes'
             records.append((scan.stamp_ns, topic, write_scan(scan, ros_message)))
         except (KeyError, TypeError, ValueError) as error:  # covers BadRow and Rejection
             report.bad_row(Path(path), f'record {index}', _why(error))
-    if truth is not None:
-        records += _truth_records(truth, report, frame_id)
-    return write_bag(out, records, report, source=Path(path).name, storage=storage)
+    if how.truth is not None:
+        records += _truth_records(how.truth, report, how.frame_id)
+    return write_bag(out, records, report, source=Path(path).name, storage=how.storage)
 
 
 def _east_north(record: Any) -> NDArray[np.float64]:

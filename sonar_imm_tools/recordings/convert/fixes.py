@@ -19,15 +19,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from msg_adapters.fixes import check_size, write_fix
 from msg_adapters.scans import write_scan
-from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection, RepeatGuard
+from sonar_imm.intake import RepeatFilter
+from sonar_imm.measurements import Fix, Fixes, NOBODY, Rejection
 
 from ..conversion import ConversionReport, Record, write_bag
-from ..csv_table import CsvOptions, CsvTable, Row
+from ..convert_options import FixesOptions
+from ..csv_table import CsvTable, Row
 from ..local_frame import LocalFrame, origin_parameters
 from ..messages import ros_message
 from .truth import number_names, truth_records
@@ -36,37 +39,27 @@ REPEAT_TIME = 5.0
 """Seconds within which the same position is a repeated poll: the default of the tracker."""
 
 
-def convert_fixes(
-    path: str | Path,
-    out: str | Path,
-    *,
-    options: CsvOptions | None = None,
-    truth: str | Path | None = None,
-    truth_options: CsvOptions | None = None,
-    frame_id: str = 'map',
-    origin: tuple[float, ...] | None = None,
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_fixes(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert a CSV of position fixes to the topic ``/fix``, or ``/fixes`` with identities.
 
     Columns: ``stamp``, ``x`` and ``y`` [m] or ``latitude`` and ``longitude`` [deg]; optional ``z``
     (or ``depth``), ``var_x cov_xy var_y`` [m^2], or ``std_x std_y``, or ``std`` [m]; ``id``: whose
     position it is, a number or a name. A row with empty uncertainties becomes a fix without
-    covariance. Latitudes become metres around `origin`
-    (latitude, longitude[, height]), the first good row when None, which is told the tracker by
-    ``parameters.yaml`` beside the bag. `truth` is a CSV as in
+    covariance. Latitudes become metres around the origin, which the tracker finds in
+    ``parameters.yaml`` beside the bag. values: as in `FixesOptions`; truth is a CSV as in
     `convert_truth`, for the same bag and the same origin.
 
     Rows that ``valid`` says are not are left out and counted. Repeated polls (the same position of
-    the same diver again a moment later, see `RepeatGuard`) stay, and are counted: the tracker
+    the same diver again a moment later, see `RepeatFilter`) stay, and are counted: the tracker
     leaves them out.
     """
-    table = CsvTable(path, options)
+    how = FixesOptions(**values)
+    table = CsvTable(path, how.options)
     table.require('stamp')
-    frame = LocalFrame(table, origin)
+    frame = LocalFrame(table, how.origin)
     report = ConversionReport(Path(out))
 
-    repeats: dict[str, RepeatGuard] = {}
+    repeats: dict[str, RepeatFilter] = {}
     repeated: list[int] = []
 
     def parse(row: Row) -> tuple[Fix, str]:
@@ -76,22 +69,22 @@ def convert_fixes(
             stamp_ns=row.stamp_ns(),
             position=frame.position(row),
             covariance=_covariance(row),
-            frame_id=frame_id,
+            frame_id=how.frame_id,
         )
         check_size(fix)
         try:
-            repeats.setdefault(name, RepeatGuard(REPEAT_TIME)).fresh(fix)
+            repeats.setdefault(name, RepeatFilter(REPEAT_TIME)).fresh(fix)
         except Rejection:
             repeated.append(row.line)
         return fix, name
 
     rows = [(row, *parsed) for row, parsed in report.read_rows(table, parse)]
     if _names_divers(table, rows, report):
-        records = _named_scans(rows, report, frame_id)
+        records = _named_scans(rows, report, how.frame_id)
     else:
         records = [(fix.stamp_ns, '/fix', write_fix(fix, ros_message)) for _, fix, _ in rows]
-    if truth is not None and records:
-        records += truth_records(truth, report, truth_options, frame_id, frame.origin)
+    if how.truth is not None and records:
+        records += truth_records(how.truth, report, how.truth_options, how.frame_id, frame.origin)
     report.notes.update(frame.notes())
     if repeated:
         report.notes['repeated'] = (
@@ -103,7 +96,7 @@ def convert_fixes(
         records,
         report,
         source=Path(path).name,
-        storage=storage,
+        storage=how.storage,
         parameters={'diver': origin_parameters(frame.origin)},
     )
 
@@ -146,9 +139,9 @@ def _named_scans(
                 Fixes(
                     stamp_ns=stamp_ns,
                     position=[fix.position for fix, _ in scan],
-                    covariance=[
-                        unknown if fix.covariance is None else fix.covariance for fix, _ in scan
-                    ],
+                    covariance=np.array(
+                        [unknown if fix.covariance is None else fix.covariance for fix, _ in scan]
+                    ),
                     target_id=[number for _, number in scan],
                     frame_id=frame_id,
                 ),

@@ -16,13 +16,13 @@
 
 Every image gives one message on ``/detections``, also when nothing is found in it; of a scanning
 sonar every sweep does. Navigation and altitudes, which the tracker needs too, are copied to
-``/nav`` and ``/altitude``. Tracking a recording of images does the same on the way (`detected`);
-here the detections are kept.
+``/nav`` and ``/altitude``. Tracking a recording of images does the same on the way
+(`DetectedImages`); here the detections are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,54 +31,40 @@ from msg_adapters.inputs import inputs_of, InputTopic, made_inputs
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers.obstacle.detector import DetectorConfig
 
-from ..conversion import ConversionReport, provenance
-from ..detected import DetectedImages
+from ..conversion import companion_topics, ConversionReport, copied, write_from_bag
+from ..convert_options import ImagesOptions
+from ..measurements import DetectedImages
 from ..messages import ros_message
-from ..reader import BagReader
+from ..reader import BagMessage, BagReader
 from ..sources import BagError
 from ..topics import made_topics
-from ..writer import BagWriter
-from .companions import companion_topics, copied
 
 SYSTEM = 'obstacle'
 FURTHER = {entry.name: entry for entry in inputs_of(SYSTEM) if entry.name != 'detections'}
 
 
-def convert_images(
-    path: str | Path,
-    out: str | Path,
-    *,
-    topic: str | None = None,
-    parameters: Mapping[str, Any] | None = None,
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_images(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Find the echoes in all images of the bag at `path`.
 
-    topic: of the images; None for the only one that holds some. parameters: of `DetectorConfig` by
-    name. Messages that cannot be used are counted and named. Raises `ConfigError`, and `BagError`
-    when the bag has no images.
+    values: as in `ImagesOptions`; parameters are those of `DetectorConfig` by name. Messages that
+    cannot be used are counted and named. Raises `ConfigError`, and `BagError` when the bag has no
+    images.
     """
-    config = DetectorConfig.from_mapping(parameters or {})
+    how = ImagesOptions(**values)
+    config = DetectorConfig.from_mapping(how.parameters)
     report = ConversionReport(Path(out))
     report.notes['detector'] = ', '.join(f'{k} {v}' for k, v in config.as_dict().items())
     with BagReader(path) as bag:
-        images = _image_topic(bag, topic)
+        images = _image_topic(bag, how.topic)
         readers = _readers(bag, images, config)
-        with BagWriter(
-            out, storage=storage, custom_data=provenance(Path(path).name, report.notes)
-        ) as made:
-            for item in bag.messages(sorted({name for name, _ in readers})):
-                report.rows += 1
-                name, read = readers.get((item.topic, item.type_name), ('', _wrong_type))
-                try:
-                    message = read(item.message)
-                except Rejection as rejection:
-                    report.bad_row(Path(path), f'{item.topic} #{item.index}', rejection)
-                    continue
-                if message is None:
-                    continue
-                made.write(f'/{name}', message, item.log_ns)
-                report.messages[f'/{name}'] = report.messages.get(f'/{name}', 0) + 1
+
+        def make(item: BagMessage) -> tuple[str, Any] | None:
+            name, read = readers.get((item.topic, item.type_name), ('', _wrong_type))
+            message = read(item.message)
+            return None if message is None else (f'/{name}', message)
+
+        topics = sorted({name for name, _ in readers})
+        write_from_bag(out, bag, topics, make, report, storage=how.storage)
         report.problems += bag.problems
     return report
 
@@ -115,7 +101,7 @@ def _readers(
             read = detected.reader(image, topic.type_name)
             readers[topic.name, topic.type_name] = (
                 detections.name,
-                lambda message, read=read: _written(detections, read(message)),
+                partial(_detections, detections, read),
             )
     types = {topic.name: topic.type_name for topic in bag.topics}
     for topic_name, name in companion_topics(bag, FURTHER).items():
@@ -124,7 +110,8 @@ def _readers(
     return readers
 
 
-def _written(entry: InputTopic, measurement: Any) -> Any:
+def _detections(entry: InputTopic, read: Callable[[Any], Any], message: Any) -> Any:
+    measurement = read(message)
     return None if measurement is None else entry.write(measurement, ros_message)
 
 

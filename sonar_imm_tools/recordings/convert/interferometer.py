@@ -20,7 +20,7 @@ altitudes are copied to ``/nav`` and ``/altitude``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,48 +29,42 @@ from msg_adapters.headers import stamp_ns
 from msg_adapters.inputs import inputs_of
 from msg_adapters.interferometer import FIELDS, snapshot_of_phase, snapshot_of_staves
 from msg_adapters.snapshots import write_snapshot
-from sonar_imm.measurements import Rejection
+from sonar_imm.measurements import Snapshot
 
-from ..conversion import ConversionReport, provenance
+from ..conversion import companion_topics, ConversionReport, copied, write_from_bag
+from ..convert_options import InterferometerOptions
 from ..messages import ros_message
-from ..reader import BagReader
+from ..reader import BagMessage, BagReader
 from ..sources import BagError
-from ..writer import BagWriter
-from .companions import companion_topics, copied
 
 FURTHER = {entry.name: entry for entry in inputs_of('bathymetry') if entry.companion}
 MOST_WAITING = 64
 """Pings that wait for the rest of their images; the oldest is given up for one more."""
 
 
-def convert_interferometer(
-    path: str | Path,
-    out: str | Path,
-    *,
-    amplitude: str = '',
-    phase: str = '',
-    iq: Sequence[str] = (),
-    fields: Mapping[str, str] | None = None,
-    side: str = '',
-    radians_per_count: float | None = None,
-    storage: str = 'mcap',
-    **how: Any,
-) -> ConversionReport:
+def convert_interferometer(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert the bag at `path` to ``/snapshot``, or ``/<side>/snapshot``.
 
-    amplitude and phase: topics, one image of each a ping; or iq: topics, one a stave. fields:
-    names of fields that differ from `FIELDS`. how: order, sound_speed, element_spacing, see
-    `msg_adapters.interferometer`. Raises `BagError`.
+    values: as in `InterferometerOptions`, either amplitude and phase or iq; fields are those that
+    differ from `FIELDS`. Raises `BagError`.
     """
-    topics = _topics(amplitude, phase, iq)
-    if unknown := [name for name in fields or {} if name not in FIELDS]:
+    how = InterferometerOptions(**values)
+    topics = _topics(how.amplitude, how.phase, how.iq)
+    if unknown := [name for name in how.fields if name not in FIELDS]:
         raise BagError(f"unknown field '{unknown[0]}'; the names are {', '.join(FIELDS)}")
-    how |= {'fields': {**FIELDS, **(fields or {})}, 'side': side}
-    if iq:
-        make = partial(_of_staves, how)
+    reading: dict[str, Any] = {
+        'fields': {**FIELDS, **how.fields},
+        'side': how.side,
+        'order': how.order,
+        'sound_speed': how.sound_speed,
+        'element_spacing': how.element_spacing,
+    }
+    make: Callable[..., Snapshot]
+    if how.iq:
+        make = partial(_of_staves, reading)
     else:
-        make = partial(snapshot_of_phase, radians_per_count=radians_per_count, **how)
-    target = f'/{side}/snapshot' if side else '/snapshot'
+        make = partial(snapshot_of_phase, radians_per_count=how.radians_per_count, **reading)
+    target = f'/{how.side}/snapshot' if how.side else '/snapshot'
     report = ConversionReport(Path(out))
     with BagReader(path) as bag:
         there = {topic.name for topic in bag.topics}
@@ -80,39 +74,27 @@ def convert_interferometer(
             )
         beside = companion_topics(bag, FURTHER)
         pings = _Pings(topics)
-        with BagWriter(
-            out, storage=storage, custom_data=provenance(Path(path).name, report.notes)
-        ) as made:
-            for item in bag.messages([*set(topics), *beside]):
-                report.rows += 1
-                where = f'{item.topic} #{item.index}'
-                try:
-                    if item.topic in beside:
-                        name = beside[item.topic]
-                        topic, message = (
-                            f'/{name}',
-                            copied(FURTHER[name], item.type_name, item.message),
-                        )
-                    elif (images := pings.add(item)) is not None:
-                        topic, message = target, write_snapshot(make(*images), ros_message)
-                    else:
-                        continue
-                except Rejection as rejection:
-                    report.bad_row(Path(path), where, rejection)
-                    continue
-                made.write(topic, message, item.log_ns)
-                report.messages[topic] = report.messages.get(topic, 0) + 1
-            if pings.lonely:
-                report.bad_rows += pings.lonely
-                report.problems.append(
-                    f'{pings.lonely} pings have not all of their images: stamps have to be equal'
-                )
+
+        def written(item: BagMessage) -> tuple[str, Any] | None:
+            if item.topic in beside:
+                name = beside[item.topic]
+                return f'/{name}', copied(FURTHER[name], item.type_name, item.message)
+            images = pings.add(item)
+            return None if images is None else (target, write_snapshot(make(*images), ros_message))
+
+        chosen = [*set(topics), *beside]
+        write_from_bag(out, bag, chosen, written, report, storage=how.storage)
+        if pings.lonely:
+            report.bad_rows += pings.lonely
+            report.problems.append(
+                f'{pings.lonely} pings have not all of their images: stamps have to be equal'
+            )
         report.problems += bag.problems
     return report
 
 
-def _of_staves(how: Mapping[str, Any], *images: Any) -> Any:
-    return snapshot_of_staves(images, **how)
+def _of_staves(reading: Mapping[str, Any], *images: Any) -> Snapshot:
+    return snapshot_of_staves(images, **reading)
 
 
 def _topics(amplitude: str, phase: str, iq: Sequence[str]) -> list[str]:

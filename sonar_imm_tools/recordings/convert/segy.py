@@ -20,8 +20,11 @@ with the depth of the water that the headers state, that is said, and the sample
 given. Headers count whole seconds, so the traces of one second are spread over it evenly.
 
 Traces that are never negative are envelopes. For them the pulse and the noise are measured
-(`profiler`) and written beside the bag, where the tracker finds them. Places in seconds of arc or
-degrees become the topic ``/position``.
+and written beside the bag, where the tracker finds them: the water above the floor is quiet, so
+that the first arrival of a trace is plain to see, and its shape is that of the pulse where little
+scatters below it. The lower quartile over all traces of its width at half height is taken. What is
+above the first arrival is noise; of coarse steps of a converter it is at least half a step. Places
+in seconds of arc or degrees become the topic ``/position``.
 """
 
 from __future__ import annotations
@@ -36,69 +39,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_adapters.array_records import write_trace
+from sonar_imm.estimation.arrays import FloatArray, IntArray
 from sonar_imm.measurements import Rejection, Trace
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 
 from ..conversion import ConversionReport, Record, write_bag
+from ..convert_options import SegyOptions
 from ..messages import ros_message
 from ..positions import write_position
 from ..sources import BagError
-from .profiler import doubted_spacing, is_envelope, measured_instrument
 
 if TYPE_CHECKING:
     import segyio
 
 SECOND = 10**9
+_RUN, _REACH, _LOUD = 3, 4, 8.0
+_LEAST_ARRIVALS = 10
+_NEAR = 1.5
+_FWHM = 2.0 * np.sqrt(2.0 * np.log(2.0))
 
 
-def convert_segy(
-    path: str | Path,
-    out: str | Path,
-    *,
-    sample_spacing: float | None = None,
-    sound_speed: float = 1500.0,
-    first_sample: int = 0,
-    samples: int | None = None,
-    stack: int = 1,
-    depth_offset: float = 0.0,
-    frame_id: str = 'profiler',
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_segy(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert a SEG-Y file to the topic ``/trace``, and ``/position`` where it states places.
 
-    sample_spacing: m from sample to sample; None: from the sample interval and `sound_speed`.
-    first_sample, samples: which part of a trace is taken. stack: how many successive traces are
-    averaged into one, which has the stamp of the last. depth_offset: m, of the transducer. Of
-    envelopes the bag gets ``parameters.yaml``. Raises `BagError`, and ModuleNotFoundError without
-    segyio.
+    values: as in `SegyOptions`. Without sample_spacing the sample interval and sound_speed say it.
+    A stack of traces has the stamp of the last. For envelopes the bag gets ``parameters.yaml``.
+    Raises `BagError`, and ModuleNotFoundError without segyio.
     """
+    how = SegyOptions(**values)
     report = ConversionReport(Path(out))
     line = read_segy(path)
-    spacing = sample_spacing or 0.5 * sound_speed * line.interval
+    spacing = how.sample_spacing or 0.5 * how.sound_speed * line.interval
     if not spacing > 0.0:
         raise BagError(f'{path} states no sample interval; give the sample spacing')
-    start = 0.5 * sound_speed * line.delay
-    depth = depth_offset + start + spacing * np.arange(line.amplitude.shape[1])
-    part = slice(first_sample, None if samples is None else first_sample + samples)
+    start = 0.5 * how.sound_speed * line.delay
+    depth = how.depth_offset + start + spacing * np.arange(line.amplitude.shape[1])
+    part = slice(how.first_sample, None if how.samples is None else how.first_sample + how.samples)
     depth, amplitude = depth[part], line.amplitude[:, part]
     if amplitude.shape[1] < 2:
         raise BagError(f'{path}: fewer than two samples of a trace are left')
     report.notes['sample_spacing'] = f'{spacing:.9g} m'
-    report.notes['stack'] = str(stack)
-    report.notes['depth_of_sample_0'] = f'{depth_offset + start:.9g} m'
-    if not sample_spacing:
-        offset = start + spacing * first_sample
+    report.notes['stack'] = str(how.stack)
+    report.notes['depth_of_sample_0'] = f'{how.depth_offset + start:.9g} m'
+    if not how.sample_spacing:
+        offset = start + spacing * how.first_sample
         if doubt := doubted_spacing(amplitude, spacing, offset, line.water_depth):
             report.notes['sample_interval'] = doubt
-    records = _records(report, Path(path), line.stamps, depth, amplitude, stack, frame_id)
+    records = _records(report, Path(path), line.stamps, depth, amplitude, how.stack, how.frame_id)
     records += _positions(line) if records else []
-    own = _instrument(report, amplitude, spacing, stack)
+    own = _instrument(report, amplitude, spacing, how.stack)
     return write_bag(
         out,
         records,
         report,
         source=Path(path).name,
-        storage=storage,
+        storage=how.storage,
         parameters={'fathometer': own},
     )
 
@@ -243,3 +238,94 @@ def _seconds(year: int, day: int, hour: int, minute: int, second: int) -> int:
     start: Any = datetime(year, 1, 1, tzinfo=timezone.utc)
     moment = start + timedelta(days=day - 1, hours=hour, minutes=minute, seconds=second)
     return int(moment.timestamp())
+
+
+def is_envelope(amplitude: FloatArray) -> bool:
+    """True when no sample of the traces (T, n) is negative, and some are not zero."""
+    return bool(np.nanmin(amplitude) >= 0.0 and np.nanmax(amplitude) > 0.0)
+
+
+def arrival_edges(amplitude: FloatArray) -> IntArray:
+    """Sample at which each trace (T, n) first begins, -1 where none does: the first of three
+    successive samples above an eighth of what the loud traces reach."""
+    loud = float(np.quantile(amplitude.max(axis=1), 0.99)) / _LOUD
+    above = amplitude > loud
+    count = amplitude.shape[1] - _RUN + 1
+    if count < 1:
+        return np.full(len(amplitude), -1)
+    run = np.logical_and.reduce([above[:, k : k + count] for k in range(_RUN)])
+    return np.where(run.any(axis=1), run.argmax(axis=1), -1)
+
+
+def first_arrivals(amplitude: FloatArray) -> IntArray:
+    """Sample of the first arrival of each trace (T, n), -1 where there is none: the greatest of
+    the four from its edge on."""
+    return np.array(
+        [
+            -1 if i < 0 else i + int(np.argmax(trace[i : i + _REACH]))
+            for i, trace in zip(arrival_edges(amplitude), amplitude)
+        ]
+    )
+
+
+def measured_instrument(
+    amplitude: FloatArray, spacing: float, stack: int = 1
+) -> tuple[float, float] | None:
+    """Standard deviation of the pulse, m, and noise, for envelopes (T, n) with samples `spacing` m
+    apart, of which `stack` successive ones are averaged; None when too few first arrivals stand
+    free."""
+    step = _step(amplitude)
+    count = len(amplitude) // stack
+    amplitude = amplitude[: count * stack].reshape(count, stack, -1).mean(axis=1)
+    arrivals = first_arrivals(amplitude)
+    free = [(trace, int(i)) for trace, i in zip(amplitude, arrivals) if i >= _REACH]
+    widths = [width for trace, i in free if (width := _width(trace, i)) is not None]
+    if len(widths) < _LEAST_ARRIVALS:
+        return None
+    pulse = spacing * max(float(np.quantile(widths, 0.25)) / _FWHM, 0.4)
+    quiet = np.concatenate([trace[: i - _REACH] for trace, i in free] or [np.empty(0)])
+    rms = float(np.sqrt(np.mean(np.square(quiet)))) if len(quiet) else 0.0
+    return pulse, max(rms, 0.5 * step, 1e-3 * float(amplitude.max()))
+
+
+def _width(trace: FloatArray, peak: int) -> float | None:
+    """Width at half height of the hump at `peak`, samples, None when it leaves the trace."""
+    half = 0.5 * trace[peak]
+    before, after = np.flatnonzero(trace[:peak] <= half), np.flatnonzero(trace[peak:] <= half)
+    if not len(before) or not len(after):
+        return None
+    low, high = int(before[-1]), peak + int(after[0])
+    left = low + (half - trace[low]) / (trace[low + 1] - trace[low])
+    right = high - (half - trace[high]) / (trace[high - 1] - trace[high])
+    return float(right - left)
+
+
+def _step(amplitude: FloatArray) -> float:
+    """The step of a coarse converter: the least difference of few distinct values, else 0."""
+    values = np.unique(amplitude)
+    return float(np.diff(values).min()) if 1 < len(values) <= 4096 else 0.0
+
+
+def doubted_spacing(
+    amplitude: FloatArray, spacing: float, offset: float, stated: NDArray
+) -> str | None:
+    """A sentence when samples `spacing` m apart, the first of the traces (T, n) `offset` m down,
+    cannot be right; None otherwise. stated (T,): depth of the water by the headers, m, 0 where
+    they say nothing."""
+    span = offset + spacing * amplitude.shape[1]
+    if not 1.0 <= span <= 12_000.0:
+        return f'the sample interval of the headers makes the traces end at {span:g} m'
+    arrivals = first_arrivals(amplitude)
+    known = (stated > 0.0) & (arrivals >= _REACH)
+    if np.count_nonzero(known) < _LEAST_ARRIVALS:
+        return None
+    sample = offset / spacing + arrivals[known]
+    fits = float(np.median(stated[known] / sample))
+    if fits / _NEAR <= spacing <= fits * _NEAR:
+        return None
+    return (
+        f'the sample interval of the headers ({spacing:.3g} m a sample) puts the first arrivals '
+        f'at {np.median(spacing * sample):.1f} m, where the headers themselves state '
+        f'{np.median(stated[known]):.1f} m of water: {fits:.3g} m a sample would fit; '
+        'give the sample spacing'
+    )

@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +35,9 @@ from sonar_imm.acoustics import array
 from sonar_imm.measurements import Rejection, Snapshot
 from sonar_imm.truth import TrueProfile
 
-from ..conversion import ConversionReport, Record, write_bag
+from ..conversion import ConversionReport, read_npz, Record, write_bag
+from ..convert_options import SnapshotsOptions
 from ..messages import ros_message
-from ..npz import read_npz
 from ..sources import BagError
 from ..truth import records_of
 
@@ -65,40 +66,31 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 _CONSTANTS = ('sound_speed', 'frequency', 'sample_rate')
 
 
-def convert_snapshots(
-    path: str | Path,
-    out: str | Path,
-    *,
-    names: Mapping[str, str] | None = None,
-    staves: Sequence[Sequence[int]] | None = None,
-    ping_rate: float = 10.0,
-    frame_id: str = 'sonar',
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_snapshots(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert an npz archive to the topic ``/snapshot``, one message per ping.
 
-    names: name in this archive by the names of `NAMES`. staves: for each stave the channels, from
-    0, that are summed; None takes each channel as a stave. Without stamps there are `ping_rate`
-    pings per second. Raises `BagError`.
+    values: as in `SnapshotsOptions`; names are by the names of `NAMES`, and without staves each
+    channel is one. Raises `BagError`.
     """
+    how = SnapshotsOptions(**values)
     report = ConversionReport(Path(out))
-    content = _Archive(path, names or {})
-    samples = _samples(content, staves)
-    stamps = _stamps(content, len(samples), ping_rate)
+    content = _Archive(path, how.names)
+    samples = _samples(content, how.staves)
+    stamps = _stamps(content, len(samples), how.ping_rate)
     constants = {name: content.number(name) for name in _CONSTANTS}
     constants['element_spacing'] = _element_spacing(content, constants, report)
     records: list[Record] = []
     for ping, (stamp, iq) in enumerate(zip(stamps, samples)):
         report.rows += 1
         try:
-            snapshot = _snapshot(content, ping, stamp, iq, constants, frame_id)
+            snapshot = _snapshot(content, ping, stamp, iq, constants, how.frame_id)
         except Rejection as error:
             report.bad_row(content.path, f'ping {ping}', error)
             continue
         records.append((stamp, '/snapshot', write_snapshot(snapshot, ros_message)))
         if (profile := _truth(content, ping, snapshot)) is not None:
             records += records_of(profile, '')
-    return write_bag(out, records, report, source=Path(path).name, storage=storage)
+    return write_bag(out, records, report, source=Path(path).name, storage=how.storage)
 
 
 class _Archive:
@@ -164,7 +156,7 @@ def _samples(content: _Archive, staves: Sequence[Sequence[int]] | None) -> NDArr
     if staves is None:
         return iq
     channels = iq.shape[2]
-    if wrong := [one for stave in staves for one in stave if not 0 <= one < channels]:
+    if wrong := [k for stave in staves for k in stave if not 0 <= k < channels]:
         raise BagError(f'{content.path} has the channels 0 to {channels - 1}, not {wrong[0]}')
     return np.stack([iq[:, :, list(stave)].sum(axis=2) for stave in staves], axis=2)
 
@@ -207,7 +199,8 @@ def _snapshot(
     if ranges is None:
         content.need('time')
         time = content.per_bin('time', ping, bins)
-        ranges = 0.5 * (constants['sound_speed'] or 1500.0) * time
+        assert time is not None
+        ranges = np.asarray(0.5 * (constants['sound_speed'] or 1500.0) * time)
     noise = content.per_bin('noise_variance', ping, bins)
     signal = content.per_bin('signal_variance', ping, bins)
     ratio = content.per_bin('snr', ping, bins)
@@ -221,7 +214,10 @@ def _snapshot(
         two_way_time=time,
         noise_variance=noise,
         signal_variance=signal,
-        **constants,
+        sound_speed=constants['sound_speed'],
+        frequency=constants['frequency'],
+        element_spacing=constants['element_spacing'],
+        sample_rate=constants['sample_rate'],
     )
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,10 @@ from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Rejection, Trace
 from sonar_imm.truth import PRESENT, TrueReflectors
 
-from ..conversion import ConversionReport, Record, write_bag
-from ..csv_table import CsvOptions, CsvTable, Row
+from ..conversion import ConversionReport, read_npz, Record, write_bag
+from ..convert_options import TracesOptions
+from ..csv_table import CsvTable, Row
 from ..messages import ros_message
-from ..npz import read_npz
 from ..sources import BagError
 from ..truth import records_of
 
@@ -37,31 +38,25 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 Arrays = dict[str, NDArray]
 
 
-def convert_traces(
-    path: str | Path,
-    out: str | Path,
-    *,
-    options: CsvOptions | None = None,
-    rate: float = 1.0,
-    frame_id: str = 'array',
-    storage: str = 'mcap',
-) -> ConversionReport:
+def convert_traces(path: str | Path, out: str | Path, **values: Any) -> ConversionReport:
     """Convert traces to the topic ``/trace``.
 
-    An archive (.npz) has ``depth`` (n,) and ``amplitude`` (n,) or (T, n). Optional: ``stamp`` (T,)
-    s, without which there are `rate` traces per second; ``sigma`` as one number, (T,) or (T, n);
-    ``reference_depth`` (T,) of the array; as truth ``reflector_depth`` and ``reflector_amplitude``
-    (T, K), where a reflector is present while its amplitude exceeds 0.4 of its largest value.
+    values: as in `TracesOptions`. An archive (.npz) has ``depth`` (n,) and ``amplitude`` (n,) or
+    (T, n). Optional: ``stamp`` (T,) s, without which there are `rate` traces per second; ``sigma``
+    as one number, (T,) or (T, n); ``reference_depth`` (T,) of the array; as truth
+    ``reflector_depth`` and ``reflector_amplitude`` (T, K), where a reflector is present while its
+    amplitude exceeds 0.4 of its largest value.
 
     Any other file is read as a CSV of ``stamp``, ``depth``, ``amplitude`` and optionally ``std``,
     one row per sample, trace after trace. Raises `BagError`.
     """
+    how = TracesOptions(**values)
     report = ConversionReport(Path(out))
     if Path(path).suffix.lower() == '.npz':
-        records = _from_archive(report, Path(path), rate, frame_id)
+        records = _from_archive(report, Path(path), how.rate, how.frame_id)
     else:
-        records = _from_table(report, CsvTable(path, options), frame_id)
-    return write_bag(out, records, report, source=Path(path).name, storage=storage)
+        records = _from_table(report, CsvTable(path, how.options), how.frame_id)
+    return write_bag(out, records, report, source=Path(path).name, storage=how.storage)
 
 
 def _from_archive(

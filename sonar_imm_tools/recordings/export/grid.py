@@ -30,8 +30,8 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
 
+from attrs import frozen
 import numpy as np
 
 from sonar_imm.estimation.arrays import FloatArray
@@ -43,7 +43,8 @@ MOST_CELLS = 25_000_000
 EMPTY_LABEL = 255
 
 
-class Grid(NamedTuple):
+@frozen(eq=False)
+class Grid:
     """Cells by row, the first the northernmost, and column, the first the westernmost.
 
     west, north: outer corner, m; cell: m. height (R, C) m, up, NaN where empty; uncertainty (R, C)
@@ -76,7 +77,7 @@ def grid_of(points: Points, cell: float) -> Grid:
     index, size = row * columns + column, rows * columns
 
     def total(values: FloatArray | None = None) -> FloatArray:
-        return np.bincount(index, values, size)
+        return np.asarray(np.bincount(index, values, size), np.float64)
 
     variance = np.maximum(points['vertical_uncertainty'], 1e-12)
     count = total().astype(np.int64)

@@ -83,12 +83,12 @@ def write_picks(out: Path, picks: Picks, original: Path, notes: Mapping[str, str
                     f'{original} hold ({largest})'
                 )
             fields = segyio.TraceField
-            for k in range(T):
-                file.trace[k] = grid[k].astype(file.dtype)
-                file.header[k].update(
+            for trace in range(T):
+                file.trace[trace] = grid[trace].astype(file.dtype)
+                file.header[trace].update(
                     {
-                        fields.UnassignedInt1: int(bottom[k]),
-                        fields.UnassignedInt2: int(number[k]),
+                        fields.UnassignedInt1: int(bottom[trace]),
+                        fields.UnassignedInt2: int(number[trace]),
                     }
                 )
     except BaseException:

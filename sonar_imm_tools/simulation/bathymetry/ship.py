@@ -57,69 +57,46 @@ PASSES, BISECTIONS = 4, 45
 class ShipScenario(Scenario):
     """What a scene says of the ship. Nothing here has a meaning unless `moving`."""
 
-    moving: bool = parameter(
-        False,
-        'the ship moves and has navigation; heights are those in the world, and the floor depends '
-        'on the place: ranges of the patch are then distances from the track',
-    )
-    speed: float = parameter(2.0, 'of the ship', unit='m/s', low=0.0, high=20.0)
-    course_deg: float = parameter(
-        30.0, 'direction the ship goes, from east to north', unit='deg', low=-360.0, high=360.0
-    )
-    roll_deg: float = parameter(2.0, 'rms roll', unit='deg', low=0.0, high=20.0)
-    pitch_deg: float = parameter(1.0, 'rms pitch', unit='deg', low=0.0, high=20.0)
-    yaw_deg: float = parameter(0.8, 'rms yaw', unit='deg', low=0.0, high=20.0)
-    heave: float = parameter(0.2, 'rms heave', unit='m', low=0.0, high=10.0)
-    swell_period: float = parameter(6.0, 'of roll and heave', unit='s', low=0.5, high=60.0)
-    sonar_lever: tuple[float, ...] = parameter(
-        (1.5, -0.4, -0.8),
-        'from the navigation reference to the array, x forward, y port, z up',
-        kind='float[]',
-        unit='m',
-        low=-100.0,
-        high=100.0,
-    )
-    sonar_mount_rpy_deg: tuple[float, ...] = parameter(
-        (1.5, -1.0, 2.0),
-        'roll, pitch, yaw of the array in the ship',
-        kind='float[]',
-        unit='deg',
-        low=-180.0,
-        high=180.0,
-    )
-    water_level: float = parameter(
-        0.0, 'z of the water line in the world', unit='m', low=-12000.0, high=12000.0
-    )
-    sound_speed_profile: tuple[float, ...] = parameter(
-        (),
-        'depth and sound speed in turn; empty: straight rays',
-        kind='float[]',
-        low=-100.0,
-        high=12000.0,
-    )
-    nav_rate: float = parameter(50.0, 'of the navigation', unit='Hz', low=1.0, high=1000.0)
-    nav_attitude_error_deg: float = parameter(
-        0.0, 'rms error of roll and pitch in the navigation', unit='deg', low=0.0, high=20.0
-    )
-    nav_heading_error_deg: float = parameter(
-        0.0, 'rms error of the heading', unit='deg', low=0.0, high=20.0
-    )
-    nav_heave_error: float = parameter(0.0, 'rms error of z', unit='m', low=0.0, high=10.0)
-    nav_position_error: float = parameter(
-        0.0, 'rms error of each horizontal coordinate', unit='m', low=0.0, high=100.0
-    )
-    patch_along: tuple[float, ...] = parameter(
-        (),
-        'where the rough patch begins and ends along the track; empty: everywhere',
-        kind='float[]',
-        unit='m',
-    )
-    patch_outline: float = parameter(
-        0.0, 'amplitude of the waves of its outline', unit='m', low=0.0, high=100.0
-    )
-    patch_outline_length: float = parameter(
-        12.0, 'length of those waves along the track', unit='m', low=0.1, high=10000.0
-    )
+    # fmt: off
+    moving: bool = parameter(False, '',
+        'whether the ship moves and has navigation; heights are then those in the world, and the '
+        'floor depends on the place: ranges of the patch are distances from the track')
+    speed: float = parameter(2.0, 'm/s', 'speed of the ship', range=(0.0, 20.0))
+    course_deg: float = parameter(30.0, 'deg',
+        'direction the ship goes, from east to north', range=(-360.0, 360.0))
+    roll_deg: float = parameter(2.0, 'deg', 'rms roll of the ship', range=(0.0, 20.0))
+    pitch_deg: float = parameter(1.0, 'deg', 'rms pitch of the ship', range=(0.0, 20.0))
+    yaw_deg: float = parameter(0.8, 'deg', 'rms yaw of the ship', range=(0.0, 20.0))
+    heave: float = parameter(0.2, 'm', 'rms heave of the ship', range=(0.0, 10.0))
+    swell_period: float = parameter(6.0, 's', 'period of roll and heave', range=(0.5, 60.0))
+    sonar_lever: tuple[float, ...] = parameter((1.5, -0.4, -0.8), 'm',
+        'vector from the navigation reference to the array: x forward, y port, z up',
+        range=(-100.0, 100.0), kind='float[]')
+    sonar_mount_rpy_deg: tuple[float, ...] = parameter((1.5, -1.0, 2.0), 'deg',
+        'roll, pitch, yaw of the array in the ship', range=(-180.0, 180.0), kind='float[]')
+    water_level: float = parameter(0.0, 'm',
+        'z of the water line in the world', range=(-12000.0, 12000.0))
+    sound_speed_profile: tuple[float, ...] = parameter((), '',
+        'depth in m and sound speed in m/s in turn; empty: straight rays', range=(-100.0, 12000.0),
+        kind='float[]')
+    nav_rate: float = parameter(50.0, 'Hz',
+        'poses of the navigation per second', range=(1.0, 1000.0))
+    nav_attitude_error_deg: float = parameter(0.0, 'deg',
+        'rms error of roll and pitch in the navigation', range=(0.0, 20.0))
+    nav_heading_error_deg: float = parameter(0.0, 'deg',
+        'rms error of the heading in the navigation', range=(0.0, 20.0))
+    nav_heave_error: float = parameter(0.0, 'm',
+        'rms error of z in the navigation', range=(0.0, 10.0))
+    nav_position_error: float = parameter(0.0, 'm',
+        'rms error of each horizontal coordinate in the navigation', range=(0.0, 100.0))
+    patch_along: tuple[float, ...] = parameter((), 'm',
+        'where the rough patch begins and ends along the track; empty: everywhere', kind='float[]')
+    patch_outline: float = parameter(0.0, 'm',
+        'amplitude of the waves in the outline of the rough patch', range=(0.0, 100.0))
+    patch_outline_length: float = parameter(12.0, 'm',
+        'length along the track of the waves in the outline of the rough patch',
+        range=(0.1, 10000.0))
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = []

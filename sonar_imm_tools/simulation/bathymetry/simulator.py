@@ -51,81 +51,74 @@ class BathymetryScenario(ShipScenario):
 
     INSTRUMENT = ('tilt_deg', 'conjugate', 'sonar_height', 'sonar_depth')
 
-    pings: int = parameter(20, 'number of pings', low=1, high=1_000_000)
-    ping_rate: float = parameter(10.0, 'pings per second', unit='Hz', low=0.01, high=1000.0)
-    side: str = parameter('starboard', 'which sides the sonar looks to', choices=SIDES)
+    # fmt: off
+    pings: int = parameter(20, '', 'number of pings of each side', range=(1, 1_000_000))
+    ping_rate: float = parameter(10.0, 'Hz', 'pings per second', range=(0.01, 1000.0))
+    side: str = parameter('starboard', '', 'which sides the sonar looks to', choices=SIDES)
 
-    staves: int = parameter(8, 'staves of the array', low=2, high=64)
-    spacing_wavelengths: float = parameter(
-        0.5, 'distance between staves, in wavelengths', low=0.01, high=100.0
-    )
-    frequency: float = parameter(455e3, 'of the sonar', unit='Hz', low=1e3, high=1e7)
-    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
-    tilt_deg: float = parameter(
-        30.0, 'direction the array looks to, below the horizon', unit='deg', low=-90.0, high=90.0
-    )
-    conjugate: bool = parameter(False, 'the array is wired the other way round')
-    sonar_height: float = parameter(
-        15.0, 'height of the sonar above the reference floor', unit='m', low=0.1, high=12000.0
-    )
-    sonar_depth: float = parameter(
-        3.0, 'depth of the sonar below the surface', unit='m', low=0.0, high=12000.0
-    )
+    staves: int = parameter(8, '', 'number of staves of the array', range=(2, 64))
+    spacing_wavelengths: float = parameter(0.5, '',
+        'distance between staves, in wavelengths', range=(0.01, 100.0))
+    frequency: float = parameter(455e3, 'Hz', 'frequency of the sonar', range=(1e3, 1e7))
+    sound_speed: float = parameter(1500.0, 'm/s',
+        'speed of sound at the sonar', range=(1300.0, 1700.0))
+    tilt_deg: float = parameter(30.0, 'deg',
+        'direction the array looks to, below the horizon', range=(-90.0, 90.0))
+    conjugate: bool = parameter(False, '', 'the array is wired the other way round')
+    sonar_height: float = parameter(15.0, 'm',
+        'height of the sonar above the reference floor', range=(0.1, 12000.0))
+    sonar_depth: float = parameter(3.0, 'm',
+        'depth of the sonar below the surface', range=(0.0, 12000.0))
 
-    first_range: float = parameter(17.0, 'slant range of the first bin', unit='m', low=0.0)
-    last_range: float = parameter(77.0, 'slant range where the swath ends', unit='m', low=0.1)
-    bin_width: float = parameter(0.05, 'distance between bins', unit='m', low=1e-3, high=10.0)
-    snr_near_db: float = parameter(30.0, 'signal to noise at a stave, first echo', unit='dB')
-    snr_far_db: float = parameter(10.0, 'signal to noise at a stave, end of the swath', unit='dB')
-    noise_variance: float = parameter(1.0, 'noise power at a stave', low=1e-12, high=1e12)
-    state_noise: bool = parameter(True, 'the snapshot says its noise variance')
-    state_signal: bool = parameter(False, 'the snapshot says its signal variance')
-    law: str = parameter('laplace', 'how the power of echoes varies', choices=LAWS)
-    texture_shape: float = parameter(
-        0.5, 'law k: shape of the gamma law of that power; 1 is laplace', low=0.05, high=100.0
-    )
-    noise_fades: bool = parameter(
-        True,
-        'the noise varies with the echo, as the observation model has it; thermal noise does not',
-    )
-    decorrelation: float = parameter(
-        0.0, 'share of the power of an echo that differs from stave to stave', low=0.0, high=1.0
-    )
+    first_range: float = parameter(17.0, 'm', 'slant range of the first bin', range=(0.0, None))
+    last_range: float = parameter(77.0, 'm', 'slant range where the swath ends', range=(0.1, None))
+    bin_width: float = parameter(0.05, 'm', 'distance between bins', range=(1e-3, 10.0))
+    snr_near_db: float = parameter(30.0, 'dB',
+        'signal-to-noise ratio at a stave, at the first echo')
+    snr_far_db: float = parameter(10.0, 'dB',
+        'signal-to-noise ratio at a stave, at the end of the swath')
+    noise_variance: float = parameter(1.0, '', 'noise power at a stave', range=(1e-12, 1e12))
+    state_noise: bool = parameter(True, '', 'whether the snapshot states its noise variance')
+    state_signal: bool = parameter(False, '', 'whether the snapshot states its signal variance')
+    law: str = parameter('laplace', '',
+        'distribution of the samples of an echo, by how its power varies', choices=LAWS)
+    texture_shape: float = parameter(0.5, '',
+        'law k: shape of the gamma distribution of the power of echoes; 1 is laplace',
+        range=(0.05, 100.0))
+    noise_fades: bool = parameter(True, '',
+        'whether the noise varies with the echo, as the observation model has it; thermal noise '
+        'does not')
+    decorrelation: float = parameter(0.0, '',
+        'share of the power of an echo that differs from stave to stave', range=(0.0, 1.0))
 
-    slope: float = parameter(0.0, 'rise of the floor per metre of slant range', low=-1.0, high=1.0)
-    undulation_height: float = parameter(0.0, 'amplitude of an undulation', unit='m', low=0.0)
-    undulation_length: float = parameter(20.0, 'its length in slant range', unit='m', low=0.1)
-    patch_start: float = parameter(40.0, 'slant range at which the rough patch begins', unit='m')
-    patch_end: float = parameter(50.0, 'slant range at which it ends', unit='m')
-    patch_std: float = parameter(
-        0.5, 'standard deviation of its heights', unit='m', low=0.0, high=100.0
-    )
-    patch_drift: float = parameter(
-        0.0, 'the patch lies so much further out from ping to ping', unit='m'
-    )
-    roughness_law: str = parameter(
-        'gaussian',
-        'law of its heights; fractal: Gaussian with a spectrum that falls with the square of the '
-        'wave number',
-        choices=ROUGHNESS_LAWS,
-    )
-    correlation_length: float = parameter(
-        0.0,
-        'standard deviation of the kernel that smooths its heights; 0: white',
-        unit='m',
-        low=0.0,
-        high=100.0,
-    )
+    slope: float = parameter(0.0, '',
+        'rise of the floor per metre of slant range', range=(-1.0, 1.0))
+    undulation_height: float = parameter(0.0, 'm',
+        'amplitude of an undulation of the floor', range=(0.0, None))
+    undulation_length: float = parameter(20.0, 'm',
+        'length of the undulation of the floor in slant range', range=(0.1, None))
+    patch_start: float = parameter(40.0, 'm', 'slant range at which the rough patch begins')
+    patch_end: float = parameter(50.0, 'm', 'slant range at which the rough patch ends')
+    patch_std: float = parameter(0.5, 'm',
+        'standard deviation of the heights of the rough patch', range=(0.0, 100.0))
+    patch_drift: float = parameter(0.0, 'm',
+        'distance by which the rough patch moves outwards from ping to ping')
+    roughness_law: str = parameter('gaussian', '',
+        'distribution of the heights of the rough patch; fractal: Gaussian with a spectrum that '
+        'falls with the square of the wave number', choices=ROUGHNESS_LAWS)
+    correlation_length: float = parameter(0.0, 'm',
+        'standard deviation of the kernel that smooths the heights of the rough patch; 0: white',
+        range=(0.0, 100.0))
 
-    shadows: tuple[float, ...] = parameter(
-        (), 'slant ranges where shadows begin and end, in pairs', kind='float[]', unit='m', low=0.0
-    )
-    spike_probability: float = parameter(0.0, 'that a bin has a burst of noise', low=0.0, high=1.0)
-    spike_db: float = parameter(20.0, 'power of bursts above echo and noise', unit='dB')
-    multipath: bool = parameter(False, 'a calm surface returns echoes too')
-    multipath_level_db: float = parameter(
-        0.0, 'power of each surface echo against the floor', unit='dB', low=-60.0, high=60.0
-    )
+    shadows: tuple[float, ...] = parameter((), 'm',
+        'slant ranges where shadows begin and end, in pairs', range=(0.0, None), kind='float[]')
+    spike_probability: float = parameter(0.0, '',
+        'probability that a bin has a burst of noise', range=(0.0, 1.0))
+    spike_db: float = parameter(20.0, 'dB', 'power of bursts of noise above echo and noise')
+    multipath: bool = parameter(False, '', 'whether a calm surface returns echoes too')
+    multipath_level_db: float = parameter(0.0, 'dB',
+        'multipath: power of each surface echo relative to the floor', range=(-60.0, 60.0))
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check()
@@ -141,10 +134,10 @@ class BathymetryScenario(ShipScenario):
             problems.append('shadows needs increasing ranges in pairs, begin and end of each')
         return problems
 
-    def told(self) -> dict[str, Any]:
+    def instruments(self) -> dict[str, Any]:
         ship = ('sonar_lever', 'sonar_mount_rpy_deg', 'sound_speed_profile', 'water_level')
         mounted = {name: getattr(self, name) for name in ship} if self.moving else {}
-        return {**super().told(), **mounted}
+        return {**super().instruments(), **mounted}
 
 
 SUMMER = (0.0, 1520.0, 5.0, 1518.0, 10.0, 1505.0, 15.0, 1495.0, 30.0, 1490.0)

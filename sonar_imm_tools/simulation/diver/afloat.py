@@ -52,7 +52,7 @@ GEODETIC = (
 """Scenes of `scenarios.SCENARIOS`."""
 
 
-def told_of_places(config: Any) -> dict[str, Any]:
+def instruments_of_places(config: Any) -> dict[str, Any]:
     """What a tracker has to know of these sensors."""
     if config.sensor == 'geodetic':
         return {'origin_latitude': ORIGIN.latitude, 'origin_longitude': ORIGIN.longitude}

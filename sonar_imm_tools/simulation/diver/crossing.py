@@ -90,7 +90,7 @@ def sense_scan(
     ]
 
 
-def told_of_scans(config: Any) -> dict[str, float]:
+def instruments_of_scans(config: Any) -> dict[str, float]:
     """What a user knows of such a sensor, by the names of the tracker's parameters."""
     return {
         'clutter_density': max(config.clutter, 1e-3) / (2.0 * config.clutter_range) ** 2,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of a diver scene, and the scenes that have a name."""
+"""Parameters of a diver scene, and the scenes that have a name."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ import numpy as np
 from sonar_imm.parameters import parameter
 
 from ..scenario import Scenario
-from .afloat import GEODETIC, told_of_places, USBL
-from .crossing import CROSSING, told_of_scans
+from .afloat import GEODETIC, instruments_of_places, USBL
+from .crossing import CROSSING, instruments_of_scans
 
 MOTIONS = ('legs', 'straight', 'circle', 'zigzag', 'stop_and_go', 'still', 'crossing')
 SENSORS = (
@@ -50,91 +50,71 @@ FIRST_STAMP_NS = 1_700_000_000_000_000_000
 class DiverScenario(Scenario):
     """Parameters of a diver scene; the defaults are Table 1 of the paper."""
 
-    motion: str = parameter('legs', 'how the diver moves', choices=MOTIONS)
-    speed: float = parameter(1.0, 'swimming speed', unit='m/s', low=0.0, high=10.0)
-    start: tuple[float, ...] = parameter(
-        (-40.0, 40.0), 'first position of the first diver', unit='m'
-    )
-    heading_deg: float = parameter(0.0, 'general heading, counter-clockwise from +x', unit='deg')
-    random_rotation: bool = parameter(
-        False, 'turn the scene, start and heading, about the sonar by an angle drawn at random'
-    )
-    turn_deg: float = parameter(
-        85.0, 'legs head within this of the general heading', unit='deg', low=0.0, high=180.0
-    )
-    leg_min: float = parameter(7.0, 'shortest leg', unit='s', low=0.1)
-    leg_max: float = parameter(15.0, 'longest leg', unit='s', low=0.1)
-    duration: float = parameter(100.0, 'length of the scene', unit='s', low=1.0, high=1e6)
-    step: float = parameter(1.0, 'time between scans', unit='s', low=1e-3, high=1e4)
-    step_jitter: float = parameter(
-        0.0, 'scan times vary uniformly by this much of a step', low=0.0, high=0.9
-    )
-    divers: int = parameter(1, 'number of divers', low=1, high=2000)
-    spacing: float = parameter(
-        15.0, 'distance between the starts of several divers', unit='m', low=0.0
-    )
-    sensor: str = parameter('polar', 'what sees the divers', choices=SENSORS)
-    range_std: float = parameter(
-        0.1, 'range error of the polar sonar and of usbl', unit='m', low=1e-6
-    )
-    bearing_std_deg: float = parameter(
-        2.0, 'bearing error of the polar sonar and of usbl', unit='deg', low=1e-6
-    )
-    toa_std: float = parameter(
-        2e-4, 'arrival-time error of the multistatic sonar', unit='s', low=1e-9
-    )
-    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
-    detection_probability: float = parameter(
-        1.0, 'that a sensor sees a diver in a scan', low=0.0, high=1.0
-    )
-    outlier_probability: float = parameter(
-        0.0, 'that a detection is an outlier', low=0.0, high=1.0
-    )
-    depth: tuple[float, ...] = parameter(
-        (0.0, 0.0), 'least and greatest depth at which a diver swims, drawn between', unit='m'
-    )
-    swell_height: float = parameter(
-        0.0, 'a diver goes up and down with the swell by this', unit='m', low=0.0, high=20.0
-    )
-    swell_period: float = parameter(60.0, 'period of the swell', unit='s', low=0.1)
-    receiver_depths: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0, 0.0),
-        'depths of the four receivers; the transmitter is at the first',
-        unit='m',
-    )
-    depth_std: float = parameter(
-        0.0, "error of the diver's own depth report, beside arrivals; 0: none", unit='m', low=0.0
-    )
-    receiver_position_std: float = parameter(
-        0.0,
-        'receivers lie off where they are said to be by this on each axis, but not the first',
-        unit='m',
-        low=0.0,
-    )
-    receiver_clock_std: float = parameter(
-        0.0, 'the clocks of the receivers are wrong by this', unit='s', low=0.0
-    )
-    sound_speed_std: float = parameter(
-        0.0, 'the sound speed differs by this from the one given', unit='m/s', low=0.0
-    )
-    fix_std: float = parameter(
-        1.0,
-        'white error on each axis of the sensors `positions`, `scans` and `geodetic`',
-        unit='m',
-        low=1e-6,
-    )
-    fix_bias_std: float = parameter(
-        0.0, 'lasting error on each axis of the sensor `positions`', unit='m', low=0.0
-    )
-    fix_bias_time: float = parameter(
-        60.0, 'time over which that error is correlated', unit='s', low=1e-3
-    )
-    clutter: float = parameter(0.0, 'false detections in a scan, on average', low=0.0, high=1e4)
-    clutter_range: float = parameter(
-        100.0, 'half width of the square they fall in', unit='m', low=1.0
-    )
-    late_fraction: float = parameter(0.0, 'share of scans received late', low=0.0, high=1.0)
-    late_delay: float = parameter(3.0, 'most they are late by', unit='s', low=0.0)
+    # fmt: off
+    motion: str = parameter('legs', '', 'how the divers move', choices=MOTIONS)
+    speed: float = parameter(1.0, 'm/s', 'swimming speed of the divers', range=(0.0, 10.0))
+    start: tuple[float, ...] = parameter((-40.0, 40.0), 'm', 'first position of the first diver')
+    heading_deg: float = parameter(0.0, 'deg', 'general heading, counter-clockwise from +x')
+    random_rotation: bool = parameter(False, '',
+        'turn the scene, start and heading, about the sonar by an angle drawn at random')
+    turn_deg: float = parameter(85.0, 'deg',
+        'largest angle between a leg and the general heading', range=(0.0, 180.0))
+    leg_min: float = parameter(7.0, 's', 'duration of the shortest leg', range=(0.1, None))
+    leg_max: float = parameter(15.0, 's', 'duration of the longest leg', range=(0.1, None))
+    duration: float = parameter(100.0, 's', 'length of the scene', range=(1.0, 1e6))
+    step: float = parameter(1.0, 's', 'time between scans', range=(1e-3, 1e4))
+    step_jitter: float = parameter(0.0, '',
+        'share of a step by which scan times vary, uniformly', range=(0.0, 0.9))
+    divers: int = parameter(1, '', 'number of divers', range=(1, 2000))
+    spacing: float = parameter(15.0, 'm',
+        'distance between the starts of several divers', range=(0.0, None))
+    sensor: str = parameter('polar', '', 'what sees the divers', choices=SENSORS)
+    range_std: float = parameter(0.1, 'm',
+        'standard deviation of ranges of the sensors polar and usbl', range=(1e-6, None))
+    bearing_std_deg: float = parameter(2.0, 'deg',
+        'standard deviation of bearings of the sensors polar and usbl', range=(1e-6, None))
+    toa_std: float = parameter(2e-4, 's',
+        'standard deviation of arrival times of the multistatic sonar', range=(1e-9, None))
+    sound_speed: float = parameter(1500.0, 'm/s',
+        'speed of sound in the water', range=(1300.0, 1700.0))
+    detection_probability: float = parameter(1.0, '',
+        'probability that a sensor sees a diver in a scan', range=(0.0, 1.0))
+    outlier_probability: float = parameter(0.0, '',
+        'probability that a detection is an outlier', range=(0.0, 1.0))
+    depth: tuple[float, ...] = parameter((0.0, 0.0), 'm',
+        'least and greatest depth of divers, drawn between')
+    swell_height: float = parameter(0.0, 'm',
+        'amplitude with which a diver moves up and down in the swell', range=(0.0, 20.0))
+    swell_period: float = parameter(60.0, 's', 'period of the swell', range=(0.1, None))
+    receiver_depths: tuple[float, ...] = parameter((0.0, 0.0, 0.0, 0.0), 'm',
+        'depths of the four receivers; the transmitter is at the first')
+    depth_std: float = parameter(0.0, 'm',
+        "standard deviation of the diver's own depth report, beside arrivals; 0: no report",
+        range=(0.0, None))
+    receiver_position_std: float = parameter(0.0, 'm',
+        'standard deviation on each axis of the error of the stated positions of receivers, '
+        'except the first', range=(0.0, None))
+    receiver_clock_std: float = parameter(0.0, 's',
+        'standard deviation of the errors of the clocks of the receivers', range=(0.0, None))
+    sound_speed_std: float = parameter(0.0, 'm/s',
+        'standard deviation of the error of the stated sound speed', range=(0.0, None))
+    fix_std: float = parameter(1.0, 'm',
+        'standard deviation on each axis of the white error of the sensors positions, scans and '
+        'geodetic', range=(1e-6, None))
+    fix_bias_std: float = parameter(0.0, 'm',
+        'standard deviation on each axis of the lasting error of the sensor positions',
+        range=(0.0, None))
+    fix_bias_time: float = parameter(60.0, 's',
+        'time over which the lasting error of the sensor positions (fix_bias_std) is correlated',
+        range=(1e-3, None))
+    clutter: float = parameter(0.0, '',
+        'mean number of false detections in a scan', range=(0.0, 1e4))
+    clutter_range: float = parameter(100.0, 'm',
+        'half width of the square in which false detections fall', range=(1.0, None))
+    late_fraction: float = parameter(0.0, '', 'share of scans received late', range=(0.0, 1.0))
+    late_delay: float = parameter(3.0, 's',
+        'largest delay of a scan that is received late', range=(0.0, None))
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = []
@@ -148,10 +128,10 @@ class DiverScenario(Scenario):
             problems.append('leg_min cannot exceed leg_max')
         return problems
 
-    def told(self) -> dict[str, Any]:
+    def instruments(self) -> dict[str, Any]:
         if self.sensor in ('geodetic', 'usbl'):
-            return told_of_places(self)
-        return told_of_scans(self) if self.sensor == 'scans' else super().told()
+            return instruments_of_places(self)
+        return instruments_of_scans(self) if self.sensor == 'scans' else super().instruments()
 
 
 MULTISTATIC = {

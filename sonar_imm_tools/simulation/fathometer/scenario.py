@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from sonar_imm.acoustics.fathometer import PROCESSORS
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.parameters import parameter
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm.truth import PRESENT
 
 from ..scenario import Scenario
@@ -55,105 +55,93 @@ class FathometerScenario(Scenario):
         'sound_speed',
     )
 
-    level: str = parameter('response', 'what is written of the scene', choices=LEVELS)
-    records: int = parameter(300, 'number of records', low=1, high=100_000)
-    record_seconds: float = parameter(
-        89.6, 'from record to record', unit='s', low=0.01, high=86400.0
-    )
-    snapshots: int = parameter(64, 'independent snapshots of a record', low=1, high=100_000)
-    snapshot_seconds: float = parameter(
-        1.4, 'length of a snapshot: the inverse of the frequency spacing', unit='s', low=1e-3
-    )
-    frequency_min: float = parameter(50.0, 'lower edge of the band', unit='Hz', low=1.0)
-    frequency_max: float = parameter(4000.0, 'upper edge of the band', unit='Hz', low=2.0)
-    sample_rate: float = parameter(12000.0, 'pressure: samples per second', unit='Hz', low=10.0)
-    phones: int = parameter(32, 'hydrophones of the array', low=3, high=256)
-    element_spacing: float = parameter(0.18, 'distance between hydrophones', unit='m', low=1e-3)
-    sound_speed: float = parameter(1500.0, 'speed of sound', unit='m/s', low=1300.0, high=1700.0)
+    # fmt: off
+    level: str = parameter('response', '', 'kind of records that is written', choices=LEVELS)
+    records: int = parameter(300, '', 'number of records', range=(1, 100_000))
+    record_seconds: float = parameter(89.6, 's',
+        'time from record to record', range=(0.01, 86400.0))
+    snapshots: int = parameter(64, '',
+        'number of independent snapshots of a record', range=(1, 100_000))
+    snapshot_seconds: float = parameter(1.4, 's',
+        'length of a snapshot: the inverse of the frequency spacing', range=(1e-3, None))
+    frequency_min: float = parameter(50.0, 'Hz',
+        'lower edge of the frequency band', range=(1.0, None))
+    frequency_max: float = parameter(4000.0, 'Hz',
+        'upper edge of the frequency band', range=(2.0, None))
+    sample_rate: float = parameter(12000.0, 'Hz',
+        'level pressure: samples per second', range=(10.0, None))
+    phones: int = parameter(32, '', 'number of hydrophones of the array', range=(3, 256))
+    element_spacing: float = parameter(0.18, 'm',
+        'distance between hydrophones', range=(1e-3, None))
+    sound_speed: float = parameter(1500.0, 'm/s',
+        'speed of sound in the water', range=(1300.0, 1700.0))
 
-    array_depth: float = parameter(73.5, 'mean depth of the deepest hydrophone', unit='m', low=0.0)
-    heave: float = parameter(2.5, 'amplitude of its slow heave', unit='m', low=0.0)
-    heave_records: float = parameter(180.0, 'records to a period of the heave', low=2.0)
-    array_depth_std: float = parameter(
-        0.03, 'error of the depth that is stated', unit='m', low=0.0
-    )
-    depth_companion: bool = parameter(
-        False, 'the depth of the array is sent beside the records, not in them'
-    )
+    array_depth: float = parameter(73.5, 'm',
+        'mean depth of the deepest hydrophone', range=(0.0, None))
+    heave: float = parameter(2.5, 'm',
+        'amplitude of the slow heave of the array', range=(0.0, None))
+    heave_records: float = parameter(180.0, '',
+        'period of the heave of the array, in records', range=(2.0, None))
+    array_depth_std: float = parameter(0.03, 'm',
+        'standard deviation of the stated depth of the array', range=(0.0, None))
+    depth_companion: bool = parameter(False, '',
+        'the depth of the array is sent beside the records, not in them')
 
-    first_depth: float = parameter(130.0, 'depth of the first layer', unit='m', low=1.0)
-    layers: int = parameter(8, 'layers that are there from the beginning', low=1, high=64)
-    layer_spacing: float = parameter(4.0, 'mean distance of layers', unit='m', low=0.1, high=100.0)
-    depth_walk: float = parameter(
-        0.01, 'how far each layer wanders from record to record', unit='m', low=0.0
-    )
-    tilt_walk: float = parameter(
-        0.04, 'how far all wander together from record to record', unit='m', low=0.0
-    )
-    first_amplitude: float = parameter(0.35, 'of the first layer', low=0.0, high=1.0)
-    amplitude: float = parameter(0.11, 'of the others', low=0.0, high=1.0)
-    amplitude_swing: float = parameter(
-        0.15, 'share by which amplitudes rise and fall over 70 to 150 records', low=0.0, high=1.0
-    )
-    appearing: tuple[int, ...] = parameter(
-        (140, 262), 'records at which one more layer begins to appear', kind='int[]', low=0
-    )
-    fading: tuple[int, ...] = parameter(
-        (85,), 'records at which a layer begins to fade', kind='int[]', low=0
-    )
-    fade_records: int = parameter(
-        5, 'over how many records layers appear and fade', low=1, high=10_000
-    )
+    first_depth: float = parameter(130.0, 'm', 'depth of the first layer', range=(1.0, None))
+    layers: int = parameter(8, '',
+        'number of layers that are there from the beginning', range=(1, 64))
+    layer_spacing: float = parameter(4.0, 'm', 'mean distance between layers', range=(0.1, 100.0))
+    depth_walk: float = parameter(0.01, 'm',
+        'standard deviation of the step of each layer from record to record', range=(0.0, None))
+    tilt_walk: float = parameter(0.04, 'm',
+        'standard deviation of the step of all layers together from record to record',
+        range=(0.0, None))
+    first_amplitude: float = parameter(0.35, '', 'amplitude of the first layer', range=(0.0, 1.0))
+    amplitude: float = parameter(0.11, '',
+        'amplitude of the layers below the first', range=(0.0, 1.0))
+    amplitude_swing: float = parameter(0.15, '',
+        'share by which amplitudes rise and fall over 70 to 150 records', range=(0.0, 1.0))
+    appearing: tuple[int, ...] = parameter((140, 262), '',
+        'numbers of the records at which one more layer begins to appear', range=(0, None),
+        kind='int[]')
+    fading: tuple[int, ...] = parameter((85,), '',
+        'numbers of the records at which a layer begins to fade', range=(0, None), kind='int[]')
+    fade_records: int = parameter(5, '',
+        'number of records over which layers appear and fade', range=(1, 10_000))
 
-    phone_noise: float = parameter(
-        0.01, 'noise power of a hydrophone against the surface noise', low=1e-6, high=1e6
-    )
-    ship_noise: float = parameter(
-        3.0, 'power of distant ships at 200 Hz against the surface noise', low=0.0, high=1e6
-    )
-    ship_pass: tuple[int, ...] = parameter(
-        (), 'records between which a ship comes by, a hundred times louder', kind='int[]', low=0
-    )
-    whitened: bool = parameter(
-        False, 'csdm, pressure: spectra made even, as a recorder does that has few bits'
-    )
-    steps_per_sigma: float = parameter(
-        0.0,
-        'pressure: whole numbers with so many steps to a standard deviation; 0: real numbers',
-        low=0.0,
-        high=1e4,
-    )
-    block_seconds: float = parameter(
-        1.0, 'pressure: length of a message', unit='s', low=1e-3, high=60.0
-    )
-    noise_sigma: float = parameter(
-        1.3e-3, 'trace, envelope: standard deviation of the noise', low=1e-9, high=1.0
-    )
-    pulse_width: float = parameter(
-        0.45, 'envelope: standard deviation of the pulse', unit='m', low=1e-3, high=100.0
-    )
-    scatter: float = parameter(
-        0.0,
-        'envelope: rms of the volume scatter just below the first layer',
-        low=0.0,
-        high=10.0,
-    )
-    scatter_decay: float = parameter(
-        5.0, 'envelope: depth over which it falls to 1/e', unit='m', low=0.01, high=1000.0
-    )
-    stack: int = parameter(4, 'envelope: pings averaged to one record', low=1, high=1000)
-    processor: str = parameter(
-        'mvdr', 'response: beamformer that looks up and down', choices=PROCESSORS
-    )
-    depth_min: float = parameter(
-        122.0, 'response, trace, envelope: least depth', unit='m', low=0.0
-    )
-    depth_max: float = parameter(
-        172.0, 'response, trace, envelope: greatest depth', unit='m', low=0.1
-    )
-    depth_step: float = parameter(
-        0.03125, 'response, trace, envelope: distance of depths', unit='m', low=1e-4
-    )
+    phone_noise: float = parameter(0.01, '',
+        'noise power of a hydrophone relative to the surface noise', range=(1e-6, 1e6))
+    ship_noise: float = parameter(3.0, '',
+        'power of distant ships at 200 Hz relative to the surface noise', range=(0.0, 1e6))
+    ship_pass: tuple[int, ...] = parameter((), '',
+        'first and last record while a ship passes, a hundred times louder than distant ships; '
+        'empty: none', range=(0, None), kind='int[]')
+    whitened: bool = parameter(False, '',
+        'levels csdm and pressure: spectra made flat, as by a recorder with few bits')
+    steps_per_sigma: float = parameter(0.0, '',
+        'level pressure: number of integer steps per standard deviation; 0: real numbers',
+        range=(0.0, 1e4))
+    block_seconds: float = parameter(1.0, 's',
+        'level pressure: length of a message', range=(1e-3, 60.0))
+    noise_sigma: float = parameter(1.3e-3, '',
+        'levels trace and envelope: standard deviation of the noise', range=(1e-9, 1.0))
+    pulse_width: float = parameter(0.45, 'm',
+        'level envelope: standard deviation of the pulse', range=(1e-3, 100.0))
+    scatter: float = parameter(0.0, '',
+        'level envelope: rms of the volume scatter just below the first layer', range=(0.0, 10.0))
+    scatter_decay: float = parameter(5.0, 'm',
+        'level envelope: depth over which the volume scatter falls to 1/e', range=(0.01, 1000.0))
+    stack: int = parameter(4, '',
+        'level envelope: number of pings averaged to one record', range=(1, 1000))
+    processor: str = parameter('mvdr', '',
+        'level response: beamformer that looks up and down', choices=PROCESSORS)
+    depth_min: float = parameter(122.0, 'm',
+        'levels response, trace and envelope: least depth', range=(0.0, None))
+    depth_max: float = parameter(172.0, 'm',
+        'levels response, trace and envelope: greatest depth', range=(0.1, None))
+    depth_step: float = parameter(0.03125, 'm',
+        'levels response, trace and envelope: distance between depths', range=(1e-4, None))
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = []
@@ -176,21 +164,21 @@ class FathometerScenario(Scenario):
             problems.append('fading would leave no layer')
         return problems
 
-    def told(self) -> dict[str, Any]:
-        """See `Scenario.told`."""
-        values = Scenario.told(self)
+    def instruments(self) -> dict[str, Any]:
+        """See `Scenario.instruments`."""
+        known = Scenario.instruments(self)
         if self.level == 'csdm':
             # They are drawn frequency by frequency: no window makes their noise fade with depth.
-            values |= {'window': 'rectangular', 'overlap': 0.0}
+            known |= {'window': 'rectangular', 'overlap': 0.0}
         if self.level == 'pressure':
             # Snapshots are the tracker's own; they are as long as the depths to be tracked need.
-            del values['snapshot_seconds']
-            values |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
+            del known['snapshot_seconds']
+            known |= {'depth_min': self.depth_min, 'depth_max': self.depth_max}
         if self.level == 'envelope':
             # A profiler has no array: of the instrument only its pulse and its noise matter.
-            values = {'sound_speed': self.sound_speed}
-            values |= envelope_parameters(self.pulse_width, self.noise_sigma)
-        return values
+            known = {'sound_speed': self.sound_speed}
+            known |= envelope_parameters(self.pulse_width, self.noise_sigma)
+        return known
 
     def spectra_bytes(self) -> float:
         """Size of all cross-spectra of the scene."""
@@ -295,13 +283,13 @@ def scenario(name: str, overrides: Mapping[str, Any] | None = None) -> Fathomete
 class Drift:
     """The floor and the array over time: depth and amplitude (records, K) of all layers that ever
     exist, present (records, K), array_depth (records,) and the depth that is stated,
-    array_depth_told (records,)."""
+    array_depth_stated (records,)."""
 
     depth: FloatArray
     amplitude: FloatArray
     present: NDArray[np.bool_]
     array_depth: FloatArray
-    array_depth_told: FloatArray
+    array_depth_stated: FloatArray
 
 
 def drift_of(config: FathometerScenario, rng: np.random.Generator) -> Drift:

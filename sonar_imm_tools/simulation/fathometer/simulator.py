@@ -78,7 +78,7 @@ def stream(
         stamp_ns = measurements[-1].stamp_ns
         received = [Received(item.stamp_ns, item) for item in measurements]
         if config.depth_companion:
-            depth = float(drift.array_depth_told[record])
+            depth = float(drift.array_depth_stated[record])
             companion = ArrayDepth(stamp_ns=stamp_ns, depth=depth, frame_id=FRAME_ID)
             received.insert(0, Received(stamp_ns, companion))
         here = np.flatnonzero(drift.present[record])
@@ -102,7 +102,7 @@ def _measurements(
 ) -> Iterator[list[Any]]:
     """The measurements of each record."""
     for record in range(config.records):
-        stated = None if config.depth_companion else float(drift.array_depth_told[record])
+        stated = None if config.depth_companion else float(drift.array_depth_stated[record])
         if config.level == 'pressure':
             yield pressure_blocks(config, drift, record, stated, rng)
         elif config.level == 'csdm':
@@ -159,7 +159,7 @@ def _response(
     w = fathometer.steering(spectra.frequency, heights, config.sound_speed)
     gamma = fathometer.coherence(spectra.csdm, w, config.processor)
     comb = float(spectra.frequency[0]), 1.0 / config.snapshot_seconds
-    where = float(drift.array_depth_told[record])
+    where = float(drift.array_depth_stated[record])
 
     def at(first: float, count: int) -> FloatArray:
         lattice = first, config.depth_step, count
@@ -181,7 +181,7 @@ def _pulses(
     spectrum = band * (rng.standard_normal((len(band), 2)) @ np.array([1.0, 1j]))
     noise = np.fft.irfft(spectrum, size)[: len(depth)]
     noise *= config.noise_sigma * size / np.sqrt(4.0 * np.count_nonzero(band))
-    shift = drift.array_depth_told[record] - drift.array_depth[record]
+    shift = drift.array_depth_stated[record] - drift.array_depth[record]
     # The level of an MVDR response falls with the two-way path plus the length of the array.
     height = drift.depth[record] - drift.array_depth[record]
     level = (

@@ -43,169 +43,144 @@ class ObstacleScenario(ImageScenario):
         'vertical_fov_deg',
     )
 
+    # fmt: off
     # -- the vehicle -----------------------------------------------------------------------------
-    speed: float = parameter(1.5, 'over ground', unit='m/s', low=0.05, high=20.0)
-    course_deg: float = parameter(30.0, 'from north, clockwise', unit='deg')
-    random_course: bool = parameter(False, 'draw the course at random instead')
-    depth: float = parameter(20.0, 'of the vehicle', unit='m', low=0.0, high=12000.0)
-    altitude: float = parameter(
-        15.0, 'of the vehicle above the sea floor', unit='m', low=0.5, high=12000.0
-    )
-    seabed_relief: float = parameter(
-        0.0, 'amplitude of ripples of the sea floor', unit='m', low=0.0, high=100.0
-    )
-    dive: float = parameter(
-        0.0, 'the vehicle goes up and down by this once per minute', unit='m', low=0.0, high=100.0
-    )
-    roll_rms_deg: float = parameter(1.5, 'swing in roll', unit='deg', low=0.0, high=30.0)
-    roll_period: float = parameter(6.0, 'its period', unit='s', low=0.5, high=600.0)
-    pitch_rms_deg: float = parameter(1.0, 'swing in pitch', unit='deg', low=0.0, high=30.0)
-    pitch_period: float = parameter(8.0, 'its period', unit='s', low=0.5, high=600.0)
-    yaw_rms_deg: float = parameter(1.5, 'swing in yaw', unit='deg', low=0.0, high=30.0)
-    yaw_period: float = parameter(11.0, 'its period', unit='s', low=0.5, high=600.0)
-    heave_rms: float = parameter(0.21, 'swing of the depth', unit='m', low=0.0, high=20.0)
-    heave_period: float = parameter(20.0, 'its period', unit='s', low=0.5, high=600.0)
-    sway_rms: float = parameter(0.14, 'swing across the course', unit='m', low=0.0, high=20.0)
-    sway_period: float = parameter(20.0, 'its period', unit='s', low=0.5, high=600.0)
+    speed: float = parameter(1.5, 'm/s', 'speed of the vehicle over ground', range=(0.05, 20.0))
+    course_deg: float = parameter(30.0, 'deg', 'course of the vehicle, from north, clockwise')
+    random_course: bool = parameter(False, '', 'draw the course at random instead of course_deg')
+    depth: float = parameter(20.0, 'm', 'depth of the vehicle', range=(0.0, 12000.0))
+    altitude: float = parameter(15.0, 'm',
+        'height of the vehicle above the sea floor', range=(0.5, 12000.0))
+    seabed_relief: float = parameter(0.0, 'm',
+        'amplitude of ripples of the sea floor', range=(0.0, 100.0))
+    dive: float = parameter(0.0, 'm',
+        'amplitude with which the vehicle goes up and down once per minute', range=(0.0, 100.0))
+    roll_rms_deg: float = parameter(1.5, 'deg', 'rms roll of the vehicle', range=(0.0, 30.0))
+    roll_period: float = parameter(6.0, 's', 'period of the roll', range=(0.5, 600.0))
+    pitch_rms_deg: float = parameter(1.0, 'deg', 'rms pitch of the vehicle', range=(0.0, 30.0))
+    pitch_period: float = parameter(8.0, 's', 'period of the pitch', range=(0.5, 600.0))
+    yaw_rms_deg: float = parameter(1.5, 'deg',
+        'rms yaw of the vehicle about its course', range=(0.0, 30.0))
+    yaw_period: float = parameter(11.0, 's', 'period of the yaw', range=(0.5, 600.0))
+    heave_rms: float = parameter(0.21, 'm', 'rms heave of the vehicle', range=(0.0, 20.0))
+    heave_period: float = parameter(20.0, 's', 'period of the heave', range=(0.5, 600.0))
+    sway_rms: float = parameter(0.14, 'm',
+        'rms sway of the vehicle across its course', range=(0.0, 20.0))
+    sway_period: float = parameter(20.0, 's', 'period of the sway', range=(0.5, 600.0))
 
     # -- navigation ------------------------------------------------------------------------------
-    ideal_navigation: bool = parameter(False, 'navigation without errors')
-    navigation_rate: float = parameter(10.0, 'poses per second', unit='Hz', low=0.1, high=1000.0)
-    log_scale_error: float = parameter(
-        0.002, 'scale error of the Doppler log, 1 sigma', low=0.0, high=0.2
-    )
-    log_bias: float = parameter(
-        0.003, 'bias of each axis of the log, 1 sigma', unit='m/s', low=0.0, high=1.0
-    )
-    log_noise: float = parameter(
-        0.005,
-        'random walk of the position that the noise of the log makes',
-        unit='m/sqrt(s)',
-        low=0.0,
-        high=1.0,
-    )
-    attitude_std_deg: float = parameter(
-        0.02, 'noise of roll, pitch and yaw', unit='deg', low=0.0, high=10.0
-    )
-    attitude_bias_deg: float = parameter(
-        0.1, 'bias of roll and pitch, 1 sigma', unit='deg', low=0.0, high=10.0
-    )
-    yaw_bias_deg: float = parameter(0.2, 'bias of yaw, 1 sigma', unit='deg', low=0.0, high=20.0)
-    depth_std: float = parameter(0.02, 'noise of the depth', unit='m', low=0.0, high=10.0)
-    altimeter: bool = parameter(True, 'altitudes are sent')
-    altitude_std: float = parameter(0.1, 'noise of the altitude', unit='m', low=0.0, high=10.0)
-    navigation_delay: float = parameter(
-        0.0, 'poses are stamped this much too late', unit='s', low=-5.0, high=5.0
-    )
-    navigation_latency: float = parameter(
-        0.0, 'poses are received this long after their stamp', unit='s', low=0.0, high=60.0
-    )
-    navigation_gaps: float = parameter(
-        0.0, 'number of gaps in the navigation, on average', low=0.0, high=1000.0
-    )
-    navigation_gap: float = parameter(3.0, 'length of a gap', unit='s', low=0.0, high=600.0)
+    ideal_navigation: bool = parameter(False, '', 'whether the navigation has no errors')
+    navigation_rate: float = parameter(10.0, 'Hz',
+        'poses of the navigation per second', range=(0.1, 1000.0))
+    log_scale_error: float = parameter(0.002, '',
+        'scale error of the Doppler log, 1 sigma', range=(0.0, 0.2))
+    log_bias: float = parameter(0.003, 'm/s',
+        'bias of each axis of the Doppler log, 1 sigma', range=(0.0, 1.0))
+    log_noise: float = parameter(0.005, 'm/sqrt(s)',
+        'random walk of the position from the noise of the Doppler log', range=(0.0, 1.0))
+    attitude_std_deg: float = parameter(0.02, 'deg',
+        'standard deviation of the noise of roll, pitch and yaw in the navigation',
+        range=(0.0, 10.0))
+    attitude_bias_deg: float = parameter(0.1, 'deg',
+        'bias of roll and pitch in the navigation, 1 sigma', range=(0.0, 10.0))
+    yaw_bias_deg: float = parameter(0.2, 'deg',
+        'bias of yaw in the navigation, 1 sigma', range=(0.0, 20.0))
+    depth_std: float = parameter(0.02, 'm',
+        'standard deviation of the noise of the depth in the navigation', range=(0.0, 10.0))
+    altimeter: bool = parameter(True, '', 'whether altitudes are sent')
+    altitude_std: float = parameter(0.1, 'm',
+        'standard deviation of the noise of the altitude', range=(0.0, 10.0))
+    navigation_delay: float = parameter(0.0, 's',
+        'time by which poses are stamped too late', range=(-5.0, 5.0))
+    navigation_latency: float = parameter(0.0, 's',
+        'time between the stamp of a pose and its reception', range=(0.0, 60.0))
+    navigation_gaps: float = parameter(0.0, '',
+        'mean number of gaps in the navigation', range=(0.0, 1000.0))
+    navigation_gap: float = parameter(3.0, 's',
+        'length of a gap in the navigation', range=(0.0, 600.0))
 
     # -- the sonar -------------------------------------------------------------------------------
-    sonar_lever: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), 'from the navigation reference to the sonar, vehicle FLU', unit='m'
-    )
-    sonar_mount_rpy_deg: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), 'roll, pitch, yaw of the sonar in the vehicle, FLU', unit='deg'
-    )
-    azimuth_model: str = parameter('plane', 'what a bearing is', choices=AZIMUTH_MODELS)
-    ping_timing: str = parameter(
-        'instant', 'to which pose an echo belongs', choices=('instant', 'two_way')
-    )
-    ping_rate: float = parameter(2.0, 'pings per second', unit='Hz', low=0.05, high=50.0)
-    ping_jitter: float = parameter(
-        0.0, 'ping times vary uniformly by this much of a step', low=0.0, high=0.9
-    )
-    ping_loss: float = parameter(0.0, 'that a ping is lost', low=0.0, high=1.0)
-    max_range: float = parameter(
-        100.0, 'range to which the sonar sees', unit='m', low=1.0, high=10000.0
-    )
-    horizontal_fov_deg: float = parameter(
-        45.0, 'full width of the sector', unit='deg', low=1.0, high=170.0
-    )
-    vertical_fov_deg: float = parameter(
-        15.0, 'full height of the beam', unit='deg', low=0.5, high=90.0
-    )
-    range_std: float = parameter(0.15, 'error of a range', unit='m', low=0.0, high=10.0)
-    bearing_std_deg: float = parameter(0.25, 'error of a bearing', unit='deg', low=0.0, high=10.0)
-    range_step: float = parameter(0.17, 'sampling step of the range', unit='m', low=0.0, high=10.0)
-    bearing_step_deg: float = parameter(
-        0.18, 'sampling step of the bearing', unit='deg', low=0.0, high=10.0
-    )
-    sound_speed_error: float = parameter(
-        0.001, 'scale error of the ranges, 1 sigma', low=0.0, high=0.2
-    )
-    detection_probability: float = parameter(
-        1.0, 'that a ping shows an obstacle in the beam', low=0.0, high=1.0
-    )
-    outlier_probability: float = parameter(
-        0.0, 'that an echo comes from elsewhere', low=0.0, high=1.0
-    )
-    outlier_range: float = parameter(8.0, 'by how much at most', unit='m', low=0.0, high=100.0)
-    outlier_bearing_deg: float = parameter(
-        6.0, 'by how much at most', unit='deg', low=0.0, high=90.0
-    )
-    clutter: float = parameter(0.0, 'false detections per ping, on average', low=0.0, high=1000.0)
-    late_fraction: float = parameter(0.0, 'share of pings received late', low=0.0, high=1.0)
-    late_delay: float = parameter(2.0, 'most they are late by', unit='s', low=0.0, high=600.0)
+    sonar_lever: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'm',
+        'vector from the navigation reference to the sonar, vehicle FLU')
+    sonar_mount_rpy_deg: tuple[float, ...] = parameter((0.0, 0.0, 0.0), 'deg',
+        'roll, pitch, yaw of the sonar in the vehicle, FLU')
+    azimuth_model: str = parameter('plane', '',
+        'what a bearing is: the angle of the vertical plane of the echo (plane), or of the cone '
+        'that a linear array measures (cone)', choices=AZIMUTH_MODELS)
+    ping_timing: str = parameter('instant', '',
+        'pose to which an echo belongs: at the instant of the ping, or over the two-way travel',
+        choices=('instant', 'two_way'))
+    ping_rate: float = parameter(2.0, 'Hz', 'pings per second', range=(0.05, 50.0))
+    ping_jitter: float = parameter(0.0, '',
+        'share of a step by which ping times vary, uniformly', range=(0.0, 0.9))
+    ping_loss: float = parameter(0.0, '', 'probability that a ping is lost', range=(0.0, 1.0))
+    max_range: float = parameter(100.0, 'm', 'range to which the sonar sees', range=(1.0, 10000.0))
+    horizontal_fov_deg: float = parameter(45.0, 'deg',
+        'full width of the sector that the sonar sees', range=(1.0, 170.0))
+    vertical_fov_deg: float = parameter(15.0, 'deg',
+        'full height of the beam of the sonar', range=(0.5, 90.0))
+    range_std: float = parameter(0.15, 'm', 'standard deviation of a range', range=(0.0, 10.0))
+    bearing_std_deg: float = parameter(0.25, 'deg',
+        'standard deviation of a bearing', range=(0.0, 10.0))
+    range_step: float = parameter(0.17, 'm', 'sampling step of the range', range=(0.0, 10.0))
+    bearing_step_deg: float = parameter(0.18, 'deg',
+        'sampling step of the bearing', range=(0.0, 10.0))
+    sound_speed_error: float = parameter(0.001, '',
+        'scale error of the ranges, 1 sigma', range=(0.0, 0.2))
+    detection_probability: float = parameter(1.0, '',
+        'probability that a ping shows an obstacle in the beam', range=(0.0, 1.0))
+    outlier_probability: float = parameter(0.0, '',
+        'probability that an echo of an obstacle is an outlier, which comes from elsewhere',
+        range=(0.0, 1.0))
+    outlier_range: float = parameter(8.0, 'm',
+        'largest error in range of an outlier', range=(0.0, 100.0))
+    outlier_bearing_deg: float = parameter(6.0, 'deg',
+        'largest error in bearing of an outlier', range=(0.0, 90.0))
+    clutter: float = parameter(0.0, '',
+        'mean number of false detections in a ping', range=(0.0, 1000.0))
+    late_fraction: float = parameter(0.0, '', 'share of pings received late', range=(0.0, 1.0))
+    late_delay: float = parameter(2.0, 's',
+        'largest delay of a ping that is received late', range=(0.0, 600.0))
 
     # -- obstacles -------------------------------------------------------------------------------
-    placement: str = parameter(
-        'offset',
-        'how deep they are: a vertical offset from the sonar at the first ping, on tethers, on '
-        'the sea floor, at the surface',
-        choices=PLACEMENTS,
-    )
-    obstacles: int = parameter(1, 'number of obstacles', low=1, high=200)
-    spacing: float = parameter(
-        8.0, 'each further off than the one before by this', unit='m', low=0.0, high=1000.0
-    )
-    vertical_offset: float = parameter(3.0, 'below the sonar', unit='m', low=-100.0, high=100.0)
-    offset_spread: float = parameter(
-        0.0, 'uniformly more or less than that', unit='m', low=0.0, high=100.0
-    )
-    tethers: tuple[float, ...] = parameter(
-        (15.0, 12.0), 'lengths of the tethers, in turn', unit='m', low=0.0
-    )
-    first_range: float = parameter(
-        90.0, 'of the first obstacle at the first ping', unit='m', low=2.0, high=10000.0
-    )
-    last_range: float = parameter(
-        6.0,
-        'of the first obstacle at the last ping, had it not passed aside',
-        unit='m',
-        low=-1000.0,
-        high=10000.0,
-    )
-    passing_distance: float = parameter(
-        6.0, 'obstacles are passed at up to this on either side', unit='m', low=0.0, high=100.0
-    )
-    obstacle_motion: str = parameter(
-        'fixed',
-        'whether they stay, sway about their place at random, swing about it in smooth waves, or '
-        'move',
-        choices=MOTIONS,
-    )
-    obstacle_sway: float = parameter(
-        0.5, 'swaying, swinging: standard deviation along each axis', unit='m', low=0.0, high=100.0
-    )
-    obstacle_sway_time: float = parameter(
-        20.0, 'swaying: time over which the place is forgotten', unit='s', low=0.1, high=3600.0
-    )
-    obstacle_swing_period: float = parameter(
-        15.0, 'swinging: period of the waves', unit='s', low=0.5, high=3600.0
-    )
-    obstacle_speed: tuple[float, ...] = parameter(
-        (0.3, 1.5), 'moving: least and greatest speed', unit='m/s', low=0.0, high=20.0
-    )
-    obstacle_starts: float = parameter(
-        -1e9, 'moving: it stays until then, counted from the first ping', unit='s'
-    )
-    obstacle_stops: float = parameter(1e9, 'moving: it stays from then on', unit='s')
+    placement: str = parameter('offset', '',
+        'what sets the depth of obstacles: a vertical offset from the sonar at the first ping '
+        '(offset), a tether, the sea floor (seabed) or the surface', choices=PLACEMENTS)
+    obstacles: int = parameter(1, '', 'number of obstacles', range=(1, 200))
+    spacing: float = parameter(8.0, 'm',
+        'distance by which each obstacle is further off than the one before', range=(0.0, 1000.0))
+    vertical_offset: float = parameter(3.0, 'm',
+        'placement offset: distance of obstacles below the sonar at the first ping',
+        range=(-100.0, 100.0))
+    offset_spread: float = parameter(0.0, 'm',
+        'placement offset: half width of the uniform distribution of offsets around '
+        'vertical_offset', range=(0.0, 100.0))
+    tethers: tuple[float, ...] = parameter((15.0, 12.0), 'm',
+        'placement tether: lengths of the tethers, in turn', range=(0.0, None))
+    first_range: float = parameter(90.0, 'm',
+        'range of the first obstacle at the first ping', range=(2.0, 10000.0))
+    last_range: float = parameter(6.0, 'm',
+        'range of the first obstacle at the last ping, as if it were passed at no distance',
+        range=(-1000.0, 10000.0))
+    passing_distance: float = parameter(6.0, 'm',
+        'largest distance to either side at which obstacles are passed', range=(0.0, 100.0))
+    obstacle_motion: str = parameter('fixed', '',
+        'motion of obstacles: fixed, swaying (about their place at random), swinging (about it in '
+        'smooth waves) or moving', choices=MOTIONS)
+    obstacle_sway: float = parameter(0.5, 'm',
+        'motion swaying and swinging: standard deviation of the position along each axis',
+        range=(0.0, 100.0))
+    obstacle_sway_time: float = parameter(20.0, 's',
+        'motion swaying: time over which the position is correlated', range=(0.1, 3600.0))
+    obstacle_swing_period: float = parameter(15.0, 's',
+        'motion swinging: period of the waves', range=(0.5, 3600.0))
+    obstacle_speed: tuple[float, ...] = parameter((0.3, 1.5), 'm/s',
+        'motion moving: least and greatest speed', range=(0.0, 20.0))
+    obstacle_starts: float = parameter(-1e9, 's',
+        'motion moving: time after the first ping at which obstacles start to move')
+    obstacle_stops: float = parameter(1e9, 's',
+        'motion moving: time after the first ping at which obstacles stop')
+    # fmt: on
 
     def check(self) -> list[str]:
         problems = super().check()

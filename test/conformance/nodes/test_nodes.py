@@ -39,7 +39,7 @@ class Driven:
     def __init__(self, bench, system):
         self.bench, self.system = bench, system
         config, scene = small_scene(system, 3)
-        settings = config.told()
+        settings = config.instruments()
         self.config = system.config_type()(**settings)
         self.node = bench.add(
             TrackerNode(

@@ -21,13 +21,13 @@ import pytest
 
 from msg_adapters.array_records import write_trace
 from sonar_imm.measurements import Trace
-from sonar_imm.trackers.fathometer.envelopes import envelope_parameters
+from sonar_imm.trackers.fathometer.response import envelope_parameters
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.fathometer.crossing import common_shift, crossing_metrics, summary
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.conversion import ConversionReport, write_bag
 from sonar_imm_tools.recordings.messages import ros_message
-from sonar_imm_tools.recordings.own_parameters import write_own_parameters
+from sonar_imm_tools.recordings.own_files import write_own_parameters
 from sonar_imm_tools.recordings.positions import write_position
 from sonar_imm_tools.recordings.sources import BagError
 

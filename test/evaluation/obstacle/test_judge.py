@@ -23,7 +23,6 @@ import pytest
 from sonar_imm.estimates import Estimate
 from sonar_imm_tools.cli import main
 from sonar_imm_tools.evaluation.judging import judge, JudgeOptions
-from sonar_imm_tools.evaluation.obstacle.bench import bench_ping
 from sonar_imm_tools.evaluation.obstacle.scoring import score
 from sonar_imm_tools.evaluation.obstacle.series import series_of, TruePath, truth_of
 from sonar_imm_tools.offline.run_folder import RunFolder
@@ -234,8 +233,3 @@ def test_an_empty_run_is_no_reason_to_stop(tmp_path):
     run = tracked(tmp_path, 'approach', detection_probability=0.0)
     verdict = judge(RunFolder(run))
     assert not verdict.accuracy(None).good and verdict.part([]).sections
-
-
-def test_the_bench_tracks_all_that_it_times():
-    result = bench_ping(rounds=1, pings=15, obstacles=5)
-    assert result['tracked'] == 5

@@ -28,7 +28,7 @@ import numpy as np
 from msg_adapters.inputs import inputs_of, made_inputs
 from sonar_imm.measurements import Rejection
 from sonar_imm.trackers import SYSTEMS
-from sonar_imm_tools.recordings.detected import DetectedImages
+from sonar_imm_tools.recordings.measurements import DetectedImages
 
 from .mutations import mutated, MUTATIONS
 from .properties import check_estimate, check_refusal

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from sonar_imm_tools.recordings.convert import convert_segy
-from sonar_imm_tools.recordings.convert.profiler import (
+from sonar_imm_tools.recordings.convert.segy import (
     doubted_spacing,
     first_arrivals,
     is_envelope,

@@ -22,7 +22,7 @@ import pytest
 from sonar_imm.measurements import Fix
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.placing import Placer
+from sonar_imm.trackers.diver.georeferencing import Georeferencer
 from sonar_imm_tools.simulation.diver.afloat import ORIGIN
 from sonar_imm_tools.simulation.diver.simulator import (
     RECEIVERS,
@@ -168,9 +168,9 @@ def test_what_a_vessel_sees_is_consistent_where_it_is_placed():
         truth = {
             one.track_id: dict(zip(one.stamp_ns.tolist(), one.position)) for one in scene.truth
         }
-        placer = Placer(DiverConfig(**config.told()), Counter())
+        georeferencer = Georeferencer(DiverConfig(**config.instruments()), Counter())
         for item in scene.measurements:
-            for fix in placer.place(item.measurement):
+            for fix in georeferencer.georeference(item.measurement):
                 error = (fix.position - truth[fix.target_id][fix.stamp_ns])[:2]
                 nees.append(error @ np.linalg.solve(fix.covariance, error))
     # 2 is due; a pose between two messages is the mean of both, and better than each.

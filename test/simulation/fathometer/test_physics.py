@@ -169,7 +169,7 @@ def test_the_array_heaves_and_its_depth_is_told_with_an_error():
     assert drift.array_depth.mean() == pytest.approx(73.5, abs=1e-6)
     assert np.ptp(drift.array_depth) == pytest.approx(8.0, abs=0.02)
     np.testing.assert_allclose(drift.array_depth[90:], drift.array_depth[:-90], atol=1e-9)
-    error = drift.array_depth_told - drift.array_depth
+    error = drift.array_depth_stated - drift.array_depth
     assert error.std() == pytest.approx(0.2, rel=0.1) and abs(error.mean()) < 0.03
 
 

@@ -109,10 +109,10 @@ def test_pressure_in_whole_numbers_has_the_steps_it_was_told():
 
 
 def test_what_a_tracker_is_told_of_pressure_leaves_its_snapshots_to_it():
-    told = scenario('pressure').told()
+    told = scenario('pressure').instruments()
     assert 'snapshot_seconds' not in told
     assert (told['depth_min'], told['depth_max']) == (42.0, 74.0)
-    assert scenario('small').told()['window'] == 'rectangular'
+    assert scenario('small').instruments()['window'] == 'rectangular'
 
 
 def test_whitened_spectra_are_even():

@@ -19,8 +19,7 @@ from helpers.bathymetry_cases import floor
 import numpy as np
 import pytest
 
-from sonar_imm.trackers.bathymetry.engines import run_particles
-from sonar_imm.trackers.bathymetry.ping import look, Ping, run
+from sonar_imm.trackers.bathymetry.ping import look, Ping, run, run_particles
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 RANGES = 17.0 + 0.05 * np.arange(200)

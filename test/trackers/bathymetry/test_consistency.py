@@ -22,8 +22,8 @@ import pytest
 
 from sonar_imm.measurements import Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.consistency import noise_warnings, residual_ratio
-from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
+from sonar_imm.trackers.bathymetry.ping import residual_ratio
+from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker, noise_warnings
 from sonar_imm_tools.simulation.bathymetry import simulator as swath
 
 
@@ -58,23 +58,23 @@ def test_the_median_ping_decides_and_a_few_are_not_enough():
     assert '0.25 times' in low and 'element_spacing' not in low
 
 
-@pytest.mark.parametrize('factor, said', [(1.0, False), (4.0, True), (0.25, True)])
-def test_a_noise_variance_that_is_wrong_by_four_is_said(factor, said):
+@pytest.mark.parametrize('factor, warned', [(1.0, False), (4.0, True), (0.25, True)])
+def test_a_noise_variance_that_is_wrong_by_four_is_said(factor, warned):
     scene = swath.scenario('paper', {'pings': 6})
-    tracker = BathymetryTracker(BathymetryConfig(**scene.told()))
-    for one in swath.simulate(scene, 4).measurements:
-        found = one.measurement
+    tracker = BathymetryTracker(BathymetryConfig(**scene.instruments()))
+    for each in swath.simulate(scene, 4).measurements:
+        found = each.measurement
         if isinstance(found, Snapshot):
             found = evolve(found, noise_variance=factor * found.noise_variance)
         tracker.process(found)
-    assert any('cannot be true' in sentence for sentence in tracker.warnings()) == said
+    assert any('cannot be true' in sentence for sentence in tracker.warnings()) == warned
     assert tracker.health()['residual_ratio'] == pytest.approx(1.0 / factor, rel=0.2)
 
 
 def test_without_a_stated_noise_there_is_nothing_to_test():
     scene = swath.scenario('paper', {'pings': 6})
-    tracker = BathymetryTracker(BathymetryConfig(**scene.told()))
-    for one in swath.simulate(scene, 4).measurements:
-        if isinstance(one.measurement, Snapshot):
-            tracker.process(evolve(one.measurement, noise_variance=None))
+    tracker = BathymetryTracker(BathymetryConfig(**scene.instruments()))
+    for each in swath.simulate(scene, 4).measurements:
+        if isinstance(each.measurement, Snapshot):
+            tracker.process(evolve(each.measurement, noise_variance=None))
     assert math.isnan(tracker.health()['residual_ratio'])

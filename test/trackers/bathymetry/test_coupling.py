@@ -24,9 +24,14 @@ import pytest
 
 from sonar_imm.measurements import Snapshot
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.bathymetry.coupling import Alone, favour_of, NEIGHBOURS_NS
 from sonar_imm.trackers.bathymetry.ping import look, Ping, run
-from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm.trackers.bathymetry.tracker import (
+    Alone,
+    BathymetryConfig,
+    BathymetryTracker,
+    favour_of,
+    NEIGHBOURS_NS,
+)
 
 RANGES = 20.0 + 0.05 * np.arange(60)
 EXACT = BathymetryConfig(engine='grid', smoothing='states', grid_extent=4.0)
@@ -135,13 +140,13 @@ def test_neighbours_are_compared_at_the_same_place_across_the_track():
 @pytest.mark.parametrize('config', [COUPLED, MODES], ids=['states', 'modes'])
 def test_estimates_come_one_ping_late_and_none_is_lost(config):
     tracker, pings = BathymetryTracker(config), [ping(k) for k in range(4)]
-    made = [tracker.process(one) for one in pings]
-    assert [len(one) for one in made] == [0, 1, 1, 1]
+    made = [tracker.process(each) for each in pings]
+    assert [len(each) for each in made] == [0, 1, 1, 1]
     assert tracker.health()['pings_held'] == 1
     last = tracker.finish()
     assert tracker.finish() == [] and 'pings_held' not in tracker.health()
-    stamps = [one.stamp_ns for one in [*sum(made, []), *last]]
-    assert stamps == [one.stamp_ns for one in pings] and tracker.counts['used'] == 4
+    stamps = [each.stamp_ns for each in [*sum(made, []), *last]]
+    assert stamps == [each.stamp_ns for each in pings] and tracker.counts['used'] == 4
 
 
 def same(a, b):
@@ -151,7 +156,9 @@ def same(a, b):
 def test_an_estimate_depends_on_its_neighbours_alone():
     def third(*seeds):
         tracker = BathymetryTracker(COUPLED)
-        made = [one for k, seed in enumerate(seeds) for one in tracker.process(ping(k, seed=seed))]
+        made = [
+            each for k, seed in enumerate(seeds) for each in tracker.process(ping(k, seed=seed))
+        ]
         return [*made, *tracker.finish()][2]
 
     assert same(third(1, 2, 3, 4, 5), third(9, 2, 3, 4, 9))
@@ -167,16 +174,16 @@ def test_pings_far_apart_and_other_sides_are_no_neighbours():
         ping(1, side='port', period_ns=NEIGHBOURS_NS + 1),
         ping(1, side='starboard', seed=8, period_ns=NEIGHBOURS_NS + 1),
     ]
-    found = [one for p in pings for one in tracker.process(p)] + tracker.finish()
+    found = [each for p in pings for each in tracker.process(p)] + tracker.finish()
     assert len(found) == 4
-    for p, one in zip(pings, found):
-        assert same(by_itself.process(p)[0], one)
+    for p, each in zip(pings, found):
+        assert same(by_itself.process(p)[0], each)
 
 
 def test_a_clock_set_back_begins_anew():
     tracker = BathymetryTracker(COUPLED)
-    made = [one for k in (5, 6, 1, 2) for one in tracker.process(ping(k))]
-    assert [one.stamp_ns for one in [*made, *tracker.finish()]] == [
+    made = [each for k in (5, 6, 1, 2) for each in tracker.process(ping(k))]
+    assert [each.stamp_ns for each in [*made, *tracker.finish()]] == [
         ping(k).stamp_ns for k in (5, 6, 1, 2)
     ]
 
@@ -185,7 +192,7 @@ def test_switched_off_the_held_ping_comes_out_first():
     tracker = BathymetryTracker(COUPLED)
     assert tracker.process(ping(0)) == []
     tracker.reconfigure(EXACT)
-    assert [one.stamp_ns for one in tracker.process(ping(1))] == [
+    assert [each.stamp_ns for each in tracker.process(ping(1))] == [
         ping(0).stamp_ns,
         ping(1).stamp_ns,
     ]
@@ -209,7 +216,7 @@ def test_a_bin_in_doubt_goes_with_its_neighbours():
     pings = [seen(0, 0.5), seen(1, 0.045), seen(2, 0.5)]
     plain = BathymetryTracker(EXACT).process(pings[1])[0]
     tracker = BathymetryTracker(evolve(COUPLED, ping_coupling=1.0))
-    coupled = [one for p in pings for one in tracker.process(p)][1]
+    coupled = [each for p in pings for each in tracker.process(p)][1]
     gain = (coupled.probabilities - plain.probabilities)[:, 1]
     assert gain[patch].mean() > 0.05 and gain[patch].min() > -1e-9
     assert gain[~patch].max() < gain[patch].max()

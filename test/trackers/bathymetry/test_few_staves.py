@@ -31,48 +31,48 @@ def run(scene, **values):
     and the tracker."""
     config = scenario('paper', {**WIDE, **scene})
     simulated = simulate(config, 1)
-    told = BathymetryConfig.from_mapping({**config.told(), **values})
-    tracker = BathymetryTracker(told)
-    error, inside, heard, echo = [], [], [], []
-    for one, truth in zip(simulated.measurements, simulated.truth):
-        made = tracker.process(one.measurement)[0]
+    stated = BathymetryConfig.from_mapping({**config.instruments(), **values})
+    tracker = BathymetryTracker(stated)
+    error, inside, found, echo = [], [], [], []
+    for each, truth in zip(simulated.measurements, simulated.truth):
+        made = tracker.process(each.measurement)[0]
         difference = made.state[:, 0] - truth.height
         error.append(difference[truth.valid])
         sd = np.sqrt(made.covariance[:, 0, 0])
         inside.append((np.abs(difference) < 2.0 * sd)[truth.valid])
-        heard.append(made.extras['valid'] > 0)
+        found.append(made.extras['valid'] > 0)
         echo.append(truth.valid)
-    heard, echo = np.concatenate(heard), np.concatenate(echo)
+    found, echo = np.concatenate(found), np.concatenate(echo)
     return (
         float(np.sqrt(np.mean(np.square(np.concatenate(error))))),
         float(np.concatenate(inside).mean()),
-        float(heard[echo].mean()),
-        float(heard[~echo].mean()) if (~echo).any() else 0.0,
+        float(found[echo].mean()),
+        float(found[~echo].mean()) if (~echo).any() else 0.0,
         tracker,
     )
 
 
 @pytest.mark.parametrize('engine', ['particles', 'grid'])
 def test_two_staves_far_apart_are_an_array_like_any(engine):
-    rmse, inside, heard, _, tracker = run({}, engine=engine)
-    assert rmse < 0.27 and 0.93 < inside <= 1.0 and heard > 0.95
+    rmse, inside, found, _, tracker = run({}, engine=engine)
+    assert rmse < 0.27 and 0.93 < inside <= 1.0 and found > 0.95
     assert tracker.warnings() == []
 
 
 def test_a_floor_that_they_see_differently_is_followed_when_told():
-    lost, inside, heard, _, tracker = run({'decorrelation': 0.2})
-    assert lost > 3.0 and heard > 0.95
+    lost, inside, found, _, tracker = run({'decorrelation': 0.2})
+    assert lost > 3.0 and found > 0.95
     assert any('decorrelation says 0%' in sentence for sentence in tracker.warnings())
-    rmse, inside, heard, _, tracker = run({'decorrelation': 0.2}, decorrelation=0.2)
-    assert rmse < 0.35 and inside > 0.9 and heard > 0.95
+    rmse, inside, found, _, tracker = run({'decorrelation': 0.2}, decorrelation=0.2)
+    assert rmse < 0.35 and inside > 0.9 and found > 0.95
     assert tracker.warnings() == []
     assert 0.05 < tracker.health()['decorrelation'] < 0.25
 
 
 def test_their_gate_knows_shadows_by_power():
     shadow = {'shadows': (30.0, 33.0)}
-    rmse, _, heard, in_shadow, _ = run({**shadow, 'decorrelation': 0.2}, decorrelation=0.2)
-    assert heard > 0.94 and in_shadow < 0.08  # two bins at either end
+    rmse, _, found, in_shadow, _ = run({**shadow, 'decorrelation': 0.2}, decorrelation=0.2)
+    assert found > 0.94 and in_shadow < 0.08  # two bins at either end
     assert rmse < 0.6
 
 
@@ -80,18 +80,18 @@ def test_their_gate_knows_shadows_by_power():
 def test_a_diffuse_floor_far_above_the_noise_is_heard(staves):
     scene = {'staves': staves, 'snr_near_db': 60.0, 'snr_far_db': 50.0, 'decorrelation': 0.6}
     scene['spacing_wavelengths'] = 0.5
-    *_, heard, _, tracker = run(scene, decorrelation=0.6)
-    assert heard > 0.95 and not tracker.warnings()
+    *_, found, _, tracker = run(scene, decorrelation=0.6)
+    assert found > 0.95 and not tracker.warnings()
 
 
 def test_where_the_noise_is_unknown_most_loud_bins_are_lost_and_it_is_said():
     unknown = {'state_noise': False, 'decorrelation': 0.6, 'snr_near_db': 60.0}
     unknown |= {'snr_far_db': 10.0, 'spacing_wavelengths': 0.5}
-    *_, heard, _, tracker = run(unknown, decorrelation=0.6)
-    assert heard < 0.5
-    assert any('state noise_variance' in one for one in tracker.warnings())
-    *_, heard, _, tracker = run(unknown, decorrelation=0.6, noise_variance=1.0)
-    assert heard > 0.9 and not tracker.warnings()
+    *_, found, _, tracker = run(unknown, decorrelation=0.6)
+    assert found < 0.5
+    assert any('state noise_variance' in each for each in tracker.warnings())
+    *_, found, _, tracker = run(unknown, decorrelation=0.6, noise_variance=1.0)
+    assert found > 0.9 and not tracker.warnings()
 
 
 def test_the_first_return_of_a_diffuse_floor_is_found_where_the_noise_is_known():
@@ -108,9 +108,9 @@ def test_spikes_on_a_coherent_floor_stay_silent():
     config = scenario('paper', {**WIDE, **scene, 'snr_near_db': 45.0, 'snr_far_db': 45.0})
     simulated = simulate(config, 1)
     tracker = BathymetryTracker(BathymetryConfig())
-    for one in simulated.measurements:
-        made = tracker.process(one.measurement)[0]
-        power = np.square(np.abs(one.measurement.iq)).mean(axis=1)
+    for each in simulated.measurements:
+        made = tracker.process(each.measurement)[0]
+        power = np.square(np.abs(each.measurement.iq)).mean(axis=1)
         spikes = power > 50.0 * 10**4.5
         assert spikes.sum() > 40 and made.extras['valid'][spikes].mean() < 0.1
 
@@ -118,8 +118,8 @@ def test_spikes_on_a_coherent_floor_stay_silent():
 def test_decorrelation_is_noise_that_grows_with_the_echo():
     config = scenario('paper', {'pings': 1, 'last_range': 20.0})
     ping = simulate(config, 1).measurements[0].measurement
-    told = BathymetryConfig(decorrelation=0.25, engine='grid', shadow_gate=False)
-    one = BathymetryTracker(told).process(ping)[0]
+    given = BathymetryConfig(decorrelation=0.25, engine='grid', shadow_gate=False)
+    each = BathymetryTracker(given).process(ping)[0]
     signal = np.maximum(
         np.convolve(np.square(np.abs(ping.iq)).mean(axis=1), np.ones(21), 'same')
         / np.convolve(np.ones(len(ping)), np.ones(21), 'same')
@@ -133,9 +133,9 @@ def test_decorrelation_is_noise_that_grows_with_the_echo():
         noise_variance=1.0 + 0.25 * signal,
         signal_variance=0.75 * signal,
     )
-    same = BathymetryTracker(evolve(told, decorrelation=0.0)).process(stated)[0]
-    assert one.state == pytest.approx(same.state, abs=1e-9)
-    assert one.covariance == pytest.approx(same.covariance, abs=1e-9)
+    same = BathymetryTracker(evolve(given, decorrelation=0.0)).process(stated)[0]
+    assert each.state == pytest.approx(same.state, abs=1e-9)
+    assert each.covariance == pytest.approx(same.covariance, abs=1e-9)
 
 
 @pytest.mark.parametrize('staves', [3, 8])
@@ -150,6 +150,6 @@ def test_a_ping_without_any_noise_is_answered(staves):
 
 def test_a_few_loud_bins_are_no_evidence():
     tracker = BathymetryTracker(BathymetryConfig())
-    for count, said in ((150, 0), (49, 0), (1, 2)):  # 200 in all are enough
-        tracker._loud.append(LoudBins(count=count, silent=count, decorrelation=0.5))
-        assert len(tracker.warnings()) == said
+    for count, sentences in ((150, 0), (49, 0), (1, 2)):  # 200 in all are enough
+        tracker._loud.append(LoudBins(bins=count, silent=count, decorrelation=0.5))
+        assert len(tracker.warnings()) == sentences

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers.bathymetry.kernels import sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
 
 

@@ -21,7 +21,8 @@ import pytest
 
 from sonar_imm.measurements import Altitude, Navigation, Snapshot
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.pose_queue import bin_stamps, PoseQueue
+from sonar_imm.trackers.bathymetry.ping import bin_stamps
+from sonar_imm.trackers.bathymetry.tracker import PoseQueue
 from sonar_imm.trackers.navigation import MOST_WAITING
 
 SECOND = 10**9
@@ -95,7 +96,7 @@ def test_what_waits_too_long_is_given_up_the_oldest_first_and_counted(queue):
     for second in range(41, 60):
         queue.add_pose(pose(second))
     ready = queue.ready(CONFIG)
-    assert [one.snapshot.stamp_ns for one in (ready[0], ready[-1])] == [
+    assert [each.snapshot.stamp_ns for each in (ready[0], ready[-1])] == [
         ping(50.03).stamp_ns,
         ping(52.02).stamp_ns,
     ]

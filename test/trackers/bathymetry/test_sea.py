@@ -26,9 +26,9 @@ from sonar_imm.measurements import Altitude, Navigation
 from sonar_imm.parameters import ConfigError
 from sonar_imm.soundings import soundings_of
 from sonar_imm.trackers.bathymetry.config import BathymetryConfig
-from sonar_imm.trackers.bathymetry.grid_kernels import _log_likelihoods as log_likelihoods
+from sonar_imm.trackers.bathymetry.kernels import _log_likelihoods as log_likelihoods
 from sonar_imm.trackers.bathymetry.kernels import drift, PingLikelihood, sines_of
-from sonar_imm.trackers.bathymetry.swath import level_geometry
+from sonar_imm.trackers.bathymetry.likelihood import level_geometry
 from sonar_imm.trackers.bathymetry.tracker import BathymetryTracker
 
 CASE = motion_case()
@@ -38,7 +38,7 @@ def track(config, *, late_s=0.0, order='nav first'):
     tracker, estimates = BathymetryTracker(config), []
     poses, pings = navigation(CASE, late_s=late_s), list(snapshots(CASE))
     if order == 'by stamp':
-        everything = sorted([*poses, *pings], key=lambda one: one.stamp_ns)
+        everything = sorted([*poses, *pings], key=lambda each: each.stamp_ns)
     else:
         everything = [*poses, *pings] if order == 'nav first' else [*pings, *poses]
     for measurement in everything:
@@ -48,13 +48,13 @@ def track(config, *, late_s=0.0, order='nav first'):
 
 def errors(estimates):
     """rmse of z, share inside two sigma, rms of the place, share inside two sigma."""
-    z = np.array([one.state[:, 0] for one in estimates]) - CASE['X'][..., 2]
+    z = np.array([each.state[:, 0] for each in estimates]) - CASE['X'][..., 2]
     vertical, horizontal = (
-        np.array([one.extras[f'{name}_uncertainty'] for one in estimates])
+        np.array([each.extras[f'{name}_uncertainty'] for each in estimates])
         for name in ('vertical', 'horizontal')
     )
     aside = np.linalg.norm(
-        np.array([one.xyz for one in estimates])[..., :2] - CASE['X'][..., :2], axis=-1
+        np.array([each.xyz for each in estimates])[..., :2] - CASE['X'][..., :2], axis=-1
     )
     return (
         np.sqrt(np.mean(z**2)),
@@ -159,7 +159,7 @@ def test_a_floor_out_of_reach_is_impossible_not_unknown():
     g = level_geometry(np.full(T, 20.0), 15.0, 0.5, 0.5)
     ping = PingLikelihood(
         ranges=np.full(T, 20.0),
-        heard=np.ones(T, bool),
+        echo=np.ones(T, bool),
         form=np.ones((T, P), complex),
         base=np.zeros(T),
         spread=np.empty((T, 0), complex),
@@ -214,8 +214,8 @@ def test_pings_in_a_gap_are_skipped_and_counted():
     for pose in navigation(CASE):
         if abs(pose.stamp_ns - middle) > 6 * 10**8:
             tracker.process(pose)
-    made = [one for ping in pings for one in tracker.process(ping)]
-    assert [one.stamp_ns for one in made] == [p.stamp_ns for k, p in enumerate(pings) if k != 2]
+    made = [each for ping in pings for each in tracker.process(ping)]
+    assert [each.stamp_ns for each in made] == [p.stamp_ns for k, p in enumerate(pings) if k != 2]
     assert tracker.counts['navigation_gap'] == 1 and tracker.counts['used'] == 5
 
 
@@ -331,8 +331,8 @@ def test_mistakes_in_the_parameters_are_named(values, word):
 def test_a_recording_says_whether_there_is_navigation():
     assert BathymetryConfig().for_inputs(frozenset({'snapshot'})).navigation == 'ignored'
     assert BathymetryConfig().for_inputs(frozenset({'snapshot', 'nav'})).navigation == 'required'
-    told = BathymetryConfig(navigation='ignored')
-    assert told.for_inputs(frozenset({'nav'})) == told
+    stated = BathymetryConfig(navigation='ignored')
+    assert stated.for_inputs(frozenset({'nav'})) == stated
 
 
 def test_navigation_in_another_frame_is_counted():

@@ -31,9 +31,9 @@ WATER = 5.0 + 0.05 * np.arange(900)
 def run(name, values, **config):
     made = scenario(name, values)
     scene = simulate(made, 1)
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping({**made.told(), **config}))
-    pings = [tracker.process(one.measurement) for one in scene.measurements]
-    return [one for ping in pings for one in ping], scene.truth
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping({**made.instruments(), **config}))
+    pings = [tracker.process(each.measurement) for each in scene.measurements]
+    return [each for ping in pings for each in ping], scene.truth
 
 
 def rmse(estimate, truth):
@@ -86,9 +86,14 @@ def test_a_wrong_height_of_the_sonar_is_survived(model_set, height):
     values = {'pings': 2, 'ping_rate': 0.3, 'patch_along': [], 'moving': True}
     made = scenario('moving', {**values, 'sonar_height': height, 'first_range': 5.0})
     scene = simulate(made, 2)
-    told = {**made.told(), 'sonar_height': 15.0, 'sonar_height_std': 5.0, 'model_set': model_set}
-    tracker = BathymetryTracker(BathymetryConfig.from_mapping(told))
-    made = [one for item in scene.measurements for one in tracker.process(item.measurement)]
+    stated = {
+        **made.instruments(),
+        'sonar_height': 15.0,
+        'sonar_height_std': 5.0,
+        'model_set': model_set,
+    }
+    tracker = BathymetryTracker(BathymetryConfig.from_mapping(stated))
+    made = [each for item in scene.measurements for each in tracker.process(item.measurement)]
     assert len(made) == 2
     assert max(rmse(a, b) for a, b in zip(made, scene.truth)) < 0.3
 
@@ -107,10 +112,10 @@ def test_angles_hold_the_floor_near_nadir(engine):
     made, truth = run('paper', {'pings': 5, 'first_range': 15.1}, **values)
     assert max(rmse(a, b) for a, b in zip(made, truth)) < 0.3
     near = truth[0].range < 20.0
-    flat = np.mean([one.probabilities[near, 1] > 0.5 for one in made])
+    flat = np.mean([each.probabilities[near, 1] > 0.5 for each in made])
     assert flat < 0.15
     made, truth = run('paper', {'pings': 5, 'first_range': 15.1}, **values, angle_drift=False)
-    rough = np.mean([one.probabilities[near, 1] > 0.5 for one in made])
+    rough = np.mean([each.probabilities[near, 1] > 0.5 for each in made])
     assert rough > 0.6  # the paper's walk cannot follow: a flat floor is called rough
 
 
@@ -129,8 +134,8 @@ def test_grid_and_particles_agree_on_drifting_angles():
 
 def overlap(name, values, **config):
     made, truth = run(name, {'pings': 4, **values}, **config)
-    rough = np.concatenate([one.extras['rough'] > 0.5 for one in made])
-    patch = np.concatenate([one.patch for one in truth])
+    rough = np.concatenate([each.extras['rough'] > 0.5 for each in made])
+    patch = np.concatenate([each.patch for each in truth])
     return (rough & patch).sum() / (rough | patch).sum()
 
 

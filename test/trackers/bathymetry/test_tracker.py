@@ -162,8 +162,8 @@ def test_the_scale_of_the_samples_does_not_matter(scale):
         iq=snapshot.iq.astype(np.complex128) * math.sqrt(scale),
         noise_variance=snapshot.noise_variance * scale,
     )
-    one, other = run(snapshot, engine='grid'), run(louder, engine='grid')
-    assert other.state == pytest.approx(one.state, abs=1e-5)
+    quiet, other = run(snapshot, engine='grid'), run(louder, engine='grid')
+    assert other.state == pytest.approx(quiet.state, abs=1e-5)
 
 
 # -- errata of the paper --------------------------------------------------------------------------

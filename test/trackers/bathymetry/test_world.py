@@ -34,7 +34,7 @@ EXACT = {
 
 def tracked(config, measurements):
     tracker = BathymetryTracker(config)
-    return [one for measurement in measurements for one in tracker.process(measurement)]
+    return [each for measurement in measurements for each in tracker.process(measurement)]
 
 
 def test_a_heading_that_passes_through_180_degrees_is_no_jump():
@@ -44,19 +44,19 @@ def test_a_heading_that_passes_through_180_degrees_is_no_jump():
     poses, pings = navigation(CASE), list(snapshots(CASE))[:3]
     plain = tracked(config, [*poses, *pings])
     heading = np.array(
-        [Rotation.from_quat(np.array(one.orientation)).as_euler('ZYX')[0] for one in poses]
+        [Rotation.from_quat(np.array(each.orientation)).as_euler('ZYX')[0] for each in poses]
     )
     turn = Rotation.from_euler('z', np.pi - np.median(heading))
     turned = []
-    for k, one in enumerate(poses):
-        q = (turn * Rotation.from_quat(np.array(one.orientation))).as_quat()
+    for k, each in enumerate(poses):
+        q = (turn * Rotation.from_quat(np.array(each.orientation))).as_quat()
         turned.append(
             evolve(
-                one, position=turn.apply(np.array(one.position)), orientation=q if k % 2 else -q
+                each, position=turn.apply(np.array(each.position)), orientation=q if k % 2 else -q
             )
         )
     south = np.array(
-        [Rotation.from_quat(np.array(one.orientation)).as_euler('ZYX')[0] for one in turned]
+        [Rotation.from_quat(np.array(each.orientation)).as_euler('ZYX')[0] for each in turned]
     )
     assert (south > 3.0).any() and (south < -3.0).any()
     found = tracked(config, [*turned, *pings])
@@ -68,13 +68,13 @@ def test_a_heading_that_passes_through_180_degrees_is_no_jump():
 def in_summer(**changes):
     scene = scenario('moving_profile', {'pings': 2, 'ping_rate': 0.3, **EXACT, **changes})
     made = simulate(scene, 3)
-    config = BathymetryConfig.from_mapping({**scene.told(), 'engine': 'grid'})
+    config = BathymetryConfig.from_mapping({**scene.instruments(), 'engine': 'grid'})
     config = config.for_inputs(frozenset({'snapshot', 'nav'}))
-    return made, config, [one.measurement for one in made.measurements]
+    return made, config, [each.measurement for each in made.measurements]
 
 
 def height_error(estimates, truth):
-    error = np.array([one.state[:, 0] for one in estimates]) - [one.height for one in truth]
+    error = np.array([each.state[:, 0] for each in estimates]) - [each.height for each in truth]
     return float(np.sqrt(np.mean(np.square(error))))
 
 
@@ -82,10 +82,10 @@ def test_depth_in_the_profile_is_counted_from_the_surface():
     """The same sea 40 m higher: the floor is 40 m higher, and bends as before."""
     made, config, measurements = in_summer()
     lifted = [
-        evolve(one, position=one.position + [0.0, 0.0, 40.0])
-        if isinstance(one, Navigation)
-        else one
-        for one in measurements
+        evolve(each, position=each.position + [0.0, 0.0, 40.0])
+        if isinstance(each, Navigation)
+        else each
+        for each in measurements
     ]
     plain = tracked(config, measurements)
     higher = tracked(evolve(config, water_level=config.water_level + 40.0), lifted)
@@ -100,7 +100,7 @@ def test_a_profile_counted_from_elsewhere_is_seen(mistake):
     made, config, measurements = in_summer(water_level=level)
     array = level - 5.0  # the array is 5 m deep
     wrong = evolve(config, water_level=array if mistake == 'from the sonar' else 0.0)
-    pings = sum(isinstance(one, Snapshot) for one in measurements)
-    found, right = (tracked(one, measurements) for one in (wrong, config))
+    pings = sum(isinstance(each, Snapshot) for each in measurements)
+    found, right = (tracked(each, measurements) for each in (wrong, config))
     assert len(found) == pings
     assert height_error(found, made.truth) > 0.4 > 0.2 > height_error(right, made.truth)

@@ -35,7 +35,7 @@ def test_arrivals_are_better_than_fixes_made_of_them():
             )
             tracker = DiverTracker(DiverConfig(max_tracks=1))
             error, _ = errors(
-                run(tracker, [one.measurement for one in scene.measurements]), scene.truth[0]
+                run(tracker, [item.measurement for item in scene.measurements]), scene.truth[0]
             )
             found += np.sum(error**2, axis=1).tolist()
     rmse = {sensor: np.sqrt(np.mean(found)) for sensor, found in squared.items()}
@@ -67,8 +67,8 @@ def test_a_tag_of_unknown_emission_time_is_followed_also_by_two_receivers():
     tracker = DiverTracker(DiverConfig(max_tracks=1))
     for second in range(1, 60):
         position = np.array([0.6 * second - 20.0, 30.0])
-        heard = RECEIVERS if second < 25 or second % 3 == 0 else RECEIVERS[[1, 2]]
-        estimate = tracker.process(tag_ping(second, position, rng, heard, rng.uniform(0, 5)))[-1]
+        rx = RECEIVERS if second < 25 or second % 3 == 0 else RECEIVERS[[1, 2]]
+        estimate = tracker.process(tag_ping(second, position, rng, rx, rng.uniform(0, 5)))[-1]
     assert np.hypot(*(estimate.state[0, :2] - position)) < 1.0
     assert estimate.extras['track_id'].tolist() == [1]
     assert tracker.health()['confirmed'] == 1
@@ -107,17 +107,17 @@ def test_bearings_help_a_single_receiver():
         tracker = DiverTracker(DiverConfig(max_tracks=1))
         for second in range(1, 40):
             p = np.array([-20.0 + 0.6 * second, 30.0])
-            heard = RECEIVERS if second < 8 else RECEIVERS[:1]
-            path = np.linalg.norm(p) + np.linalg.norm(p - heard[:, :2], axis=1)
-            n = len(heard)
-            bearing = np.arctan2(*(p - heard[:, :2]).T[::-1]) + 0.01 * rng.normal(size=n)
+            received = RECEIVERS if second < 8 else RECEIVERS[:1]
+            path = np.linalg.norm(p) + np.linalg.norm(p - received[:, :2], axis=1)
+            n = len(received)
+            bearing = np.arctan2(*(p - received[:, :2]).T[::-1]) + 0.01 * rng.normal(size=n)
             tracker_out = tracker.process(
                 Arrivals(
                     stamp_ns=second * SECOND,
                     tx_id=np.zeros(n),
                     rx_id=np.arange(n),
                     tx=np.zeros((n, 3)),
-                    rx=heard,
+                    rx=received,
                     toa=path / 1500.0 + 1e-4 * rng.normal(size=n),
                     var_toa=np.full(n, 1e-8),
                     bearing=bearing if with_bearing else np.full(n, np.nan),
@@ -168,11 +168,11 @@ def test_bearings_across_half_a_turn_are_bearings(turn, learn_scale):
     plain, _, health = one_receiver_with_bearings(0.0, estimate_covariance_scale=learn_scale)
     other, diver, same = one_receiver_with_bearings(turn, estimate_covariance_scale=learn_scale)
     with_bearing = 0
-    for one, two in zip(plain[7:], other[7:]):
-        assert two.extras['nis_dof'].tolist() == one.extras['nis_dof'].tolist()
-        assert two.extras['nis'] == pytest.approx(one.extras['nis'], abs=1e-5)
-        assert two.state[0, :2] == pytest.approx(R @ one.state[0, :2], abs=1e-5)
-        with_bearing += one.extras['nis_dof'][0] > 1
+    for item, two in zip(plain[7:], other[7:]):
+        assert two.extras['nis_dof'].tolist() == item.extras['nis_dof'].tolist()
+        assert two.extras['nis'] == pytest.approx(item.extras['nis'], abs=1e-5)
+        assert two.state[0, :2] == pytest.approx(R @ item.state[0, :2], abs=1e-5)
+        with_bearing += item.extras['nis_dof'][0] > 1
     assert with_bearing == 52 - 6  # all but the six wild ones
     assert np.hypot(*(two.state[0, :2] - diver)) < 1.0
     assert same['scale_arrivals'] == pytest.approx(health['scale_arrivals'], rel=1e-5)
@@ -226,19 +226,19 @@ def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
     depth = {'target_z': -2.0, 'adaptation': 'fixed', 'passive': passive}
     plain, divers, _ = many_receivers(0.0, **depth)
     other, turned, _ = many_receivers(np.pi, **depth)
-    for one, two, diver in zip(plain[5:], other[5:], turned[5:]):
-        assert two.state[0, :2] == pytest.approx(-one.state[0, :2], abs=1e-5)
-        assert two.extras['nis_dof'].tolist() == one.extras['nis_dof'].tolist()
+    for item, two, diver in zip(plain[5:], other[5:], turned[5:]):
+        assert two.state[0, :2] == pytest.approx(-item.state[0, :2], abs=1e-5)
+        assert two.extras['nis_dof'].tolist() == item.extras['nis_dof'].tolist()
         assert np.hypot(*(two.state[0, :2] - diver[:2])) < 0.6
-    with_bearing = np.mean([one.extras['nis_dof'][0] for one in plain[5:]])
+    with_bearing = np.mean([item.extras['nis_dof'][0] for item in plain[5:]])
     assert with_bearing > (7 if passive else 8)  # more than the arrival times alone
 
 
 def test_elevations_show_the_depth():
     """Two hundredths of a radian at 70 m are 1.4 m a receiver, and eight of them hear it."""
     seen, divers, _ = many_receivers(0.0, elevation=True, dimensions=3)
-    error = np.array([one.state[0, :3] - diver for one, diver in zip(seen, divers)])[5:]
-    P = np.array([one.covariance[0, :3, :3] for one in seen])[5:]
+    error = np.array([item.state[0, :3] - diver for item, diver in zip(seen, divers)])[5:]
+    P = np.array([item.covariance[0, :3, :3] for item in seen])[5:]
     nees = np.einsum('ka,ka->k', error, np.linalg.solve(P, error[..., None])[..., 0])
     assert np.sqrt(np.mean(error[:, 2] ** 2)) < 0.5
     assert np.sqrt(P[-1, 2, 2]) < 0.6 and 1.0 < nees.mean() < 6.0

@@ -41,9 +41,12 @@ def test_taking_fixes_is_the_plain_update_of_those_tracks():
     tracks, detection = np.array([4, 1]), np.array([0, 7])
     v = z[detection][:, None] - h[tracks]
     want = imm.update(x[tracks], P[tracks], mu[tracks], v, H, R[detection])
-    x1, P1, mu1 = x.copy(), P.copy(), mu.copy()
-    nis, dof = np.ones(T), np.ones(T, np.uint16)
-    repairs = fix_kernels.take(x1, P1, mu1, h, H, z, R, tracks, detection, nis, dof)
+    kept = x.copy(), P.copy(), mu.copy()
+    x1, P1, mu1, nis, dof, repairs = fix_kernels.update(
+        x, P, mu, h, H, z, R, tracks, detection, np.ones(T), np.ones(T, np.uint16)
+    )
+    for argument, before in zip((x, P, mu), kept):
+        np.testing.assert_array_equal(argument, before)
     assert repairs == 0 and dof.tolist() == [1, 3, 1, 1, 3, 1]
     np.testing.assert_allclose(nis[tracks], 1.0 + want.nis)
     for got, plain, before in ((x1, want.x, x), (P1, want.P, P), (mu1, want.mu, mu)):
@@ -61,15 +64,17 @@ def test_the_account_of_innovations():
     white[5], z[detection[-1]] = [9.0, -12.0], z[detection[-1]] + 40.0  # sharp turns
     before, memory = white.copy(), 50.0
     old = (49.0, 30.0, 40.0, 5.0, 35.0)
-    new = fix_kernels.watch(x, P, mu, H, z, R, tracks, detection, tentative, white, old, memory)
+    white, new = fix_kernels.watch(
+        x, P, mu, H, z, R, tracks, detection, tentative, white, old, memory
+    )
     mean, covariance = imm.combine(x[tracks], P[tracks], mu[tracks], H[0])
     root = np.linalg.cholesky(covariance + R[detection])
     now = np.linalg.solve(root, (z[detection] - mean)[..., None])[..., 0]
     np.testing.assert_allclose(white[tracks], now)
     np.testing.assert_array_equal(np.delete(white, tracks, 0), np.delete(before, tracks, 0))
 
-    def short(one):
-        return one * np.minimum(1.0, np.sqrt(18.0) / np.linalg.norm(one, axis=1))[:, None]
+    def short(v):
+        return v * np.minimum(1.0, np.sqrt(18.0) / np.linalg.norm(v, axis=1))[:, None]
 
     firm, paired = short(now[[0, 1, 3]]), (short(now[[0, 3]]), short(before[[0, 5]]))
     assert np.sum(now[3] ** 2) > 18.0 and np.sum(now[0] ** 2) < 18.0
@@ -87,8 +92,9 @@ def test_scores_and_numbers_that_are_not_finite():
     score, chosen = np.zeros(3), np.array([1, -1, -1])
     named = np.array([False, False, True])
     fit = np.array([[0.0, -1.5], [0.0, 0.0], [0.0, 0.0]])
-    fix_kernels.keep_score(score, fit, chosen, named, -2.3, 2.2, -7.0)
-    np.testing.assert_allclose(score, [-2.3 - 1.5 + 2.2 + 7.0, -2.3, 0.0])
+    after = fix_kernels.scores(score, fit, chosen, named, -2.3, 2.2, -7.0)
+    assert not score.any()
+    np.testing.assert_allclose(after, [-2.3 - 1.5 + 2.2 + 7.0, -2.3, 0.0])
     x, P = np.zeros((3, 2, 2)), np.zeros((3, 2, 2, 2))
     x[1, 1, 0], P[2, 0, 1, 1] = np.nan, np.inf
     assert fix_kernels.finite(x, P).tolist() == [True, False, False]

@@ -79,10 +79,10 @@ def test_a_ping_of_the_largest_size_takes_seconds_and_megabytes(make):
     tracker = DiverTracker(DiverConfig())
     tracker.warm()
     for second in (1, 2):
-        one = make(rng, second * SECOND)
+        item = make(rng, second * SECOND)
         tracemalloc.start()
         start = time.process_time()
-        tracker.process(one)
+        tracker.process(item)
         took, (_, peak) = time.process_time() - start, tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert took < LIMIT_SECONDS and peak < LIMIT_BYTES
@@ -104,8 +104,8 @@ def test_an_echo_that_very_many_receivers_hear_is_taken_whole():
     place = np.array([20.0, 30.0, 0.0])
     path = np.linalg.norm(rx - place, axis=1) + np.linalg.norm(place)
     for second in range(1, 5):
-        one = ping(rx, path / 1500.0, second * SECOND, tx=(0.0, 0.0, 0.0))
-        (estimate,) = tracker.process(one)
+        item = ping(rx, path / 1500.0, second * SECOND, tx=(0.0, 0.0, 0.0))
+        (estimate,) = tracker.process(item)
     assert len(estimate) == 1
     np.testing.assert_allclose(estimate.state[0, :2], place[:2], atol=0.05)
 
@@ -139,16 +139,16 @@ def test_a_target_on_the_line_of_a_line_array_breaks_nothing(seed):
     rng = np.random.default_rng(seed)
     tracker = DiverTracker(DiverConfig())
     for second in range(1, 151):
-        one = in_line(rng)
+        item = in_line(rng)
         fix = localise(
-            one.rx,
-            one.toa,
-            one.var_toa,
-            tx=one.tx,
-            bearing=one.bearing,
-            var_bearing=one.var_bearing,
+            item.rx,
+            item.toa,
+            item.var_toa,
+            tx=item.tx,
+            bearing=item.bearing,
+            var_bearing=item.var_bearing,
         )
         for found in (fix, *fix.alternatives) if hasattr(fix, 'covariance') else ():
             assert (np.linalg.eigvalsh(found.covariance) > 0.0).all()
-        tracker.process(evolve(one, stamp_ns=second * SECOND))
+        tracker.process(evolve(item, stamp_ns=second * SECOND))
     assert tracker.health()['broken_tracks'] == 0

@@ -41,7 +41,7 @@ def test_every_set_is_consistent(model_set):
         np.testing.assert_array_equal(Q, np.swapaxes(Q, -1, -2))
         assert np.linalg.eigvalsh(Q).min() > -1e-9 * max(Q.max(), 1e-9)
         np.testing.assert_allclose(models.chain.transition(dt).sum(axis=1), 1.0)
-    x, P, mu = (one[0] for one in models.new_tracks(CENTRE[None], SPREAD[None]))
+    x, P, mu = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     mean, covariance = imm.combine(x[None], P[None], mu[None], models.E)
     np.testing.assert_allclose(mean[0, :2], CENTRE)
     np.testing.assert_allclose(covariance[0, :2, :2], SPREAD)
@@ -50,7 +50,7 @@ def test_every_set_is_consistent(model_set):
 @pytest.mark.parametrize('model_set', COMPOSE)
 def test_ten_short_steps_are_one_long_step(model_set):
     models = build_models(DiverConfig(model_set=model_set, speed_noise=0.2))
-    x, P, _ = (one[0] for one in models.new_tracks(CENTRE[None], SPREAD[None]))
+    x, P, _ = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
     short_x, short_P = x[None], P[None]
     for _ in range(10):
@@ -64,7 +64,7 @@ def test_ten_short_steps_are_one_long_step(model_set):
 def test_world_headings_compose_in_position():
     """Their velocity is drawn afresh at each step; the law of the position composes."""
     models = build_models(DiverConfig(model_set='world_headings'))
-    x, P, _ = (one[0] for one in models.new_tracks(CENTRE[None], SPREAD[None]))
+    x, P, _ = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
     for _ in range(10):
         x, P, _ = (a[0] for a in imm.predict(x[None], P[None], *models.motion(0.1)))

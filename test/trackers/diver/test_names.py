@@ -89,7 +89,7 @@ def test_two_divers_that_swim_together_stay_two(association):
     for second in range(1, 80):
         place = np.array([0.5 * second, 0.0])
         both = [place + 0.4 * rng.normal(size=2), place + [0.0, 3.0] + 0.4 * rng.normal(size=2)]
-        seen = [one for one in both if rng.uniform() < 0.9]
+        seen = [item for item in both if rng.uniform() < 0.9]
         (estimate,) = tracker.process(scan(second, *seen))
         if second >= 10 and second % 4 == 0:
             tracker.process(named(second + 0.4, place + 0.5 * rng.normal(size=2), 5))
@@ -117,7 +117,7 @@ def test_names_without_a_track_are_not_kept():
         ids = [1, *range(1000 * second, 1000 * second + 50)]
         places = [(float(k), 0.0) for k in range(len(ids))]
         tracker.process(scan(second, *places, target_id=ids))
-    assert len(tracker._stream.state.said) < 100
+    assert len(tracker._stream.state.last_named) < 100
 
 
 @pytest.mark.parametrize('association', BOTH)
@@ -135,7 +135,7 @@ def test_order_inside_the_window_changes_no_bit_with_names(association):
         tracker, last = DiverTracker(config), {}
         for index in order:
             made = tracker.process(measurements[index])
-            last.update((one.stamp_ns, one) for one in made)
+            last.update((item.stamp_ns, item) for item in made)
         return [last[stamp].state.tobytes() for stamp in sorted(last)]
 
     straight = np.arange(len(measurements))

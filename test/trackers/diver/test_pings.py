@@ -17,17 +17,17 @@
 from attrs import evolve
 from helpers.sea_vectors import vectors
 import numpy as np
+from oracles.student_t import student_t_maximum
+from oracles.subset_update import subset_update
 import pytest
 
 from sonar_imm.acoustics.arrivals_3d import observe
-from sonar_imm.estimation.student_t import student_t_maximum
-from sonar_imm.estimation.subset_update import subset_update
 from sonar_imm.measurements import Arrivals
-from sonar_imm.trackers.diver.instruments import Instruments
 from sonar_imm.trackers.diver.models import build_models
-from sonar_imm.trackers.diver.ping_kernels import Numbers, subset_ping
-from sonar_imm.trackers.diver.pings import optima, ping_numbers, update_by_ping
-from sonar_imm.trackers.diver.robust_kernels import student_t_ping
+from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
+from sonar_imm.trackers.diver.pings import optima, update_by_ping
+from sonar_imm.trackers.diver.scan import ping_measurements
+from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -49,7 +49,7 @@ def case(seed=0):
     value[2] += 9.0
     variance = np.where(kind < 2, 0.09, 1e-4)
     nobody = np.full(6, -1)
-    numbers = Numbers(
+    numbers = PingMeasurements(
         np.arange(6), nobody, kind, value, variance, np.full(6, 0.02), tx, rx, columns
     )
 
@@ -71,11 +71,11 @@ def test_a_bearing_is_the_same_after_a_whole_turn(turns):
     turned = numbers._replace(value=numbers.value + 2.0 * np.pi * turns * (numbers.kind == 2))
     mask = np.ones(N, bool)
     for update in (
-        lambda told: subset_ping(x[None], P[None], mask, 0.0, told, 0.05, 128)[:2],
-        lambda told: student_t_ping(x[None], P[None], mask, 0.0, told, x[None, :2], 4.0)[:2],
+        lambda m: subset_ping(x[None], P[None], mask, 0.0, m, 0.05, 128)[:2],
+        lambda m: student_t_ping(x[None], P[None], mask, 0.0, m, x[None, :2], 4.0)[:2],
     ):
-        for one, other in zip(update(numbers), update(turned)):
-            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9)
+        for item, other in zip(update(numbers), update(turned)):
+            np.testing.assert_allclose(other, item, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize('considered', [0, 6])
@@ -98,7 +98,7 @@ def test_numbers_of_a_node_exclude_each_other_and_angles_follow_their_echo():
     """Two echoes of a pair, the second of which is late, and the bearing of the first."""
     x, P, numbers, _ = case()
     two = np.array([0, 2, 4])
-    some = Numbers(*(np.ascontiguousarray(column[two]) for column in numbers))
+    some = PingMeasurements(*(np.ascontiguousarray(column[two]) for column in numbers))
     some = some._replace(node=np.array([0, 0, 1]), parent=np.array([-1, -1, 0]))
     _, _, _, good = subset_ping(x[None], P[None], np.ones(N, bool), 0.0, some, 0.05, 128)
     assert good[0, 0] + good[0, 1] <= 1.0 + 1e-12
@@ -161,25 +161,25 @@ def test_the_order_of_arrivals_changes_no_bit(passive, many):
             name: getattr(ping, name)[order]
             for name in ('tx_id', 'rx_id', 'tx', 'rx', 'var_toa', 'bearing', 'var_bearing')
         }
-        one = trackers[0].process(evolve(ping, toa=late))[-1]
+        item = trackers[0].process(evolve(ping, toa=late))[-1]
         other = trackers[1].process(evolve(ping, toa=late[order], **shuffled))[-1]
-        assert one.state.tobytes() == other.state.tobytes()
-        assert one.covariance.tobytes() == other.covariance.tobytes()
-        assert one.probabilities.tobytes() == other.probabilities.tobytes()
-    assert np.hypot(*(one.state[0, :2] - place[:2])) < 2.0
+        assert item.state.tobytes() == other.state.tobytes()
+        assert item.covariance.tobytes() == other.covariance.tobytes()
+        assert item.probabilities.tobytes() == other.probabilities.tobytes()
+    assert np.hypot(*(item.state[0, :2] - place[:2])) < 2.0
 
 
 def test_many_good_arrivals_outvote_any_prior():
     """A track that is ten standard deviations off comes to where nine receivers hear the tag."""
     config = DiverConfig(max_tracks=1)
     models = build_models(config)
-    layout = Instruments().layout(config, models.n)
+    layout = Instruments().layout(config, models)
     rng = np.random.default_rng(4)
     receivers = rng.uniform(-80.0, 80.0, (9, 3)) * [1.0, 1.0, 0.0]
     measurement = ping_of(np.array([20.0, 35.0, 0.0]), receivers, (np.nan,) * 3, rng=rng)
-    numbers = ping_numbers(measurement, np.arange(9), config, 1.0, models, layout)
+    numbers = ping_measurements(measurement, np.arange(9), config, 1.0, models, layout)
     x, P, mu = (
-        one[0] for one in models.new_tracks(np.array([[-30.0, 10.0]]), 25.0 * np.eye(2)[None])
+        item[0] for item in models.new_tracks(np.array([[-30.0, 10.0]]), 25.0 * np.eye(2)[None])
     )
     after = update_by_ping(x, P, mu, numbers, config, layout)
     assert np.hypot(*(after.mu @ after.x[:, :2] - [20.0, 35.0])) < 1.0
@@ -189,12 +189,12 @@ def test_many_good_arrivals_outvote_any_prior():
 def test_wild_echoes_only_leave_the_prediction():
     config = DiverConfig(max_tracks=1)
     models = build_models(config)
-    layout = Instruments().layout(config, models.n)
+    layout = Instruments().layout(config, models)
     measurement = ping_of(np.array([20.0, 35.0, 0.0]))
     measurement = evolve(measurement, toa=measurement.toa + [0.02, 0.03, 0.025, 0.022])
-    numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
+    numbers = ping_measurements(measurement, np.arange(4), config, 1.0, models, layout)
     x, P, mu = (
-        one[0] for one in models.new_tracks(np.array([[20.0, 35.0]]), 0.25 * np.eye(2)[None])
+        item[0] for item in models.new_tracks(np.array([[20.0, 35.0]]), 0.25 * np.eye(2)[None])
     )
     after = update_by_ping(x, P, mu, numbers, config, layout)
     assert (after.good < 1e-3).all()
@@ -204,19 +204,19 @@ def test_wild_echoes_only_leave_the_prediction():
 
 def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
     v = vectors('depth_one_ping')
-    low, high = (float(one) for one in v['depth_range'])
+    low, high = (float(item) for item in v['depth_range'])
     config = DiverConfig(
         max_tracks=1, dimensions=3, depth_min=low, depth_max=high, outlier_probability=1e-6
     )
     models = build_models(config)
-    layout = Instruments().layout(config, models.n)
+    layout = Instruments().layout(config, models)
     sigma = float(v['sigma'])
     measurement = ping_of(v['truth'], v['rx'], tuple(v['tx']), sigma / 1500.0)
     measurement = evolve(measurement, toa=v['path'] / 1500.0)
-    numbers = ping_numbers(measurement, np.arange(4), config, 1.0, models, layout)
+    numbers = ping_measurements(measurement, np.arange(4), config, 1.0, models, layout)
     x, P, mu = (
-        one[0]
-        for one in models.new_tracks(
+        item[0]
+        for item in models.new_tracks(
             v['prior_mean'][None], float(v['prior_var']) * np.eye(2)[None], False
         )
     )
@@ -234,18 +234,23 @@ def test_the_copies_at_three_depths_are_near_the_posterior_by_quadrature():
 def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
     config = DiverConfig(max_tracks=1, dimensions=3)
     models = build_models(config)
-    layout = Instruments().layout(config, models.n)
+    layout = Instruments().layout(config, models)
     place = np.array([20.0, 35.0, -11.0])
     beside = {'depth': np.full(4, 11.0), 'var_depth': np.full(4, 0.04)}
     beside |= {'elevation': np.full(4, -0.2), 'var_elevation': np.full(4, 1e-4)}
-    numbers = ping_numbers(
+    numbers = ping_measurements(
         ping_of(place, **beside), np.arange(4), config, 1.0, models, layout
-    ).numbers
+    ).measured
     assert numbers.kind.tolist() == [4, 0, 3, 0, 3, 0, 3, 0, 3]
     assert numbers.value[0] == -11.0
     flat = DiverConfig(max_tracks=1)
     models = build_models(flat)
-    numbers = ping_numbers(
-        ping_of(place, **beside), np.arange(4), flat, 1.0, models, Instruments().layout(flat, 3)
-    ).numbers
+    numbers = ping_measurements(
+        ping_of(place, **beside),
+        np.arange(4),
+        flat,
+        1.0,
+        models,
+        Instruments().layout(flat, models),
+    ).measured
     assert numbers.kind.tolist() == [0, 0, 0, 0]

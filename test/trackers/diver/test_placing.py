@@ -58,8 +58,8 @@ def relative(second, offset, **values):
 
 
 def run(tracker, measurements):
-    made = [one for measurement in measurements for one in tracker.process(measurement)]
-    final = {one.stamp_ns: one for one in made}
+    made = [item for measurement in measurements for item in tracker.process(measurement)]
+    final = {item.stamp_ns: item for item in made}
     return [final[stamp] for stamp in sorted(final)]
 
 

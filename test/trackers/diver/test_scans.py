@@ -24,12 +24,11 @@ import pytest
 
 from sonar_imm.estimation.association import TrackStatus
 from sonar_imm.measurements import Arrivals, Fixes, NOBODY
-from sonar_imm.trackers.diver import fix_kernels, soft
-from sonar_imm.trackers.diver import scan as scan_module
-from sonar_imm.trackers.diver.fix_consistency import FixConsistency, MEMORY
-from sonar_imm.trackers.diver.scan import SCALE_MEMORY
-from sonar_imm.trackers.diver.sensing import position_groups
+from sonar_imm.trackers.diver import fix_kernels, jipda
+from sonar_imm.trackers.diver import tracker as tracker_module
+from sonar_imm.trackers.diver.scan import position_groups
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.state import FixConsistency, MEMORY, ROWS, SCALE_MEMORY
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -53,22 +52,24 @@ def ids_of(estimate):
 
 def test_a_scan_is_the_same_as_its_fixes_one_by_one():
     scene = simulate(scenario('several', {'duration': 30.0}), seed=2)
-    single = [one.measurement for one in scene.measurements]
-    stamps = sorted({one.stamp_ns for one in single})
+    single = [item.measurement for item in scene.measurements]
+    stamps = sorted({item.stamp_ns for item in single})
     scans = []
     for stamp in stamps:
-        own = sorted((one for one in single if one.stamp_ns == stamp), key=lambda one: one.key())
+        own = sorted(
+            (item for item in single if item.stamp_ns == stamp), key=lambda item: item.key()
+        )
         scans.append(
             Fixes(
                 stamp_ns=stamp,
-                position=[one.position for one in own],
-                covariance=[one.covariance for one in own],
+                position=[item.position for item in own],
+                covariance=[item.covariance for item in own],
                 frame_id='map',
             )
         )
-    one, other = (run(DiverTracker(DiverConfig()), items) for items in (single, scans))
-    assert len(one) == len(other) == len(stamps)
-    assert all(same(*pair) for pair in zip(one, other))
+    first, other = (run(DiverTracker(DiverConfig()), items) for items in (single, scans))
+    assert len(first) == len(other) == len(stamps)
+    assert all(same(*pair) for pair in zip(first, other))
 
 
 @pytest.mark.parametrize('association', ASSOCIATIONS)
@@ -148,12 +149,14 @@ def test_two_confirmed_tracks_on_one_diver_become_the_older_one():
 @pytest.mark.parametrize('association', ASSOCIATIONS)
 def test_late_scans_give_the_same_bits(association):
     scene = simulate(scenario('crossing', {'duration': 25.0, 'clutter': 3.0}), seed=4)
-    items = [one.measurement for one in scene.measurements]
-    config = DiverConfig(association=association, **scenario('crossing', {'clutter': 3.0}).told())
+    items = [item.measurement for item in scene.measurements]
+    config = DiverConfig(
+        association=association, **scenario('crossing', {'clutter': 3.0}).instruments()
+    )
     order = np.argsort(np.arange(len(items)) + np.random.default_rng(1).uniform(0, 8, len(items)))
-    one = run(DiverTracker(config), items)
+    first = run(DiverTracker(config), items)
     other = run(DiverTracker(config), [items[k] for k in order])
-    assert all(same(*pair) for pair in zip(one, other)) and len(one) == len(other)
+    assert all(same(*pair) for pair in zip(first, other)) and len(first) == len(other)
 
 
 def test_crossing_in_clutter_is_better_softly():
@@ -167,11 +170,11 @@ def test_crossing_in_clutter_is_better_softly():
 
 def test_a_smoother_takes_scans_and_hides_what_does_not_exist():
     scene = simulate(scenario('crossing', {'duration': 30.0}), seed=1)
-    config = DiverConfig(association='jipda', **scenario('crossing').told())
+    config = DiverConfig(association='jipda', **scenario('crossing').instruments())
     tracker = SmoothingDiverTracker(config)
-    forward = run(tracker, [one.measurement for one in scene.measurements])
+    forward = run(tracker, [item.measurement for item in scene.measurements])
     smooth = tracker.smoothed()
-    assert [ids_of(one) for one in smooth] == [ids_of(one) for one in forward]
+    assert [ids_of(item) for item in smooth] == [ids_of(item) for item in forward]
 
 
 # -- names ---------------------------------------------------------------------------------------
@@ -232,7 +235,7 @@ def test_the_column_of_fixes_may_be_mixed_with_single_fixes():
 
 def test_existence_of_a_track_that_was_counted_is_guessed_from_its_state():
     status = np.array([TrackStatus.TENTATIVE, TrackStatus.CONFIRMED, TrackStatus.CONFIRMED])
-    known = soft.known_existence(np.array([np.nan, np.nan, 0.3]), status)
+    known = jipda.known_existence(np.array([np.nan, np.nan, 0.3]), status)
     assert known.tolist() == [0.5, 0.9, 0.3]
 
 
@@ -242,8 +245,8 @@ def test_what_is_stated_is_scaled_in_scans_as_in_single_fixes():
     stated = np.array([0.25, np.nan, 1.0])[:, None, None] * np.eye(2)
     expected = 3.0 * np.array([0.25, 4.0, 1.0])[:, None, None] * np.eye(2)
     for ids in (None, [6, 7, 8], [NOBODY] * 3):
-        one = evolve(scan(1, *places, ids=ids), covariance=stated)
-        (group,) = position_groups([one], config, 3.0)
+        item = evolve(scan(1, *places, ids=ids), covariance=stated)
+        (group,) = position_groups([item], config, 3.0)
         assert group.factor == 3.0
         assert group.R == pytest.approx(expected)
 
@@ -280,25 +283,42 @@ def test_the_learnt_scale_is_that_of_the_last_fixes():
     assert not tracker._stream.state.scale[1].any()  # of arrivals nothing is known
 
 
-def test_arrivals_are_judged_where_no_fix_says_the_same():
+def ping(second):
+    """The echoes of a diver at (20, 30, -2) at four receivers."""
     rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
     leg = np.linalg.norm(rx - [20.0, 30.0, -2.0], axis=1)
+    return Arrivals(
+        stamp_ns=second * SECOND,
+        tx_id=np.zeros(4),
+        rx_id=np.arange(4),
+        tx=np.tile(rx[0], (4, 1)),
+        rx=rx,
+        toa=(leg + leg[0]) / 1500.0,
+        var_toa=np.full(4, 1e-8),
+        bearing=np.full(4, np.nan),
+        var_bearing=np.full(4, np.nan),
+        frame_id='map',
+    )
+
+
+@pytest.mark.parametrize('association', ASSOCIATIONS)
+def test_a_scan_changes_nothing_of_the_state_before_it(association):
+    """States are values: those in the history are what a late measurement is replayed from."""
+    tracker = DiverTracker(
+        DiverConfig(association=association, estimate_covariance_scale=True, target_z=-2.0)
+    )
+    for second in range(1, 10):
+        before = tracker._stream.state
+        kept = {name: np.copy(getattr(before, name)) for name in (*ROWS, 'scale')}
+        seen = scan(second, (20.0, 30.0), (30.0, 5.0 + second), ids=[NOBODY, 7])
+        tracker.process(ping(second) if second % 3 == 0 else seen)
+        assert tracker._stream.state is not before
+        for name, value in kept.items():
+            np.testing.assert_array_equal(getattr(before, name), value, err_msg=name)
+
+
+def test_arrivals_are_judged_where_no_fix_says_the_same():
     tracker = DiverTracker(DiverConfig(target_z=-2.0))
-
-    def ping(second):
-        return Arrivals(
-            stamp_ns=second * SECOND,
-            tx_id=np.zeros(4),
-            rx_id=np.arange(4),
-            tx=np.tile(rx[0], (4, 1)),
-            rx=rx,
-            toa=(leg + leg[0]) / 1500.0,
-            var_toa=np.full(4, 1e-8),
-            bearing=np.full(4, np.nan),
-            var_bearing=np.full(4, np.nan),
-            frame_id='map',
-        )
-
     for second in range(1, 9):
         tracker.process(scan(second, (20.0, 30.0)))
         tracker.process(ping(second))
@@ -320,14 +340,14 @@ def test_repairs_of_every_step_of_a_gap_are_counted(monkeypatch):
     tracker = DiverTracker(DiverConfig(history=0.0))
     for second in (1, 2):
         tracker.process(scan(second, (0.0, 0.0)))
-    real, crossed = scan_module.cross, []
+    real, crossed = tracker_module.cross, []
 
-    def cross(*told):
-        for step in real(*told):
+    def cross(*arguments):
+        for step in real(*arguments):
             crossed.append(step)
             yield step._replace(repairs=len(crossed))
 
-    monkeypatch.setattr(scan_module, 'cross', cross)
+    monkeypatch.setattr(tracker_module, 'cross', cross)
     tracker.process(scan(8, (0.0, 0.0)))
     steps = len(crossed)
     assert steps > 2
@@ -345,7 +365,7 @@ def test_scans_near_another_track_are_counted_for_each_partner_alone():
         near_for=np.array([0, 5, 5, 5]),
     )
     tentative, wide = np.zeros(4, bool), np.tile(np.eye(2), (4, 1, 1))
-    near_to, near_for = soft.coalescence(now, tentative, mean, wide)
+    near_to, near_for = jipda.coalescence(now, tentative, mean, wide)
     assert near_to.tolist() == [0, 0, 2, 1]
     assert near_for.tolist() == [0, 0, 1, 6]
 
@@ -353,10 +373,10 @@ def test_scans_near_another_track_are_counted_for_each_partner_alone():
 def test_warnings_of_fixes_need_evidence_and_a_bias_that_is_not_stated():
     pessimistic = FixConsistency(MEMORY, 0.4 * MEMORY, MEMORY, 0.0, MEMORY)
     lasting = FixConsistency(MEMORY, MEMORY, MEMORY, 0.4 * MEMORY, MEMORY)
-    for one in (pessimistic, lasting):
-        assert 'state fix_bias_std' in one.warnings(False)[0]
-        assert one.warnings(True) == []
-        assert evolve(one, count=0.9 * MEMORY).warnings(False) == []
+    for item in (pessimistic, lasting):
+        assert 'state fix_bias_std' in item.warnings(False)[0]
+        assert item.warnings(True) == []
+        assert item._replace(number=0.9 * MEMORY).warnings(False) == []
     optimistic = FixConsistency(MEMORY, 2.0 * MEMORY, MEMORY, 0.0, MEMORY)
     for stated in (False, True):
         assert 'raise covariance_scale' in optimistic.warnings(stated)[0]

@@ -22,8 +22,9 @@ import pytest
 
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.diver.config import DiverConfig
-from sonar_imm.trackers.diver.instruments import Instruments
+from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -36,8 +37,8 @@ def judged(name, scene, config, seeds=range(4), smooth=False):
     for seed in seeds:
         made = simulate(scenario(name, {'duration': 60.0, **scene}), seed)
         tracker, final = SmoothingDiverTracker(DiverConfig(max_tracks=1, **config)), {}
-        for one in made.measurements:
-            final.update((e.stamp_ns, e) for e in tracker.process(one.measurement))
+        for scan in made.measurements:
+            final.update((e.stamp_ns, e) for e in tracker.process(scan.measurement))
         estimates = tracker.smoothed() if smooth else [final[stamp] for stamp in sorted(final)]
         track = made.truth[0]
         at = {int(stamp): k for k, stamp in enumerate(track.stamp_ns)}
@@ -83,10 +84,10 @@ def test_what_is_considered_is_the_same_in_all_models_and_times():
     config = DiverConfig(max_tracks=1, **OFF, systematic_errors='consider')
     tracker = DiverTracker(config)
     made = simulate(scenario('misplaced_receivers', {'duration': 30.0}), 1)
-    for one in made.measurements:
-        tracker.process(one.measurement)
+    for scan in made.measurements:
+        tracker.process(scan.measurement)
     state = tracker._stream.state
-    layout = state.instruments.layout(config, tracker.models.n)
+    layout = state.instruments.layout(config, tracker.models)
     assert layout.size == 3 + 1 + 3 * 2 + 4  # the receiver at the transmitter has no offset
     considered = slice(tracker.models.n, layout.size)
     assert (state.x[..., considered] == 0.0).all()
@@ -103,11 +104,11 @@ def test_receivers_that_come_later_bring_their_prior():
     config = DiverConfig(max_tracks=1, receiver_clock_std=1e-3)
     made = simulate(scenario('multistatic', {'duration': 5.0, 'detection_probability': 1.0}), 1)
     ping = made.measurements[0].measurement
-    first = Instruments().heard(evolve(ping, rx_id=[7, 7, 3, 3]), config)
-    assert [one for one, _ in first.known] == [3, 7]
-    both = first.heard(ping, config)
-    assert [one for one, _ in both.known] == [3, 7, 0, 1, 2]
-    x, P = both.layout(config, 3).widened(np.ones((2, 5)), np.ones((2, 5, 5)))
+    first = Instruments().with_receivers(evolve(ping, rx_id=[7, 7, 3, 3]), config)
+    assert [receiver for receiver, _ in first.known] == [3, 7]
+    both = first.with_receivers(ping, config)
+    assert [receiver for receiver, _ in both.known] == [3, 7, 0, 1, 2]
+    x, P = both.layout(config, build_models(config)).widened(np.ones((2, 5)), np.ones((2, 5, 5)))
     assert x.shape == (2, 8) and (P[:, :5, 5:] == 0.0).all()
     np.testing.assert_allclose(P[0, 5:, 5:], 1.5**2 * np.eye(3))
 
@@ -137,12 +138,12 @@ def test_looking_back_is_better_and_as_true(name, config):
 @pytest.mark.parametrize('config', [{'dimensions': 3, **OFF}, {'fix_bias_std': 1.0, **OFF}])
 def test_late_input_gives_the_same_bits(config):
     made = simulate(scenario('at_depth', {'duration': 15.0}), 2)
-    heard = [one.measurement for one in made.measurements]
-    heard += [fix(heard[0].stamp_ns * 1e-9 + second, 20.0, 30.0) for second in (3.5, 7.5)]
-    heard.sort(key=lambda one: one.stamp_ns)
-    order = np.random.default_rng(1).permutation(len(heard))
+    received = [scan.measurement for scan in made.measurements]
+    received += [fix(received[0].stamp_ns * 1e-9 + second, 20.0, 30.0) for second in (3.5, 7.5)]
+    received.sort(key=lambda scan: scan.stamp_ns)
+    order = np.random.default_rng(1).permutation(len(received))
     ends = []
-    for items in (heard, [heard[0], *(heard[k] for k in order)]):
+    for items in (received, [received[0], *(received[k] for k in order)]):
         tracker, final = DiverTracker(DiverConfig(max_tracks=1, history=30.0, **config)), {}
         for item in items:
             final.update((e.stamp_ns, e) for e in tracker.process(item))
@@ -178,8 +179,8 @@ def test_sharp_turns_are_not_taken_for_errors_of_the_fixes():
     tracker, farthest = DiverTracker(DiverConfig(max_tracks=1)), 0.0
     for seed in (1006, 1014):
         tracker.reset()
-        for one in simulate(scenario('table1', {}), seed).measurements:
-            tracker.process(one.measurement)
+        for scan in simulate(scenario('table1', {}), seed).measurements:
+            tracker.process(scan.measurement)
             assert tracker.warnings() == []
             farthest = max(farthest, float(np.sum(tracker._stream.state.white[:1] ** 2)))
     assert farthest > 50.0
@@ -197,11 +198,11 @@ def test_depths_that_do_not_fit_are_refused():
         DiverConfig.from_mapping({'depth_min': 30.0})
 
 
-@pytest.mark.parametrize('told', [{'sound_speed_std': 15.0}, OFF])
-def test_a_fix_before_any_ping_begins_a_track(told) -> None:
+@pytest.mark.parametrize('options', [{'sound_speed_std': 15.0}, OFF])
+def test_a_fix_before_any_ping_begins_a_track(options) -> None:
     """Instruments that are off have their place in the state before a ping is heard; `warm` needs
     it at every start."""
-    tracker = DiverTracker(DiverConfig(**told))
+    tracker = DiverTracker(DiverConfig(**options))
     tracker.warm()
     (estimate,) = tracker.process(fix(1.0, 3.0, 4.0))
     np.testing.assert_allclose(estimate.state[0, :2], [3.0, 4.0])

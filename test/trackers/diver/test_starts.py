@@ -45,17 +45,17 @@ def fix(second, x, y=0.0, name=NOBODY):
     )
 
 
-def run(measurements, **told):
-    tracker = DiverTracker(DiverConfig(**told))
-    newest = [tracker.process(one)[-1] for one in measurements][-1]
+def run(measurements, **options):
+    tracker = DiverTracker(DiverConfig(**options))
+    newest = [tracker.process(item)[-1] for item in measurements][-1]
     return tracker, newest
 
 
 @pytest.mark.parametrize(
-    'told', [{}, {'association': 'jipda'}, {'dimensions': 3}, {'max_tracks': 1}]
+    'options', [{}, {'association': 'jipda'}, {'dimensions': 3}, {'max_tracks': 1}]
 )
-def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(told):
-    tracker, first = run([start(1, 5.0, 7.0, sigma=2.0)], **told)
+def test_a_track_begins_confirmed_at_the_place_and_follows_the_fixes_after_it(options):
+    tracker, first = run([start(1, 5.0, 7.0, sigma=2.0)], **options)
     assert first.extras['track_state'].tolist() == [CONFIRMED]
     assert first.xyz[0, :2] == pytest.approx([5.0, 7.0])
     assert first.covariance[0, :2, :2] == pytest.approx(np.eye(2) * 4.0)
@@ -110,24 +110,31 @@ def test_a_start_is_no_missed_detection():
 
 
 def test_the_order_of_arrival_changes_nothing():
-    told = [fix(1, 0.0), fix(2, 0.2), start(2, 30.0), start(2.5, 0.5), fix(3, 0.4), fix(3, 30.1)]
-    _, expected = run(told)
-    for order in itertools.islice(itertools.permutations(told), 0, 720, 37):
+    items = [
+        fix(1, 0.0),
+        fix(2, 0.2),
+        start(2, 30.0),
+        start(2.5, 0.5),
+        fix(3, 0.4),
+        fix(3, 30.1),
+    ]
+    _, expected = run(items)
+    for order in itertools.islice(itertools.permutations(items), 0, 720, 37):
         tracker = DiverTracker(DiverConfig())
-        for one in order:
-            last = tracker.process(one)[-1]
-        newest = [one for one in [last] if one.stamp_ns == 3 * SECOND]
-        for one in newest:
-            assert (one.state == expected.state).all()
-            assert one.extras['track_id'].tolist() == expected.extras['track_id'].tolist()
+        for item in order:
+            last = tracker.process(item)[-1]
+        newest = [item for item in [last] if item.stamp_ns == 3 * SECOND]
+        for item in newest:
+            assert (item.state == expected.state).all()
+            assert item.extras['track_id'].tolist() == expected.extras['track_id'].tolist()
 
 
 def test_a_start_may_stand_in_a_smoothed_run():
     from sonar_imm.trackers import SYSTEMS
 
     smoother = SYSTEMS['diver'].build_smoother(DiverConfig())
-    for one in [start(1, 0.0), *(fix(k, 0.5 * k) for k in range(2, 9)), start(9, 60.0)]:
-        smoother.process(one)
+    for item in [start(1, 0.0), *(fix(k, 0.5 * k) for k in range(2, 9)), start(9, 60.0)]:
+        smoother.process(item)
     made = list(smoother.smoothed())
-    assert [len(one) for one in made] == [1] * 8 + [2]
-    assert all(np.isfinite(one.state).all() for one in made)
+    assert [len(item) for item in made] == [1] * 8 + [2]
+    assert all(np.isfinite(item.state).all() for item in made)

@@ -26,8 +26,8 @@ from sonar_imm.estimation.imm_kernels import combine
 from sonar_imm.measurements import Fix
 from sonar_imm.trackers import SYSTEMS
 from sonar_imm.trackers.diver.config import ADAPTATIONS, MODEL_SETS
-from sonar_imm.trackers.diver.scan import cross
 from sonar_imm.trackers.diver.smoothing import SmoothingDiverTracker
+from sonar_imm.trackers.diver.state import cross
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
 
@@ -45,10 +45,10 @@ def test_every_set_follows_a_diver_better_than_its_fixes(model_set, adaptation):
             gate_probability=0.999999,
         )
     )
-    estimates = run(tracker, [one.measurement for one in scene.measurements])
+    estimates = run(tracker, [item.measurement for item in scene.measurements])
     error, _ = errors(estimates, scene.truth[0])
     raw = (
-        np.array([one.measurement.position[:2] for one in scene.measurements])
+        np.array([item.measurement.position[:2] for item in scene.measurements])
         - scene.truth[0].position[:, :2]
     )
     assert len(error) >= 95  # confirmed by the third fix or so, never lost
@@ -103,7 +103,7 @@ def test_consistency_where_the_models_hold():
 @given(st.randoms(use_true_random=False))
 def test_shuffled_input_gives_the_same_bits(random):
     scene = simulate(scenario('irregular', {'duration': 25.0, 'clutter': 1.0}), seed=8)
-    ordered = sorted((one.measurement for one in scene.measurements), key=lambda m: m.stamp_ns)
+    ordered = sorted((item.measurement for item in scene.measurements), key=lambda m: m.stamp_ns)
     shuffled = sorted(ordered, key=lambda m: m.stamp_ns + random.uniform(0.0, 9.0) * SECOND)
     expected, late = (run(DiverTracker(DiverConfig()), items) for items in (ordered, shuffled))
     assert len(expected) == len(late)
@@ -152,7 +152,7 @@ def test_a_burst_of_late_fixes_ends_no_track():
 
 def test_reset_equals_a_fresh_tracker():
     scene = simulate(scenario('several', {'duration': 20.0}), seed=1)
-    items = [one.measurement for one in scene.measurements]
+    items = [item.measurement for item in scene.measurements]
     tracker = DiverTracker(DiverConfig())
     first = run(tracker, items)
     tracker.reset()
@@ -185,12 +185,12 @@ def test_a_turned_and_shifted_scene_gives_the_turned_and_shifted_answer():
     shift = np.array([1000.0, -500.0])
     scene = simulate(scenario('zigzag', {'duration': 30.0}), seed=5)
     plain, turned = DiverTracker(DiverConfig()), DiverTracker(DiverConfig())
-    for one in scene.measurements:
-        z, C = one.measurement.position[:2], one.measurement.covariance
-        a = plain.process(one.measurement)[-1]
+    for item in scene.measurements:
+        z, C = item.measurement.position[:2], item.measurement.covariance
+        a = plain.process(item.measurement)[-1]
         b = turned.process(
             Fix(
-                stamp_ns=one.measurement.stamp_ns,
+                stamp_ns=item.measurement.stamp_ns,
                 frame_id='map',
                 position=np.append(R @ z + shift, 0.0),
                 covariance=R @ C @ R.T,
@@ -206,7 +206,7 @@ def test_a_turned_and_shifted_scene_gives_the_turned_and_shifted_answer():
 def test_several_divers_keep_their_names():
     scene = simulate(scenario('several', {'spacing': 25.0}), seed=2)
     tracker = DiverTracker(DiverConfig(clutter_density=2.0 / 200.0**2))
-    estimates = run(tracker, [one.measurement for one in scene.measurements])
+    estimates = run(tracker, [item.measurement for item in scene.measurements])
     confirmed = [
         estimate.extras['track_id'][estimate.extras['track_state'] > 0]
         for estimate in estimates[10:]
@@ -299,9 +299,9 @@ def test_smoothing_lowers_the_error_and_keeps_the_tracks():
     for seed in range(3):
         scene = simulate(scenario('table1', {'duration': 60.0}), seed)
         tracker = SmoothingDiverTracker(DiverConfig(max_tracks=1))
-        estimates = run(tracker, [one.measurement for one in scene.measurements])
+        estimates = run(tracker, [item.measurement for item in scene.measurements])
         back = tracker.smoothed()
-        assert [one.stamp_ns for one in back] == [one.stamp_ns for one in estimates]
+        assert [item.stamp_ns for item in back] == [item.stamp_ns for item in estimates]
         assert same(back[-1], estimates[-1])
         for series, found in ((estimates, filtered), (back, smooth)):
             found += np.sum(errors(series, scene.truth[0])[0] ** 2, axis=1).tolist()

@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure
-from sonar_imm.trackers.fathometer import array_depths
-from sonar_imm.trackers.fathometer.array_depths import ToldDepths
-from sonar_imm.trackers.fathometer.array_response import array_response
-from sonar_imm.trackers.fathometer.response import lattice_of_array
+from sonar_imm.trackers.fathometer import pressure
+from sonar_imm.trackers.fathometer.pressure import CompanionDepths
+from sonar_imm.trackers.fathometer.response import array_response, lattice_of_array
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig
 from sonar_imm_tools.simulation.fathometer.simulator import scenario, simulate
 
-SMALL = {**scenario('small').told(), 'particles': 2000}
+SMALL = {**scenario('small').instruments(), 'particles': 2000}
 
 
 @pytest.fixture(scope='module')
@@ -59,10 +58,10 @@ PRESSURE = {
 
 def blocks(scene, size=None):
     """The scene's pressure, as it is or in blocks of `size` samples."""
-    own = [one.measurement for one in scene.measurements]
+    own = [each.measurement for each in scene.measurements]
     if size is None:
         return own
-    p = np.concatenate([one.pressure for one in own])
+    p = np.concatenate([each.pressure for each in own])
     return [
         Pressure(
             stamp_ns=own[0].stamp_ns + round(first / own[0].sample_rate * 1e9),
@@ -81,7 +80,7 @@ def test_pressure_gives_what_its_cross_spectra_give(pressure_scene):
     assert len(found) == 1 and tracker.counts['blocks'] == len(own)
     (estimate,) = found.values()
 
-    p = np.concatenate([one.pressure for one in own]).astype(np.float64)
+    p = np.concatenate([each.pressure for each in own]).astype(np.float64)
     n = 4200
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(n) / n)
     parts = [
@@ -138,7 +137,7 @@ def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
     own = blocks(pressure_scene)
     tracker, found = run(own[:3] + own[4:], **PRESSURE)
     assert tracker.counts['gaps'] == 1 and not found
-    late = [evolve(one, stamp_ns=one.stamp_ns + 60 * 10**9) for one in own]
+    late = [evolve(each, stamp_ns=each.stamp_ns + 60 * 10**9) for each in own]
     tracker, found = run(own[:6] + late, **PRESSURE)
     assert tracker.counts['records_abandoned'] == 1
     assert len(found) == 1
@@ -147,25 +146,25 @@ def test_a_lost_block_is_counted_and_a_long_gap_begins_anew(pressure_scene):
 def test_a_preview_is_not_committed(pressure_scene):
     own = blocks(pressure_scene)
     again = [
-        evolve(one, stamp_ns=one.stamp_ns + k * round(9.8e9)) for k in range(3) for one in own
+        evolve(each, stamp_ns=each.stamp_ns + k * round(9.8e9)) for k in range(3) for each in own
     ]
     plain, found = run(again, **PRESSURE)
     eager, more = run(again, preview_seconds=2.8, **PRESSURE)
     assert eager.counts['previews'] > 3
     assert set(found) < set(more)
-    for stamp, one in more.items():
-        assert one.extras['preview'].all() == (stamp not in found)
+    for stamp, each in more.items():
+        assert each.extras['preview'].all() == (stamp not in found)
         if stamp in found:
-            assert one.state.tobytes() == found[stamp].state.tobytes()
+            assert each.state.tobytes() == found[stamp].state.tobytes()
 
 
 def test_the_small_drift_is_followed_from_cross_spectra_and_a_companion():
     scene = simulate(scenario('small'), 3)
-    tracker, found = run([one.measurement for one in scene.measurements], **SMALL)
+    tracker, found = run([each.measurement for each in scene.measurements], **SMALL)
     assert tracker.counts['array_depths'] == 12 and not tracker.counts['array_depth_unknown']
-    truth = {one.stamp_ns: one for one in scene.truth}
+    truth = {each.stamp_ns: each for each in scene.truth}
     near = [
-        np.abs(one.state[0, 0] - truth[stamp].depth.min()) < 0.3 for stamp, one in found.items()
+        np.abs(each.state[0, 0] - truth[stamp].depth.min()) < 0.3 for stamp, each in found.items()
     ]
     assert len(near) == 12 and np.mean(near) > 0.9
 
@@ -204,9 +203,9 @@ def test_a_dead_hydrophone_is_left_out_and_changes_little(spectra, dead):
 
 
 def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
-    one = np.ones((len(spectra), 8, 8), np.complex64)
+    each = np.ones((len(spectra), 8, 8), np.complex64)
     cases = {
-        'singular': ([changed(spectra, one)], {'loading': 0.0}),
+        'singular': ([changed(spectra, each)], {'loading': 0.0}),
         'wrong_hydrophones': ([changed(spectra, spectra.csdm[:, :7, :7])], {}),
         'bad_band': ([spectra], {'frequency_min': 5000.0, 'frequency_max': 6000.0}),
         'bad_frequency': (
@@ -224,7 +223,7 @@ def test_hostile_cross_spectra_are_counted_and_stop_nothing(spectra):
         tracker, found = run(items, **{**SMALL, **options})
         assert tracker.counts[reason] == 1, (reason, tracker.counts)
         assert not found
-    tracker, found = run([changed(spectra, one)], **SMALL)
+    tracker, found = run([changed(spectra, each)], **SMALL)
     assert tracker.counts['rank_deficient'] == 1
 
 
@@ -251,19 +250,19 @@ def test_where_the_array_is(spectra):
         assert tracker.counts['array_depth_unknown'] == (expected == 0.0)
 
 
-def test_the_nearest_word_on_the_depth_counts_before_or_after(monkeypatch):
+def test_the_nearest_depth_counts_before_or_after(monkeypatch):
     second = 10**9
     config = FathometerConfig(array_depth_age=5.0)
-    told = ToldDepths()
-    assert told.nearest(0, config) is None and told.spread(0, second) == 0.0
+    depths = CompanionDepths()
+    assert depths.nearest(0, config) is None and depths.spread(0, second) == 0.0
     for seconds, depth in ((30, 73.0), (10, 71.0), (20, 72.0)):  # in the order of arrival
-        told.hear(ArrayDepth(stamp_ns=seconds * second, depth=depth))
+        depths.add(ArrayDepth(stamp_ns=seconds * second, depth=depth))
     for seconds, depth in ((4, None), (5, 71.0), (14, 71.0), (16, 72.0), (35, 73.0), (36, None)):
-        assert told.nearest(seconds * second, config) == depth, seconds
-    assert told.over(25 * second, 15 * second, config) == 71.5
-    assert told.spread(25 * second, 15 * second) == 0.5
-    assert told.over(29 * second, second, config) == 73.0  # nothing within: the nearest
-    monkeypatch.setattr(array_depths, '_DEPTHS_KEPT', 2)
-    told.hear(ArrayDepth(stamp_ns=40 * second, depth=74.0))
-    assert told.nearest(20 * second, config) is None
-    assert told.nearest(30 * second, config) == 73.0
+        assert depths.nearest(seconds * second, config) == depth, seconds
+    assert depths.over(25 * second, 15 * second, config) == 71.5
+    assert depths.spread(25 * second, 15 * second) == 0.5
+    assert depths.over(29 * second, second, config) == 73.0  # nothing within: the nearest
+    monkeypatch.setattr(pressure, '_DEPTHS_KEPT', 2)
+    depths.add(ArrayDepth(stamp_ns=40 * second, depth=74.0))
+    assert depths.nearest(20 * second, config) is None
+    assert depths.nearest(30 * second, config) == 73.0

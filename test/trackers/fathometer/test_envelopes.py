@@ -34,21 +34,21 @@ def scene():
     return simulate(scenario('diffuse', {'records': 60}), 5)
 
 
-def told(**overrides):
+def stated(**overrides):
     return FathometerConfig.from_mapping(
-        {**scenario('diffuse').told(), 'particles': 1000, **overrides}, ignore_unknown=True
+        {**scenario('diffuse').instruments(), 'particles': 1000, **overrides}, ignore_unknown=True
     )
 
 
 def track(scene, config):
     tracker = FathometerTracker(config)
-    return tracker, [tracker.process(one.measurement)[0] for one in scene.measurements]
+    return tracker, [tracker.process(each.measurement)[0] for each in scene.measurements]
 
 
 def test_the_scene_is_quiet_above_the_floor_and_scatters_below(scene):
     above, below = [], []
-    for one, true in zip(scene.measurements, scene.truth):
-        trace = one.measurement
+    for each, true in zip(scene.measurements, scene.truth):
+        trace = each.measurement
         above.append(trace.amplitude[trace.depth < true.depth.min() - 2.0])
         inside = (trace.depth > true.depth.min() + 1.5) & (trace.depth < true.depth.min() + 3.5)
         below.append(trace.amplitude[inside])
@@ -59,18 +59,18 @@ def test_the_scene_is_quiet_above_the_floor_and_scatters_below(scene):
 
 
 def test_the_floor_is_followed_under_one_identity(scene):
-    _, estimates = track(scene, told())
-    rows = [one.columns() for one in estimates]
-    first = [int(np.argmax(one['is_bottom'])) for one in rows]
-    away = [one['depth'][k] - true.depth.min() for one, k, true in zip(rows, first, scene.truth)]
+    _, estimates = track(scene, stated())
+    rows = [each.columns() for each in estimates]
+    first = [int(np.argmax(each['is_bottom'])) for each in rows]
+    away = [each['depth'][k] - true.depth.min() for each, k, true in zip(rows, first, scene.truth)]
     assert np.mean(np.abs(away) < 1.0) >= 0.95
-    assert len({int(one['track_id'][k]) for one, k in zip(rows, first)}) == 1
+    assert len({int(each['track_id'][k]) for each, k in zip(rows, first)}) == 1
     right = [len(r.found) == len(t.depth) for r, t in zip(records_of(estimates), scene.truth)]
     assert np.mean(right) >= 0.9
 
 
 def test_the_first_return_keeps_its_name_on_a_wall():
-    config = evolve(told(), depth_std=0.3, min_separation=1.0)
+    config = evolve(stated(), depth_std=0.3, min_separation=1.0)
     first, ids = Identities().name(np.array([10.0, 14.0]), np.array([1.0, 0.0]), config)
     assert list(ids) == [1, 2]
     # It rises by 2 m, and something below it is nearer to where it was.
@@ -87,16 +87,16 @@ def test_the_first_return_keeps_its_name_on_a_wall():
 
 def test_a_wrong_pulse_is_said_with_its_remedy(scene):
     tracker, _ = track(scene, FathometerConfig(noise_sigma=0.02, particles=300))
-    said = ' '.join(tracker.warnings())
-    assert 'envelopes need pulse gaussian' in said and 'no set of reflectors' in said
-    tracker, _ = track(scene, told(particles=300))
+    sentences = ' '.join(tracker.warnings())
+    assert 'envelopes need pulse gaussian' in sentences and 'no set of reflectors' in sentences
+    tracker, _ = track(scene, stated(particles=300))
     assert tracker.warnings() == []
 
 
 def test_a_full_set_is_said(scene):
-    tracker, _ = track(scene, told(order_max=2, particles=300))
-    said = ' '.join(tracker.warnings())
-    assert 'against a limit of 2' in said and 'order_max may not fit' in said
+    tracker, _ = track(scene, stated(order_max=2, particles=300))
+    sentences = ' '.join(tracker.warnings())
+    assert 'against a limit of 2' in sentences and 'order_max may not fit' in sentences
 
 
 def test_unexplained_records_are_said():
@@ -110,7 +110,7 @@ def test_unexplained_records_are_said():
         assert tracker.counts['unexplained'] == second
         assert tracker._before is None  # the next one begins anew
         assert bool(tracker.warnings()) == (second >= 10)  # a few records are no evidence
-    assert any('no set of reflectors explains 100 %' in one for one in tracker.warnings())
+    assert any('no set of reflectors explains 100 %' in each for each in tracker.warnings())
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_what_does_not_go_with_scatter(values, words):
 
 
 def test_too_fine_a_lattice_is_refused_with_a_sentence():
-    config = told(depth_step=0.001, depth_std=0.001, particles=10)
+    config = stated(depth_step=0.001, depth_std=0.001, particles=10)
     tracker = FathometerTracker(config)
     depth = 5.0 + 0.1 * np.arange(400)
     amplitude = np.exp(-0.5 * np.square(depth - 20.0))

@@ -41,8 +41,8 @@ def errors(found, scene, after):
         error = estimate.state[:, 0] - scene.depth_at(stamp)
         common.append(error.mean())
         relative.append(error - error.mean())
-        told = scene.file['array_depth_error'][stamp // 10**9 - 1]
-        heave.append(estimate.extras['heave'][0] - told)
+        given = scene.file['array_depth_error'][stamp // 10**9 - 1]
+        heave.append(estimate.extras['heave'][0] - given)
         stated.append(estimate.extras['heave_std'][0])
         assert np.ptp(estimate.extras['heave']) == 0.0
     return np.array(common), np.concatenate(relative), np.array(heave), np.array(stated)
@@ -70,8 +70,8 @@ def test_layers_are_followed_although_the_array_heaves(scene):
 def test_without_the_state_they_are_lost(scene):
     _, found = run(scene.traces(range(40)), particles=2000)
     assert score_scene(found, scene, after=20).right < 0.5
-    assert all((one.extras['heave'] == 0.0).all() for one in found.values())
-    assert all((one.extras['heave_std'] == 0.0).all() for one in found.values())
+    assert all((each.extras['heave'] == 0.0).all() for each in found.values())
+    assert all((each.extras['heave_std'] == 0.0).all() for each in found.values())
 
 
 def lasting(scene, seed, records=40):
@@ -83,13 +83,13 @@ def lasting(scene, seed, records=40):
         wrong[k] = 0.9 * wrong[k - 1] + np.sqrt(1.0 - 0.81) * wrong[k]
     traces = [
         Trace(
-            stamp_ns=one.stamp_ns,
-            depth=one.depth - scene.file['array_depth_error'][k] + wrong[k],
-            amplitude=one.amplitude,
-            sigma=one.sigma,
+            stamp_ns=each.stamp_ns,
+            depth=each.depth - scene.file['array_depth_error'][k] + wrong[k],
+            amplitude=each.amplitude,
+            sigma=each.sigma,
             reference_depth=scene.array_depth,
         )
-        for k, one in enumerate(scene.traces(range(records)))
+        for k, each in enumerate(scene.traces(range(records)))
     ]
     return traces, wrong
 
@@ -124,10 +124,10 @@ def test_the_heave_is_known_as_a_kalman_filter_knows_it(scene, heave, seed, dept
     options = {'heave': heave, 'array_depth_std': 0.5, 'depth_std': depth_std, **WINDOW}
     _, found = run(traces, particles=3000, seed=seed, **options)
     layers = len(scene.amplitude)
-    seen = [scene.depth_at(one.stamp_ns).mean() + w for one, w in zip(traces, wrong)]
+    seen = [scene.depth_at(each.stamp_ns).mean() + w for each, w in zip(traces, wrong)]
     expected = kalman(seen, layers, depth_std, 0.5, 0.9 if heave == 'memory' else 0.0)
     heaves = np.array(
-        [[one.extras[k][0] for k in ('heave', 'heave_std')] for one in found.values()]
+        [[each.extras[k][0] for k in ('heave', 'heave_std')] for each in found.values()]
     )
     assert heaves[:, 1] == pytest.approx(expected[:, 1], rel=0.08)
     away = (heaves[:, 0] - expected[:, 0]) / expected[:, 1]
@@ -160,7 +160,7 @@ def test_the_heave_of_revised_records_is_known_as_what_came_later_tells(scene, h
     options = {'heave': heave, 'array_depth_std': 0.5, 'smoothing_lag': lag, **WINDOW}
     _, found = run(traces, particles=3000, seed=1, **options)
     memory = 0.9 if heave == 'memory' else 0.0
-    seen = [scene.depth_at(one.stamp_ns).mean() + w for one, w in zip(traces, wrong)]
+    seen = [scene.depth_at(each.stamp_ns).mean() + w for each, w in zip(traces, wrong)]
     layers = len(scene.amplitude)
     expected = known_later(seen, layers, 0.1, 0.5, memory, lag)
     # Without a lag it is the filter of above.
@@ -168,7 +168,7 @@ def test_the_heave_of_revised_records_is_known_as_what_came_later_tells(scene, h
         kalman(seen, layers, 0.1, 0.5, memory), abs=2e-3
     )
     revised = list(found.values())[: len(expected)]
-    heaves = np.array([[one.extras[k][0] for k in ('heave', 'heave_std')] for one in revised])
+    heaves = np.array([[each.extras[k][0] for k in ('heave', 'heave_std')] for each in revised])
     assert heaves[:, 1] == pytest.approx(expected[:, 1], rel=0.08)
     away = (heaves[:, 0] - expected[:, 0]) / expected[:, 1]
     assert rms(away) < 0.1 and np.abs(away).max() < 0.25
@@ -192,7 +192,7 @@ def test_threads_do_not_change_a_byte(scene):
             polarity='both',
             **parameters,
         )
-        return [c.tobytes() for one in found.values() for c in one.columns().values()]
+        return [c.tobytes() for each in found.values() for c in each.columns().values()]
 
     assert columns() == columns(threads=4)
 

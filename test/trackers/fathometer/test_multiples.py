@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.multiples import Multiples, RECORDS, Seen, ways_above
+from sonar_imm.trackers.fathometer.reflectors import Multiples, RECORDS, Seen, ways_above
 
 PRIMARIES = np.array([9.0, 12.5, 17.0, 23.0])
 
@@ -102,14 +102,14 @@ def test_all_ways_share_one_prior():
 
 def test_the_sign_counts_where_there_are_two():
     depth = np.tile([9.0, 18.05], (1, 1))
-    both, one = FathometerConfig(polarity='both'), FathometerConfig()
+    both, positive = FathometerConfig(polarity='both'), FathometerConfig()
     right, wrong = {'sign': [1.0, -1.0]}, {'sign': [1.0, 1.0]}
     right_odds, wrong_odds = (
         p / (1.0 - p) for p in (after(depth, both, **kind)[1] for kind in (right, wrong))
     )
     # Told right .95 times against .05, where .05 and .95 of the primaries have that sign.
     assert right_odds / wrong_odds == pytest.approx((0.95 / 0.05) ** 2)
-    assert after(depth, one, **right)[1] == after(depth, one, **wrong)[1]
+    assert after(depth, positive, **right)[1] == after(depth, positive, **wrong)[1]
 
 
 @settings(max_examples=40, deadline=None)
@@ -146,4 +146,4 @@ def test_multiples_of_the_vectors_are_marked_through_the_filter():
 def test_they_need_not_be_marked():
     scene = sea_scene('multiples')
     _, found = run(scene.traces(range(2)), particles=200, multiples='off')
-    assert all(np.isnan(one.extras['multiple_probability']).all() for one in found.values())
+    assert all(np.isnan(each.extras['multiple_probability']).all() for each in found.values())

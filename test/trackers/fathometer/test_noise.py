@@ -25,10 +25,9 @@ import pytest
 from sonar_imm.acoustics.fathometer import depth_response
 from sonar_imm.measurements import Pressure, Rejection, Trace
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.fathometer.array_response import array_response, mirror_sigma
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.response import array_response, Lattice, mirror_sigma
 
 SEA = Path(__file__).parents[2] / 'vectors' / 'fathometer_sea'
 MIRROR = {'noise_depth_min': 0.0, 'noise_depth_max': 0.0}
@@ -103,8 +102,8 @@ def test_the_noise_of_a_trace_is_what_its_reflectors_leave():
     options = {'particles': 2000, 'polarity': 'both', **MIRROR}
     _, found = run(traces, **options)
     assert score_scene(found, scene, after=5).right >= 0.9
-    measured = np.mean([one.extras['sigma'][0] for one in found.values()])
-    whole = np.mean([_mad(one.amplitude) for one in traces])
+    measured = np.mean([each.extras['sigma'][0] for each in found.values()])
+    whole = np.mean([_mad(each.amplitude) for each in traces])
     assert measured == pytest.approx(1.0, abs=0.15)
     assert abs(measured - 1.0) < 0.7 * abs(whole - 1.0)
 

@@ -20,9 +20,8 @@ import pytest
 from sonar_imm.acoustics.fathometer import printed_correlation, steering
 from sonar_imm.acoustics.pulse import envelope_pulse
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.fathometer.array_response import array_response
 from sonar_imm.trackers.fathometer.config import FathometerConfig
-from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.response import array_response, Lattice
 from sonar_imm_tools.simulation.fathometer.scenario import Drift
 from sonar_imm_tools.simulation.fathometer.simulator import cross_spectra, scenario
 
@@ -32,15 +31,15 @@ LAYER, ARRAY = 130.0, 73.5
 @pytest.fixture(scope='module')
 def spectra():
     config = scenario('small', {'ship_noise': 0.0, 'snapshots': 4000})
-    one = np.array([[LAYER]])
-    floor = Drift(one, 0.5 * np.ones((1, 1)), one > 0.0, np.array([ARRAY]), np.array([ARRAY]))
+    layer = np.array([[LAYER]])
+    floor = Drift(layer, 0.5 * np.ones((1, 1)), layer > 0.0, np.array([ARRAY]), np.array([ARRAY]))
     return cross_spectra(config, floor, 0, ARRAY, np.random.default_rng(0))
 
 
-def heard(spectra, low, high, **options):
+def received(spectra, low, high, **options):
     """Depth, response and noise between `low` and `high`."""
-    told = scenario('small').told()
-    config = FathometerConfig(**told, noise_depth_min=0.0, noise_depth_max=0.0, **options)
+    stated = scenario('small').instruments()
+    config = FathometerConfig(**stated, noise_depth_min=0.0, noise_depth_max=0.0, **options)
     lattice = Lattice(low, 0.03, int((high - low) / 0.03))
     found = array_response(spectra, lattice, config, ARRAY)
     return found.depth, found.amplitude, found.sigma[0]
@@ -48,17 +47,17 @@ def heard(spectra, low, high, **options):
 
 @pytest.mark.parametrize('output', ['coherence', 'correlation'])
 def test_echoes_are_positive_and_where_they_should_be(spectra, output):
-    depth, b, sigma = heard(spectra, 100.0, 140.0, output=output)
+    depth, b, sigma = received(spectra, 100.0, 140.0, output=output)
     assert depth[np.argmax(b)] == pytest.approx(LAYER, abs=0.15)
     assert b.max() > 3.0 * sigma
-    depth, e, _ = heard(spectra, 100.0, 140.0, output=output, envelope=True)
+    depth, e, _ = received(spectra, 100.0, 140.0, output=output, envelope=True)
     assert (e >= np.abs(b) - 1e-12).all()
     assert depth[np.argmax(e)] == pytest.approx(LAYER, abs=0.2)
 
 
 def test_red_noise_spoils_a_correlation(spectra):
     def strength(output):
-        _, b, sigma = heard(spectra, 110.0, 140.0, output=output)
+        _, b, sigma = received(spectra, 110.0, 140.0, output=output)
         return b.max() / sigma
 
     assert strength('coherence') > 1.5 * strength('correlation')
@@ -73,15 +72,15 @@ def test_equation_4_as_printed_has_its_echo_above_the_array(spectra):
     assert z[np.argmax(above)] == pytest.approx(LAYER, abs=0.2)
     assert above.max() > 2.0 * at_depth.max()
     # The tracker, which looks below the array, is told so and finds less there.
-    _, e, _ = heard(spectra, 110.0, 140.0, output='printed', envelope=True, loading=1e-3)
+    _, e, _ = received(spectra, 110.0, 140.0, output='printed', envelope=True, loading=1e-3)
     assert e.max() == pytest.approx(at_depth.max(), rel=0.1)
 
 
 def test_the_conventional_one_is_printed_right(spectra):
-    _, e, _ = heard(
+    _, e, _ = received(
         spectra, 110.0, 140.0, output='printed', envelope=True, processor='conventional'
     )
-    _, c, _ = heard(
+    _, c, _ = received(
         spectra, 110.0, 140.0, output='correlation', envelope=True, processor='conventional'
     )
     assert e == pytest.approx(c, rel=1e-5)

@@ -18,13 +18,14 @@ from pathlib import Path
 
 from helpers.fathometer_runs import run
 from helpers.sea_scenes import score_scene, sea_scene
+from helpers.set_cycle import cycle
 import numpy as np
+from oracles.set_particles import weigh
 import pytest
 
 from benchmarks.fathometer_vectors import signed_sets
-from sonar_imm.estimation.set_filter import SetFilter
+from sonar_imm.estimation.set_filter import SetFilter, Weighted
 from sonar_imm.estimation.set_model import SetModel
-from sonar_imm.estimation.set_particles import weigh
 from sonar_imm.parameters import ConfigError
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 
@@ -34,17 +35,18 @@ VECTORS = Path(__file__).parents[2] / 'vectors'
 @pytest.mark.parametrize('compiled', [False, True])
 def test_a_set_with_a_wrong_sign_is_impossible(compiled):
     impossible = 0
-    for one in signed_sets(VECTORS):
+    for case in signed_sets(VECTORS):
         if compiled:
-            found = np.zeros(1)
-            filter_ = SetFilter(one.model, 1)
-            amplitude = filter_._weigh(one.sets, one.response, found, filter_._amplitudes)
+            filter_ = SetFilter(case.model, 1)
+            record = filter_.record(case.response, (0, 0))
+            step = filter_.weigh(Weighted(case.sets, np.zeros(1)), record)
+            found, amplitude = step.after.log_weight, step.amplitude
         else:
-            found, amplitude = weigh(one.model, one.response, one.sets)
-        assert found[0] == pytest.approx(one.log_likelihood, abs=1e-9)
-        impossible += np.isinf(one.log_likelihood)
-        if np.isfinite(one.log_likelihood):
-            assert amplitude[0] == pytest.approx(one.amplitude, abs=1e-9)
+            found, amplitude = weigh(case.model, case.response, case.sets)
+        assert found[0] == pytest.approx(case.log_likelihood, abs=1e-9)
+        impossible += np.isinf(case.log_likelihood)
+        if np.isfinite(case.log_likelihood):
+            assert amplitude[0] == pytest.approx(case.amplitude, abs=1e-9)
     assert impossible == 24
 
 
@@ -52,13 +54,13 @@ def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
     """One member or none, on 12 cells: the posterior of place and sign by enumeration."""
     n, prior, std = 12, 0.2, 3.0
     switch = np.array([[0.7, 0.3], [0.2, 0.8]])
-    move = np.array([0.25, 0.5, 0.25])
+    walk = np.array([0.25, 0.5, 0.25])
     model = SetModel(
         cells=n,
         separation=2,
         order_min=0,
         transition=switch,
-        move=move,
+        walk=walk,
         gram=np.exp(-0.5 * np.arange(n) ** 2.0),
         amplitude_std=std,
         negative_probability=prior,
@@ -66,27 +68,27 @@ def test_the_filter_agrees_with_the_sum_over_all_sets_of_one():
     rng = np.random.default_rng(3)
     b = rng.standard_normal((3, n))
     b[:, 4] -= 3.5
-    none, one = 0.5, 0.5 * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
-    K = sum(w * np.eye(n, k=shift) for w, shift in zip(move, (-1, 0, 1)))
+    none, single = 0.5, 0.5 * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
+    K = sum(w * np.eye(n, k=shift) for w, shift in zip(walk, (-1, 0, 1)))
     tracker, before = SetFilter(model, 200_000), None
     for name, record in enumerate(b):
         born = none * switch[0, 1] * np.outer([1.0 - prior, prior], np.full(n, 1.0 / n))
-        none = none * switch[0, 0] + one.sum() * switch[1, 0]
-        one = one @ K * switch[1, 1] + born
+        none = none * switch[0, 0] + single.sum() * switch[1, 0]
+        single = single @ K * switch[1, 1] + born
         variance = 1.0 / (1.0 + std**-2)
         likelihood = np.exp(0.5 * variance * record**2) / np.sqrt(1.0 + std**2)
-        one = one * np.where(np.array([[1.0], [-1.0]]) * record > 0.0, likelihood, 0.0)
-        total = none + one.sum()
-        none, one = none / total, one / total
-        step = tracker.step(before, record, (5, name))
+        single = single * np.where(np.array([[1.0], [-1.0]]) * record > 0.0, likelihood, 0.0)
+        total = none + single.sum()
+        none, single = none / total, single / total
+        step = cycle(tracker, before, record, (5, name))
         before = step.after
         there = step.sets.order == 1
         found = np.zeros((2, n))
         row = (step.sets.sign[there, 0] < 0).astype(int)
         np.add.at(found, (row, step.sets.cell[there, 0]), step.w[there])
         assert step.log_evidence == pytest.approx(np.log(total), abs=0.02)
-        assert np.abs(found - one).sum() < 0.03
-    assert one[1].sum() > 0.3
+        assert np.abs(found - single).sum() < 0.03
+    assert single[1].sum() > 0.3
 
 
 def test_negative_layers_are_found_where_they_are_looked_for():
@@ -103,7 +105,7 @@ def test_negative_layers_are_found_where_they_are_looked_for():
             assert estimate.extras['polarity'].dtype == np.int8
     _, found = run(scene.traces(range(30)), particles=2000, polarity='positive')
     assert score_scene(found, scene, after=5).right == 0.0
-    assert all((one.extras['polarity'] >= 0).all() for one in found.values())
+    assert all((each.extras['polarity'] >= 0).all() for each in found.values())
 
 
 def test_envelopes_have_no_negative_reflectors():
@@ -119,6 +121,6 @@ def test_threads_do_not_change_a_byte_of_either_sign():
 
     def columns(**parameters):
         _, found = run(scene.traces(range(6)), particles=1001, polarity='both', **parameters)
-        return [c.tobytes() for one in found.values() for c in one.columns().values()]
+        return [c.tobytes() for each in found.values() for c in each.columns().values()]
 
     assert columns() == columns(threads=4)

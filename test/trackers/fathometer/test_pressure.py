@@ -25,10 +25,9 @@ import pytest
 from sonar_imm.acoustics.spectra import effective_snapshots, window_of
 from sonar_imm.measurements import ArrayDepth, Pressure, Rejection
 from sonar_imm.parameters import ConfigError
-from sonar_imm.trackers.fathometer.array_response import array_coherence, processor_pulse
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.pressure import automatic_snapshot, MAX_BYTES, PressureStream
-from sonar_imm.trackers.fathometer.response import Lattice
+from sonar_imm.trackers.fathometer.response import array_coherence, Lattice, processor_pulse
 from sonar_imm_tools.simulation.fathometer.field import expected_csdm
 from sonar_imm_tools.simulation.fathometer.scenario import Drift
 from sonar_imm_tools.simulation.fathometer.simulator import scenario
@@ -105,9 +104,9 @@ def test_the_tracker_takes_the_depths_it_tracks_and_the_mirror_window():
 
 
 def test_a_companion_tells_how_far_down_snapshots_must_reach():
-    blocks = [evolve(one, reference_depth=None) for one in noise(4.0)]
-    told = ArrayDepth(stamp_ns=blocks[0].stamp_ns - 10**9, depth=70.0)
-    tracker, found = run([told, *blocks], **SHORT)
+    blocks = [evolve(each, reference_depth=None) for each in noise(4.0)]
+    stated = ArrayDepth(stamp_ns=blocks[0].stamp_ns - 10**9, depth=70.0)
+    tracker, found = run([stated, *blocks], **SHORT)
     assert len(found) == 1 and tracker.response.reference_depth == 70.0
     seconds = 7.0 * 2.0 * 30.0 / 1500.0
     assert 0.95 * seconds < tracker.response.snapshot_seconds <= seconds
@@ -144,12 +143,12 @@ def test_an_array_that_heaves_within_a_record_is_said_and_its_mean_is_taken():
 
 
 def test_heave_that_a_companion_tells_counts_as_well():
-    blocks = [evolve(one, reference_depth=None) for one in noise(4.0)]
-    told = [
-        ArrayDepth(stamp_ns=one.stamp_ns, depth=80.0 + 0.2 * (k % 2))
-        for k, one in enumerate(blocks)
+    blocks = [evolve(each, reference_depth=None) for each in noise(4.0)]
+    stated = [
+        ArrayDepth(stamp_ns=each.stamp_ns, depth=80.0 + 0.2 * (k % 2))
+        for k, each in enumerate(blocks)
     ]
-    tracker, _ = run([x for pair in zip(told, blocks) for x in pair], **SHORT)
+    tracker, _ = run([x for pair in zip(stated, blocks) for x in pair], **SHORT)
     assert tracker.counts['heave_within_record'] == 1
 
 
@@ -189,8 +188,8 @@ def test_an_array_that_is_refused_between_good_blocks_costs_nothing():
     assert tracker.counts['bad_band'] == 1 and len(found) == 1
     assert not tracker.counts['restarted_array'] and not tracker.counts['gaps']
     _, plain = run(good, **SHORT)
-    assert [one.state.tobytes() for one in found.values()] == [
-        one.state.tobytes() for one in plain.values()
+    assert [each.state.tobytes() for each in found.values()] == [
+        each.state.tobytes() for each in plain.values()
     ]
 
 
@@ -238,12 +237,12 @@ def collected(vectors, record):
 @pytest.mark.parametrize('record', [0, 1])
 def test_spectrum_and_pulse_of_the_processor_are_those_of_the_vectors(vectors, record):
     config, found = collected(vectors, record)
-    heard = array_coherence(found.spectra, config)
-    weight = heard.weight / heard.weight.max()
+    received = array_coherence(found.spectra, config)
+    weight = received.weight / received.weight.max()
     expected = vectors['weight'][record] / vectors['weight'][record].max()
     assert np.abs(weight - expected).max() < 1e-4
     step = float(vectors['depth'][1] - vectors['depth'][0])
-    pulse = processor_pulse(heard, Lattice(40.0, step, 320), 1500.0)
+    pulse = processor_pulse(received, Lattice(40.0, step, 320), 1500.0)
     assert pulse(step * np.arange(320)) == pytest.approx(
         vectors['pulse_processor'][record], abs=1e-4
     )

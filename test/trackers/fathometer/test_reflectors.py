@@ -23,7 +23,7 @@ import pytest
 
 from sonar_imm.acoustics.fathometer import sediment_thickness
 from sonar_imm.acoustics.pulse import band_pulse
-from sonar_imm.estimation.set_members import Members
+from sonar_imm.estimation.set_filter import Members
 from sonar_imm.measurements import Trace
 from sonar_imm.trackers.fathometer.config import FathometerConfig
 from sonar_imm.trackers.fathometer.reflectors import (
@@ -79,7 +79,7 @@ def test_without_a_speed_the_sediment_is_as_the_water():
     depth, std = sediment_depths(reflectors([60.0, 100.0], [1.0, 0.0]), FathometerConfig())
     assert depth == pytest.approx([60.0, 100.0]) and std == pytest.approx([0.1, 0.1])
     nothing = sediment_depths(reflectors([], []), FathometerConfig())
-    assert [len(one) for one in nothing] == [0, 0]
+    assert [len(each) for each in nothing] == [0, 0]
 
 
 def layers(depths, amplitudes, records=4, reference_depth=25.0):
@@ -113,7 +113,7 @@ def test_times_and_the_bottom_in_the_estimate():
 
 def test_without_an_array_depth_there_is_no_two_way_time():
     _, found = run(layers([47.0], [20.0], reference_depth=None), particles=500)
-    assert all(np.isnan(one.extras['two_way_time']).all() for one in found.values())
+    assert all(np.isnan(each.extras['two_way_time']).all() for each in found.values())
 
 
 @pytest.mark.parametrize('column', ['amplitude', 'sigma'])
@@ -163,7 +163,7 @@ def test_a_reflector_is_waited_for_as_many_records_as_is_told():
         ids, (first,) = Identities().name(*here, config)
         for _ in range(missed):
             ids, _ = ids.name(*nothing, config)
-        assert [one.missed for one in ids.reflectors] == ([3] if missed == 3 else [])
+        assert [each.missed for each in ids.reflectors] == ([3] if missed == 3 else [])
         assert (first, *ids.name(*here, config)[1]) == (1, expected)
 
 

@@ -76,7 +76,7 @@ def test_the_simulated_drift_is_followed(vectors, given):
     assert right >= 0.94
     assert distance <= 0.07
     assert tracker.counts['used'] == 300 == len(found)
-    ids = np.concatenate([one.extras['track_id'] for one in found.values()])
+    ids = np.concatenate([each.extras['track_id'] for each in found.values()])
     names, lives = np.unique(ids, return_counts=True)
     # Ten reflectors; what else got an id was soon gone.
     assert np.count_nonzero(lives > 20) in (10, 11)
@@ -108,8 +108,8 @@ def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
     _, found = run(traces(vectors, range(300)), **options)
     assert 0.8 < depth_nees(found, true) < 1.2
     scene = simulate(scenario('drift_traces', {'records': 100}), 0)
-    measured = [one.measurement for one in scene.measurements]
-    true = {one.stamp_ns: one.depth for one in scene.truth}
+    measured = [each.measurement for each in scene.measurements]
+    true = {each.stamp_ns: each.depth for each in scene.truth}
     _, found = run(measured, **options)
     assert 0.7 < depth_nees(found, true) < 1.3
     _, found = run(measured, array_depth_std=0.0, **options)
@@ -119,9 +119,9 @@ def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
 def test_a_perfect_depth_sensor_needs_no_allowance():
     scene = simulate(scenario('drift_traces', {'records': 100, 'array_depth_std': 0.0}), 0)
     _, found = run(
-        [one.measurement for one in scene.measurements], particles=3000, array_depth_std=0.0
+        [each.measurement for each in scene.measurements], particles=3000, array_depth_std=0.0
     )
-    assert 0.6 < depth_nees(found, {one.stamp_ns: one.depth for one in scene.truth}) < 1.2
+    assert 0.6 < depth_nees(found, {each.stamp_ns: each.depth for each in scene.truth}) < 1.2
 
 
 @pytest.mark.parametrize('memory', [0.0, 0.98])
@@ -130,7 +130,7 @@ def test_the_uncertainty_of_amplitudes_is_that_of_their_errors(memory):
     amplitude was before makes its variance smaller by a fourth."""
     scene = simulate(scenario('drift_traces', {'records': 100}), 1)
     _, found = run(
-        [one.measurement for one in scene.measurements], particles=3000, amplitude_memory=memory
+        [each.measurement for each in scene.measurements], particles=3000, amplitude_memory=memory
     )
     error, variance = [], []
     for received, truth in zip(scene.measurements, scene.truth, strict=True):
@@ -175,13 +175,13 @@ def test_noise_alone_has_no_reflector():
         for k in range(1, 30)
     ]
     _, found = run(noise, pulse='gaussian', pulse_width=0.05, order_min=0, particles=2000)
-    nothing = [one for one in found.values() if np.isnan(one.state[0, 0])]
+    nothing = [each for each in found.values() if np.isnan(each.state[0, 0])]
     assert len(nothing) > 24
-    for one in nothing:
-        assert len(one) == 1
-        assert one.probabilities[0].argmax() == 0
-        assert one.probabilities[0].sum() == pytest.approx(1.0)
-        assert one.extras['track_id'][0] == 0 and np.isnan(one.xyz[0, 2])
+    for each in nothing:
+        assert len(each) == 1
+        assert each.probabilities[0].argmax() == 0
+        assert each.probabilities[0].sum() == pytest.approx(1.0)
+        assert each.extras['track_id'][0] == 0 and np.isnan(each.xyz[0, 2])
 
 
 def test_columns_are_those_of_the_contract(vectors):
@@ -207,41 +207,41 @@ def test_amplitudes_are_freed_of_spreading(vectors):
     of the processor."""
     _, found = run(traces(vectors, range(60)), particles=1000)
     raw, freed = [], []
-    for stamp, one in found.items():
+    for stamp, each in found.items():
         k = stamp // RECORD_NS - 1
-        nearest = np.abs(one.state[:, :1] - vectors['reflector_depth'][k]).argmin(axis=1)
+        nearest = np.abs(each.state[:, :1] - vectors['reflector_depth'][k]).argmin(axis=1)
         true = vectors['reflector_amplitude'][k][nearest]
         strong = true > 0.09
-        raw.append(one.state[strong, 1] / true[strong])
-        freed.append(one.extras['relative_amplitude'][strong] / true[strong])
-    spread = [np.std(one) / np.mean(one) for one in map(np.concatenate, (raw, freed))]
+        raw.append(each.state[strong, 1] / true[strong])
+        freed.append(each.extras['relative_amplitude'][strong] / true[strong])
+    spread = [np.std(each) / np.mean(each) for each in map(np.concatenate, (raw, freed))]
     assert spread[1] < 0.9 * spread[0]
 
 
 def test_the_same_input_gives_the_same_bytes(vectors):
     def columns(**parameters):
         _, found = run(traces(vectors, range(12)), particles=1001, **parameters)
-        return [c.tobytes() for one in found.values() for c in one.columns().values()]
+        return [c.tobytes() for each in found.values() for c in each.columns().values()]
 
     assert columns() == columns(threads=4)
     assert columns() != columns(seed=1)
 
 
 def test_late_repeated_and_restarted_input(vectors):
-    one = list(traces(vectors, range(8)))
+    given = list(traces(vectors, range(8)))
     tracker = FathometerTracker(FathometerConfig(particles=200))
     for k in (3, 3, 1, 4):
-        tracker.process(one[k])
+        tracker.process(given[k])
     assert tracker.counts['duplicate'] == 1
     assert tracker.counts['too_late'] == 1
     assert tracker.counts['used'] == 2
     tracker = FathometerTracker(FathometerConfig(particles=200))
-    estimates = [tracker.process(one[k]) for k in (7, 0, 1, 2, 3)]
+    estimates = [tracker.process(given[k]) for k in (7, 0, 1, 2, 3)]
     assert [len(each) for each in estimates] == [1, 0, 0, 3, 1]
     assert tracker.counts['restarts'] == 1
     # Nothing says that what is seen now is what was seen before: no identity is used again.
     before, after = (
-        {int(one) for each in part for e in each for one in e.extras['track_id'] if one}
+        {int(item) for each in part for e in each for item in e.extras['track_id'] if item}
         for part in (estimates[:3], estimates[3:])
     )
     assert before and after and max(before) < min(after)
@@ -251,8 +251,8 @@ def test_reset_equals_a_fresh_tracker(vectors):
     tracker = FathometerTracker(FathometerConfig(particles=300))
     first, again = [], []
     for out in (first, again):
-        for one in traces(vectors, range(5)):
-            out += [c.tobytes() for e in tracker.process(one) for c in e.columns().values()]
+        for each in traces(vectors, range(5)):
+            out += [c.tobytes() for e in tracker.process(each) for c in e.columns().values()]
         tracker.reset()
     assert first == again
 

@@ -1,0 +1,353 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How fast the bathymetry tracker is, against other filters on the same pings in the same run.
+
+All filters take the complex64 snapshots of the paper's scene and are timed in turn, round after
+round. The best round counts, because it is the least disturbed one. Of the tracker the whole of
+`process` is timed: variances, filter and estimate.
+
+`numpy_filter` is the IMM particle filter in plain numpy: all particles of a model at once, one bin
+after the other. `stone_soup_filter` is the multi-model particle filter of Stone Soup, another
+algorithm (one set of particles that carry their model) with the same likelihood and as many
+particles in all. Both suppose the scene of the paper, two random walks and noise of unit variance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta
+from functools import partial
+import math
+import os
+import time
+from typing import Any
+
+import numpy as np
+from scipy.special import kve
+
+from benchmarks.speed import Bench
+from sonar_imm.acoustics.laplace import autocorrelation
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Snapshot
+from sonar_imm.trackers.bathymetry.tracker import BathymetryConfig, BathymetryTracker
+from sonar_imm_tools.simulation.bathymetry.simulator import scenario, simulate
+
+PEER_BINS = 400
+GOAL, GOAL_RATIO = 80_000, 30
+SEA_GOALS = {'particles': 120_000, 'grid': 25_000}
+
+Timed = tuple[Callable[[], Any], int]
+
+CHAIN = np.array([[0.98, 0.02], [0.02, 0.98]])
+SIGMAS = (0.01, 1.0)
+HEIGHT, TILT, SPACING = 15.0, math.radians(30.0), 0.5
+
+
+def config(**values: Any) -> BathymetryConfig:
+    """Parameters with which the tracker computes what the peers compute."""
+    defaults = {'sigmas': SIGMAS, 'initial_std': 1.0, 'transition_matrix': tuple(CHAIN.ravel())}
+    return BathymetryConfig(**{**defaults, **values})
+
+
+class NumpyLikelihood:
+    """Log likelihood of heights for every bin of a ping, complex Laplace, without constants."""
+
+    def __init__(self, ping: Snapshot):
+        self.range, self.P = ping.range, ping.staves
+        power = (np.abs(ping.iq) ** 2).mean(axis=1)
+        window = np.ones(21)
+        level = np.convolve(power, window, 'same') / np.convolve(power**0, window, 'same')
+        rho = np.maximum(level - 1.0, 0.01)
+        self.c = autocorrelation(ping.iq)
+        self.kappa = rho / (1.0 + self.P * rho)
+
+    def log_likelihood(self, t: int, height: FloatArray) -> FloatArray:
+        ratio = (HEIGHT - height) / self.range[t]
+        with np.errstate(invalid='ignore'):
+            u = ratio * math.cos(TILT) - np.sqrt(1.0 - ratio**2) * math.sin(TILT)
+        waves = np.exp(-2j * math.pi * SPACING * u[..., None] * np.arange(1, self.P))
+        beam = self.c[t, 0].real + 2.0 * (waves @ self.c[t, 1:]).real
+        v = np.sqrt(np.maximum(self.c[t, 0].real - self.kappa[t] * beam, 1e-12))
+        log_q = np.log(kve(self.P - 1, 2.0 * v)) - 2.0 * v - (self.P - 1) * np.log(v)
+        return np.where(np.isnan(u), -np.inf, log_q)
+
+
+def numpy_filter(ping: Snapshot, particles: int = 100, seed: int = 0) -> FloatArray:
+    """Mean height (T,) by the IMM particle filter, one bin after the other."""
+    likelihood, rng, N = NumpyLikelihood(ping), np.random.default_rng(seed), particles
+    x, w = rng.normal(size=(2, N)), np.full((2, N), 1.0 / N)
+    mu, sigma = np.array([0.5, 0.5]), np.array(SIGMAS)[:, None]
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        joint = CHAIN * mu[:, None]
+        c = joint.sum(axis=0)
+        points = (np.arange(N) + rng.random((2, 1))) / N
+        drawn = np.empty_like(x)
+        for j in range(2):
+            cumulative = np.cumsum(joint[:, j, None] * w)
+            index = np.searchsorted(cumulative, points[j] * cumulative[-1])
+            drawn[j] = x.ravel()[np.minimum(index, 2 * N - 1)]
+        x = drawn + sigma * rng.standard_normal((2, N))
+        log_q = likelihood.log_likelihood(t, x)
+        q = np.exp(log_q - log_q.max())
+        total = q.sum(axis=1)
+        w = q / np.maximum(total, 1e-300)[:, None]
+        mu = c * total
+        mu /= mu.sum()
+        mean[t] = mu @ (w * x).sum(axis=1)
+    return mean
+
+
+def stone_soup_filter(ping: Snapshot, particles: int = 200) -> FloatArray:
+    """Mean height (T,) by Stone Soup's multi-model particle filter. Raises ModuleNotFoundError."""
+    from stonesoup.base import Property
+    from stonesoup.models.measurement.base import MeasurementModel
+    from stonesoup.models.transition.linear import RandomWalk
+    from stonesoup.predictor.particle import MultiModelPredictor
+    from stonesoup.resampler.particle import SystematicResampler
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import MultiModelParticleState
+    from stonesoup.updater.particle import MultiModelParticleUpdater
+
+    class Likelihood(MeasurementModel):
+        """A detection is the number of its bin; the likelihood has the samples."""
+
+        likelihood: NumpyLikelihood = Property()
+        ndim_meas = 1
+
+        def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
+            raise NotImplementedError
+
+        def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
+            raise NotImplementedError
+
+        def pdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
+            return np.exp(self.logpdf(state1, state2))
+
+        def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> FloatArray:
+            heights = np.asarray(state2.state_vector[0, :], np.float64)
+            return self.likelihood.log_likelihood(int(state1.state_vector[0, 0]), heights)
+
+    # Stone Soup scales the variance with the time step, which is one second here.
+    predictor = MultiModelPredictor([RandomWalk(sigma**2) for sigma in SIGMAS], CHAIN, [[0], [0]])
+    model = Likelihood(ndim_state=1, mapping=(0,), likelihood=NumpyLikelihood(ping))
+    updater = MultiModelParticleUpdater(model, predictor, SystematicResampler())
+    np.random.seed(0)
+    start = datetime(2026, 1, 1)
+    state = MultiModelParticleState(
+        StateVectors(np.random.normal(size=(1, particles))),
+        weight=np.full(particles, 1.0 / particles),
+        dynamic_model=np.random.randint(0, 2, particles),
+        timestamp=start,
+    )
+    mean = np.empty(len(ping))
+    for t in range(len(ping)):
+        stamp = start + timedelta(seconds=t + 1)
+        prediction = predictor.predict(state, timestamp=stamp)
+        detection = Detection([t], timestamp=stamp)
+        state = updater.update(SingleHypothesis(prediction, detection))
+        mean[t] = float(np.mean(state.state_vector[0, :]))
+        state.hypothesis = None
+        state.parent = None
+    return mean
+
+
+def cut(ping: Snapshot, bins: int) -> Snapshot:
+    """The first `bins` bins of a ping."""
+    return Snapshot(
+        stamp_ns=ping.stamp_ns,
+        range=ping.range[:bins],
+        iq=ping.iq[:bins],
+        noise_variance=np.ones(min(bins, len(ping))),
+    )
+
+
+def a_ping(**values: Any) -> Snapshot:
+    """One ping of the paper's scene, longer: 2000 bins."""
+    scene = simulate(scenario('paper', {'pings': 1, 'last_range': 117.0, **values}), 1)
+    ping: Snapshot = scene.measurements[0].measurement
+    return ping
+
+
+def rates(
+    methods: Mapping[str, Timed],
+    rounds: int,
+    clock: Callable[[], float] | None = None,
+) -> dict[str, float]:
+    """Bins per second of each method in the best of `rounds` rounds. `methods` maps a name to a
+    function and the number of bins that it processes."""
+    clock = clock or time.perf_counter
+    best = dict.fromkeys(methods, math.inf)
+    for run, _ in methods.values():
+        run()
+    for _ in range(rounds):
+        for name, (run, _) in methods.items():
+            begin = clock()
+            run()
+            best[name] = min(best[name], clock() - begin)
+    return {name: bins / best[name] for name, (_, bins) in methods.items()}
+
+
+def engines(ping: Snapshot) -> dict[str, Timed]:
+    """The tracker with the settings of the peers, with its coherence gate, and with the grid."""
+    variants: dict[str, dict[str, Any]] = {
+        'particles': {'shadow_gate': False},
+        'gated': {},
+        'grid': {'engine': 'grid', 'shadow_gate': False},
+    }
+    trackers = {name: BathymetryTracker(config(**values)) for name, values in variants.items()}
+    return {
+        name: (lambda tracker=tracker: tracker.process(ping), len(ping))  # type: ignore[misc]
+        for name, tracker in trackers.items()
+    }
+
+
+def bench_numpy(rounds: int = 7) -> dict[str, Any]:
+    """Bins per second of the tracker and of the same filter in plain numpy. Their estimates may
+    differ by no more than Monte Carlo noise."""
+    ping = a_ping()
+    short = cut(ping, PEER_BINS)
+    peer: Timed = (lambda: numpy_filter(short), PEER_BINS)
+    speed = rates({**engines(ping), 'numpy': peer}, rounds)
+    ratio = speed['particles'] / speed['numpy']
+    apart = float(np.sqrt(np.mean(np.square(_heights(short) - numpy_filter(short)))))
+    return {
+        'bins_per_second': speed,
+        'ratio': ratio,
+        'ratio_wanted': GOAL_RATIO,
+        'wanted': GOAL,
+        'rms_difference_m': apart,
+        'good': ratio >= GOAL_RATIO and speed['particles'] >= GOAL,
+    }
+
+
+def bench_sea(rounds: int = 7) -> dict[str, Any]:
+    """Bins per second on a ship that moves, in CPU time: poses, rays through a profile, soundings'
+    uncertainties; particles and grid."""
+    config = scenario('moving_profile', {'pings': 1, 'last_range': 117.0})
+    measurements = [item.measurement for item in simulate(config, 1).measurements]
+    ping = next(item for item in measurements if isinstance(item, Snapshot))
+    methods: dict[str, Timed] = {}
+    for engine in ('particles', 'grid'):
+        values = BathymetryConfig.from_mapping({**config.instruments(), 'engine': engine})
+        tracker = BathymetryTracker(values.for_inputs(frozenset({'snapshot', 'nav'})))
+        for measurement in measurements:
+            if measurement is not ping:
+                tracker.process(measurement)
+        methods[engine] = partial(tracker.process, ping), len(ping)
+    speed = rates(methods, rounds, clock=time.process_time)
+    return {
+        'bins_per_second': speed,
+        'wanted': SEA_GOALS,
+        'good': all(speed[name] >= goal for name, goal in SEA_GOALS.items()),
+    }
+
+
+def bench_stone_soup(rounds: int = 7) -> dict[str, Any]:
+    """Bins per second of the tracker and of Stone Soup. Raises ModuleNotFoundError without it."""
+    short = cut(a_ping(), PEER_BINS)
+    peer: Timed = (lambda: stone_soup_filter(short), PEER_BINS)
+    speed = rates({'particles': engines(short)['particles'], 'stone_soup': peer}, min(rounds, 3))
+    return {'bins_per_second': speed, 'ratio': speed['particles'] / speed['stone_soup']}
+
+
+def bench_scaling(rounds: int = 7) -> dict[str, Any]:
+    """Bins a second with more models (M), more particles of each (N), more staves (P)."""
+    ping = a_ping()
+    variants: dict[str, tuple[dict[str, Any], Snapshot]] = {}
+    for M in (1, 2, 4, 8):
+        sigmas = tuple(np.geomspace(0.01, 1.0, M).tolist())
+        bank = {'model_set': 'height_bank', 'sigmas': sigmas, 'engine': 'particles'}
+        variants[f'M = {M}'] = bank, ping
+    for N in (50, 100, 300, 1000):
+        variants[f'N = {N}'] = {'sigmas': SIGMAS, 'particles_per_model': N}, ping
+    for P in (2, 4, 8, 16, 32):
+        variants[f'P = {P}'] = {'sigmas': SIGMAS}, a_ping(staves=P)
+    methods: dict[str, Timed] = {}
+    for name, (values, shot) in variants.items():
+        tracker = BathymetryTracker(BathymetryConfig(shadow_gate=False, **values))
+        methods[name] = partial(tracker.process, shot), len(shot)
+    return {'bins_per_second': rates(methods, rounds)}
+
+
+def bench_threads(rounds: int = 7, pings: int = 16) -> dict[str, Any]:
+    """Bins a second of one tracker, and of one in each of several threads: the kernels release
+    Python's lock. The best of `rounds` rounds in turn."""
+    ping = a_ping()
+
+    def together(trackers: list[BathymetryTracker]) -> None:
+        with ThreadPoolExecutor(len(trackers)) as pool:
+            list(pool.map(lambda each: [each.process(ping) for _ in range(pings)], trackers))
+
+    most = min(4, os.cpu_count() or 1)
+    groups = {
+        n: [BathymetryTracker(config(shadow_gate=False)) for _ in range(n)]
+        for n in sorted({1, most})
+    }
+    methods = {
+        str(n): (partial(together, trackers), n * pings * len(ping))
+        for n, trackers in groups.items()
+    }
+    return {'bins_per_second': rates(methods, min(rounds, 3))}
+
+
+def _heights(ping: Snapshot) -> np.ndarray:
+    tracker = BathymetryTracker(config(shadow_gate=False))
+    return tracker.process(ping)[0].state[:, 0]
+
+
+def _numpy_sentence(result: Mapping[str, Any]) -> str:
+    speed = result['bins_per_second']
+    return (
+        f'two models, 100 particles each, 8 staves: {speed["particles"]:,.0f} bins/s (wanted '
+        f'{result["wanted"]:,}), with the coherence gate {speed["gated"]:,.0f}, exact grid '
+        f'{speed["grid"]:,.0f}; numpy {speed["numpy"]:,.0f}: {result["ratio"]:.0f} times as fast '
+        f'(wanted {result["ratio_wanted"]}), {result["rms_difference_m"]:.3f} m apart (RMS)'
+    )
+
+
+def _sea_sentence(result: Mapping[str, Any]) -> str:
+    speed, wanted = result['bins_per_second'], result['wanted']
+    each = ', '.join(f'{name} {speed[name]:,.0f} (wanted {wanted[name]:,})' for name in wanted)
+    return f'a moving ship and bent rays, bins a second of CPU time: {each}'
+
+
+def _stone_soup_sentence(result: Mapping[str, Any]) -> str:
+    speed = result['bins_per_second']
+    return (
+        f'Stone Soup, multi-model particle filter with as many particles: '
+        f'{speed["stone_soup"]:,.0f} bins/s: {result["ratio"]:.0f} times as fast'
+    )
+
+
+def _rates_sentence(result: Mapping[str, Any], what: str) -> str:
+    each = ', '.join(f'{name} {speed:,.0f}' for name, speed in result['bins_per_second'].items())
+    return f'{what}: {each} bins/s'
+
+
+BENCHES = (
+    Bench('numpy', bench_numpy, _numpy_sentence),
+    Bench('sea', bench_sea, _sea_sentence),
+    Bench('stone_soup', bench_stone_soup, _stone_soup_sentence),
+    Bench(
+        'scaling',
+        bench_scaling,
+        partial(_rates_sentence, what='models (M), particles of each (N), staves (P)'),
+    ),
+    Bench('threads', bench_threads, partial(_rates_sentence, what='trackers in so many threads')),
+)

@@ -1,0 +1,310 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How fast the diver filter is, against FilterPy with the same computation in the same run.
+
+Times depend on the machine and its load; the ratio of two programs measured in turn hardly does.
+Each round times both, one after the other, and the median of the ratios is reported. Their
+estimates have to agree, which shows that both did the same work.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+import time
+from typing import Any
+
+from attrs import frozen
+import numpy as np
+
+from benchmarks.speed import Bench
+from sonar_imm.estimation import imm, imm_kernels
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.estimation.association import assign, association_cost, gate_threshold
+from sonar_imm.measurements import Fix, Fixes
+from sonar_imm.trackers.diver.config import DiverConfig
+from sonar_imm.trackers.diver.tracker import DiverTracker
+from sonar_imm_tools.simulation.diver.simulator import scenario, simulate
+
+MODELS, STATES, STEP = 16, 4, 1.0
+RATIO_WANTED = 100.0
+SCAN_WANTED_MS = 25.0
+STAMPS_WANTED = 1.5
+CLUTTER_WANTED_MS = 0.3
+
+
+@frozen(eq=False)
+class Problem:
+    """Sixteen coordinated turns, position fixes: F, Q (M, 4, 4), transition (M, M), z (K, 2)."""
+
+    F: FloatArray
+    Q: FloatArray
+    H: FloatArray
+    R: FloatArray
+    transition: FloatArray
+    z: FloatArray
+
+
+def problem(steps: int, seed: int = 0) -> Problem:
+    """A target that turns left and right. The transition matrix is not symmetric."""
+    rng = np.random.default_rng(seed)
+    rates = np.radians(np.linspace(-40.0, 40.0, MODELS))
+    F = np.array([turn(rate) for rate in rates])
+    Q = np.array([np.diag([0.05, 0.05, 0.02, 0.02]) * (1.0 + 0.1 * j) for j in range(MODELS)])
+    transition = 0.8 * np.eye(MODELS) + 0.2 * rng.dirichlet(np.ones(MODELS), MODELS)
+    state, z = np.array([0.0, 0.0, 1.0, 0.0]), np.empty((steps, 2))
+    for k in range(steps):
+        state = turn(rates[(k // 10 * 7) % MODELS]) @ state
+        z[k] = state[:2] + rng.normal(0.0, 1.0, 2)
+    return Problem(F, Q, np.eye(2, STATES), np.eye(2), transition, z)
+
+
+def turn(rate: float) -> FloatArray:
+    """(4, 4) coordinated turn over `STEP`, state px, py, vx, vy."""
+    angle = rate * STEP
+    s, c = np.sin(angle), np.cos(angle)
+    a, b = (s / rate, (1.0 - c) / rate) if rate else (STEP, 0.0)
+    return np.array([[1, 0, a, -b], [0, 1, b, a], [0, 0, c, -s], [0, 0, s, c]], float)
+
+
+def run_kernel(p: Problem) -> FloatArray:
+    """(K, 4) estimates by our compiled cycle, one target."""
+    x, P = np.zeros((1, MODELS, STATES)), np.tile(10.0 * np.eye(STATES), (1, MODELS, 1, 1))
+    mu, B = np.full((1, MODELS), 1.0 / MODELS), np.zeros((MODELS, STATES))
+    E = np.tile(np.eye(STATES), (MODELS, 1, 1))
+    H, R, transition = np.tile(p.H, (MODELS, 1, 1)), p.R[None], p.transition[None]
+    means = np.empty((len(p.z), STATES))
+    for k in range(len(p.z)):
+        x, P, mu, mean, *_ = imm_kernels.linear_cycle(
+            x, P, mu, transition, p.F, p.Q, B, p.z[k : k + 1], H, R, E
+        )
+        means[k] = mean[0]
+    return means
+
+
+def run_filterpy(p: Problem) -> FloatArray:
+    """(K, 4) estimates by FilterPy. Raises ModuleNotFoundError when it is not installed."""
+    from filterpy.kalman import IMMEstimator, KalmanFilter
+
+    filters = []
+    for F, Q in zip(p.F, p.Q):
+        kalman = KalmanFilter(dim_x=STATES, dim_z=2)
+        kalman.x, kalman.P = np.zeros(STATES), 10.0 * np.eye(STATES)
+        kalman.F, kalman.Q, kalman.H, kalman.R = F, Q, p.H, p.R
+        filters.append(kalman)
+    imm = IMMEstimator(filters, np.full(MODELS, 1.0 / MODELS), p.transition)
+    means = np.empty((len(p.z), STATES))
+    for k, z in enumerate(p.z):
+        imm.predict()
+        imm.update(z)
+        means[k] = imm.x
+    return means
+
+
+def bench_step(rounds: int = 7, steps: int = 150) -> dict[str, Any]:
+    """Microseconds of one IMM step, ours and FilterPy's, and their ratio in paired rounds."""
+    p = problem(steps)
+    ours, theirs = run_kernel(p), run_filterpy(p)
+    agreement = float(np.abs(ours - theirs).max())
+    pairs = (
+        np.array([[_seconds(run_kernel, p), _seconds(run_filterpy, p)] for _ in range(rounds)])
+        / steps
+        * 1e6
+    )
+    ratio = pairs[:, 1] / pairs[:, 0]
+    return {
+        'models': MODELS,
+        'states': STATES,
+        'measurements': 2,
+        'steps': steps,
+        'rounds': rounds,
+        'ours_us': float(np.median(pairs[:, 0])),
+        'filterpy_us': float(np.median(pairs[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'ratio_lowest': float(ratio.min()),
+        'ratio_wanted': RATIO_WANTED,
+        'largest_difference_m': agreement,
+        'good': bool(np.median(ratio) >= RATIO_WANTED and agreement < 1e-9),
+    }
+
+
+def bench_scan(targets: int = 1000, scans: int = 20) -> dict[str, Any]:
+    """Milliseconds of a whole scan: mix, predict, gate, assign, update, combine."""
+    p = problem(1)
+    rng = np.random.default_rng(1)
+    side = 20.0 * np.sqrt(targets)
+    x = np.zeros((targets, MODELS, STATES))
+    x[:, :, :2] = rng.uniform(0.0, side, (targets, 1, 2))
+    P = np.tile(np.eye(STATES), (targets, MODELS, 1, 1))
+    mu = np.full((targets, MODELS), 1.0 / MODELS)
+    times, hits = [], []
+    for _ in range(scans + 1):
+        z = x[:, 0, :2] + rng.normal(0.0, 1.0, (targets, 2))
+        begin = time.perf_counter()
+        x, P, mu, hit = _scan(p, x, P, mu, z)
+        times.append(1e3 * (time.perf_counter() - begin))
+        hits.append(hit / targets)
+    median = float(np.median(times[1:]))
+    return {
+        'targets': targets,
+        'scans': scans,
+        'median_ms': median,
+        'worst_ms': float(np.max(times[1:])),
+        'assigned': float(np.mean(hits)),
+        'wanted_ms': SCAN_WANTED_MS,
+        'good': median <= SCAN_WANTED_MS,
+    }
+
+
+def _scan(
+    p: Problem, x: FloatArray, P: FloatArray, mu: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, int]:
+    """One scan of many targets, and how many of them were hit."""
+    targets = len(x)
+    H = np.tile(p.H, (1, MODELS, 1, 1))
+    x, P, c = imm_kernels.mix(x, P, mu, p.transition[None])
+    x, P, _ = imm_kernels.predict(x, P, p.F, p.Q, np.zeros((MODELS, STATES)))
+    expected = np.ascontiguousarray(x[:, :, :2])
+    fit = imm_kernels.gate(
+        expected, H, P, c, z, np.tile(p.R, (len(z), 1, 1)), gate_threshold(0.999, 2)
+    )
+    target, detection = imm.pairs_inside(fit)
+    cost = association_cost(fit[target, detection], 0.95, 1e-4)
+    chosen = assign(target, detection, cost, targets, len(z))
+    innovation = z[chosen][:, None] - expected
+    innovation[chosen < 0] = np.nan
+    x, P, mu, *_ = imm_kernels.update(x, P, c, innovation, H, p.R[None])
+    imm_kernels.combine(x, P, mu, np.tile(np.eye(STATES), (MODELS, 1, 1)))
+    return x, P, mu, int((chosen >= 0).sum())
+
+
+def bench_stamps(rounds: int = 7, fixes: int = 120) -> dict[str, Any]:
+    """CPU milliseconds that a whole tracker takes for a fix, with stamps every second and with
+    stamps that never have the same distance twice, and their ratio in paired rounds. CPU time,
+    because threads that nobody asked for show in nothing else."""
+    DiverTracker(DiverConfig()).warm()
+    regular, irregular = (
+        _fixes(np.ones(fixes)),
+        _fixes(np.random.default_rng(2).uniform(0.5, 1.5, fixes)),
+    )
+    pairs = np.array(
+        [[_cpu_of_tracking(regular), _cpu_of_tracking(irregular)] for _ in range(rounds)]
+    )
+    pairs *= 1e3 / fixes
+    ratio = pairs[:, 1] / pairs[:, 0]
+    return {
+        'fixes': fixes,
+        'rounds': rounds,
+        'regular_cpu_ms': float(np.median(pairs[:, 0])),
+        'irregular_cpu_ms': float(np.median(pairs[:, 1])),
+        'ratio': float(np.median(ratio)),
+        'ratio_highest': float(ratio.max()),
+        'ratio_wanted': STAMPS_WANTED,
+        'good': bool(np.median(ratio) <= STAMPS_WANTED),
+    }
+
+
+def bench_clutter(rounds: int = 7, scans: int = 200) -> dict[str, Any]:
+    """CPU milliseconds that a whole tracker takes for a scan of four divers and three false fixes
+    on average, with either association in turn."""
+    setting = scenario('crossing', {'duration': scans - 1.0, 'clutter': 3.0})
+    scene = [item.measurement for item in simulate(setting, 0).measurements]
+    configs = [
+        DiverConfig(**{**setting.instruments(), 'association': association})
+        for association in ('gnn', 'jipda')
+    ]
+    DiverTracker(configs[1]).warm()
+    spent = np.array([[_cpu_of_tracking(scene, each) for each in configs] for _ in range(rounds)])
+    gnn, jipda = np.median(spent, axis=0) * 1e3 / len(scene)
+    return {
+        'scans': len(scene),
+        'fixes': sum(len(scan) for scan in scene if isinstance(scan, Fixes)),
+        'rounds': rounds,
+        'gnn_cpu_ms': float(gnn),
+        'jipda_cpu_ms': float(jipda),
+        'wanted_ms': CLUTTER_WANTED_MS,
+        'good': bool(max(gnn, jipda) <= CLUTTER_WANTED_MS),
+    }
+
+
+def _fixes(steps: FloatArray) -> list[Fix]:
+    """A diver at .4 m/s, seen after each of `steps` (K,) seconds."""
+    noise = np.random.default_rng(3).normal(0.0, 0.5, (len(steps), 2))
+    time_s = np.cumsum(steps)
+    return [
+        Fix(
+            stamp_ns=10**9 + round(1e9 * seconds),
+            position=np.array([0.4 * seconds + dx, dy, 0.0]),
+            covariance=0.25 * np.eye(2),
+        )
+        for seconds, (dx, dy) in zip(time_s.tolist(), noise)
+    ]
+
+
+def _cpu_of_tracking(items: Sequence[Any], config: DiverConfig | None = None) -> float:
+    """CPU seconds of this process, all its threads, for a new tracker."""
+    tracker = DiverTracker(config or DiverConfig())
+    begin = time.process_time()
+    for item in items:
+        tracker.process(item)
+    return time.process_time() - begin
+
+
+def _seconds(function: Callable[[Problem], Any], p: Problem) -> float:
+    begin = time.perf_counter()
+    function(p)
+    return time.perf_counter() - begin
+
+
+def _step_sentence(step: Mapping[str, Any]) -> str:
+    return (
+        f'IMM step, {step["models"]} models, {step["states"]} states, {step["measurements"]} '
+        f'measurements: {step["ours_us"]:.1f} us, FilterPy {step["filterpy_us"]:.0f} us: '
+        f'{step["ratio"]:.0f} times as fast (wanted {step["ratio_wanted"]:.0f}; lowest of '
+        f'{step["rounds"]} paired rounds {step["ratio_lowest"]:.0f}); the estimates agree to '
+        f'{step["largest_difference_m"]:.0e} m'
+    )
+
+
+def _scan_sentence(scan: Mapping[str, Any]) -> str:
+    return (
+        f'scan of {scan["targets"]} targets with gating and assignment: median '
+        f'{scan["median_ms"]:.1f} ms (wanted {scan["wanted_ms"]:.0f}), worst of '
+        f'{scan["scans"]} {scan["worst_ms"]:.1f} ms'
+    )
+
+
+def _stamps_sentence(stamps: Mapping[str, Any]) -> str:
+    return (
+        f'tracker, CPU for a fix: {stamps["regular_cpu_ms"]:.2f} ms every second, '
+        f'{stamps["irregular_cpu_ms"]:.2f} ms at irregular stamps: {stamps["ratio"]:.2f} times as '
+        f'much (wanted at most {stamps["ratio_wanted"]:.1f}; highest of {stamps["rounds"]} paired '
+        f'rounds {stamps["ratio_highest"]:.2f})'
+    )
+
+
+def _clutter_sentence(clutter: Mapping[str, Any]) -> str:
+    return (
+        f'tracker, CPU for a scan of 4 divers and 3 false fixes: {clutter["gnn_cpu_ms"]:.2f} ms '
+        f'with gnn, {clutter["jipda_cpu_ms"]:.2f} ms with jipda (wanted '
+        f'{clutter["wanted_ms"]:.1f}; median of {clutter["rounds"]} rounds)'
+    )
+
+
+BENCHES = (
+    Bench('step', bench_step, _step_sentence),
+    Bench('scan', lambda rounds: bench_scan(), _scan_sentence),
+    Bench('stamps', bench_stamps, _stamps_sentence),
+    Bench('clutter', bench_clutter, _clutter_sentence),
+)

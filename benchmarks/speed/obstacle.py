@@ -1,0 +1,135 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How fast the obstacle tracker is: whole pings of many obstacles, association included."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.speed import Bench
+from sonar_imm.measurements import Altitude, Detections, Navigation
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+OBSTACLES = 20
+WANTED_MS = 2.0
+STEP_NS = 500_000_000
+
+
+VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
+    'fixed obstacles alone': (0, {'behaviours': ('fixed',)}),
+    'with 5 false echoes per ping': (5, {}),
+    '5 slices instead of 9': (0, {'components': 5}),
+    'two_way timing': (0, {'ping_timing': 'two_way', 'max_extrapolation': 0.2}),
+    'landmark': (0, {'method': 'landmark'}),
+}
+"""False echoes per ping and parameters of what is measured beside the default."""
+
+
+def bench_ping(
+    rounds: int = 7,
+    pings: int = 40,
+    obstacles: int = OBSTACLES,
+    clutter: int = 0,
+    **parameters: Any,
+) -> dict[str, Any]:
+    """Milliseconds per ping with `obstacles` tracked obstacles: median over all rounds."""
+    times, tracked = [], []
+    for _ in range(rounds):
+        spent, followed = _approach(pings, obstacles, clutter, ObstacleConfig(**parameters))
+        times += spent
+        tracked.append(followed)
+    median = float(np.median(times))
+    return {
+        'obstacles': obstacles,
+        'pings': len(times),
+        'median_ms': median,
+        'p99_ms': float(np.percentile(times, 99.0)),
+        'tracked': float(np.mean(tracked)),
+        'wanted_ms': WANTED_MS,
+        'good': median <= WANTED_MS and float(np.mean(tracked)) == obstacles,
+    }
+
+
+def bench_variants(rounds: int = 7, pings: int = 40) -> dict[str, Any]:
+    """Milliseconds per ping as in `bench_ping`, for what costs more or less than the default."""
+    return {
+        'median_ms': {
+            name: bench_ping(min(rounds, 3), pings, clutter=clutter, **values)['median_ms']
+            for name, (clutter, values) in VARIANTS.items()
+        }
+    }
+
+
+def _approach(
+    pings: int, obstacles: int, clutter: int, config: ObstacleConfig
+) -> tuple[list[float], int]:
+    """Approach a wall of obstacles. Gives the milliseconds of each ping after confirmation, and
+    the number of tracks at the end."""
+    rng = np.random.default_rng(0)
+    tracker = ObstacleTracker(config)
+    tracker.warm()
+    # A lattice ahead, with spacings that the sonar resolves.
+    ahead = 60.0 + 5.0 * (np.arange(obstacles) // 5)
+    aside = 5.0 * (np.arange(obstacles) % 5 - 2.0)
+    down = rng.uniform(-2.0, 2.0, obstacles)
+    times, confirmed = [], 0
+    for ping in range(pings):
+        stamp = (ping + 1) * STEP_NS
+        east = 1.5 * stamp * 1e-9
+        tracker.process(Altitude(stamp_ns=stamp, altitude=15.0))
+        tracker.process(
+            Navigation(
+                stamp_ns=stamp, position=(east, 0.0, -20.0), orientation=(0.0, 0.0, 0.0, 1.0)
+            )
+        )
+        away = np.column_stack([ahead - east, aside, -down])
+        noise = rng.normal(size=(obstacles, 2)) * (0.1, np.radians(0.2))
+        distance = np.linalg.norm(away, axis=1) + noise[:, 0]
+        bearing = np.arctan2(away[:, 1], away[:, 0]) + noise[:, 1]
+        echoes = Detections(
+            stamp_ns=stamp,
+            range=np.append(distance, rng.uniform(5.0, 100.0, clutter)),
+            bearing=np.append(bearing, rng.uniform(-0.39, 0.39, clutter)),
+        )
+        begin = time.perf_counter()
+        estimates = tracker.process(echoes)  # none while it waits for a pose
+        if ping >= 10:
+            times.append(1e3 * (time.perf_counter() - begin))
+        for estimate in estimates:
+            confirmed = int((estimate.extras['track_state'] > 0).sum())
+    return times, confirmed
+
+
+def _sentence(result: Mapping[str, Any]) -> str:
+    return (
+        f'{result["obstacles"]} obstacles per ping, association included: '
+        f'{result["median_ms"]:.2f} ms, p99 {result["p99_ms"]:.2f} ms '
+        f'(wanted {result["wanted_ms"]:.0f}), {result["tracked"]:.0f} of them tracked'
+    )
+
+
+def _variants_sentence(result: Mapping[str, Any]) -> str:
+    return ', '.join(f'{name} {spent:.2f} ms' for name, spent in result['median_ms'].items())
+
+
+BENCHES = (
+    Bench('ping', bench_ping, _sentence),
+    Bench('variants', bench_variants, _variants_sentence),
+)

@@ -1,0 +1,219 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The harness of all studies: a command line, progress, tables to read and a file of numbers.
+
+A study is a module with a generator `main`, whose parameters are the options of its command line,
+each with its default, and which yields its numbers as parts of one JSON object:
+
+    def main(runs: int = 100, cases: Sequence[str] = tuple(CASES)) -> Parts:
+        yield {'runs': runs}
+        for name in cases:
+            yield {'table': {name: case(name, range(runs))}}
+
+
+    if __name__ == '__main__':
+        study(main, cases={'choices': list(CASES)})
+
+Parts are merged; what is a table, or a row of one, is printed as it comes, and ``--out FILE``
+holds all that is known so far. The rest of this module is what several studies compute.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+import inspect
+from itertools import groupby
+import json
+from multiprocessing import get_context
+from pathlib import Path
+import sys
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sonar_imm.estimates import Estimate
+from sonar_imm.truth import Scene
+
+Parts = Iterator[Mapping[str, Any]]
+Row = Mapping[str, Any]
+T = TypeVar('T')
+
+
+def study(
+    main: Callable[..., Parts],
+    *,
+    digits: int = 3,
+    shown: Callable[[Row], Row] = dict,
+    **options: Mapping[str, Any],
+) -> None:
+    """Run `main` with the options given on the command line, print its tables and write its file.
+
+    digits: of the numbers in tables. shown: what is printed of a row. options: by parameter of
+    `main`, what `argparse` is told beside its type and default, or instead of them. A default that
+    is a tuple takes any number of values, False is a flag. A parameter `out` is the file itself.
+    """
+    module = sys.modules[main.__module__]
+    parser = argparse.ArgumentParser(
+        description=module.__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parameters = inspect.signature(main).parameters
+    for name, parameter in parameters.items():
+        if name != 'out':
+            settings = {**_inferred(parameter.default), **options.get(name, {})}
+            parser.add_argument(f'--{name.replace("_", "-")}', **settings)
+    file = {'type': Path, 'help': 'write the numbers here, as JSON', **options.get('out', {})}
+    parser.add_argument('--out', **file)
+    given = vars(parser.parse_args())
+    out = given['out'] if 'out' in parameters else given.pop('out')
+    content: dict[str, Any] = {}
+    printed: dict[str, int] = {}
+    for part in main(**given):
+        merge(content, part)
+        for title, table in tables(part, shown):
+            printed[title] = len(table)
+            if len(table) > 1:
+                print(f'\n{title}\n\n{markdown(table, digits)}')
+            else:
+                ((name, row),) = table.items()
+                words = ', '.join(f'{key} {cell(value, digits)}' for key, value in row.items())
+                print(f'{name}: {words}')
+        sys.stdout.flush()
+        write_json(out, content)
+    for title, table in tables(content, shown):
+        if len(table) != printed.get(title, 0):
+            print(f'\n{title}\n\n{markdown(table, digits)}')
+
+
+def _inferred(default: Any) -> dict[str, Any]:
+    """What `argparse` is told of an option with this default."""
+    if default is False:
+        return {'action': 'store_true'}
+    if isinstance(default, tuple):
+        return {'nargs': '*', 'type': type(default[0]) if default else str, 'default': default}
+    return {'type': type(default), 'default': default} if default is not None else {}
+
+
+def merge(content: dict[str, Any], part: Mapping[str, Any]) -> None:
+    """Put a part into what is there: into mappings, behind lists, in place of all else."""
+    for key, value in part.items():
+        there = content.get(key)
+        if isinstance(value, Mapping) and isinstance(there, dict):
+            merge(there, value)
+        elif isinstance(value, list) and isinstance(there, list):
+            there += value
+        else:
+            content[key] = list(value) if isinstance(value, list) else value
+            if isinstance(value, Mapping):
+                content[key] = {}
+                merge(content[key], value)
+
+
+def tables(
+    content: Any, shown: Callable[[Row], Row] = dict, title: str = ''
+) -> Iterator[tuple[str, dict[str, Row]]]:
+    """The tables in nested mappings, each with its title: rows by name, or a list of rows."""
+    if isinstance(content, list):
+        content = {str(number): row for number, row in enumerate(content, start=1)}
+    if not isinstance(content, Mapping):
+        return
+    rows = {key: _flat(row, shown) for key, row in content.items()}
+    if flat := {key: row for key, row in rows.items() if row}:
+        yield title, flat
+    for key, value in content.items():
+        if key not in flat:
+            yield from tables(value, shown, f'{title}, {key}' if title else key)
+
+
+def _flat(row: Any, shown: Callable[[Row], Row]) -> Row | None:
+    """What is printed of a row; None of what is no row."""
+    if not isinstance(row, Mapping) or not row:
+        return None
+    try:
+        picked = shown(row)
+    except (KeyError, TypeError):
+        return None
+    plain = all(isinstance(v, (int, float, str, type(None))) for v in picked.values())
+    return picked if plain else None
+
+
+def cell(value: Any, digits: int = 3) -> str:
+    if value is None:
+        return '-'
+    return f'{value:.{digits}f}' if isinstance(value, float) else str(value)
+
+
+def markdown(table: Mapping[str, Row], digits: int = 3) -> str:
+    """A row for each entry, a column for each of its numbers; rows of other columns follow in a
+    table of their own."""
+    parts = []
+    for columns, rows in groupby(table.items(), lambda item: list(item[1])):
+        lines = ['| | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 1) + '|']
+        lines += [
+            f'| {name} | ' + ' | '.join(cell(value, digits) for value in row.values()) + ' |'
+            for name, row in rows
+        ]
+        parts.append('\n'.join(lines))
+    return '\n\n'.join(parts)
+
+
+def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
+    """Write `content`, and the folders to it; nothing without a path."""
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(content, indent=1) + '\n', encoding='utf-8')
+
+
+def known(path: Path | None) -> dict[str, Any]:
+    """What is in the file of an earlier run; nothing when there is none."""
+    if path is None or not path.is_file():
+        return {}
+    content: dict[str, Any] = json.loads(path.read_text(encoding='utf-8'))
+    return content
+
+
+def mean_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The mean of every number of some rows, by name."""
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+
+
+def standard_error(values: Sequence[float] | np.ndarray) -> float:
+    """Of the mean of `values` (n,); 0 of a single one."""
+    return float(np.std(values) / max(1, np.size(values) - 1) ** 0.5)
+
+
+def rms(values: Sequence[float] | np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def final_estimates(tracker: Any, measurements: Iterable[Any]) -> dict[int, Estimate]:
+    """The last estimate of every stamp, by stamp."""
+    final: dict[int, Estimate] = {}
+    for measurement in measurements:
+        final.update((each.stamp_ns, each) for each in tracker.process(measurement))
+    return final
+
+
+def truths(scene: Scene, kind: type[T]) -> tuple[T, ...]:
+    """What is true of a scene, by its type."""
+    return tuple(truth for truth in scene.truth if isinstance(truth, kind))
+
+
+def in_fresh_process(function: Callable[..., T], *arguments: Any) -> T:
+    """The result of a call in a process of its own, with nothing compiled or kept from before."""
+    with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:
+        return pool.submit(function, *arguments).result()

@@ -1,0 +1,326 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Positions of all kinds, brought into the frame of the tracks before the tracker sees them.
+
+Latitude and longitude become metres east and north of the origin. A relative fix waits until the
+vessel's pose is known around its stamp, from ``nav`` or from ``nav_fix`` and ``heading``, and is
+composed with it. Everything else goes through as it is.
+
+Without a stated origin the first position in latitude and longitude is it, once such a position is
+used. Then metres that others have measured are from somewhere else, and cannot be used beside it:
+what came first stays.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from operator import attrgetter
+from typing import NamedTuple
+
+import numpy as np
+
+from ...acoustics import geometry
+from ...acoustics.geodesy import Origin
+from ...acoustics.geometry import Pose
+from ...acoustics.relative_position import Mounting, place, Uncertainty
+from ...estimation.arrays import FloatArray
+from ...estimation.history import StampGate
+from ...measurements import (
+    Arrivals,
+    Fix,
+    Fixes,
+    GeodeticFix,
+    Measurement,
+    nanoseconds,
+    Navigation,
+    Rejection,
+    RelativeFix,
+    VesselFix,
+    VesselHeading,
+    VesselPose,
+)
+from ..navigation import MOST_WAITING, NavigationBuffer, Readiness
+from .config import DiverConfig
+
+KEPT_NS = 60_000_000_000
+"""Poses are kept that long, and for the history of the tracker."""
+_LONGEST_PAUSE_NS = 3_600_000_000_000
+_RESTART_AFTER = 5
+_LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+class _Vessel(NamedTuple):
+    """The vessel at an instant, and the frame it is placed in."""
+
+    pose: Pose
+    uncertainty: Uncertainty
+    frame_id: str
+
+
+class _Samples:
+    """What one instrument says of the vessel: poses, of which only a part may be meant."""
+
+    def __init__(self, kept_ns: int):
+        self._kept_ns = kept_ns
+        self._gate: StampGate[Navigation] = StampGate(kept_ns, _LONGEST_PAUSE_NS, _RESTART_AFTER)
+        self.buffer = NavigationBuffer()
+
+    def add(self, sample: Navigation, counts: Counter[str]) -> bool:
+        """Take a sample in; True when the clock was restarted, so that all before is forgotten."""
+        decision = self._gate.decide(sample.stamp_ns, sample)
+        decision.count_in(counts)
+        restarted = decision.verdict == 'restart'
+        if restarted:
+            self.buffer = NavigationBuffer()
+        for released in decision.released:
+            counts['poses'] += 1
+            self.buffer = self.buffer.inserted(released)
+        if self.buffer.stamps:
+            self.buffer = self.buffer.since(self.buffer.stamps[-1] - self._kept_ns)
+        return restarted
+
+    def nearest(self, stamp_ns: int) -> Navigation:
+        """The sample nearest to a stamp."""
+        stamps = np.array(self.buffer.stamps)
+        return self.buffer.samples[int(np.abs(stamps - stamp_ns).argmin())]
+
+
+class Georeferencer:
+    """Gives what the tracker can use of each measurement; counts what it cannot in `counts`."""
+
+    def __init__(self, config: DiverConfig, counts: Counter[str]):
+        self.config = config
+        self.origin = config.origin()
+        self._counts = counts
+        self._stated = self.origin is not None
+        self._first: Origin | None = None
+        self._metric = False
+        kept = max(KEPT_NS, nanoseconds(config.history))
+        self._poses, self._places, self._headings = (_Samples(kept) for _ in range(3))
+        self._waiting: list[RelativeFix] = []
+
+    def __len__(self) -> int:
+        """How many relative fixes wait for the vessel's pose."""
+        return len(self._waiting)
+
+    def warnings(self) -> list[str]:
+        """What the user has to do, in sentences."""
+        sentences = []
+        if self._counts['no_origin']:
+            sentences.append(
+                f'{self._counts["no_origin"]} positions cannot be used: those in metres and those '
+                'in latitude and longitude need origin_latitude and origin_longitude to stand '
+                'beside each other'
+            )
+        if len(self._waiting) > 1 and not self._vessel_known():
+            sentences.append(
+                f'{len(self._waiting)} relative fixes wait for the pose of the vessel: nav, or '
+                'nav_fix and heading, or the parameter vessel: fixed'
+            )
+        return sentences
+
+    def georeference(self, measurement: Measurement) -> list[Measurement]:
+        """What of `measurement`, and of what waited for it, is ready now, oldest stamp first."""
+        if isinstance(measurement, (Fix, Fixes, Arrivals)):
+            return [measurement] if self._in_metres() else []
+        if isinstance(measurement, VesselPose):
+            return self._after(self._poses, measurement)
+        if isinstance(measurement, VesselHeading):
+            return self._after(self._headings, _turned(measurement))
+        if isinstance(measurement, GeodeticFix):
+            if self._first is None:
+                height = self.config.origin_height
+                self._first = Origin(measurement.latitude, measurement.longitude, height)
+            if isinstance(measurement, VesselFix):
+                return self._after(self._places, self._moved(measurement))
+            return [self._fix_of(measurement)] if self._on_earth() else []
+        if isinstance(measurement, RelativeFix):
+            if len(self._waiting) == MOST_WAITING:
+                self._waiting.pop(0)
+                self._counts['vessel_pose_missing'] += 1
+            self._waiting.append(measurement)
+            return self._ready()
+        return [measurement]
+
+    # -- where the origin is ---------------------------------------------------------------------
+
+    def _in_metres(self) -> bool:
+        """Whether metres can be used; counts a refusal."""
+        if self.origin is not None and not self._stated:
+            self._counts['no_origin'] += 1
+            return False
+        self._metric = True
+        return True
+
+    def _on_earth(self) -> bool:
+        """Whether latitude and longitude can be used; the first of them may be the origin."""
+        if self.origin is None:
+            if self._metric:
+                self._counts['no_origin'] += 1
+                return False
+            self.origin = self._first
+        return True
+
+    def _local(self, fix: GeodeticFix) -> tuple[FloatArray, FloatArray | None]:
+        """The place (3,) in metres of the origin, and its covariance (3, 3)."""
+        origin = self.origin or self._first
+        assert origin is not None
+        height = origin.height if np.isnan(fix.height) else fix.height
+        position = origin.local(fix.latitude, fix.longitude, height)
+        if fix.covariance is None:
+            return position, None
+        turn = origin.turn(fix.latitude, fix.longitude)
+        return position, turn @ fix.covariance @ turn.T
+
+    def _fix_of(self, fix: GeodeticFix) -> Fix:
+        position, covariance = self._local(fix)
+        return Fix(
+            stamp_ns=fix.stamp_ns,
+            position=position,
+            covariance=None if covariance is None else covariance[:2, :2],
+            target_id=fix.target_id,
+            sensor=fix.sensor,
+            frame_id=self.config.map_frame,
+        )
+
+    def _moved(self, fix: VesselFix) -> VesselPose:
+        """A position of the vessel as a pose whose attitude is not meant."""
+        position, covariance = self._local(fix)
+        whole = np.zeros((6, 6))
+        if covariance is not None:
+            whole[:3, :3] = covariance
+        return VesselPose(
+            stamp_ns=fix.stamp_ns,
+            position=position,
+            orientation=_LEVEL,
+            pose_covariance=whole,
+            frame_id=self.config.map_frame,
+        )
+
+    # -- relative to the vessel ------------------------------------------------------------------
+
+    def _vessel_known(self) -> bool:
+        places, headings = self._places.buffer.stamps, self._headings.buffer.stamps
+        return bool(self._poses.buffer.stamps or (places and headings))
+
+    def _by_places(self) -> bool:
+        """Whether the vessel is known by latitude and longitude, because there is no nav."""
+        return self.config.vessel == 'moving' and not self._poses.buffer.stamps
+
+    def _after(self, samples: _Samples, pose: Navigation) -> list[Measurement]:
+        """Take what an instrument says of the vessel; gives what is ready after it."""
+        if samples.add(pose, self._counts):
+            self._counts['vessel_pose_gap'] += len(self._waiting)
+            self._waiting = []
+        return self._ready()
+
+    def _ready(self) -> list[Measurement]:
+        done: list[Measurement] = []
+        waiting = []
+        for fix in self._waiting:
+            known = self._readiness(fix.stamp_ns)
+            if known == 'wait':
+                waiting.append(fix)
+            elif known == 'gap':
+                self._counts['vessel_pose_gap'] += 1
+            elif self._on_earth() if self._by_places() else self._in_metres():
+                try:
+                    done.append(self._composed(fix, self._vessel(fix.stamp_ns)))
+                except Rejection:  # poses that leap within nanoseconds lead beyond the Earth
+                    self._counts['vessel_pose_gap'] += 1
+        self._waiting = waiting
+        return sorted(done, key=attrgetter('stamp_ns'))
+
+    def _readiness(self, stamp_ns: int) -> Readiness:
+        """Whether the pose of the vessel at a stamp is known, will be, or never will be."""
+        if self.config.vessel == 'fixed':
+            return 'ready'
+        limits = (
+            nanoseconds(self.config.vessel_max_gap),
+            nanoseconds(self.config.vessel_max_extrapolation),
+        )
+        parts = (self._places, self._headings) if self._by_places() else (self._poses,)
+        known = [part.buffer.readiness(stamp_ns, stamp_ns, *limits) for part in parts]
+        return 'wait' if 'wait' in known else 'gap' if 'gap' in known else 'ready'
+
+    def _vessel(self, stamp_ns: int) -> _Vessel:
+        config = self.config
+        if config.vessel == 'fixed':
+            level, nothing = Pose(np.zeros(3), np.eye(3)), np.zeros((3, 3))
+            return _Vessel(level, Uncertainty(nothing, nothing), config.map_frame)
+        attitude, heading = np.radians(
+            [config.vessel_attitude_std_deg, config.vessel_heading_std_deg]
+        )
+        assumed = Uncertainty(
+            np.eye(3) * config.vessel_position_std**2,
+            np.diag([attitude**2, attitude**2, heading**2]),
+        )
+        places = self._by_places()
+        where = self._places if places else self._poses
+        lies = self._headings if places else self._poses
+        pose = Pose(where.buffer.pose(stamp_ns).position, lies.buffer.pose(stamp_ns).R)
+        near = where.nearest(stamp_ns)
+        stated = Uncertainty(
+            _stated(near, slice(0, 3), assumed.position),
+            _stated(lies.nearest(stamp_ns), slice(3, 6), assumed.attitude),
+        )
+        return _Vessel(pose, stated, near.frame_id)
+
+    def _composed(self, fix: RelativeFix, vessel: _Vessel) -> Fix:
+        config = self.config
+        mounting = Mounting(
+            np.array(config.transceiver_lever),
+            geometry.rotation(*np.radians(config.transceiver_mount_rpy_deg)),
+            config.transceiver_lever_std,
+        )
+        placed = place(
+            vessel.pose,
+            vessel.uncertainty,
+            mounting,
+            fix.offset,
+            fix.covariance,
+            range_std=config.relative_range_std,
+            angle_std=float(np.radians(config.relative_angle_std_deg)),
+            levelled=fix.levelled,
+        )
+        return Fix(
+            stamp_ns=fix.stamp_ns,
+            position=placed.position,
+            covariance=placed.covariance[:2, :2],
+            target_id=fix.target_id,
+            sensor=fix.sensor,
+            frame_id=vessel.frame_id,
+        )
+
+
+def _turned(heading: VesselHeading) -> VesselPose:
+    """An attitude of the vessel as a pose whose position is not meant."""
+    whole = np.zeros((6, 6))
+    if heading.covariance is not None:
+        whole[3:, 3:] = heading.covariance
+    return VesselPose(
+        stamp_ns=heading.stamp_ns,
+        position=np.zeros(3),
+        orientation=heading.orientation,
+        pose_covariance=whole,
+    )
+
+
+def _stated(sample: Navigation, part: slice, assumed: FloatArray) -> FloatArray:
+    """The part (3, 3) of a pose's covariance, where it is filled in, else what is assumed."""
+    if sample.pose_covariance is None:
+        return assumed
+    block = sample.pose_covariance[part, part]
+    return np.asarray(block if block.any() else assumed)

@@ -1,0 +1,183 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Joint integrated probabilistic data association of a group of fixes: every pairing is weighed
+(`estimation.jipda`).
+
+What the hits and misses of `estimation.association.Tracks` are to a hard choice, the probability
+of existence is here: it says when a track is confirmed, published and ended.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...estimation import jipda as joint_association
+from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from ...estimation.association import COASTING, CONFIRMED, gate_threshold, TENTATIVE
+from ...measurements import NOBODY
+from .config import DiverConfig
+from .scan import Positions
+from .state import DiverState
+
+CONFIRMS = 0.9
+"""Existence above which a track may be confirmed."""
+
+EVIDENCE = 2.5
+"""Sum of the probabilities of its detections that a confirmed track has seen."""
+
+PUBLISHES = 0.5
+"""Existence above which a track is published."""
+
+ENDS = 0.002
+"""Existence below which a track ends."""
+
+NEAR_TENTATIVE, SCANS_TENTATIVE = 4.0, 2
+"""A tentative track ends when it is nearer than this (Mahalanobis distance squared) to an older
+one in so many scans in a row."""
+
+NEAR_CONFIRMED, SCANS_CONFIRMED = 0.3, 8
+"""The same of a confirmed track and an older confirmed one: two tracks on one diver."""
+
+
+StatusArray = NDArray[np.uint8]
+
+
+class JointWeights(NamedTuple):
+    """Which fixes belong to which tracks, by probability: beta (T, D) of each pair; missed (T,)
+    that a track has no fix; detected (T,) that it has one; existence (T,) now that this is
+    known; excluded (T,): tracks that take no part."""
+
+    beta: FloatArray
+    missed: FloatArray
+    detected: FloatArray
+    existence: FloatArray
+    excluded: BoolArray
+
+    def likeliest(self) -> tuple[IndexArray, IntArray]:
+        """The tracks (t,) for which a hit is likelier than a miss, and the likeliest fix (t,) of
+        each."""
+        hit = np.flatnonzero(self.detected > 0.5 * self.existence)
+        return hit, self.beta[hit].argmax(axis=1) if len(hit) else hit
+
+
+def joint_weights(
+    now: DiverState, fixes: Positions, h: FloatArray, H: FloatArray, excluded: BoolArray
+) -> JointWeights:
+    """Weigh all pairings of tracks and `fixes`; h (T, M, 2) expected by H (1, M, 2, n)."""
+    config = fixes.config
+    threshold = gate_threshold(config.gate_probability, 2)
+    mixture, nis = joint_association.likelihoods(h, H, now.P, now.mu, fixes.z, fixes.R, threshold)
+    nis[excluded] = np.inf
+    seen = ~excluded & (fixes.whole | (nis <= threshold).any(axis=1))
+    beta, missed, existence = joint_association.associate(
+        mixture / (config.clutter_density + config.birth_density),
+        nis,
+        known_existence(now.existence, now.life.status),
+        np.where(seen, config.detection_probability, 0.0),
+        threshold,
+    )
+    return JointWeights(beta, missed, beta.sum(axis=1), existence, excluded)
+
+
+def update_jointly(
+    now: DiverState,
+    fixes: Positions,
+    weights: JointWeights,
+    hit: IndexArray,
+    h: FloatArray,
+    H: FloatArray,
+    considered: BoolArray,
+) -> DiverState:
+    """Update the tracks by all fixes they may have caused; hit (t,): those whose whitened
+    innovation is new; considered (n,): what an update does not move."""
+    nis, nis_dof = now.nis.copy(), now.nis_dof.copy()
+    nis[hit] += np.square(now.white[hit]).sum(axis=1)
+    nis_dof[hit] += np.uint16(2)
+    x, P, mu, repairs = joint_association.update(
+        now.x, now.P, now.mu, h, H, fixes.z, fixes.R, weights.beta, weights.missed, considered
+    )
+    # The life of a named track hangs on its own fixes.
+    named = now.target_id != NOBODY
+    return now._replace(
+        x=x,
+        P=P,
+        mu=mu,
+        nis=nis,
+        nis_dof=nis_dof,
+        repairs=now.repairs + repairs,
+        existence=np.where(named, now.existence, weights.existence),
+        evidence=now.evidence + weights.detected,
+        score=np.where(weights.excluded, now.score, joint_association.log_odds(weights.existence)),
+    )
+
+
+def known_existence(existence: FloatArray, status: StatusArray) -> FloatArray:
+    """Existence (T,), where it is not known (a track that began otherwise) by the status."""
+    guess = np.where(status == TENTATIVE, 0.5, CONFIRMS)
+    return np.where(np.isnan(existence), guess, existence)
+
+
+def birth_existence(config: DiverConfig, claimed: FloatArray) -> FloatArray:
+    """Existence (D,) of tracks that begin at fixes which belong, with the probability `claimed`
+    (D,), to others."""
+    new = config.birth_density / (config.birth_density + config.clutter_density)
+    return np.asarray(new * (1.0 - claimed))
+
+
+class Judged(NamedTuple):
+    """What becomes of tracks (T,) that live by their existence: status; alive; near_to and
+    near_for as in `DiverState`."""
+
+    status: StatusArray
+    alive: BoolArray
+    near_to: IntArray
+    near_for: IntArray
+
+
+def judge(now: DiverState, hit: BoolArray, looked: BoolArray, E: FloatArray) -> Judged:
+    """Judge tracks by their existence and by how near they are to older ones.
+
+    hit (T,): a detection is more probable than a miss; looked (T,): whether one would have been
+    seen; E (M, 2, n): to the position.
+    """
+    was = now.life.status != TENTATIVE
+    confirmed = was | (now.existence > CONFIRMS) & (now.evidence >= EVIDENCE)
+    alive = ~(now.existence < ENDS)
+    seen = np.where(looked, COASTING, now.life.status)
+    seen = np.where(hit | (seen == TENTATIVE), CONFIRMED, seen)
+    status = np.where(confirmed, seen, TENTATIVE).astype(np.uint8)
+    if not looked.any():
+        return Judged(status, alive, now.near_to, now.near_for)
+    near_to, near_for = coalescence(now, was, *now.positions(E))
+    patience = np.where(was, SCANS_CONFIRMED, SCANS_TENTATIVE)
+    return Judged(status, alive & (near_for < patience), near_to, near_for)
+
+
+def coalescence(
+    now: DiverState, confirmed: BoolArray, mean: FloatArray, covariance: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """The older track that each one is near (T,), 0 for none, and for how many scans (T,).
+
+    mean (T, 2) and covariance (T, 2, 2) of the positions. Named tracks take no part.
+    """
+    ids, free = now.life.track_id.astype(np.int64), now.target_id == NOBODY
+    partner, distance = joint_association.nearest_older(mean, covariance, ids, free, confirmed)
+    near = distance < np.where(confirmed, NEAR_CONFIRMED, NEAR_TENTATIVE)
+    near_to = np.where(near, ids[partner], 0)
+    near_for = np.where(near, np.where(near_to == now.near_to, now.near_for, 0) + 1, 0)
+    return near_to, near_for

@@ -1,0 +1,344 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the state of a diver holds: the motion of all models, and the constants behind it.
+
+*Motion* (`ModelSet`): M models over a common state, and how a track begins in them. Any set may be
+given two things besides: depth, and the lasting error of fixes.
+
+Depth is z up and its rate, which fades like that of a diver who goes up and down. One filter with
+the whole water column as its prior locks onto a wrong depth, because the path of an echo bends
+with z squared and the error is common to all pings. So there are copies of the models, each of
+which begins in its part of the column; they do not switch, and what they say of the arrivals
+weighs them. Where the arrivals say nothing about z the copies stay as likely as they were, and
+their spread is in the published covariance.
+
+*Constants* (`Instruments`, `Layout`): each receiver may lie off its stated place and have a late
+clock; the sound speed may be wrong for all. These constants stand behind the states of motion of
+every model and track, and the receivers that have been heard so far decide how many there are. New
+ones come in with their prior, uncorrelated with all that is known.
+
+How a constant is treated is described in `estimation.consider`. What is considered is one
+constant for all models and tracks. What is estimated is a copy in each model and track, mixed like
+any state: one posterior shared by tracks would need their joint covariance, and the posterior of
+one track as the prior of another would count its data twice.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import NamedTuple
+
+from attrs import evolve, field, frozen
+import numpy as np
+
+from ...acoustics.arrivals_3d import CLOCK, EMISSION, OFFSET, SOUND_SPEED_ERROR, X, Y, Z
+from ...estimation import markov
+from ...estimation.adaptation import Chain
+from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.gauss_markov import gauss_markov
+from ...measurements import Arrivals
+from .config import DiverConfig
+
+OUTPUTS = ('px', 'py', 'vx', 'vy')
+_CACHED_STEPS = 64
+
+DEPTH_COPIES = 3
+"""Copies of the models, each of which begins in its part of the water column."""
+
+COPY_SPREAD = 1.3
+"""Variance in z with which a copy begins, in variances of its part: the parts overlap."""
+
+AT_TRANSMITTER = 0.01
+"""Horizontal distance in metres within which a receiver is at the transmitter: the frame hangs on
+that place, so that it has no error of position there."""
+
+
+class Motion(NamedTuple):
+    """One step of all models: x <- F x + B + N(0, Q). F, Q (M, n, n), B (M, n)."""
+
+    F: FloatArray
+    Q: FloatArray
+    B: FloatArray
+
+
+@frozen(eq=False)
+class ModelSet:
+    """M models over a common state of n components, x and y first.
+
+    names: of the models; E: (M, q, n) outputs; chain: the law of switching; start: state
+    components after the position for a new track, mean and variance, (n - 2,) each; initial: (M,)
+    model probabilities of a new track. What `with_depth` and `with_fix_bias` add: outputs, names
+    of the q outputs; height and bias, places of z and of the bias of fixes in the state, -1 for
+    none; heights (K,): where K copies of the models begin in z, which do not switch between each
+    other.
+    """
+
+    names: tuple[str, ...]
+    E: FloatArray
+    chain: Chain
+    start_mean: FloatArray
+    start_variance: FloatArray
+    initial: FloatArray
+    _motion: Callable[[float], Motion]
+    outputs: tuple[str, ...] = OUTPUTS
+    height: int = -1
+    bias: int = -1
+    heights: tuple[float, ...] = (0.0,)
+    _cache: OrderedDict[float, Motion] = field(factory=OrderedDict, init=False)
+
+    @property
+    def n(self) -> int:
+        return int(self.E.shape[2])
+
+    @property
+    def copies(self) -> int:
+        return len(self.heights)
+
+    def by_model(self, mu: FloatArray) -> FloatArray:
+        """Model probabilities (T, M) of mu (T, K M), whatever the copy."""
+        if self.copies == 1:
+            return mu
+        return np.asarray(mu.reshape(len(mu), self.copies, len(self.names)).sum(axis=1))
+
+    @property
+    def fix(self) -> FloatArray:
+        """(M, 2, n): what a fix measures of the state."""
+        if self.bias < 0:
+            return self.E[:, :2]
+        H = self.E[:, :2].copy()
+        H[:, :, self.bias : self.bias + 2] += np.eye(2)
+        return H
+
+    def motion(self, dt: float) -> Motion:
+        """The models over a step of dt seconds, dt >= 0."""
+        found = self._cache.get(dt)
+        if found is None:
+            found = self._cache[dt] = Motion(*map(np.ascontiguousarray, self._motion(dt)))
+            if len(self._cache) > _CACHED_STEPS:
+                self._cache.popitem(last=False)
+        return found
+
+    def new_tracks(
+        self, position: FloatArray, covariance: FloatArray, from_fix: bool = True
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """x (k, K M, n), P (k, K M, n, n), mu (k, K M) of tracks first seen at `position` (k, 2)
+        with `covariance` (k, 2, 2)."""
+        M, n, K = len(self.names), self.n, self.copies
+        shape = len(position), K * M
+        x, P = np.empty((*shape, n)), np.zeros((*shape, n, n))
+        x[..., :2], x[..., 2:] = position[:, None], self.start_mean
+        P[..., :2, :2] = covariance[:, None]
+        P[..., range(2, n), range(2, n)] = self.start_variance
+        if self.height >= 0:
+            x[..., self.height] = np.repeat(self.heights, M)
+        if self.bias >= 0 and from_fix:
+            # A fix is position and bias: as much as one is larger the other is smaller.
+            shared = np.diag(self.start_variance[self.bias - 2 : self.bias])
+            there = slice(self.bias, self.bias + 2)
+            P[..., :2, :2] += shared
+            P[..., :2, there] = P[..., there, :2] = -shared
+        mu = np.empty(shape)
+        mu[:] = np.tile(self.initial / K, K) if K > 1 else self.initial
+        return x, P, mu
+
+
+def headings(config: DiverConfig) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Unit vectors along u (M, 2) and to the left of w (M, 2) each heading, and their names."""
+    angle = 2.0 * np.pi * np.arange(config.directions) / config.directions
+    u = np.column_stack([np.cos(angle), np.sin(angle)])
+    w = np.column_stack([-np.sin(angle), np.cos(angle)])
+    return (
+        u,
+        w,
+        tuple(f'heading_{360 * j // config.directions:03d}' for j in range(config.directions)),
+    )
+
+
+def rate_chain(config: DiverConfig, matrix: FloatArray) -> markov.RateChain:
+    """The chain of `matrix` (M, M), or of the one that the parameters state."""
+    if config.transition_matrix:
+        matrix = np.reshape(config.transition_matrix, matrix.shape)
+    return markov.RateChain(matrix, config.reference_step)
+
+
+def initial_probabilities(config: DiverConfig, models: int) -> FloatArray:
+    """(M,) of a new track."""
+    if config.initial_probabilities:
+        return np.array(config.initial_probabilities)
+    return np.full(models, 1.0 / models)
+
+
+def heights_of(config: DiverConfig) -> tuple[float, ...]:
+    """z at which the copies of the models begin: the middles of equal parts of the water column,
+    or where the diver is assumed to be."""
+    if config.dimensions == 2:
+        return (config.target_z,)
+    copies = DEPTH_COPIES if config.depth_max > config.depth_min else 1
+    width = (config.depth_max - config.depth_min) / copies
+    return tuple(-config.depth_min - (k + 0.5) * width for k in range(copies))
+
+
+def with_depth(base: ModelSet, config: DiverConfig) -> ModelSet:
+    """`base` with the height z and its rate w, z' = z + tau (1 - a) w, w' = a w + q, in copies
+    over the water column."""
+    M, n, heights = len(base.names), base.n, heights_of(config)
+    copies = len(heights)
+    width = (config.depth_max - config.depth_min) / copies
+    E = np.zeros((M, 6, n + 2))
+    E[:, :2, :n], E[:, 3:5, :n] = base.E[:, :2], base.E[:, 2:]
+    E[:, 2, n] = E[:, 5, n + 1] = 1.0
+    rate = config.vertical_speed_std**2
+
+    def motion(dt: float) -> Motion:
+        fade, added = gauss_markov(config.vertical_speed_std, config.vertical_speed_time, dt)
+        way = config.vertical_speed_time * (1.0 - fade)
+        return _joined(base.motion(dt), np.array([[1.0, way], [0.0, fade]]), np.diag([0.0, added]))
+
+    return evolve(
+        base,
+        E=np.tile(E, (copies, 1, 1)),
+        start_mean=np.append(base.start_mean, [heights[0], 0.0]),
+        start_variance=np.append(
+            base.start_variance, [max(COPY_SPREAD * width**2 / 12.0, 1e-4), rate]
+        ),
+        motion=motion,
+        outputs=('px', 'py', 'pz', 'vx', 'vy', 'vz'),
+        height=n,
+        heights=heights,
+    )
+
+
+def with_fix_bias(base: ModelSet, config: DiverConfig) -> ModelSet:
+    """`base` with an error of the fixes that lasts, one Gauss-Markov process an axis."""
+    n, std = base.n, config.fix_bias_std
+    E = np.concatenate([base.E, np.zeros((*base.E.shape[:2], 2))], axis=2)
+
+    def motion(dt: float) -> Motion:
+        fade, added = gauss_markov(std, config.fix_bias_time, dt)
+        return _joined(base.motion(dt), fade * np.eye(2), added * np.eye(2))
+
+    return evolve(
+        base,
+        E=E,
+        start_mean=np.append(base.start_mean, [0.0, 0.0]),
+        start_variance=np.append(base.start_variance, [std**2, std**2]),
+        motion=motion,
+        bias=n,
+    )
+
+
+def _joined(base: Motion, F: FloatArray, Q: FloatArray) -> Motion:
+    """The motion of more states beside those of `base`, on which nothing of it depends."""
+    M, n = base.B.shape
+    m = len(F)
+    both = Motion(np.zeros((M, n + m, n + m)), np.zeros((M, n + m, n + m)), np.zeros((M, n + m)))
+    both.F[:, :n, :n], both.Q[:, :n, :n], both.B[:, :n] = base
+    both.F[:, n:, n:], both.Q[:, n:, n:] = F, Q
+    return both
+
+
+@frozen
+class Instruments:
+    """Receivers heard so far, in the order in which their errors stand in the state.
+
+    known: (receiver id, has an offset) each.
+    """
+
+    known: tuple[tuple[int, bool], ...] = ()
+
+    def with_receivers(self, ping: Arrivals, config: DiverConfig) -> Instruments:
+        """With the receivers of a ping; the same where nothing is to be known of them."""
+        if not (config.receiver_position_std or config.receiver_clock_std):
+            return self
+        ids = {receiver for receiver, _ in self.known}
+        new = []
+        for receiver in np.unique(ping.rx_id).tolist():
+            if receiver not in ids:
+                row = int(np.flatnonzero(ping.rx_id == receiver)[0])
+                apart = np.hypot(*(ping.rx[row] - ping.tx[row])[:2])
+                new.append((receiver, not apart <= AT_TRANSMITTER))
+        return Instruments((*self.known, *new)) if new else self
+
+    def layout(self, config: DiverConfig, models: ModelSet) -> Layout:
+        """Where the errors stand behind the states of motion of `models`."""
+        n = models.n
+        variances: list[float] = []
+        estimated: list[bool] = []
+        errors = config.systematic_errors
+        sound = -1
+        if config.sound_speed_std:
+            sound = n
+            variances.append((config.sound_speed_std / config.sound_speed) ** 2)
+            estimated.append(errors != 'consider')
+        offsets, clocks = {}, {}
+        for receiver, apart in self.known:
+            if config.receiver_position_std and apart:
+                offsets[receiver] = n + len(variances)
+                variances += [config.receiver_position_std**2] * 2
+                estimated += [errors == 'estimate'] * 2
+            if config.receiver_clock_std:
+                clocks[receiver] = n + len(variances)
+                variances.append((config.receiver_clock_std * config.sound_speed) ** 2)
+                estimated.append(errors != 'consider')
+        H = np.zeros((1, len(models.E), 2, n + len(variances)))
+        H[0, :, :, :n] = models.fix
+        mask = np.array([True] * n + estimated)
+        return Layout(n, np.array(variances), mask, H, sound, offsets, clocks)
+
+
+@frozen(eq=False)
+class Layout:
+    """n states of motion, then q constants with prior `variances` (q,).
+
+    mask (n + q,): True for what an update may move, False for what is only considered; H
+    (1, M, 2, n + q): what a fix measures of the whole state; sound, offsets, clocks: places in the
+    whole state, -1 or absent for none.
+    """
+
+    n: int
+    variances: FloatArray
+    mask: BoolArray
+    H: FloatArray
+    sound: int
+    offsets: dict[int, int]
+    clocks: dict[int, int]
+
+    @property
+    def size(self) -> int:
+        return self.n + len(self.variances)
+
+    def columns(self, models: ModelSet, receivers: np.ndarray, passive: bool) -> IntArray:
+        """(C, 7) for `acoustics.arrivals_3d.observe`; of a tag the emission stands last."""
+        out = np.full((len(receivers), 7), -1)
+        out[:, X], out[:, Y], out[:, Z] = 0, 1, models.height
+        out[:, SOUND_SPEED_ERROR] = self.sound
+        out[:, OFFSET] = [self.offsets.get(receiver, -1) for receiver in receivers.tolist()]
+        out[:, CLOCK] = [self.clocks.get(receiver, -1) for receiver in receivers.tolist()]
+        if passive:
+            out[:, EMISSION] = self.size
+        return out
+
+    def widened(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States (..., m) and covariances (..., m, m), m <= n + q, with the constants that are new
+        at their prior."""
+        m, size = x.shape[-1], self.size
+        if m == size:
+            return x, P
+        wide, covariance = np.zeros((*x.shape[:-1], size)), np.zeros((*x.shape[:-1], size, size))
+        wide[..., :m], covariance[..., :m, :m] = x, P
+        new = range(m, size)
+        covariance[..., new, new] = self.variances[m - self.n :]
+        return wide, covariance

@@ -1,0 +1,287 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The options of each kind of conversion: one attrs class for each, with the help page of
+``sonar-imm convert KIND``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from attrs import frozen, NOTHING
+
+from .csv_table import CsvOptions
+from .options import group, nanoseconds, option
+
+
+def _origin(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(','))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (2, 3):
+        raise ValueError(f"'{text}' is not of the form LAT,LON or LAT,LON,HEIGHT")
+    return numbers
+
+
+def _sensor_offsets(text: str) -> int | dict[str, int]:
+    """``-1.5`` for all sensors, or ``radar=-1.5,lidar=0.1``."""
+    if '=' not in text:
+        return nanoseconds(text)
+    pairs = dict(part.partition('=')[::2] for part in text.split(','))
+    return {name.strip(): nanoseconds(seconds) for name, seconds in pairs.items()}
+
+
+def _staves(text: str) -> list[list[int]]:
+    try:
+        return [[int(channel) for channel in stave.split('+')] for stave in text.split(',')]
+    except ValueError:
+        raise ValueError(f"'{text}' is not of the form 0+3,1+2") from None
+
+
+def _storage() -> Any:
+    return option('mcap', '', 'Storage of the bag.', choices=('mcap', 'sqlite3'))
+
+
+def _map_frame() -> Any:
+    return option('map', '', 'Frame of the positions, east-north-up.')
+
+
+def _origin_option() -> Any:
+    help = 'Origin of local metres; by default the first good row.'
+    return option(None, 'LAT,LON[,HEIGHT]', help, parse=_origin)
+
+
+def _truth_file() -> Any:
+    return option(None, '', 'CSV of true positions for the same bag.', kind='file')
+
+
+# fmt: off
+@frozen(kw_only=True)
+class FixesOptions:
+    """CSV of position fixes to /fix, or to /fixes where a column says whose they are.
+
+    Columns: stamp, or date and time of day, x and y [m] or latitude and longitude [deg]; optional
+    var_x, cov_xy, var_y [m^2] or std_x, std_y or std [m], id and valid. Usual names are
+    recognised; which columns were taken, and which not, is said. Times may count from 0; one that
+    is written without a zone needs --time-zone. Rows flagged as invalid are left out and counted;
+    repeated polls are counted, and left out by `track`.
+    """
+
+    EXAMPLES: ClassVar = (
+        'fixes.csv dive.bag --truth gps.csv',
+        'usbl.csv dive.bag --column x=easting --column y=northing',
+    )
+    options: CsvOptions = group(CsvOptions)
+    truth: Path | str | None = _truth_file()
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class ArrivalsOptions:
+    """CSV of arrival times to /arrivals, one message per ping.
+
+    Columns: receiver and arrival (or toa and transmitter); ping says which rows belong together.
+    """
+
+    EXAMPLES: ClassVar = ('arrivals.csv dive.bag --receivers hydrophones.csv',)
+    receivers: Path | str = option(NOTHING, '', 'CSV of receiver positions.', kind='file')
+    transmitters: Path | str | None = option(None, '',
+        'CSV of transmitter positions.', kind='file')
+    toa_std: float | None = option(None, 'SECONDS',
+        'Standard deviation of arrival times, for rows that state none.', kind='float', above=0.0)
+    options: CsvOptions = group(CsvOptions)
+    receiver_options: CsvOptions = group(CsvOptions, 'receiver', 'the position files')
+    truth: Path | str | None = _truth_file()
+    truth_options: CsvOptions = group(CsvOptions, 'truth', 'the truth')
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class TruthOptions:
+    """CSV of true positions to /truth/estimate, for `evaluate --truth`."""
+
+    EXAMPLES: ClassVar = ('gps.csv truth.bag',)
+    options: CsvOptions = group(CsvOptions)
+    frame_id: str = _map_frame()
+    origin: tuple[float, ...] | None = _origin_option()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class AutoferryOptions:
+    """Detections of the Autoferry data set (JSON) to /fixes: boats in clutter."""
+
+    EXAMPLES: ClassVar = (
+        'scenario13.json boats.bag --truth scenario13_groundTruth.json --sensor radar --std 5',
+    )
+    truth: Path | str | None = option(None, '', 'Ground truth of the scenario, JSON.', kind='file')
+    sensors: Sequence[str] = option(('radar',), '',
+        'radar or lidar; may be given twice.', flag='sensor', many=True)
+    std: float | None = option(None, 'METRES',
+        'Standard deviation to state on each axis.', kind='float', above=0.0)
+    time_offset_ns: int | Mapping[str, int] = option(0, 'SECONDS',
+        'Added to the stamps of the detections, of all sensors or as radar=-1.5,lidar=0.1.',
+        flag='time-offset', parse=_sensor_offsets)
+    frame_id: str = _map_frame()
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class SnapshotsOptions:
+    """Array snapshots in a numpy archive (npz) to /snapshot.
+
+    Arrays: iq, complex, (bins, staves) or (pings, bins, staves), and range [m] or time [s];
+    optional sound_speed, frequency, element_spacing or spacing_wavelengths, stamp, noise_variance,
+    signal_variance. Usual names are recognised.
+    """
+
+    EXAMPLES: ClassVar = (
+        'pings.npz survey.bag --name iq=data', 'ping.npz ping.bag --staves 0+3,1+2',
+    )
+    names: Mapping[str, str] = option({}, 'WHAT=ARRAY',
+        'Name of an array in this archive, e.g. iq=data.', flag='name', kind='pairs')
+    staves: Sequence[Sequence[int]] | None = option(None, 'CHANNELS',
+        'Channels, from 0, of each stave; those joined by + are summed.', parse=_staves)
+    ping_rate: float = option(10.0, '',
+        'Pings per second, when there are no stamps.', kind='float', range=(0.001, 1000.0))
+    frame_id: str = option('sonar', '', 'Frame of the array.')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class ImagesOptions:
+    """Bag with images of a forward-looking sonar to /detections, for the obstacle tracker.
+
+    Takes marine_acoustic_msgs ProjectedSonarImage and RawSonarImage, pings of the Oculus, echoes
+    of the Ping360, SonoptixECHO and sensor_msgs/Image. Navigation and altitudes are copied. --set
+    changes the detector, whose parameters docs/parameters/fls_detector.md lists; those beside the
+    recording, in its parameters.yaml, are used.
+    """
+
+    EXAMPLES: ClassVar = ('survey.bag detections.bag --set image_order=beam_major',)
+    topic: str | None = option(None, '', 'Topic of the images, where several could be.')
+    parameters: Mapping[str, Any] = option({}, 'NAME=VALUE',
+        'Change one parameter; may be given several times.', flag='set', kind='pairs')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class InterferometerOptions:
+    """Bag with images of amplitude and phase, or of each stave, to /snapshot.
+
+    Takes RawSonarImage of marine_acoustic_msgs and messages like it: their fields are found by
+    name. --field names others: amplitude, phase, iq, sample_rate, sample0, frequency, sound_speed.
+    Navigation and altitudes are copied.
+    """
+
+    EXAMPLES: ClassVar = (
+        'survey.bag swath.bag --amplitude /sss/amplitude --phase /sss/phase --element-spacing '
+        '0.012',
+        'survey.bag swath.bag --iq /stave_0 --iq /stave_1',
+    )
+    amplitude: str = option('', 'TOPIC', 'Topic with the amplitudes.')
+    phase: str = option('', 'TOPIC',
+        'Topic with the phases, of stave 1 against stave 0, or one of each stave.')
+    iq: Sequence[str] = option((), 'TOPIC',
+        'Topic with the complex samples of a stave, the uppermost first; once for each.',
+        many=True)
+    fields: Mapping[str, str] = option({}, 'WHAT=PATH',
+        'Where something stands in the messages, e.g. phase=sidescan.phase.', flag='field',
+        kind='pairs')
+    side: str = option('', '', 'Of the array.', choices=('port', 'starboard'))
+    radians_per_count: float | None = option(None, 'RAD',
+        'Radians of one count of the phase; by default 1 for floats, and for whole numbers the '
+        'full circle over their range.', flag='phase-scale', kind='float')
+    element_spacing: float | None = option(None, 'METRES',
+        'Distance between staves, to be stated in the snapshots.', kind='float',
+        range=(1e-5, 10.0))
+    sound_speed: float = option(1500.0, '',
+        'Speed of sound in m/s, where a message states none.', kind='float',
+        range=(1300.0, 1700.0))
+    order: str = option('range_major', '',
+        'Order of the samples in an image with several channels.',
+        choices=('range_major', 'beam_major'))
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class SegyOptions:
+    """Traces of a sub-bottom profiler in SEG-Y to /trace. Needs segyio.
+
+    Stamps come from the trace headers; traces within one second are spread over it.
+    """
+
+    EXAMPLES: ClassVar = (
+        'line.seg line.bag', 'line.seg line.bag --sample-spacing 0.376 --first-sample 12',
+    )
+    sample_spacing: float | None = option(None, 'METRES',
+        'Depth from sample to sample; by default from the sample interval.', kind='float',
+        above=0.0)
+    sound_speed: float = option(1500.0, '',
+        'Speed of sound in m/s, for the sample interval and the recording delay.', kind='float',
+        range=(1300.0, 1700.0))
+    first_sample: int = option(0, '',
+        'Leave out samples before it, e.g. the transmit pulse.', kind='int', range=(0, None))
+    samples: int | None = option(None, '',
+        'How many samples to take; all by default.', kind='int', range=(2, None))
+    stack: int = option(1, '',
+        'Number of successive traces averaged into one.', kind='int', range=(1, None))
+    depth_offset: float = option(0.0, 'METRES',
+        'Depth of the transducer.', flag='depth', kind='float')
+    frame_id: str = option('profiler', '', 'Frame of the traces.')
+    storage: str = _storage()
+
+
+@frozen(kw_only=True)
+class TracesOptions:
+    """Traces in a numpy archive (npz) or CSV to /trace.
+
+    Archive: depth (n,), amplitude (n,) or (traces, n); optional stamp, sigma, reference_depth, and
+    as truth reflector_depth and reflector_amplitude (traces, K). CSV: stamp, depth, amplitude and
+    optional std, one row per sample.
+    """
+
+    EXAMPLES: ClassVar = (
+        'responses.npz drift.bag --rate 0.0112', 'traces.csv line.bag --column depth=z',
+    )
+    options: CsvOptions = group(CsvOptions)
+    rate: float = option(1.0, '',
+        'Traces per second, when an archive has no stamps.', kind='float', range=(1e-6, 1e6))
+    frame_id: str = option('array', '', 'Frame of the traces.')
+    storage: str = _storage()
+# fmt: on
+
+
+OPTIONS: dict[str, type] = {
+    'fixes': FixesOptions,
+    'arrivals': ArrivalsOptions,
+    'truth': TruthOptions,
+    'autoferry': AutoferryOptions,
+    'snapshots': SnapshotsOptions,
+    'images': ImagesOptions,
+    'interferometer': InterferometerOptions,
+    'segy': SegyOptions,
+    'traces': TracesOptions,
+}
+"""The options by the kind of conversion."""
+FROM_BAGS = ('images', 'interferometer')
+"""The kinds that read a bag; the others read a file."""

@@ -1,0 +1,38 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The measurements measure what they say."""
+
+import pytest
+
+from benchmarks.speed import obstacle as bench
+
+
+def test_all_obstacles_are_tracked_and_every_ping_is_timed():
+    result = bench.bench_ping(rounds=1, pings=16, obstacles=10)
+    assert result['tracked'] == 10 and result['pings'] == 6
+    assert 0.0 < result['median_ms'] <= result['p99_ms']
+
+
+@pytest.mark.parametrize('name', bench.VARIANTS)
+def test_each_variant_tracks_the_obstacles_too(name):
+    clutter, parameters = bench.VARIANTS[name]
+    result = bench.bench_ping(rounds=1, pings=16, obstacles=10, clutter=clutter, **parameters)
+    assert result['tracked'] >= 10 and result['median_ms'] > 0.0
+
+
+def test_the_sentence_names_every_variant():
+    result = bench.bench_variants(rounds=1, pings=12)
+    sentence = bench.BENCHES[1].sentence(result)
+    assert all(name in sentence for name in bench.VARIANTS)

@@ -1,0 +1,127 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The harness of the studies: options from parameters, tables as they come, one file."""
+
+from collections.abc import Sequence
+import json
+import os
+from pathlib import Path
+
+from helpers.source import ROOT
+import numpy as np
+import pytest
+
+from benchmarks import study
+
+
+def numbers(runs: int = 3, cases: Sequence[str] = ('a', 'b'), fast: bool = False) -> study.Parts:
+    yield {'runs': runs, 'fast': fast}
+    for case in cases:
+        yield {'table': {case: {'error': runs / 8.0, 'n': runs}}}
+    yield {'whole': {'x': {'y': 1.0}, 'z': {'y': None}}, 'list': [1.0, 2.0]}
+
+
+def run(monkeypatch, main, *words, **options):
+    monkeypatch.setattr('sys.argv', ['study', *map(str, words)])
+    study.study(main, **options)
+
+
+def test_parts_become_one_file_and_tables(monkeypatch, tmp_path, capsys):
+    file = tmp_path / 'folder' / 'numbers.json'
+    run(monkeypatch, numbers, '--runs', 2, '--cases', 'a', 'c', '--fast', '--out', file)
+    assert json.loads(file.read_text()) == {
+        'runs': 2,
+        'fast': True,
+        'table': {'a': {'error': 0.25, 'n': 2}, 'c': {'error': 0.25, 'n': 2}},
+        'whole': {'x': {'y': 1.0}, 'z': {'y': None}},
+        'list': [1.0, 2.0],
+    }
+    text = capsys.readouterr().out
+    assert text.startswith('a: error 0.250, n 2\nc: error 0.250, n 2\n')
+    # What came row by row is a table at the end, what came whole is not printed again.
+    assert text.count('| error | n |') == 1 and '| c | 0.250 | 2 |' in text
+    assert text.count('whole') == 1 and '| z | - |' in text
+
+
+def test_the_file_holds_what_is_known_when_a_run_is_broken_off(monkeypatch, tmp_path):
+    def broken() -> study.Parts:
+        yield {'table': {'a': {'n': 1}}}
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(monkeypatch, broken, '--out', tmp_path / 'numbers.json')
+    assert study.known(tmp_path / 'numbers.json') == {'table': {'a': {'n': 1}}}
+    assert study.known(tmp_path / 'none') == study.known(None) == {}
+
+
+def test_a_study_may_read_its_own_file(monkeypatch, tmp_path):
+    def again(out: Path | None = None) -> study.Parts:
+        yield (before := study.known(out))
+        yield {'times': before.get('times', 0) + 1}
+
+    for _ in range(2):
+        run(monkeypatch, again, '--out', tmp_path / 'numbers.json')
+    assert study.known(tmp_path / 'numbers.json') == {'times': 2}
+
+
+@pytest.mark.parametrize('words', [['--cases', 'd'], ['--runs', 'many'], ['--none', '1']])
+def test_a_wrong_option_is_refused(monkeypatch, words):
+    with pytest.raises(SystemExit) as ended:
+        run(monkeypatch, numbers, *words, cases={'choices': ['a', 'b']})
+    assert ended.value.code == 2
+
+
+def test_what_is_shown_of_a_row_can_be_chosen(monkeypatch, capsys):
+    def nested() -> study.Parts:
+        yield {'cases': {'a': {'deep': {'error': 1.0}}, 'b': {'deep': {'error': 2.0}}}}
+
+    run(monkeypatch, nested, shown=lambda row: {'error': row['deep']['error']}, digits=1)
+    assert '| b | 2.0 |' in capsys.readouterr().out
+
+
+def test_rows_of_other_columns_have_a_table_of_their_own():
+    text = study.markdown({'a': {'x': 1.0}, 'b': {'x': 2.0}, 'c': {'y': 'z'}}, 1)
+    assert text == '| | x |\n|---|---|\n| a | 1.0 |\n| b | 2.0 |\n\n| | y |\n|---|---|\n| c | z |'
+
+
+def test_lists_of_rows_are_tables_and_grow():
+    content = {'rows': [{'n': 1}]}
+    study.merge(content, {'rows': [{'n': 2}]})
+    assert dict(study.tables(content)) == {'rows': {'1': {'n': 1}, '2': {'n': 2}}}
+
+
+def test_means_and_errors():
+    rows = [{'a': 1.0, 'b': 2.0}, {'a': 3.0, 'b': 2.0}]
+    assert study.mean_of(rows) == {'a': 2.0, 'b': 2.0}
+    assert study.standard_error([1.0]) == 0.0
+    values = np.random.default_rng(0).normal(size=50)
+    assert study.standard_error(values) == pytest.approx(values.std(ddof=1) / np.sqrt(50.0))
+    assert study.rms([3.0, -4.0]) == pytest.approx(np.sqrt(12.5))
+
+
+def test_a_fresh_process_is_another_one_and_its_errors_arrive():
+    assert study.in_fresh_process(os.getpid) != os.getpid()
+    with pytest.raises(ZeroDivisionError):
+        study.in_fresh_process(divmod, 1, 0)
+
+
+@pytest.mark.skipif(not (ROOT / 'docs').is_dir(), reason='reads the source tree')
+def test_every_study_of_the_docs_is_there():
+    sources = json.loads((ROOT / 'docs' / 'results' / 'sources.json').read_text())
+    names = [row['command'].split()[2] for row in sources.values() if 'python' in row['command']]
+    assert names
+    for name in names:
+        text = (ROOT / (name.replace('.', '/') + '.py')).read_text(encoding='utf-8')
+        assert 'study(' in text, f'{name} does not use the harness'

@@ -1,0 +1,227 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verbs of `sonar_imm.estimation.set_filter` in numpy, for the same random numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sonar_imm.estimation.arrays import FloatArray, IntArray
+from sonar_imm.estimation.set_filter import gains, propose_births
+from sonar_imm.estimation.set_kernels import Proposals
+from sonar_imm.estimation.set_model import SetModel, Sets
+from sonar_imm.estimation.set_scatter import fit_scatter, NO_SCATTER, ScatterFit
+from sonar_imm.estimation.set_shifts import shift_tables, ShiftTables
+
+IMPOSSIBLE = -math.inf
+
+
+def background(model: SetModel, b: FloatArray) -> ScatterFit:
+    """The volume scatter of a record."""
+    return fit_scatter(model.scatter, b) if model.scatter else NO_SCATTER
+
+
+def propose(model: SetModel, b: FloatArray) -> Proposals:
+    """the tables for the record b (n,)."""
+    n, radius = model.record_cells, len(model.walk) // 2
+    to = np.arange(n)[:, None] + np.arange(-radius, radius + 1)
+    there = (to >= 0) & (to < n)
+    gained = gains(model, b, background(model, b))
+    K = np.where(there, model.walk, 0.0)
+    signs = len(model.signs)
+    g = np.where(there, gained[:, np.clip(to, 0, n - 1)], -np.inf).reshape(signs * n, -1)
+    K = np.tile(K, (signs, 1))
+    best = g.max(axis=1, keepdims=True)
+    data_driven = K * np.exp(g - best)
+    q = model.walk_share * data_driven / data_driven.sum(axis=1, keepdims=True)
+    q += (1.0 - model.walk_share) * K / K.sum(axis=1, keepdims=True)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        ratio = np.where(q > 0.0, np.log(K / q), IMPOSSIBLE)
+    log_sum = (best[:, 0] + np.log(data_driven.sum(axis=1))).reshape(signs, n)
+    shifts = shift_tables(model.shift, log_sum, model.walk_share)
+    return Proposals(np.cumsum(q, axis=1), ratio, *propose_births(model, gained), shifts)
+
+
+def start(model: SetModel, proposals: Proposals, uniform: FloatArray) -> tuple[Sets, FloatArray]:
+    """sets before the first record, drawn where it will want them, and the log
+    ratio (N,).
+
+    uniform (N, 1 + J), or one more with a shift: the order, one for each member, and the shift.
+    """
+    N = len(uniform)
+    orders = len(model.transition)
+    sets = Sets.empty(model, N)
+    sets.order[:] = model.order_min + np.minimum((uniform[:, 0] * orders).astype(int), orders - 1)
+    log_ratio = np.zeros(N)
+    for i in range(N):
+        m = int(sets.order[i])
+        if model.shift:
+            place = np.searchsorted(proposals.shifts.start, uniform[i, -1], 'right')
+            sets.shift[i] = min(int(place), model.shift.count - 1) * model.shift.step
+        members: list[int] = []
+        sign: dict[int, int] = {}
+        for k in range(m):
+            born = _birth(model, proposals, members, sign, uniform[i, 1 + k], int(sets.shift[i]))
+            log_ratio[i] += born
+        sets.cell[i, : len(members)] = members
+        sets.sign[i, : len(members)] = [sign[z] for z in members]
+        # Births charge 1/n each; possible sets of one size are equally likely in any order.
+        charge = math.log(math.factorial(m) * model.room(m)) - m * math.log(model.cells)
+        log_ratio[i] -= charge
+    return sets, log_ratio
+
+
+def propagate(
+    model: SetModel, proposals: Proposals, sets: Sets, uniform: FloatArray
+) -> tuple[Sets, FloatArray]:
+    """steps 1 to 5 of the model, the new sets and the log ratio (N,) of model to
+    proposal, -inf for impossible sets (whose members mean nothing)."""
+    N, changes = len(uniform), model.most_changes
+    cumulative = np.cumsum(model.transition, axis=1)
+    new = Sets.empty(model, N)
+    log_ratio = np.zeros(N)
+    radius = len(model.walk) // 2
+    for i in range(N):
+        row = cumulative[sets.order[i] - model.order_min]
+        m = model.order_min + min(int(np.searchsorted(row, uniform[i, 0], 'right')), len(row) - 1)
+        members = [(int(z), j) for j, z in enumerate(sets.cell[i, : sets.order[i]])]
+        for k in range(len(members) - m):
+            del members[min(int(uniform[i, 1 + k] * len(members)), len(members) - 1)]
+        offset = model.pad
+        if model.shift:
+            at = np.array([z for z, _ in members], np.int64)
+            below = np.array([int(sets.sign[i, j] < 0) for _, j in members], np.int64)
+            chances, paid = propose_shift(proposals.shifts, int(sets.shift[i]), at, below)
+            running = np.cumsum(chances)
+            place = int(np.searchsorted(running, uniform[i, -1] * running[-1], 'right'))
+            offset, log_ratio[i] = place * model.shift.step, paid[place]
+        new.shift[i] = offset
+        survivors = []
+        for k, (z, j) in enumerate(members):
+            row = z + offset + (sets.sign[i, j] < 0) * model.record_cells
+            table = proposals.walk[row]
+            point = uniform[i, 1 + changes + k] * table[-1]
+            step = min(int(np.searchsorted(table, point, 'right')), 2 * radius)
+            log_ratio[i] += proposals.walk_ratio[row, step]
+            survivors.append((z + step - radius, j))
+        places = sorted(z for z, _ in survivors)
+        sign = {z: int(sets.sign[i, j]) for z, j in survivors}
+        apart = all(b - a >= model.separation for a, b in zip(places, places[1:]))
+        if not apart or (places and not 0 <= places[0] <= places[-1] < model.cells):
+            log_ratio[i] = IMPOSSIBLE
+        for k in range(m - len(survivors)):
+            if log_ratio[i] > IMPOSSIBLE:
+                log_ratio[i] += _birth(model, proposals, places, sign, uniform[i, 1 + k], offset)
+        new.order[i] = m
+        if log_ratio[i] > IMPOSSIBLE:
+            new.cell[i, :m] = places
+            new.sign[i, :m] = [sign[z] for z in places]
+            parents = dict(survivors)
+            for k, z in enumerate(places):
+                if model.amplitude_memory and z in parents:
+                    new.prior_mean[i, k] = sets.prior_mean[i, parents[z]]
+                    new.prior_variance[i, k] = sets.prior_variance[i, parents[z]]
+    return new, log_ratio
+
+
+def _birth(
+    model: SetModel,
+    proposals: Proposals,
+    places: list[int],
+    sign: dict[int, int],
+    uniform: float,
+    offset: int,
+) -> float:
+    """Insert one more place into ascending `places`, as far from them as it must be, and its sign
+    into `sign`; the log ratio of the model's birth to this one, -inf when there is no room.
+    offset: from cells of the lattice to those of the record."""
+    birth = proposals.birth[offset:]
+    edges = [-model.separation, *places, model.cells - 1 + model.separation]
+    gaps = [
+        (low + model.separation, high - model.separation + 1)
+        for low, high in zip(edges, edges[1:])
+    ]
+    weights = [birth[high] - birth[low] if high > low else 0.0 for low, high in gaps]
+    total = math.fsum(weights)
+    if not total > 0.0:
+        return IMPOSSIBLE
+    left = uniform * total
+    for k, ((low, high), weight) in enumerate(zip(gaps, weights)):
+        if weight > 0.0 and (left < weight or not any(weights[k + 1 :])):
+            point = birth[low] + left
+            found = int(np.searchsorted(birth, point, 'right')) - 1
+            place = min(max(found, low), high - 1)
+            places.insert(k, place)
+            # What is left of the random number within the cell chooses the sign.
+            negative = point - birth[place] >= proposals.birth_positive[place + offset]
+            sign[place] = -1 if negative and len(model.signs) > 1 else 1
+            row = int(sign[place] < 0)
+            return float(proposals.birth_ratio[row, place + offset] + math.log(total))
+        left -= weight
+    raise AssertionError('a gap that has weight is always found')
+
+
+def weigh(model: SetModel, b: FloatArray, sets: Sets) -> tuple[FloatArray, FloatArray]:
+    """log likelihood (N,) of the record against that of an empty one, -inf where
+    an amplitude is not of its member's sign, and the amplitudes (N, J), their mean given the set,
+    in units of the noise."""
+    log_likelihood = np.zeros(len(sets.order))
+    amplitude = np.zeros(sets.cell.shape)
+    fit = background(model, b)
+    for m in np.unique(sets.order[sets.order > 0]):
+        at = np.flatnonzero(sets.order == m)
+        z = sets.cell[at, :m]
+        A = model.gram[np.abs(z[:, :, None] - z[:, None, :])]
+        precision, expected = np.full(z.shape, model.ridge), np.zeros(z.shape)
+        if model.amplitude_memory:
+            precision = 1.0 / sets.prior_variance[at, :m]
+            expected = sets.prior_mean[at, :m]
+        place = z + sets.shift[at, None]
+        seen, scale = b[place], np.ones(z.shape)
+        if model.scatter:
+            k = place[:, :1]
+            mean = fit.level[k] * fit.profile[fit.row[k], len(b) - 1 + place - k]
+            scale = np.sqrt(1.0 + np.square(fit.spread * mean))
+            seen = (seen - mean) / scale
+        h = seen + precision * expected
+        A = A + precision[:, :, None] * np.eye(m)
+        a = np.linalg.solve(A, h[..., None])[..., 0]
+        value = 0.5 * np.einsum('im,im->i', h, a) - m * model.penalty
+        if model.amplitude_prior == 'marginal':
+            value -= 0.5 * np.linalg.slogdet(A)[1]
+        if model.amplitude_memory:
+            value -= 0.5 * np.sum(precision * np.square(expected), axis=1)
+            value += m * model.penalty + 0.5 * np.sum(np.log(precision), axis=1)
+        if model.scatter:
+            value += fit.evidence[place[:, 0]]
+        amplitude[at, :m] = scale * a
+        log_likelihood[at] = np.where((a * sets.sign[at, :m] > 0.0).all(axis=1), value, IMPOSSIBLE)
+    return log_likelihood, amplitude
+
+
+def propose_shift(
+    tables: ShiftTables, before: int, cells: IntArray, negative: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """q (G,) and log of model to proposal (G,) for members at `cells` (k,), with
+    `negative` (k,) 1 for negative ones; before: the shift of the record before plus pad."""
+    prior = tables.log_prior[before // tables.step if len(tables.log_prior) > 1 else 0]
+    at = cells[:, None] + tables.step * np.arange(len(prior))
+    score = prior + tables.log_sum[negative[:, None], at].sum(axis=0)
+    driven = np.exp(score - score.max())
+    q = tables.share * driven / driven.sum() + (1.0 - tables.share) * np.exp(prior)
+    with np.errstate(divide='ignore'):
+        return q, prior - np.log(q)
