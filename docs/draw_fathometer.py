@@ -111,10 +111,10 @@ def draw_conventions() -> None:
         ),
         1,
     )
-    one, H = scene.measurements[0].measurement, float(scene.truth[0].depth[0] - 73.5)
-    w = fathometer.steering(one.frequency, 0.18 * np.arange(one.hydrophones), 1500.0)
-    csdm = one.csdm.astype(np.complex128)
-    comb = float(one.frequency[0]), float(one.frequency[1] - one.frequency[0])
+    item, H = scene.measurements[0].measurement, float(scene.truth[0].depth[0] - 73.5)
+    w = fathometer.steering(item.frequency, 0.18 * np.arange(item.hydrophones), 1500.0)
+    csdm = item.csdm.astype(np.complex128)
+    comb = float(item.frequency[0]), float(item.frequency[1] - item.frequency[0])
     z = np.linspace(-80.0, 80.0, 6401)
 
     def response(gamma):
@@ -213,7 +213,7 @@ def drift(seed):
     config = FathometerScenario(snapshot_seconds=0.35, snapshots=256)
     rng = np.random.default_rng(seed)
     floor = drift_of(config, rng)
-    told = {
+    settings = {
         'window': 'rectangular',
         'overlap': 0.0,
         'depth_min': config.depth_min,
@@ -223,7 +223,9 @@ def drift(seed):
     }
     low = {'mvdr': 50.0, 'conventional': 200.0}
     trackers = {
-        name: FathometerTracker(FathometerConfig(**told, processor=name, frequency_min=low[name]))
+        name: FathometerTracker(
+            FathometerConfig(**settings, processor=name, frequency_min=low[name])
+        )
         for name in low
     }
     records, columns = {name: [] for name in low}, {name: [] for name in low}
@@ -245,8 +247,8 @@ def draw_paper(processed) -> None:
     for name, column in zip(('conventional', 'mvdr'), axes.T):
         records, value, depth = processed[name]
         extent = (-0.5, len(records) - 0.5, depth[-1], depth[0])
-        for one in column[:2]:
-            _draw_image(one, value, extent, 8.0 if name == 'conventional' else 15.0)
+        for axis in column[:2]:
+            _draw_image(axis, value, extent, 8.0 if name == 'conventional' else 15.0)
         _draw_found(column[1], records)
         column[1].set(ylim=(depth[-1], depth[0]))
         column[0].set(title={'mvdr': 'MVDR, 50-4000 Hz'}.get(name, 'conventional, 200-4000 Hz'))
@@ -260,10 +262,10 @@ def draw_paper(processed) -> None:
                 *zip(*place), '.-', lw=0.8, ms=2, color=COLOURS[track_id % len(COLOURS)]
             )
         column[2].set(xlabel='record', ylim=(0.0, None))
-    for one, label in zip(axes[:, 0], ('depth [m]', 'depth [m]', 'relative amplitude')):
-        one.set_ylabel(label)
-    for one, letter in zip(axes.ravel(), 'abcdef'):
-        one.set_title(f'({letter})', loc='left')
+    for axis, label in zip(axes[:, 0], ('depth [m]', 'depth [m]', 'relative amplitude')):
+        axis.set_ylabel(label)
+    for axis, letter in zip(axes.ravel(), 'abcdef'):
+        axis.set_title(f'({letter})', loc='left')
     save(figure, 'fathometer_paper.png')
 
 
@@ -272,8 +274,8 @@ def draw_orders(processed) -> None:
     records = processed['mvdr'][0]
     pmf = np.array([record.pmf for record in records]).T
     figure, axes = plt.subplots(1, 2, figsize=(12, 3.4), width_ratios=(1.7, 1.0))
-    for one, (first, last), letter in zip(axes, ((0, len(records)), (240, 281)), 'ab'):
-        one.imshow(
+    for axis, (first, last), letter in zip(axes, ((0, len(records)), (240, 281)), 'ab'):
+        axis.imshow(
             pmf[:, first:last],
             aspect='auto',
             cmap='Blues',
@@ -283,9 +285,9 @@ def draw_orders(processed) -> None:
             extent=(first - 0.5, last - 0.5, 0.5, len(pmf) + 0.5),
         )
         shown = range(first, last)
-        one.step(shown, processed['number'][first:last], color=RED, lw=1, where='mid')
-        one.set(xlabel='record', ylim=(4.5, 11.5))
-        one.set_title(f'({letter})', loc='left')
+        axis.step(shown, processed['number'][first:last], color=RED, lw=1, where='mid')
+        axis.set(xlabel='record', ylim=(4.5, 11.5))
+        axis.set_title(f'({letter})', loc='left')
     axes[0].set(ylabel='number of reflectors', title='probability; red: truth')
     save(figure, 'fathometer_orders.png')
 
@@ -298,12 +300,12 @@ def draw_fixed_orders(processed) -> None:
         for k, column in enumerate(value.T)
     ]
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), sharey=True)
-    for order, one in zip((7, 8, 9), axes):
+    for order, axis in zip((7, 8, 9), axes):
         config = FathometerConfig(order_min=order, order_max=order, proposal='prior')
         records, value, depth = track(traces, config)
-        _draw_image(one, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]))
-        _draw_found(one, records, 1.5)
-        one.set(xlabel='record', title=f'fixed order {order}, bootstrap')
+        _draw_image(axis, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]))
+        _draw_found(axis, records, 1.5)
+        axis.set(xlabel='record', title=f'fixed order {order}, bootstrap')
     axes[0].set_ylabel('depth [m]')
     save(figure, 'fathometer_fixed_order.png')
 
@@ -311,7 +313,7 @@ def draw_fixed_orders(processed) -> None:
 def draw_lines() -> None:
     """The tracks over all four real lines."""
     figure, axes = plt.subplots(4, 1, figsize=(10, 13))
-    for name, one in zip(LINES, axes):
+    for name, axis in zip(LINES, axes):
         with tempfile.TemporaryDirectory() as folder:
             convert_segy(
                 DATA / name,
@@ -325,11 +327,11 @@ def draw_lines() -> None:
             own = {**own['fathometer']['ros__parameters'], 'particles': 5000}
             config = FathometerConfig.from_mapping(own)
             with BagReader(Path(folder) / 'bag') as bag:
-                traces = [heard.measurement for heard in measurements_of(bag, 'fathometer')]
+                traces = [item.measurement for item in measurements_of(bag, 'fathometer')]
         records, value, depth = track(traces, config)
-        _draw_image(one, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]), 20.0)
-        _draw_found(one, records, 4.0)
-        one.set(ylabel='depth [m]', title=name.split('_')[3])
+        _draw_image(axis, value, (-0.5, len(records) - 0.5, depth[-1], depth[0]), 20.0)
+        _draw_found(axis, records, 4.0)
+        axis.set(ylabel='depth [m]', title=name.split('_')[3])
     axes[-1].set_xlabel('trace, four averaged to one')
     save(figure, 'fathometer_chiapas.png')
 

@@ -96,12 +96,16 @@ def draw_curves(ax: Axes) -> None:
     """The deferred estimate of the same approach: RMSD against the offset that is tried."""
     setting = scenario('approach')
     scene, config = simulate(setting, SEED), config_of(setting)
-    pings = [one.measurement for one in scene.measurements]
-    pings = [one for one in pings if isinstance(one, Detections) and len(one)]
-    echoes = np.array([[one.range[0], -one.bearing[0]] for one in pings])
+    pings = [measurement.measurement for measurement in scene.measurements]
+    pings = [ping for ping in pings if isinstance(ping, Detections) and len(ping)]
+    echoes = np.array([[ping.range[0], -ping.bearing[0]] for ping in pings])
     poses, known = sonar_poses(
-        [one.measurement for one in scene.measurements if isinstance(one.measurement, Navigation)],
-        np.array([one.stamp_ns for one in pings]),
+        [
+            measurement.measurement
+            for measurement in scene.measurements
+            if isinstance(measurement.measurement, Navigation)
+        ],
+        np.array([ping.stamp_ns for ping in pings]),
         config,
     )
     poses = Pose(poses.position[known], poses.R[known])
@@ -127,10 +131,10 @@ def draw_sphere(above: Axes, below: Axes) -> None:
     z = read(z, 'by eye', SEED)
     found = deferred(z, poses, config_of(setting), offsets=OFFSETS)
     ping = np.arange(len(z))
-    heights = [one.measurement for one in scene.measurements]
-    heights = [one for one in heights if isinstance(one, Altitude)]
+    heights = [measurement.measurement for measurement in scene.measurements]
+    heights = [height for height in heights if isinstance(height, Altitude)]
     # An altitude every half second, as often as a ping.
-    altitude = np.array([one.altitude for one in heights])[: len(z)]
+    altitude = np.array([height.altitude for height in heights])[: len(z)]
     above.plot(ping[: len(altitude)], altitude, color=INK, lw=1, label='vehicle, altimeter')
     floor = setting.depth + setting.altitude
     estimated = floor - poses.position[0, 2] - found.best
@@ -164,12 +168,12 @@ def draw_image(above: Axes, below: Axes) -> None:
     floats = [middle + side * across - [0.0, 0.0, 4.0] for side in (-5.0, 0.0, 5.0)]
     down = np.arange(1.0, 9.0, 1.0)[:, None] * [0.0, 0.0, 1.0]
     bar = middle + [0.0, 0.0, 5.0] + np.arange(-5.0, 5.1, 0.5)[:, None] * across
-    places = [*floats, *(place for one in floats for place in one + down), *bar]
+    places = [*floats, *(place for item in floats for place in item + down), *bar]
     looks = scenario('images', {'target_fading': 'rayleigh', 'max_range': 100.0})
     sonar = ImageSonar(looks, np.random.default_rng(SEED))
     config = DetectorConfig.from_mapping(looks.feeder_instruments(), ignore_unknown=True)
-    one, found = 40, []
-    for k in {one, *range(0, len(poses.position), 4)}:
+    item, found = 40, []
+    for k in {item, *range(0, len(poses.position), 4)}:
         pixels = sonar.image(Pose(poses.position[k], poses.R[k]), places, 1.0)
         image = SonarImage(
             stamp_ns=k + 1,
@@ -180,7 +184,7 @@ def draw_image(above: Axes, below: Axes) -> None:
         )
         echo = detect(image, config)
         found.append(np.column_stack([echo.range, -echo.bearing]))
-        if k == one:
+        if k == item:
             d, azimuth = sonar.range[:, None], -sonar.bearing
             above.pcolormesh(
                 d * np.sin(azimuth), d * np.cos(azimuth), pixels, cmap='Greys', rasterized=True
@@ -194,7 +198,7 @@ def draw_image(above: Axes, below: Axes) -> None:
         ax.set(xlim=(-25.0, 25.0), xlabel='m to starboard', ylabel='m ahead')
     above.set(title='Figure 4: image of a large obstacle', ylim=(50.0, 85.0))
     below.set(ylim=(40.0, 100.0))
-    above.text(-24.0, 51.0, f'ping {one}, detections circled')
+    above.text(-24.0, 51.0, f'ping {item}, detections circled')
     below.text(-24.0, 41.5, 'detections of every fourth ping')
 
 
@@ -206,9 +210,11 @@ def show(ax: Axes, found: np.ndarray, marker: str, **style: object) -> None:
 
 def draw_readings(above: Axes, below: Axes) -> None:
     """Figure 5: RMSD by eye and by a noisy detector, and what a single such number is worth."""
-    told = json.loads(SECTION5.read_text(encoding='utf-8'))['large']['estimates']
+    estimates = json.loads(SECTION5.read_text(encoding='utf-8'))['large']['estimates']
     # One encounter that reads as the paper's did: 8 m by eye, 11 m by the detector.
-    off = np.abs(np.array(told['by eye']) - 8.0) + np.abs(np.array(told['noisy detector']) - 11.0)
+    off = np.abs(np.array(estimates['by eye']) - 8.0) + np.abs(
+        np.array(estimates['noisy detector']) - 11.0
+    )
     seed = int(np.argmin(off))
     setting, scene = encounter('large', {}, seed)
     z, poses = echoes(setting, scene)
@@ -218,13 +224,13 @@ def draw_readings(above: Axes, below: Axes) -> None:
         above.plot(found.best, found.least, 'o', color=colour)
     above.axvline(8.0, color=INK, ls='--', lw=1)
     above.set(
-        title=f'Figure 5: one of {len(told["by eye"])}, chosen',
+        title=f'Figure 5: one of {len(estimates["by eye"])}, chosen',
         xlabel='offset tried, m below the sonar',
         ylabel='RMSD, pixels',
         ylim=(0.0, None),
     )
     above.legend(frameon=False)
-    for row, values in enumerate(told.values()):
+    for row, values in enumerate(estimates.values()):
         low, middle, high = np.percentile(values, [5.0, 50.0, 95.0])
         spread = np.random.default_rng(row).uniform(-0.25, 0.25, len(values))
         below.plot(values, row + spread, '.', ms=2, color=COLOURS[row], alpha=0.5)
@@ -233,8 +239,8 @@ def draw_readings(above: Axes, below: Axes) -> None:
     below.axvline(8.0, color=INK, ls='--', lw=1)
     below.axvline(11.0, color=INK, ls=':', lw=1)
     below.set(
-        yticks=range(len(told)),
-        yticklabels=list(told),
+        yticks=range(len(estimates)),
+        yticklabels=list(estimates),
         xlabel='deferred estimate, m',
     )
     below.invert_yaxis()

@@ -105,7 +105,7 @@ def policy(name: str, used: dict[tuple[str, str, str], list[str]]) -> str:
     for (kind, rule, item), names in used.items():
         if names:
             lines.append(f'<{kind} {rule}="ALLOW">')
-            lines += [f'  <{item}>{one}</{item}>' for one in names]
+            lines += [f'  <{item}>{name}</{item}>' for name in names]
             lines.append(f'</{kind}>')
     body = ''.join(f'          {line}\n' for line in lines)
     return HEAD.format(name=name) + body + TAIL

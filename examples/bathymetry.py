@@ -29,18 +29,18 @@ scene = scenes.simulate(config, seed=1)
 tracker = SYSTEMS['bathymetry'].build(BathymetryConfig(**config.instruments()))
 (floor,) = tracker.process(scene.measurements[0].measurement)
 (truth,) = scene.truth[0].tables(scene.frame_id)
-heard = floor.extras['valid'] > 0
+valid = floor.extras['valid'] > 0
 
-height = floor.columns()['height'][heard]
-at = floor.extras['range'][heard]
+height = floor.columns()['height'][valid]
+at = floor.extras['range'][valid]
 true = np.interp(at, truth.columns['range'], truth.columns['height'])
-print(f'height RMSE {np.sqrt(np.nanmean((height - true) ** 2)):.2f} m in {heard.sum()} bins')
+print(f'height RMSE {np.sqrt(np.nanmean((height - true) ** 2)):.2f} m in {valid.sum()} bins')
 
 figure = go.Figure(layout_title_text='The floor along one ping')
 figure.add_scatter(x=at, y=height, name='estimate')
 figure.add_scatter(x=at, y=true, name='truth')
 for name, share in zip(floor.model_names, floor.probabilities.T):
-    figure.add_scatter(x=at, y=share[heard], name=f'probability of {name}', yaxis='y2')
+    figure.add_scatter(x=at, y=share[valid], name=f'probability of {name}', yaxis='y2')
 figure.update_layout(
     xaxis_title='range, m',
     yaxis_title='height, m',

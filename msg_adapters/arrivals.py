@@ -133,11 +133,11 @@ def write_arrivals(arrivals: Arrivals, make: Make) -> Any:
 
 def _usable(toa: NDArray, tx: NDArray, rx: NDArray) -> NDArray[np.bool_]:
     """Rows (n,) with a finite time and receiver and, where any row has one, a transmitter."""
-    heard = (np.abs(toa) <= LONGEST) & (np.abs(rx) <= FARTHEST).all(axis=1)
+    received = (np.abs(toa) <= LONGEST) & (np.abs(rx) <= FARTHEST).all(axis=1)
     emitted = (np.abs(tx) <= FARTHEST).all(axis=1)
-    if (heard & emitted).any():
-        return heard & emitted & (toa > 0.0)
-    return heard & np.isnan(tx).all(axis=1)
+    if (received & emitted).any():
+        return received & emitted & (toa > 0.0)
+    return received & np.isnan(tx).all(axis=1)
 
 
 def _ids(values: NDArray, name: str) -> NDArray[np.uint16]:

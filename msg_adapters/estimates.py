@@ -52,8 +52,8 @@ def _packed(estimate: Estimate, make: Make) -> tuple[NDArray, tuple[Any, ...], b
     numbers are finite. States, covariances and probabilities go in as one block: column by column
     a live node would spend a tenth of its time on columns of one number."""
     extras = estimate.extras
-    told = tuple((name, one.dtype, one.shape[1:]) for name, one in extras.items())
-    plan = _plan(make, estimate.state_names, estimate.model_names, told)
+    layout = tuple((name, value.dtype, value.shape[1:]) for name, value in extras.items())
+    plan = _plan(make, estimate.state_names, estimate.model_names, layout)
     packed = np.empty(len(estimate), plan.dtype)
     whole = packed.view(plan.pieces)
     upper = estimate.covariance[:, plan.upper[0], plan.upper[1]]

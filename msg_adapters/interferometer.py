@@ -84,10 +84,10 @@ def snapshot_of_staves(messages: Sequence[Any], **how: Any) -> Snapshot:
     """The snapshot of one message per stave with in-phase and quadrature samples; see
     `snapshot_of_phase`."""
     fields, order = how.get('fields', FIELDS), how.get('order', 'range_major')
-    staves = [_in_quadrature(_samples(one, fields['iq'], order)[0]) for one in messages]
+    staves = [_in_quadrature(_samples(message, fields['iq'], order)[0]) for message in messages]
     if len({len(stave) for stave in staves}) > 1:
         raise Rejection(
-            'bad_shape', f'the staves have {", ".join(str(len(one)) for one in staves)} ranges'
+            'bad_shape', f'the staves have {", ".join(str(len(stave)) for stave in staves)} ranges'
         )
     return _snapshot(messages[0], np.column_stack(staves), **how)
 

@@ -52,10 +52,10 @@ def read_scan(message: Any, *, world_frame: str = 'enu') -> Fixes:
     columns = decode_table(message, COLUMNS, most_rows=MAX_FIXES)
     require_columns(columns, REQUIRED, 'fixes')
     values = {name: scalar_column(columns, name) for name in columns}
-    if 'valid' in values and not (said := values['valid'] != 0).all():
-        if not said.any():
-            raise Rejection('flagged_invalid', f'all {len(said)} fixes are flagged as invalid')
-        values = {name: column[said] for name, column in values.items()}
+    if 'valid' in values and not (valid := values['valid'] != 0).all():
+        if not valid.any():
+            raise Rejection('flagged_invalid', f'all {len(valid)} fixes are flagged as invalid')
+        values = {name: column[valid] for name, column in values.items()}
     rows = len(values['x'])
     z = values.get('z', np.zeros(rows))
     position = np.column_stack([values['x'], values['y'], np.where(np.isfinite(z), z, 0.0)])

@@ -39,7 +39,7 @@ def read_transforms(message: Any, **_: Any) -> StaticTransforms:
         raise Rejection('empty', 'the message holds no transform')
     if len(stamped) > MOST_TRANSFORMS:
         raise Rejection('too_large', f'{len(stamped)} transforms; {MOST_TRANSFORMS} are read')
-    return StaticTransforms(poses=dict(_pose(one) for one in stamped))
+    return StaticTransforms(poses=dict(_pose(item) for item in stamped))
 
 
 def write_transforms(transforms: StaticTransforms, make: Make) -> Any:
@@ -116,5 +116,5 @@ TF_STATIC = InputTopic(
     prefix='/',
     latched=True,
     by_name=frozenset(TYPES),
-    wanted=lambda told: bool(told.get('use_tf_static') or told.get('sonar_frame')),
+    wanted=lambda settings: bool(settings.get('use_tf_static') or settings.get('sonar_frame')),
 )

@@ -31,7 +31,7 @@ from .navigation import read_navigation
 def read_vessel_pose(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselPose:
     """Read an Odometry. Raises `Rejection`."""
     pose = read_navigation(message, world_frame=world_frame)
-    return VesselPose(**{one.name: getattr(pose, one.name) for one in fields(type(pose))})
+    return VesselPose(**{field.name: getattr(pose, field.name) for field in fields(type(pose))})
 
 
 def read_heading(message: Any, *, world_frame: str = 'enu', **_: Any) -> VesselHeading:

@@ -62,9 +62,9 @@ def on_disk(path: Path) -> None:
         with path.open('rb') as file:
             os.fsync(file.fileno())
         return
-    for one in path.iterdir():
-        if not one.is_symlink():
-            on_disk(one)
+    for item in path.iterdir():
+        if not item.is_symlink():
+            on_disk(item)
     sync_folder(path)
 
 

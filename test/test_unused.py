@@ -39,7 +39,7 @@ LIBRARY = {
 
 
 def trees():
-    users = [*MODULES, *(ROOT / 'benchmarks').glob('*.py')]
+    users = [*MODULES, *(ROOT / 'benchmarks').rglob('*.py')]
     return {path: ast.parse(path.read_text(encoding='utf-8')) for path in users}
 
 

@@ -33,12 +33,12 @@ __all__ = ['Displays', 'displays_of', 'Drawn']
 class Displays(Protocol):
     """The drawings of one system. topics: their message types by name.
 
-    Messages are made by `make`, and only for names that `heard` somebody asks for.
+    Messages are made by `make`, and only for names that `is_wanted` somebody asks for.
     """
 
     topics: Mapping[str, str]
 
-    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
+    def of(self, estimate: Estimate, make: Make, is_wanted: Callable[[str], Any]) -> Drawn:
         """Draw the newest estimate."""
 
     def forget(self, make: Make) -> Drawn:

@@ -31,8 +31,8 @@ class Displays:
 
     topics: Mapping[str, str] = {MODELS: NAMED_SCALARS}
 
-    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
-        if heard(MODELS):
+    def of(self, estimate: Estimate, make: Make, is_wanted: Callable[[str], Any]) -> Drawn:
+        if is_wanted(MODELS):
             yield MODELS, write_model_shares(estimate, make)
 
     def forget(self, make: Make) -> Drawn:

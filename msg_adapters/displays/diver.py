@@ -41,15 +41,15 @@ class Displays:
     def __init__(self) -> None:
         self._markers = Markers(NAMES, write_markers)
 
-    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
+    def of(self, estimate: Estimate, make: Make, is_wanted: Callable[[str], Any]) -> Drawn:
         rows = confirmed_rows(estimate)
-        if heard('odometry'):
+        if is_wanted('odometry'):
             for row in rows:
                 yield 'odometry', write_odometry(estimate, row, make)
-        if heard('divers'):
+        if is_wanted('divers'):
             yield 'divers', write_poses(estimate, rows, make)
-        yield from self._markers.of(estimate, rows, make, heard)
-        yield from models_of_the_oldest(estimate, rows, make, heard)
+        yield from self._markers.of(estimate, rows, make, is_wanted)
+        yield from models_of_the_oldest(estimate, rows, make, is_wanted)
 
     def forget(self, make: Make) -> Drawn:
         return self._markers.forget(make)

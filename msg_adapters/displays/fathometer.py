@@ -31,8 +31,8 @@ class Displays:
 
     topics: Mapping[str, str] = {MODELS: NAMED_SCALARS}
 
-    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
-        if heard(MODELS) and len(estimate):
+    def of(self, estimate: Estimate, make: Make, is_wanted: Callable[[str], Any]) -> Drawn:
+        if is_wanted(MODELS) and len(estimate):
             yield MODELS, write_model_probabilities(estimate, 0, make)
 
     def forget(self, make: Make) -> Drawn:

@@ -38,12 +38,12 @@ class Displays:
     def __init__(self) -> None:
         self._markers = Markers(NAMES, write_markers)
 
-    def of(self, estimate: Estimate, make: Make, heard: Callable[[str], Any]) -> Drawn:
+    def of(self, estimate: Estimate, make: Make, is_wanted: Callable[[str], Any]) -> Drawn:
         rows = confirmed_rows(estimate)
-        if heard('obstacles'):
+        if is_wanted('obstacles'):
             yield 'obstacles', write_poses(estimate, rows, make)
-        yield from self._markers.of(estimate, rows, make, heard)
-        yield from models_of_the_oldest(estimate, rows, make, heard)
+        yield from self._markers.of(estimate, rows, make, is_wanted)
+        yield from models_of_the_oldest(estimate, rows, make, is_wanted)
 
     def forget(self, make: Make) -> Drawn:
         return self._markers.forget(make)

@@ -47,10 +47,10 @@ def confirmed_rows(estimate: Estimate) -> np.ndarray:
 
 
 def models_of_the_oldest(
-    estimate: Estimate, rows: np.ndarray, make: Make, heard: Callable[[str], Any]
+    estimate: Estimate, rows: np.ndarray, make: Make, is_wanted: Callable[[str], Any]
 ) -> Drawn:
     """Draw the models of the track in `rows` that lasted longest."""
-    if len(rows) and heard(MODELS):
+    if len(rows) and is_wanted(MODELS):
         oldest = rows[np.argmin(estimate.extras['track_id'][rows])]
         yield MODELS, write_model_probabilities(estimate, oldest, make)
 
@@ -65,15 +65,15 @@ class Markers:
         self._shown: set[int] = set()
 
     def of(
-        self, estimate: Estimate, rows: np.ndarray, make: Make, heard: Callable[[str], Any]
+        self, estimate: Estimate, rows: np.ndarray, make: Make, is_wanted: Callable[[str], Any]
     ) -> Drawn:
         """Those of an estimate, before them what removes the ones that are over."""
         self._frame_id = estimate.frame_id
         ids = set(estimate.extras['track_id'][rows].tolist())
         ended, self._shown = sorted(self._shown - ids), ids
-        if heard('markers') and ended:
+        if is_wanted('markers') and ended:
             yield 'markers', write_ended(self._frame_id, ended, self._names, make)
-        if heard('markers') and len(rows):
+        if is_wanted('markers') and len(rows):
             yield 'markers', self._write(estimate, rows, make)
 
     def forget(self, make: Make) -> Drawn:

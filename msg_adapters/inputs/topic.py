@@ -148,8 +148,8 @@ class InputTopic:
 
         topic: the name of the topic, by which measurements may be labelled.
         """
-        told = {name: settings[name] for name in self.settings if name in settings}
-        read = partial(self.readers[type_name], world_frame=world_frame, **told)
+        own = {name: settings[name] for name in self.settings if name in settings}
+        read = partial(self.readers[type_name], world_frame=world_frame, **own)
         label = Labels.of(topic, settings, self.named_by)
         return read if label is None else lambda message: label(read(message))
 

@@ -129,14 +129,14 @@ def tracker_from(saved: Saved, system: System, config: Config) -> Tracker:
     if saved.system != system.name:
         raise StateError(f'it is of a {saved.system} tracker')
     kind = system.config_type()
-    told = config.as_dict()
+    parameters = config.as_dict()
     known = {spec.name: spec for spec in kind.specs()}
-    if set(saved.parameters) != set(told):
+    if set(saved.parameters) != set(parameters):
         raise StateError('it was saved with other parameters')
     differ = [
-        f'{name} was {saved.parameters[name]}, is {_json(told[name])}'
-        for name in told
-        if saved.parameters[name] != _json(told[name]) and known[name].read_only
+        f'{name} was {saved.parameters[name]}, is {_json(parameters[name])}'
+        for name in parameters
+        if saved.parameters[name] != _json(parameters[name]) and known[name].read_only
     ]
     if differ:
         raise StateError(f'it was saved with other parameters: {"; ".join(differ[:3])}')

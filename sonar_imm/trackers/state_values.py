@@ -77,17 +77,17 @@ def freeze(value: Any) -> Any:
     if kind is np.ndarray:
         return value.copy() if value.flags.writeable else value
     if kind is list:
-        return [freeze(one) for one in value]
+        return [freeze(item) for item in value]
     if kind in (dict, Counter):
-        return kind({key: freeze(one) for key, one in value.items()})
+        return kind({key: freeze(item) for key, item in value.items()})
     if kind is deque:
-        return deque((freeze(one) for one in value), value.maxlen)
+        return deque((freeze(item) for item in value), value.maxlen)
     if isinstance(value, (FunctionType, MethodType)):
         return _SKIPPED
     if not _ours(kind):
         return value  # a slice, or what `encode` does not know and refuses
-    items = {name: freeze(one) for name, one in vars(value).items() if name[:2] != '__'}
-    return FrozenObject(kind, {k: one for k, one in items.items() if one is not _SKIPPED})
+    items = {name: freeze(item) for name, item in vars(value).items() if name[:2] != '__'}
+    return FrozenObject(kind, {k: value for k, value in items.items() if value is not _SKIPPED})
 
 
 def put(there: Any, value: Any) -> Any:
@@ -96,19 +96,20 @@ def put(there: Any, value: Any) -> Any:
     if value is _SKIPPED:
         return there
     if isinstance(value, FrozenObject):
-        target = there if type(there) is value.cls else value.cls.__new__(value.cls)
-        for name, one in value.attributes.items():
-            setattr(target, name, put(getattr(target, name, None), one))
+        cls: Any = value.cls
+        target = there if type(there) is cls else cls.__new__(cls)
+        for name, item in value.attributes.items():
+            setattr(target, name, put(getattr(target, name, None), item))
         return target
     if isinstance(value, Counter) and isinstance(there, Counter):
         there.clear()
         there.update(value)
         return there
     if isinstance(value, (list, deque)):
-        whole = [put(None, one) for one in value]
+        whole = [put(None, item) for item in value]
         return whole if isinstance(value, list) else deque(whole, value.maxlen)
     if type(value) is dict:
-        return {key: put(None, one) for key, one in value.items()}
+        return {key: put(None, item) for key, item in value.items()}
     return value
 
 
@@ -130,7 +131,7 @@ class Encoder:
     @property
     def block(self) -> np.ndarray:
         """All arrays, one after another, (bytes,) uint8."""
-        parts = [np.frombuffer(one.tobytes('A'), np.uint8) for one in self._blocks]
+        parts = [np.frombuffer(block.tobytes('A'), np.uint8) for block in self._blocks]
         return np.concatenate([np.empty(0, np.uint8), *parts])
 
     def encode(self, value: Any) -> Any:
@@ -164,7 +165,7 @@ class Encoder:
         if kind is deque:
             return ['deque', value.maxlen, *map(self.encode, value)]
         if kind in (dict, Counter):
-            pairs = [[self.encode(key), self.encode(one)] for key, one in value.items()]
+            pairs = [[self.encode(key), self.encode(item)] for key, item in value.items()]
             return [kind.__name__, *pairs]
         raise TypeError(f'{kind.__qualname__} cannot be kept')
 
@@ -178,7 +179,7 @@ class Encoder:
         return ['named', self._class(kind, list(kind._fields)), *map(self.encode, value)]
 
     def _all(self, items: dict[str, Any]) -> list[Any]:
-        return [self.encode(one) for one in items.values()]
+        return [self.encode(item) for item in items.values()]
 
     def _class(self, cls: type, names: list[str]) -> int:
         if cls not in self._numbers:
@@ -214,11 +215,11 @@ class Decoder:
         block: np.ndarray,
     ):
         try:
-            self._classes = [_class_of(*one) for one in classes]
-            self._arrays = [_array_of(block, *one) for one in arrays]
+            self._classes = [_class_of(*cls) for cls in classes]
+            self._arrays = [_array_of(block, *array) for array in arrays]
             self._values: list[Any] = []
-            for one in values:
-                self._values.append(self.decode(one))
+            for value in values:
+                self._values.append(self.decode(value))
         except (TypeError, ValueError, AttributeError, ImportError) as error:
             raise StateError(f'it does not fit this version ({error})') from None
 
@@ -242,19 +243,19 @@ class Decoder:
         if kind == 'bytes':
             return bytes.fromhex(parts[0])
         if kind in ('tuple', 'list'):
-            whole = [self.decode(one) for one in parts]
+            whole = [self.decode(part) for part in parts]
             return tuple(whole) if kind == 'tuple' else whole
         if kind == 'deque':
-            return deque((self.decode(one) for one in parts[1:]), parts[0])
+            return deque((self.decode(part) for part in parts[1:]), parts[0])
         if kind in ('dict', 'Counter'):
-            pairs = {self.decode(key): self.decode(one) for key, one in parts}
+            pairs = {self.decode(key): self.decode(item) for key, item in parts}
             return pairs if kind == 'dict' else Counter(pairs)
         cls = self._classes[parts[0]]
         if kind == 'class':
             return cls
         if kind == 'kept':
             return cls.from_kept(self.decode(parts[1]))
-        values = [self.decode(one) for one in parts[2 if kind == 'object' else 1 :]]
+        values = [self.decode(part) for part in parts[2 if kind == 'object' else 1 :]]
         if kind == 'object':
             return FrozenObject(cls, dict(zip(parts[1], values, strict=True)))
         if kind == 'named':
@@ -262,8 +263,8 @@ class Decoder:
         if kind != 'value':
             raise ValueError(f'unknown kind {kind!r}')
         made = cls.__new__(cls)
-        for field, one in zip(attrs.fields(cls), values, strict=True):
-            object.__setattr__(made, field.name, one)
+        for field, value in zip(attrs.fields(cls), values, strict=True):
+            object.__setattr__(made, field.name, value)
         return made
 
 

@@ -100,8 +100,8 @@ def _signals_unwind() -> Iterator[None]:
 
 def _leave(number: int, _frame: object) -> NoReturn:
     # A second signal must not interrupt the unwinding.
-    for one in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(one, signal.SIG_IGN)
+    for item in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(item, signal.SIG_IGN)
     sys.unraisablehook = functools.partial(_quiet_on_half_made, sys.unraisablehook)
     raise SystemExit(128 + number)
 

@@ -181,8 +181,8 @@ def _equal(folder: Path) -> Check:
 
 
 def _rows_apart(first: Path, second: Path) -> int:
-    with first.open(encoding='utf-8') as one, second.open(encoding='utf-8') as other:
-        return sum(a != b for a, b in zip_longest(one, other))
+    with first.open(encoding='utf-8') as item, second.open(encoding='utf-8') as other:
+        return sum(a != b for a, b in zip_longest(item, other))
 
 
 def _ended(live: LockstepResult) -> Check:

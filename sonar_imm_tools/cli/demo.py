@@ -42,7 +42,7 @@ def command(out: Path) -> None:
     from ..evaluation.report import write_report
 
     report = out / 'report.html'
-    write_report(report, [one.judgement.part(one.checks) for one in recordings])
+    write_report(report, [recording.judgement.part(recording.checks) for recording in recordings])
     say(f'report: {report.resolve()}')
     if not all(recording.good for recording in recordings):
         raise click.exceptions.Exit(1)

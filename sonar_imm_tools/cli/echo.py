@@ -118,10 +118,10 @@ def _picture(newest: Mapping[str, ReceivedTable], most: int) -> Any:
 
     parts = []
     for name in sorted(newest):
-        told = newest[name]
-        names, rows = readable(told.columns or {}, most)
-        picture = Table(title=_head(told), title_justify='left', caption_justify='left')
-        picture.caption = told.problem or _further(told, most)
+        table = newest[name]
+        names, rows = readable(table.columns or {}, most)
+        picture = Table(title=_head(table), title_justify='left', caption_justify='left')
+        picture.caption = table.problem or _further(table, most)
         for column in names:
             picture.add_column(column, justify='right')
         for row in rows:

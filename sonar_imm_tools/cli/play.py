@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -119,7 +120,7 @@ class ManyWords(click.Command):
     metavar='[NODE]',
     help='Send the next message only when NODE, by default the only one, has answered.',
 )
-def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options: object) -> None:
+def command(bag: Path, remaps: tuple[str, ...], qos_file: Path | None, **options: Any) -> None:
     """Publish the recording BAG to live nodes, byte for byte, stamps included.
 
     These options are those of `ros2 bag play`, with its names and words; others of it are not

@@ -127,7 +127,7 @@ def command(
             run = track_one(evolve(runs[0], options=evolve(runs[0].options, jobs=jobs)), as_json)
             print_json(run) if as_json else _print(run, out_dir)
             return
-        failures = []
+        failures: list[Outcome] = []
     else:
         runs, failures = _of_all(plan, bags, out_dir)
     _track_all(runs, failures, out_dir, jobs, scheduler, as_json)
@@ -250,7 +250,9 @@ def _track_all(
                 click.echo(f'{name}: {outcome.failure}', err=True)
             outcomes.append(outcome)
             advance(1)
-    content = summary_of(out_dir, sorted(outcomes, key=lambda one: (str(one.bag), one.instrument)))
+    content = summary_of(
+        out_dir, sorted(outcomes, key=lambda item: (str(item.bag), item.instrument))
+    )
     write_summary(out_dir, content)
     print_json(content) if as_json else _print_summary(content, out_dir)
     if any(outcome.failure for outcome in outcomes):
@@ -321,5 +323,5 @@ def _print_summary(content: Mapping[str, Any], out_dir: Path) -> None:
         if run['state'] != 'failed' and run['rows'] == 0:
             say(f'{run["folder"]}: no track was made; sonar-imm info may show why')
     counts = Counter(run['state'] for run in runs)
-    told = ', '.join(f'{counts[state]} {state}' for state in ('tracked', 'kept', 'failed'))
-    say(f'{len(runs)} runs in {out_dir}: {told}')
+    summary = ', '.join(f'{counts[state]} {state}' for state in ('tracked', 'kept', 'failed'))
+    say(f'{len(runs)} runs in {out_dir}: {summary}')

@@ -169,12 +169,12 @@ def _show_live(topics: Sequence[str], host: str, port: int, layout_file: Path | 
         relay.step(0.5)
         relay.step(0.5)
         _announce(server, relay.topics, layout_file)
-        said: set[str] = set()
+        shown: set[str] = set()
         while True:
             relay.step(0.1)
-            for name in relay.problems.keys() - said:
+            for name in relay.problems.keys() - shown:
                 say(f'  problem: {relay.problems[name]}')
-                said.add(name)
+                shown.add(name)
 
 
 def _announce(server: Any, topics: Sequence[str], layout_file: Path | None) -> None:

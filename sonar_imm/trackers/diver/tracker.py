@@ -41,12 +41,12 @@ import numpy as np
 from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
 from ...estimation import adaptation, association, imm_kernels
-from ...estimation import jipda as joint_association
 from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...estimation.consider import consider_models
 from ...estimation.consistency import NisMemory
+from ...estimation.jipda import warm as warm_jipda
 from ...estimation.small_matrices import add_jitter_all
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
@@ -139,7 +139,7 @@ class DiverTracker:
 
     def warm(self) -> None:
         imm_kernels.warm()
-        joint_association.warm()
+        warm_jipda()
         adaptation.warm()
         association.warm()
         fix_kernels.warm()
