@@ -47,7 +47,7 @@ KERNEL_TESTS := $(addprefix test/estimation/test_,$(addsuffix .py,elementary gri
 unexport AMENT_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH
 
 .NOTPARALLEL:
-.PHONY: help venv demo test test-core test-bounds test-system fuzz reliability lint generate docs docs-numbers bench clean
+.PHONY: help venv demo test test-core test-statistics test-bounds test-system fuzz reliability lint generate docs docs-numbers bench clean
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
@@ -72,11 +72,14 @@ demo: venv ## track a shipped bag with the live node and offline, score both, wr
 test: test-core test-system ## run every test
 
 test-core: venv ## run the tests that need no processes of their own (JOBS=... CORETYPE=... TESTS=...)
-	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' -n $(JOBS) $(TESTS)
+	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' --statistics share -n $(JOBS) $(TESTS)
+
+test-statistics: venv ## run every Monte Carlo test; `make test` takes a fourth of them in turn
+	$(TEST_ENV) $(BIN)/python -m pytest -m statistics -n $(JOBS) $(TESTS)
 
 test-bounds: venv ## run the tests of the compiled kernels with every index checked
 	$(TEST_ENV) NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/numba-bounds \
-	    $(BIN)/python -m pytest -m 'not system' -n $(JOBS) $(or $(TESTS),$(KERNEL_TESTS))
+	    $(BIN)/python -m pytest -m 'not system' --statistics none -n $(JOBS) $(or $(TESTS),$(KERNEL_TESTS))
 
 fuzz: venv ## send 100,000 hostile messages to each tracker (CASES=... FUZZ_JSON=...)
 	cd test && $(TEST_ENV) PYTHONPATH=.. $(BIN)/python -m helpers.hostile --cases $(CASES) \

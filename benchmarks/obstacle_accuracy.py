@@ -37,9 +37,9 @@ from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses
 from sonar_imm.trackers.obstacle.tracker import ObstacleConfig, ObstacleTracker
 from sonar_imm.truth import Scene
+from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses
 from sonar_imm_tools.simulation.obstacle.simulator import (
     ObstacleScenario,
     scenario,

@@ -41,8 +41,8 @@ from benchmarks.study import Parts, study
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Detections, Navigation
-from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses
 from sonar_imm.truth import Scene
+from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses
 from sonar_imm_tools.simulation.obstacle.simulator import ObstacleScenario, scenario, simulate
 
 EXACT = {

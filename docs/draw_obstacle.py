@@ -42,8 +42,8 @@ from benchmarks.obstacle_section5 import echoes, encounter, OFFSETS, read  # noq
 from sonar_imm.acoustics import geometry  # noqa: E402
 from sonar_imm.acoustics.geometry import Pose  # noqa: E402
 from sonar_imm.measurements import Altitude, Detections, Navigation, SonarImage  # noqa: E402
-from sonar_imm.trackers.obstacle.deferred import deferred, sonar_poses  # noqa: E402
 from sonar_imm.trackers.obstacle.detector import detect, DetectorConfig  # noqa: E402
+from sonar_imm_tools.evaluation.obstacle.rmsd import deferred, sonar_poses  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.images import ImageSonar  # noqa: E402
 from sonar_imm_tools.simulation.obstacle.simulator import scenario, simulate  # noqa: E402
 

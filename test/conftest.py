@@ -14,8 +14,11 @@
 
 """Set up what has to be set before rclpy is imported anywhere."""
 
+import contextlib
 import importlib.util
 import os
+from pathlib import Path
+import subprocess
 import tempfile
 
 from helpers.kernel_types import in_effect
@@ -36,6 +39,42 @@ os.environ.pop('ROS_LOCALHOST_ONLY', None)
 # Without ROS the rest of the package is still tested, e.g. on the oldest numpy.
 without_ros = ['conformance/nodes', 'nodes', 'replay', 'system']
 collect_ignore = [] if importlib.util.find_spec('rclpy') else without_ros
+
+
+SHARES = 4
+"""Of the statistical tests `make test` runs every so many-th, another share after each commit."""
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        '--statistics',
+        choices=('all', 'share', 'none'),
+        default='all',
+        help='which of the tests marked statistics to run: all, the share of this commit, or none',
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out the statistical tests that are not wanted in this run."""
+    wanted = config.getoption('--statistics')
+    if wanted == 'all':
+        return
+    statistics = [item for item in items if item.get_closest_marker('statistics')]
+    turn = commits() % SHARES
+    run = statistics[turn::SHARES] if wanted == 'share' else []
+    left_out = set(statistics) - set(run)
+    config.hook.pytest_deselected(items=sorted(left_out, key=lambda item: item.nodeid))
+    items[:] = [item for item in items if item not in left_out]
+
+
+def commits():
+    """How many commits there are, which chooses the share; 0 outside of a checkout."""
+    command = ['git', '-C', str(Path(__file__).parent), 'rev-list', '--count', 'HEAD']
+    with contextlib.suppress(OSError):
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode == 0:
+            return int(done.stdout)
+    return 0
 
 
 def pytest_report_header():

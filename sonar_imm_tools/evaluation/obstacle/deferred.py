@@ -15,7 +15,7 @@
 """The deferred estimate of the paper beside the online one: RMSD against the vertical offset.
 
 The echoes of a track are those nearest to where the track was at its hits. With them, and the
-navigation of the recording, `trackers.obstacle.deferred` computes the curves of the paper's
+navigation of the recording, `rmsd` computes the curves of the paper's
 Figure 3.
 """
 
@@ -30,8 +30,8 @@ import numpy as np
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.measurements import Altitude, Detections, Navigation
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
-from sonar_imm.trackers.obstacle.deferred import Deferred, deferred, sonar_poses
 
+from .rmsd import Deferred, deferred, sonar_poses
 from .series import Series, TruePath
 
 MOST_ECHOES = 300

@@ -24,7 +24,6 @@ import plotly.graph_objects as go
 
 from sonar_imm.measurements import Detections
 from sonar_imm.trackers.obstacle.config import BEHAVIOURS
-from sonar_imm.trackers.obstacle.deferred import Deferred
 
 from ..plotting import (
     add_band,
@@ -43,6 +42,7 @@ from ..plotting import (
 )
 from ..report import Section
 from .deferred import DeferredEstimates
+from .rmsd import Deferred
 from .series import level, Matching, Series, TruePath
 
 NEARING = {'title': 'range [m]', 'autorange': 'reversed', 'zeroline': False}

@@ -106,6 +106,7 @@ def test_without_navigation_the_unknown_height_is_in_the_variance():
     assert (unsure.covariance[:, 0, 0] > 4.0).all() and (sure.covariance[20:, 0, 0] < 0.1).all()
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('engine', ['particles', 'grid'])
 def test_angles_hold_the_floor_near_nadir(engine):
     values = {'model_set': 'angle_two_rw', 'engine': engine}
@@ -139,6 +140,7 @@ def overlap(name, values, **config):
     return (rough & patch).sum() / (rough | patch).sum()
 
 
+@pytest.mark.statistics
 def test_the_bank_finds_correlated_and_white_roughness():
     bank = {'model_set': 'height_bank'}
     assert overlap('paper', {}, **bank) > 0.93

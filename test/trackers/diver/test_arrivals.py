@@ -234,6 +234,7 @@ def test_bearings_of_many_receivers_across_half_a_turn_are_bearings(passive):
     assert with_bearing > (7 if passive else 8)  # more than the arrival times alone
 
 
+@pytest.mark.statistics
 def test_elevations_show_the_depth():
     """Two hundredths of a radian at 70 m are 1.4 m a receiver, and eight of them hear it."""
     seen, divers, _ = many_receivers(0.0, elevation=True, dimensions=3)

@@ -159,6 +159,7 @@ def test_late_scans_give_the_same_bits(association):
     assert all(same(*pair) for pair in zip(first, other)) and len(first) == len(other)
 
 
+@pytest.mark.statistics
 def test_crossing_in_clutter_is_better_softly():
     from benchmarks.diver_crossing import case
 

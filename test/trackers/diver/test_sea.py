@@ -120,6 +120,7 @@ def test_lasting_errors_of_fixes_are_in_the_covariance():
     assert white[1] > 8.0 and nees < 2.6 and rmse < 1.05 * white[0]
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize(
     'name, config',
     [

@@ -74,6 +74,7 @@ def test_the_estimate_is_the_contract():
     assert estimate.stamp_ns == SECOND and estimate.frame_id == 'map'
 
 
+@pytest.mark.statistics
 def test_consistency_where_the_models_hold():
     """A diver drawn from the models themselves: NEES within its bounds."""
     rng = np.random.default_rng(4)
@@ -148,16 +149,6 @@ def test_a_burst_of_late_fixes_ends_no_track():
     after = run(tracker, [fix(second, second, 0.0) for second in range(160, 170)])
     assert tracker.counts['restarts'] == 0 and tracker.counts['too_late'] == 5
     assert after[-1].extras['track_id'].tolist() == before[-1].extras['track_id'].tolist()
-
-
-def test_reset_equals_a_fresh_tracker():
-    scene = simulate(scenario('several', {'duration': 20.0}), seed=1)
-    items = [item.measurement for item in scene.measurements]
-    tracker = DiverTracker(DiverConfig())
-    first = run(tracker, items)
-    tracker.reset()
-    assert not tracker.counts
-    assert all(same(*pair) for pair in zip(first, run(tracker, items)))
 
 
 def test_another_frame_is_refused_by_name():

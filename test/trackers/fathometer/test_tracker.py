@@ -97,6 +97,7 @@ def depth_nees(found, true_depths):
     return nees(error[:, None], variance[:, None, None]).mean()
 
 
+@pytest.mark.statistics
 def test_the_uncertainty_of_depths_covers_the_depth_sensor(vectors):
     """All reflectors of a record share the error of the array's depth, 0.03 m in the vectors and
     the scenes, and it is greater than what the trace leaves open."""
@@ -245,16 +246,6 @@ def test_late_repeated_and_restarted_input(vectors):
         for part in (estimates[:3], estimates[3:])
     )
     assert before and after and max(before) < min(after)
-
-
-def test_reset_equals_a_fresh_tracker(vectors):
-    tracker = FathometerTracker(FathometerConfig(particles=300))
-    first, again = [], []
-    for out in (first, again):
-        for each in traces(vectors, range(5)):
-            out += [c.tobytes() for e in tracker.process(each) for c in e.columns().values()]
-        tracker.reset()
-    assert first == again
 
 
 def test_strange_input_is_counted():

@@ -158,6 +158,7 @@ def image_runs():
     return np.array([image_run(setting, seed) for seed in range(24)])
 
 
+@pytest.mark.statistics
 def test_tracks_of_images_are_as_good_as_they_say(image_runs):
     """Each image says how far glints are apart, which does not tell how far the centroid is off:
     taken at its word the whole-state NEES of these scenes is several times what it should be."""

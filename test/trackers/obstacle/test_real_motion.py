@@ -19,6 +19,7 @@ import pytest
 from benchmarks.real_navigation import data_folder, dead_reckoned, summary
 
 
+@pytest.mark.statistics
 @pytest.mark.skipif(
     not (data_folder() / 'dvl.csv').exists(),
     reason='the recorded navigation is not there (SONAR_IMM_DATA)',

@@ -142,6 +142,7 @@ def approaches():
     return found
 
 
+@pytest.mark.statistics
 def test_the_offset_is_found(approaches):
     for name, most in {'approach': 1.7, 'above': 1.8, 'rolling': 0.8}.items():
         assert np.sqrt(np.mean(approaches[name][:, 0] ** 2)) < most
@@ -191,6 +192,7 @@ def test_navigation_that_is_late_shows_in_the_innovations():
     assert nis(0.5) > 3.0
 
 
+@pytest.mark.statistics
 def test_the_scale_state_carries_an_error_of_the_log():
     worse = {'log_scale_error': 0.008, 'sound_speed_error': 0.0}
 
@@ -321,15 +323,6 @@ def test_what_comes_twice_counts_once():
     plain = ObstacleTracker(tracker.config)
     assert same_runs(run(tracker, doubled), run(plain, approach(NAME)[:150]))
     assert tracker.counts['duplicate'] == 150
-
-
-def test_what_is_too_late_is_dropped():
-    tracker = ObstacleTracker(ObstacleConfig(history=1.0))
-    run(tracker, approach(NAME)[:60])
-    before = tracker.counts['used']
-    assert not tracker.process(Detections(stamp_ns=SECOND, range=[50.0], bearing=[0.1]))
-    assert tracker.counts['too_late'] == 1
-    assert tracker.counts['used'] == before
 
 
 def test_a_restarted_clock_begins_anew():

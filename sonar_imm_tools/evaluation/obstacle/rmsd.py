@@ -34,14 +34,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...acoustics import geometry
-from ...acoustics.geometry import Pose
-from ...estimation.angles import wrap_angle
-from ...estimation.arrays import FloatArray
-from ...measurements import Navigation
-from ..navigation import NavigationBuffer
-from .config import ObstacleConfig
-from .navigation import Mount
+from sonar_imm.acoustics import geometry
+from sonar_imm.acoustics.geometry import Pose
+from sonar_imm.estimation.angles import wrap_angle
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.measurements import Navigation
+from sonar_imm.trackers.navigation import NavigationBuffer
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.navigation import Mount
 
 _STEPS = (1e-3, 1e-6, 1e-6)
 """Differences for the slopes: range m, azimuth rad, scale."""
