@@ -80,6 +80,7 @@ def draws(count, rng, *, levelled=False, angle_std=STD['angle_std'], covariance=
     return np.array(found), np.array(stated)
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('levelled', [False, True])
 @pytest.mark.parametrize('covariance', [None, np.diag([4.0, 9.0, 1.0]) + 0.5])
 def test_mean_and_covariance_are_those_of_the_draws(levelled, covariance):

@@ -111,6 +111,7 @@ def test_what_lies_above_or_below_the_axis_is_fainter():
     assert 10.0 * np.log10(level / low) == pytest.approx(6.0, abs=1.0)
 
 
+@pytest.mark.statistics
 def test_a_fading_point_is_rayleigh_and_glints_wander():
     small = {**NOWHERE, 'image_bins': 240, 'image_beams': 128, 'horizontal_fov_deg': 22.5}
     one = sonar(**{**small, 'target_fading': 'rayleigh', 'image_gain': 4.0})

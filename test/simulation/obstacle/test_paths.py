@@ -22,6 +22,7 @@ from sonar_imm.parameters import ConfigError
 from sonar_imm_tools.simulation.obstacle.simulator import DOES, scenario, simulate
 
 
+@pytest.mark.statistics
 def test_a_swaying_obstacle_stays_about_its_place():
     moved = []
     for seed in range(40):

@@ -129,6 +129,7 @@ def test_a_beam_is_a_box_of_elevation_azimuth_and_range():
     assert inside > 100
 
 
+@pytest.mark.statistics
 def test_errors_of_echoes_are_as_large_as_told():
     told = {**EXACT, 'range_std': 0.2, 'bearing_std_deg': 0.4, 'roll_rms_deg': 0.0}
     range_errors, bearing_errors = [], []
@@ -155,6 +156,7 @@ def test_ranges_and_bearings_come_in_steps():
     assert len(set(np.round(ranges))) > 20
 
 
+@pytest.mark.statistics
 def test_a_wrong_sound_speed_scales_all_ranges_of_a_run_alike():
     scales = []
     for seed in range(60):
@@ -240,6 +242,7 @@ def test_without_errors_dead_reckoning_is_the_path():
     assert way > 80.0 and np.abs(off).max() < 0.03
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize(
     'errors, along, across',
     [
@@ -258,6 +261,7 @@ def test_errors_of_the_navigation_grow_as_their_kind_does(errors, along, across)
         assert found == pytest.approx(expected, rel=0.28, abs=0.05)
 
 
+@pytest.mark.statistics
 def test_attitudes_and_depths_have_the_errors_told():
     angles, depths = [], []
     for seed in range(30):

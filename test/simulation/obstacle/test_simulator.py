@@ -120,6 +120,7 @@ def test_the_beam_has_the_stated_size():
     assert [echoes[int(stamp)] for stamp in truth.stamp_ns] == truth.in_beam.astype(int).tolist()
 
 
+@pytest.mark.statistics
 def test_swings_have_the_stated_size():
     rolls = []
     for seed in range(12):
