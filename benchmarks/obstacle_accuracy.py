@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.landmark import LandmarkTracker
 from benchmarks.study import final_estimates, Parts, rms, study, truths
 from sonar_imm.estimates import Estimate
 from sonar_imm.estimation.consistency import gospa
@@ -75,10 +76,12 @@ def config_of(scene: ObstacleScenario, **values: object) -> ObstacleConfig:
     return ObstacleConfig(**{'behaviours': ('fixed',), **own, **values})
 
 
-def track(scene: Scene, config: ObstacleConfig) -> dict[int, Estimate]:
+def track(
+    scene: Scene, config: ObstacleConfig, kind: type[ObstacleTracker] = ObstacleTracker
+) -> dict[int, Estimate]:
     """The last estimate of every ping, by stamp."""
     measurements = [item.measurement for item in scene.measurements]
-    return final_estimates(ObstacleTracker(config), measurements)
+    return final_estimates(kind(config), measurements)
 
 
 def level(estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
@@ -159,7 +162,10 @@ def case(
                 config = config_of(setting, **tracker_values)
                 rows.append([deferred_at(scene, config, at, method == 'refit') for at in RANGES])
             else:
-                final = track(scene, config_of(setting, method=method, **tracker_values))
+                kind = LandmarkTracker if method == 'landmark' else ObstacleTracker
+                parameters = {} if method == 'landmark' else {'method': method}
+                config = config_of(setting, **parameters, **tracker_values)
+                final = track(scene, config, kind)
                 truth = truths(scene, TrueObstacle)[0]
                 rows.append([offset_at(truth, final, at) for at in RANGES])
     return {f'{name}, {method}': summary(rows) for method, rows in results.items()}

@@ -37,7 +37,6 @@ VARIANTS: dict[str, tuple[int, dict[str, Any]]] = {
     'with 5 false echoes per ping': (5, {}),
     '5 slices instead of 9': (0, {'components': 5}),
     'two_way timing': (0, {'ping_timing': 'two_way', 'max_extrapolation': 0.2}),
-    'landmark': (0, {'method': 'landmark'}),
 }
 """False echoes per ping and parameters of what is measured beside the default."""
 

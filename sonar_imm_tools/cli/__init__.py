@@ -21,9 +21,10 @@ gives one line on standard error; a traceback is a bug.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 import functools
+from importlib import import_module
 import os
 import signal
 import sys
@@ -33,10 +34,9 @@ from typing import Any, NoReturn
 import click
 
 from sonar_imm import __version__
+from sonar_imm.parameters import did_you_mean
 from sonar_imm.texts import visible
 from sonar_imm.threads import one_blas_thread
-
-from .lazy import LazyGroup, READER_GONE
 
 PROGRAM = 'sonar-imm'
 
@@ -55,6 +55,46 @@ COMMANDS = {
     'bench': 'Measure speed against other libraries, in one run.',
     'demo': 'Live node, offline tracker, scores and one report on the shipped bags.',
 }
+
+
+READER_GONE = 141
+"""Exit code when the reader of the output went away: that of SIGPIPE in a shell."""
+
+
+class LazyGroup(click.Group):
+    """Subcommand NAME is the attribute ``command`` of the module ``<package>.NAME``."""
+
+    def __init__(self, *args: Any, package: str, summaries: Mapping[str, str], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._package = package
+        self._summaries = summaries
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._summaries)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in self._summaries:
+            return None
+        return import_module(f'{self._package}.{name}').command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] not in self._summaries and not args[0].startswith('-'):
+            ctx.fail(f"there is no command '{args[0]}'{did_you_mean(args[0], self._summaries)}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the subcommand. A reader that went away, as in ``... | head``, is no error."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            raise click.exceptions.Exit(READER_GONE) from None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The help page from the summaries; importing every module would take seconds."""
+        with formatter.section('Commands'):
+            formatter.write_dl(list(self._summaries.items()))
 
 
 @click.group(

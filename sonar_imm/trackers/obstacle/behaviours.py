@@ -38,7 +38,7 @@ from ...estimation.arrays import BoolArray, FloatArray
 from . import behaviour_kernels, kernels
 from .behaviour_kernels import COMMON, Motion, Step
 from .config import BEHAVIOURS, ObstacleConfig
-from .filters import depth_slices, depth_span, DepthSlices, Filter, Landmark, Mixture, Sonar, View
+from .filters import depth_slices, depth_span, DepthSlices, Mixture, Sonar, View
 
 PRIOR = {'fixed': 0.54, 'swaying': 0.18, 'moving': 0.18, 'seabed': 0.10}
 """Probability of each behaviour of a new obstacle, among those asked for."""
@@ -149,15 +149,13 @@ def _cut_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[FloatA
     return 0.5 * (ends[:, 1:] + ends[:, :-1]), 0.5 * width
 
 
-def build_filter(config: ObstacleConfig) -> Filter:
+def build_filter(config: ObstacleConfig) -> DepthSlices:
     """The filter `config.method` names, for the behaviours it asks for."""
-    if config.method == 'landmark':
-        return Landmark(config)
     alone = config.method == 'seafloor' or set(config.behaviours) == {'fixed'}
     return DepthSlices(config) if alone else BehaviourSlices(config)
 
 
-def moving_alike(filter_: Filter, mixture: Mixture, confirmed: np.ndarray) -> bool:
+def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
     """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
     is more probably the navigation that drifts: an error of its velocity moves all alike."""
     if not filter_.moves.any():

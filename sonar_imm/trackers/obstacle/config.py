@@ -28,7 +28,7 @@ from ..shared_parameters import (
     TrackLifeParameters,
 )
 
-METHODS = ('gaussian_sum', 'seafloor', 'landmark')
+METHODS = ('gaussian_sum', 'seafloor')
 BEHAVIOURS = ('fixed', 'swaying', 'moving', 'seabed')
 
 
@@ -41,9 +41,8 @@ class ObstacleConfig(
 
     # fmt: off
     method: str = parameter('gaussian_sum', '',
-        'treatment of the vertical offset: gaussian_sum (estimated, over depth slices), seafloor '
-        '(assumed on the sea floor, as in the paper) or landmark (estimated by one filter in '
-        'world coordinates)', choices=METHODS)
+        'treatment of the vertical offset: gaussian_sum (estimated, over depth slices) or '
+        'seafloor (assumed on the sea floor, as in the paper)', choices=METHODS)
     components: int = parameter(9, '', 'number of depth slices of gaussian_sum', range=(1, 201))
 
     # -- what an obstacle may do, gaussian_sum only ----------------------------------------------

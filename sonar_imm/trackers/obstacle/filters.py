@@ -23,7 +23,7 @@ filter over (d, delta, z, s), and their likelihoods say in which of them the obs
 that stays constant is the obstacle's own depth z; d_st follows from it and the vehicle's depth.
 
 With a single slice that is clamped to the sea floor below the vehicle the same filter is the
-paper's (`seafloor`). `Landmark` keeps one Gaussian in world coordinates instead.
+paper's (`seafloor`).
 
 Everything is in NED and FRD; T targets, K components. Component weights mu (T, K).
 """
@@ -37,7 +37,6 @@ import numpy as np
 
 from ...acoustics import geometry
 from ...acoustics.geometry import Pose
-from ...estimation import kalman, unscented
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
 from . import behaviour_kernels, kernels, ping_kernels
@@ -135,7 +134,7 @@ class DepthSlices:
         self.cone = config.azimuth_model == 'cone'
         self.scale = 0.0 if self.seafloor else config.scale_std
         self.outlier_density = _outlier_density(config)
-        self._beam = _beam(config)
+        self._beam = beam_of(config)
         self._noise = (
             config.position_noise**2,
             np.radians(config.yaw_noise_deg) ** 2,
@@ -230,7 +229,7 @@ class DepthSlices:
         if sonar.late is None:
             return np.ascontiguousarray(mixture.x[..., :2])
         out = kernels.points(mixture.x, *sonar.pose, self.cone)
-        return _two_way(out, sonar, self.config)
+        return two_way_echo(out, sonar, self.config)
 
     def _clamp_to_seafloor(self, mixture: Mixture, sonar: Sonar) -> Mixture:
         """For `seafloor`: the depth is the sea floor's, whatever was measured."""
@@ -241,107 +240,6 @@ class DepthSlices:
         P[..., 2, :] = P[..., :, 2] = 0.0
         P[..., 2, 2] = self.config.altitude_std**2
         return Mixture(x, P, mixture.mu)
-
-
-class Landmark:
-    """One Gaussian a target over its place in the world, north, east, depth, and the scale of the
-    navigation: the unscented filter a navigator would write first."""
-
-    n = 4
-    K = 1
-    behaviours: tuple[str, ...] = ('fixed',)
-    moves = np.zeros(1, np.bool_)
-
-    def __init__(self, config: ObstacleConfig):
-        self.config = config
-        self.model = config.azimuth_model
-        self._beam = _beam(config)
-        self._noise = (config.position_noise**2, config.depth_noise**2)
-
-    def ready(self, sonar: Sonar) -> bool:
-        return True
-
-    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
-        lowest, highest = depth_span(z, sonar, self.config)
-        seen = np.zeros((len(z), 4))
-        seen[:, :2], seen[:, 2] = z, sonar.pose.position[2] + 0.5 * (lowest + highest)
-        covariance = np.zeros((len(z), 4, 4))
-        covariance[:, :2, :2] = R
-        covariance[:, 2, 2] = np.square(highest - lowest) / 12.0
-        covariance[:, 3, 3] = self.config.scale_std**2
-
-        def place(points: FloatArray) -> FloatArray:
-            m = kernels.points(points, *sonar.pose, self.model == 'cone')
-            return np.concatenate([geometry.to_world(sonar.pose, m), points[..., 3:]], axis=-1)
-
-        moved = unscented.unscented_transform(place, seen, covariance)
-        return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
-
-    def advance(
-        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
-    ) -> tuple[Mixture, int]:
-        """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
-        level, depth = (part * dt for part in self._noise)
-        F = np.eye(4)
-        F[:2, 3] = (before.pose.position - after.pose.position)[:2]
-        x, P, repaired = kalman.predict(
-            mixture.x, mixture.P, F, np.diag([level, level, depth, 0.0])
-        )
-        return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
-
-    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
-        seen = unscented.unscented_transform(
-            lambda points: self._echo(points, sonar), mixture.x, mixture.P, angles=_ANGLES
-        )
-        return seen.mean, seen.covariance
-
-    def update(
-        self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
-    ) -> tuple[Mixture, FloatArray, int]:
-        after = unscented.update(
-            mixture.x, mixture.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
-            angles=_ANGLES,
-        )  # fmt: skip
-        return (
-            Mixture(after.x, after.P, mixture.mu),
-            after.nis[:, 0],
-            int(np.count_nonzero(after.repaired)),
-        )
-
-    def view(self, mixture: Mixture, sonar: Sonar) -> View:
-        x, P = mixture.x[:, 0], mixture.P[:, 0]
-
-        def words(points: FloatArray) -> FloatArray:
-            m = geometry.to_body(sonar.pose, points[..., :3])
-            offset = points[..., 2] - sonar.pose.position[2]
-            return np.stack([*geometry.project(m, self.model), offset], axis=-1)
-
-        seen = unscented.unscented_transform(words, x, P, angles=np.array([False, True, False]))
-        std = np.sqrt(seen.covariance[:, 2:, 2])
-        low, high, above = kernels.bands(
-            np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)
-        )
-        place = mixture.x[..., :3] - sonar.pose.position
-        near = np.zeros((len(x), 1, 5)), np.zeros((len(x), 1, 5, 5))
-        near[0][..., :3], near[1][..., :3, :3] = place, mixture.P[..., :3, :3]
-        still = np.ones((len(x), 1)), np.zeros((len(x), 2)), np.zeros((len(x), 2, 2))
-        return View(
-            seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3], *still, near
-        )
-
-    def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
-        m = geometry.to_body(sonar.pose, mixture.x[..., :3])
-        spread = np.sqrt(mixture.P[..., 2, 2]) / np.linalg.norm(m, axis=-1)
-        return kernels.outlook(m, spread, mixture.mu, *self._beam)
-
-    def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
-        out = geometry.to_body(sonar.pose, points[..., :3])
-        if sonar.late is None:
-            return np.stack(geometry.project(out, self.model), axis=-1)
-        return _two_way(out, sonar, self.config)
-
-
-Filter = DepthSlices | Landmark
 
 
 def depth_span(
@@ -380,9 +278,6 @@ def depth_slices(lowest: FloatArray, highest: FloatArray, K: int) -> tuple[Float
     return first[:, None] + np.arange(K) * width[:, None], 0.5 * width
 
 
-_ANGLES = np.array([False, True])
-
-
 def _outlier_density(config: ObstacleConfig) -> float:
     """Of a detection that passed the gate but is not the target's: uniform over a gate as wide as
     the sonar's own error makes it."""
@@ -392,7 +287,7 @@ def _outlier_density(config: ObstacleConfig) -> float:
     return float(1.0 / (np.pi * threshold * range_std * bearing_std))
 
 
-def _two_way(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArray:
+def two_way_echo(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArray:
     """Range and azimuth (..., 2) of points seen at `out` (..., 3) when the ping left."""
     d_out = np.linalg.norm(out, axis=-1)
     fraction = np.clip(2.0 * d_out / config.sound_speed / sonar.late_by, 0.0, 1.0)
@@ -402,7 +297,7 @@ def _two_way(out: FloatArray, sonar: Sonar, config: ObstacleConfig) -> FloatArra
     return np.stack([0.5 * (d_out + d_back), azimuth], axis=-1)
 
 
-def _beam(config: ObstacleConfig) -> tuple[float, float, float]:
+def beam_of(config: ObstacleConfig) -> tuple[float, float, float]:
     """Half height and half width, rad, and reach of the beam, m."""
     fov = config.vertical_fov_deg, config.horizontal_fov_deg
     vertical, horizontal = np.radians(0.5 * np.array(fov))

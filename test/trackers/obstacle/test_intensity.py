@@ -110,7 +110,7 @@ def test_a_detection_without_intensity_changes_nothing():
 def test_it_is_off_by_default_and_for_the_gaussian_sum_only():
     assert ObstacleConfig().vertical_beam_width_deg == 0.0
     with pytest.raises(ConfigError, match='gaussian_sum'):
-        ObstacleConfig(method='landmark', vertical_beam_width_deg=15.0)
+        ObstacleConfig(method='seafloor', vertical_beam_width_deg=15.0)
 
 
 def test_a_nodding_sonar_knows_the_height_sooner_in_the_whole_tracker():

@@ -1,0 +1,143 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A baseline of the obstacle tracker: one Gaussian per obstacle in world coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sonar_imm.acoustics import geometry
+from sonar_imm.estimation import kalman, unscented
+from sonar_imm.estimation.arrays import FloatArray
+from sonar_imm.trackers.obstacle import kernels
+from sonar_imm.trackers.obstacle.config import ObstacleConfig
+from sonar_imm.trackers.obstacle.filters import (
+    BAND,
+    beam_of,
+    depth_span,
+    Mixture,
+    Sonar,
+    two_way_echo,
+    View,
+)
+from sonar_imm.trackers.obstacle.tracker import ObstacleTracker
+
+_ANGLES = np.array([False, True])
+
+
+class Landmark:
+    """One Gaussian a target over its place in the world, north, east, depth, and the scale of the
+    navigation: the unscented filter a navigator would write first."""
+
+    n = 4
+    K = 1
+    behaviours: tuple[str, ...] = ('fixed',)
+    moves = np.zeros(1, np.bool_)
+
+    def __init__(self, config: ObstacleConfig):
+        self.config = config
+        self.model = config.azimuth_model
+        self._beam = beam_of(config)
+        self._noise = (config.position_noise**2, config.depth_noise**2)
+
+    def ready(self, sonar: Sonar) -> bool:
+        return True
+
+    def begin(self, z: FloatArray, R: FloatArray, sonar: Sonar) -> Mixture:
+        lowest, highest = depth_span(z, sonar, self.config)
+        seen = np.zeros((len(z), 4))
+        seen[:, :2], seen[:, 2] = z, sonar.pose.position[2] + 0.5 * (lowest + highest)
+        covariance = np.zeros((len(z), 4, 4))
+        covariance[:, :2, :2] = R
+        covariance[:, 2, 2] = np.square(highest - lowest) / 12.0
+        covariance[:, 3, 3] = self.config.scale_std**2
+
+        def place(points: FloatArray) -> FloatArray:
+            m = kernels.points(points, *sonar.pose, self.model == 'cone')
+            return np.concatenate([geometry.to_world(sonar.pose, m), points[..., 3:]], axis=-1)
+
+        moved = unscented.unscented_transform(place, seen, covariance)
+        return Mixture(moved.mean[:, None], moved.covariance[:, None], np.ones((len(z), 1)))
+
+    def advance(
+        self, mixture: Mixture, before: Sonar, after: Sonar, dt: float
+    ) -> tuple[Mixture, int]:
+        """In the drifting world of the navigation a fixed obstacle moves with the scale error."""
+        level, depth = (part * dt for part in self._noise)
+        F = np.eye(4)
+        F[:2, 3] = (before.pose.position - after.pose.position)[:2]
+        x, P, repaired = kalman.predict(
+            mixture.x, mixture.P, F, np.diag([level, level, depth, 0.0])
+        )
+        return Mixture(x, P, mixture.mu), int(np.count_nonzero(repaired))
+
+    def expected(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, FloatArray]:
+        seen = unscented.unscented_transform(
+            lambda points: self._echo(points, sonar), mixture.x, mixture.P, angles=_ANGLES
+        )
+        return seen.mean, seen.covariance
+
+    def update(
+        self, mixture: Mixture, h: FloatArray, z: FloatArray, R: FloatArray, sonar: Sonar
+    ) -> tuple[Mixture, FloatArray, int]:
+        after = unscented.update(
+            mixture.x, mixture.P, z[:, None], lambda points: self._echo(points, sonar), R[:, None],
+            angles=_ANGLES,
+        )  # fmt: skip
+        return (
+            Mixture(after.x, after.P, mixture.mu),
+            after.nis[:, 0],
+            int(np.count_nonzero(after.repaired)),
+        )
+
+    def view(self, mixture: Mixture, sonar: Sonar) -> View:
+        x, P = mixture.x[:, 0], mixture.P[:, 0]
+
+        def words(points: FloatArray) -> FloatArray:
+            m = geometry.to_body(sonar.pose, points[..., :3])
+            offset = points[..., 2] - sonar.pose.position[2]
+            return np.stack([*geometry.project(m, self.model), offset], axis=-1)
+
+        seen = unscented.unscented_transform(words, x, P, angles=np.array([False, True, False]))
+        std = np.sqrt(seen.covariance[:, 2:, 2])
+        low, high, above = kernels.bands(
+            np.ascontiguousarray(seen.mean[:, 2:]), std, mixture.mu, 0.5 * (1.0 - BAND)
+        )
+        place = mixture.x[..., :3] - sonar.pose.position
+        near = np.zeros((len(x), 1, 5)), np.zeros((len(x), 1, 5, 5))
+        near[0][..., :3], near[1][..., :3, :3] = place, mixture.P[..., :3, :3]
+        still = np.ones((len(x), 1)), np.zeros((len(x), 2)), np.zeros((len(x), 2, 2))
+        return View(
+            seen.mean, seen.covariance, low, high, above, x[:, :3], P[:, :3, :3], *still, near
+        )
+
+    def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
+        m = geometry.to_body(sonar.pose, mixture.x[..., :3])
+        spread = np.sqrt(mixture.P[..., 2, 2]) / np.linalg.norm(m, axis=-1)
+        return kernels.outlook(m, spread, mixture.mu, *self._beam)
+
+    def _echo(self, points: FloatArray, sonar: Sonar) -> FloatArray:
+        out = geometry.to_body(sonar.pose, points[..., :3])
+        if sonar.late is None:
+            return np.stack(geometry.project(out, self.model), axis=-1)
+        return two_way_echo(out, sonar, self.config)
+
+
+class LandmarkTracker(ObstacleTracker):
+    """The obstacle tracker with `Landmark` as its filter; its behaviours are not used."""
+
+    def _settle(self, config: ObstacleConfig) -> None:
+        super()._settle(config)
+        self.filter = Landmark(config)  # type: ignore[assignment]
