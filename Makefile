@@ -69,7 +69,7 @@ $(STAMP): setup.py pyproject.toml
 demo: venv ## track a shipped bag with the live node and offline, score both, write a report
 	$(BIN)/sonar-imm demo --out demo
 
-test: test-core test-system ## run every test
+test: test-core test-system ## run the tests; of the Monte Carlo ones a fourth, in turn
 
 test-core: venv ## run the tests that need no processes of their own (JOBS=... CORETYPE=... TESTS=...)
 	$(TEST_ENV) $(BIN)/python -m pytest -m 'not system' --statistics share -n $(JOBS) $(TESTS)

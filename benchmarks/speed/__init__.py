@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+import time
 from typing import Any
 
 from attrs import frozen
@@ -45,6 +46,13 @@ class Bench:
     name: str
     measure: Callable[[int], dict[str, Any]]
     sentence: Callable[[dict[str, Any]], str]
+
+
+def seconds_of(function: Callable[..., Any], *arguments: Any) -> float:
+    """Seconds that one call takes."""
+    begin = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - begin
 
 
 def benches_of(system: str) -> tuple[Bench, ...]:

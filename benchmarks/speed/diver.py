@@ -21,14 +21,14 @@ estimates have to agree, which shows that both did the same work.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import time
 from typing import Any
 
 from attrs import frozen
 import numpy as np
 
-from benchmarks.speed import Bench
+from benchmarks.speed import Bench, seconds_of
 from sonar_imm.estimation import imm, imm_kernels
 from sonar_imm.estimation.arrays import FloatArray
 from sonar_imm.estimation.association import assign, association_cost, gate_threshold
@@ -118,7 +118,7 @@ def bench_step(rounds: int = 7, steps: int = 150) -> dict[str, Any]:
     ours, theirs = run_kernel(p), run_filterpy(p)
     agreement = float(np.abs(ours - theirs).max())
     pairs = (
-        np.array([[_seconds(run_kernel, p), _seconds(run_filterpy, p)] for _ in range(rounds)])
+        np.array([[seconds_of(run_kernel, p), seconds_of(run_filterpy, p)] for _ in range(rounds)])
         / steps
         * 1e6
     )
@@ -259,12 +259,6 @@ def _cpu_of_tracking(items: Sequence[Any], config: DiverConfig | None = None) ->
     for item in items:
         tracker.process(item)
     return time.process_time() - begin
-
-
-def _seconds(function: Callable[[Problem], Any], p: Problem) -> float:
-    begin = time.perf_counter()
-    function(p)
-    return time.perf_counter() - begin
 
 
 def _step_sentence(step: Mapping[str, Any]) -> str:

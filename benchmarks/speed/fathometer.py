@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.speed import Bench
+from benchmarks.speed import Bench, seconds_of
 from sonar_imm.acoustics.fathometer import coherence, steering
 from sonar_imm.acoustics.pulse import band_pulse
 from sonar_imm.acoustics.spectra import outer_sum, SnapshotStream
@@ -136,10 +136,10 @@ def bench_array(
         **{name: partial(coherence, R, w, name) for name in ('conventional', 'mvdr')},
     }
     times = {
-        name: float(np.median([_seconds(work) for _ in range(min(rounds, 3))]))
+        name: float(np.median([seconds_of(work) for _ in range(min(rounds, 3))]))
         for name, work in works.items()
     }
-    times['white_noise'] = _seconds(coherence, R, w, 'white_noise')
+    times['white_noise'] = seconds_of(coherence, R, w, 'white_noise')
     return {'snapshots': snapshots, 'ms': {name: 1e3 * spent for name, spent in times.items()}}
 
 
@@ -158,7 +158,10 @@ def bench_likelihood(rounds: int = 7, sets: int = 100) -> dict[str, Any]:
     short, full = _by_gram(b, gram, places), _by_least_squares(x, shapes, places)
     pairs = np.array(
         [
-            [_seconds(_by_gram, b, gram, places), _seconds(_by_least_squares, x, shapes, places)]
+            [
+                seconds_of(_by_gram, b, gram, places),
+                seconds_of(_by_least_squares, x, shapes, places),
+            ]
             for _ in range(rounds)
         ]
     )
@@ -206,12 +209,6 @@ def _by_least_squares(x: FloatArray, shapes: FloatArray, places: np.ndarray) -> 
         fit = A @ np.linalg.lstsq(A, x, rcond=None)[0]
         values[k] = 0.5 * (x @ x - np.sum(np.square(x - fit)))
     return values
-
-
-def _seconds(function: Any, *arguments: Any) -> float:
-    begin = time.perf_counter()
-    function(*arguments)
-    return time.perf_counter() - begin
 
 
 def _record_sentence(result: Mapping[str, Any]) -> str:
