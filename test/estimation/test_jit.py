@@ -24,7 +24,7 @@ import sys
 from numba.core import caching
 import pytest
 
-from sonar_imm.estimation import imm_kernels, jit
+from sonar_imm.estimation import jit
 
 ROOT = Path(__file__).parents[2]
 
@@ -308,9 +308,3 @@ def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkey
     with pytest.warns(RuntimeWarning):
         tripled = jit.kernel(lambda x: 3.0 * x)
     assert tripled(2.0) == 6.0 and tripled.stats.cache_path is None
-
-
-def test_warm_leaves_nothing_to_compile():
-    imm_kernels.warm()
-    verbs = ('mix', 'predict', 'update', 'gate', 'combine')
-    assert all(getattr(imm_kernels, verb).signatures for verb in verbs)
