@@ -358,10 +358,10 @@ class DiverTracker:
             step.dt,
             np.flatnonzero(hit),
         )
-        nis, arrivals = np.where(hit, now.nis, np.nan), NisMemory()
+        nis, arrivals = np.where(hit, now.nis, np.nan), before.arrivals
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
-            arrivals = before.arrivals.after(nis[sure], now.nis_dof[sure])
+            arrivals = arrivals.after(nis[sure], now.nis_dof[sure])
         return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
 
     def _prune(self, now: DiverState, scan: Scan) -> DiverState:
