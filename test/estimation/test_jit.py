@@ -173,8 +173,8 @@ def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
         return jit.kernel(doubled)
 
     def files(function):
-        folder = Path(function.stats.cache_path)
-        return {path: path.read_bytes() for path in folder.glob('*doubled*.nbc')}
+        folder, line = Path(function.stats.cache_path), doubled.__code__.co_firstlineno
+        return {path: path.read_bytes() for path in folder.glob(f'*doubled-{line}.*.nbc')}
 
     mine, other = compiled(), compiled()
     mine._cache.flush()
