@@ -45,7 +45,6 @@ from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...estimation.consider import consider_models
-from ...estimation.consistency import NisMemory
 from ...estimation.jipda import warm as warm_jipda
 from ...estimation.small_matrices import add_jitter_all
 from ...intake import KnownFrames

@@ -25,7 +25,7 @@ from sonar_imm.acoustics.arrivals_3d import observe
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
-from sonar_imm.trackers.diver.pings import optima, update_by_ping
+from sonar_imm.trackers.diver.pings import optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -184,6 +184,28 @@ def test_many_good_arrivals_outvote_any_prior():
     after = update_by_ping(x, P, mu, numbers, config, layout)
     assert np.hypot(*(after.mu @ after.x[:, :2] - [20.0, 35.0])) < 1.0
     assert np.hypot(*(optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
+
+
+@pytest.mark.parametrize('std', [1.0, 1e2, 1e6, 1e9])
+def test_exact_arrivals_at_twin_receivers_are_judged_whatever_was_known(std):
+    """What is expected at two receivers in one place is the same to the last bit. After a long
+    silence it is so uncertain that the variances of the arrivals are lost in its rounding."""
+    config = DiverConfig(max_tracks=1)
+    models = build_models(config)
+    layout = Instruments().layout(config, models)
+    at, origin = np.array([20.0, 35.0, 0.0]), np.array([5e5, 6e6, 0.0])
+    twins = origin + np.repeat(RECEIVERS, 2, axis=0)
+    measurement = ping_of(origin + at, twins, tuple(twins[0]))
+    measurement = evolve(measurement, var_toa=np.full(len(twins), 1e-30))
+    numbers = ping_measurements(measurement, np.arange(len(twins)), config, 1.0, models, layout)
+    before = tuple(
+        item[0]
+        for item in models.new_tracks((origin + at)[None, :2] + 1e-4, std**2 * np.eye(2)[None])
+    )
+    after = PingUpdate(*before, np.ones(len(numbers.row)), 0.0, 0)
+    taking = taking_of(before, after, numbers, config, 1.0)
+    assert taking.dof == len(numbers.row)
+    assert 0.0 <= taking.nis <= taking.dof
 
 
 def test_wild_echoes_only_leave_the_prediction():
