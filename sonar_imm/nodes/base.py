@@ -278,6 +278,7 @@ class TrackerNode(BaseNode):
     def destroy_node(self) -> None:
         """Save the state, then end."""
         self._saved_state.save(self._config, wait=True)
+        self._saved_state.close()
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:

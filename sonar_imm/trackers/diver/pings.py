@@ -345,7 +345,7 @@ def taking_of(
 
 
 def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
-    """``residual' S^-1 residual``, ``S = covariance + diag(variance)``; residual and variance (C,).
+    """``residual' S^-1 residual``, ``S = covariance + diag(variance)``; variance (C,).
 
     Beside what is expected of exact arrivals after a long silence their own variances are lost in
     rounding, and S can have no inverse. Its eigenvalues in units of the variances are 1 at least.
