@@ -129,6 +129,8 @@ class BaseNode(Node):
         topic, reader = self._inputs[name]
         stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(name, start)
+        if stamp is not None:
+            self._meter.stamped(name, start - (stamp.sec + 1e-9 * stamp.nanosec))
         if self._waited_too_long(name, info):
             self._acknowledge(stamp)
             return
@@ -242,6 +244,7 @@ class BaseNode(Node):
                 stale_after=self._node_config.stale_after,
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
+                publishers=self.count_publishers,
                 **self.work_report(),
             )
         )

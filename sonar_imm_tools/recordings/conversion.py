@@ -179,13 +179,13 @@ def read_npz(path: Path) -> dict[str, NDArray]:
                 raise BagError(f'{path} is not a numpy archive (npz)')
         with zipfile.ZipFile(path) as packed:
             size = sum(part.file_size for part in packed.infolist())
-            arrays = all(name.endswith('.npy') for name in packed.namelist())
         if size > max(MAX_UNPACKED, MAX_RATIO * path.stat().st_size):
             raise BagError(f'{path} {TOO_LARGE}')
-        if not arrays:  # an archive in it, say
-            raise ValueError
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError('numpy gives the bytes of anything else, such as an archive')
+        return arrays
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
     except (ValueError, EOFError, MemoryError, zlib.error, zipfile.BadZipFile):
