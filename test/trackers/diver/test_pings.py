@@ -25,7 +25,7 @@ from sonar_imm.acoustics.arrivals_3d import observe
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
-from sonar_imm.trackers.diver.pings import optima, PingUpdate, taking_of, update_by_ping
+from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
 from sonar_imm.trackers.diver.state_space import Instruments
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
@@ -276,3 +276,22 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
         Instruments().layout(flat, models),
     ).measured
     assert numbers.kind.tolist() == [0, 0, 0, 0]
+
+
+def test_a_search_begins_on_the_ellipse_of_the_shortest_path():
+    """Where the sum of the ways is the path that was heard first: anywhere else the first echo is
+    late or early by what the search has to find."""
+    config = DiverConfig(max_tracks=1)
+    models = build_models(config)
+    layout = Instruments().layout(config, models)
+    at, tx = np.array([60.0, 35.0, 0.0]), (-40.0, -20.0, 0.0)
+    measurement = ping_of(at, RECEIVERS, tx)
+    every = np.arange(len(RECEIVERS))
+    measured = ping_measurements(measurement, every, config, 1.0, models, layout).measured
+    starts = _starts(measured, passive=False)
+    first = np.argmin(measured.value)
+    ways = [
+        np.linalg.norm(starts - place[first, :2], axis=1) for place in (measured.tx, measured.rx)
+    ]
+    np.testing.assert_allclose(sum(ways), measured.value[first], rtol=1e-9)
+    assert np.ptp(starts, axis=0).min() > 10.0
