@@ -27,7 +27,7 @@ from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
 from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
-from sonar_imm.trackers.diver.state_space import Instruments
+from sonar_imm.trackers.diver.state_space import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -295,3 +295,17 @@ def test_a_search_begins_on_the_ellipse_of_the_shortest_path():
     ]
     np.testing.assert_allclose(sum(ways), measured.value[first], rtol=1e-9)
     assert np.ptp(starts, axis=0).min() > 10.0
+
+
+def test_the_state_does_not_grow_with_numbers_that_wander():
+    """A receiver that gives itself a new number with every ping."""
+    config = DiverConfig(receiver_position_std=0.5, receiver_clock_std=1e-4)
+    models, known = build_models(config), Instruments()
+    for k in range(50):
+        ping = evolve(ping_of(np.array([20.0, 35.0, 0.0])), rx_id=100 + 4 * k + np.arange(4))
+        known = known.with_receivers(ping, config)
+    layout = known.layout(config, models)
+    assert len(known.known) == MOST_RECEIVERS
+    assert len(layout.mask) <= models.n + 1 + 3 * MOST_RECEIVERS
+    first, last = layout.columns(models, np.array([100, 299]), False)
+    assert (first != last).sum() == 2  # the errors of the last one have no place
