@@ -46,6 +46,7 @@ cache is used, and a warning says so.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
@@ -67,6 +68,12 @@ F = TypeVar('F', bound=Callable[..., Any])
 
 KEPT_SECONDS = 7 * 86400.0
 """How long code is kept that was compiled of sources as they no longer are."""
+
+kernels: Counter[str] = Counter()
+"""How many kernels this process has 'loaded' and 'compiled', one for each signature."""
+
+listeners: list[Callable[[], object]] = []
+"""Called after each kernel that was compiled."""
 
 _CHECKSUM = hashlib.sha256().digest_size
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
@@ -103,17 +110,24 @@ def _attach_cache(compiled: Any, function: Callable[..., Any]) -> None:
     replaced: Any = type(compiled._cache)
     _check_verbs(files, replaced)
     numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
-    numbas_own.load_overload = _or_none(numbas_own.load_overload)
-    numbas_own.save_overload = _or_none(numbas_own.save_overload)
+    numbas_own.load_overload = _or_none(numbas_own.load_overload, 'loaded')
+    numbas_own.save_overload = _or_none(numbas_own.save_overload, 'compiled')
     compiled._cache = numbas_own
 
 
-def _or_none(use_cache: Callable[..., Any]) -> Callable[..., Any]:
-    """`use_cache`, which gives None and warns where it failed: the kernel is compiled then."""
+def _or_none(use_cache: Callable[..., Any], counted_as: str) -> Callable[..., Any]:
+    """`use_cache`, which gives None and warns where it failed: the kernel is compiled then. Counts
+    in `kernels` what was found, or is to be kept."""
 
     def guarded(*args: Any) -> Any:
         try:
-            return use_cache(*args)
+            found = use_cache(*args)
+            if found is not None or counted_as == 'compiled':
+                kernels[counted_as] += 1
+            if counted_as == 'compiled':
+                for listener in listeners:
+                    listener()
+            return found
         except Exception as error:  # whatever it is, it is no reason to end a node
             _warn_of_no_cache(getattr(error, 'strerror', None) or type(error).__name__)
             return None
@@ -158,6 +172,8 @@ class _FilePerKey:
 
     def __init__(self, folder: Path, function: Callable[..., Any]):
         self.folder = folder
+        # Compiled by who installed the package, for those who may not write there.
+        self._installed = Path(inspect.getfile(function)).parent / '__pycache__'
         path, code = inspect.getfile(function), function.__code__
         name = re.sub('[<>]', '', f'{Path(path).stem}.{function.__qualname__}')
         python = f'py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, "abiflags", "")}'
@@ -167,8 +183,15 @@ class _FilePerKey:
         self._stem = f'{self._base}{_short_digest(self._stamp)}.'
 
     def load(self, key: Any) -> Any:
+        for folder in (self.folder, self._installed):
+            found = self._load(folder / self._path_of(key).name, key)
+            if found is not None:
+                return found
+        return None
+
+    def _load(self, path: Path, key: Any) -> Any:
         try:
-            content = self._path_of(key).read_bytes()
+            content = path.read_bytes()
         except OSError:
             return None
         checksum, packed = content[:_CHECKSUM], content[_CHECKSUM:]
