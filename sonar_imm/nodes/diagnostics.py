@@ -133,7 +133,7 @@ def clock_offset(ages: Sequence[float]) -> float:
     cut = int(np.argmax(np.diff(ordered))) + 1
     low, high = ordered[:cut], ordered[cut:]
     offset = float(np.median(high) - np.median(low))
-    turns = np.count_nonzero(np.diff(np.asarray(ages) >= high[0]))
+    turns = int(np.count_nonzero(np.diff(np.asarray(ages) >= high[0])))
     if min(len(low), len(high), turns) < _AGES // 4 or offset < _LEAST_OFFSET:
         return 0.0
     return offset if max(np.ptp(low), np.ptp(high)) < 0.25 * offset else 0.0
