@@ -217,6 +217,8 @@ class BaseNode(Node):
         topic, _, reader = self._inputs[name]
         stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(name, start)
+        if stamp is not None:
+            self._meter.stamped(name, start - (stamp.sec + 1e-9 * stamp.nanosec))
         if self._waited_too_long(name, info):
             self._acknowledge(stamp)
             return
@@ -374,6 +376,7 @@ class BaseNode(Node):
                 starting='' if self._hears else self._warming.sentence(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
+                publishers=self.count_publishers,
                 **self.work_report(),
             )
         )
@@ -409,6 +412,7 @@ class TrackerNode(BaseNode):
     def destroy_node(self) -> None:
         """Save the state, then end."""
         self._saved_state.save(self._config, wait=True)
+        self._saved_state.close()
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:
