@@ -63,7 +63,9 @@ F = TypeVar('F', bound=Callable[..., Any])
 KEPT_SECONDS = 7 * 86400.0
 """How long code is kept that was compiled of sources as they no longer are."""
 
-_OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
+_OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
+"""Nobody hands a kernel to C, and what that would need is a tenth of the code."""
+
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)
 
