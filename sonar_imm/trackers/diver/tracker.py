@@ -312,7 +312,8 @@ class DiverTracker:
         layout = self._layout(now.instruments)
         white, consistency = now.white, now.fixes
         if len(tracks):
-            innovations = now.x, now.P, now.mu, layout.H, fixes.z, fixes.R, tracks, detection
+            mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, layout.H[0])
+            innovations = mean, covariance, fixes.z, fixes.R, tracks, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
             white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
             consistency = FixConsistency(*sums)
