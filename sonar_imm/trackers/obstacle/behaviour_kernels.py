@@ -167,7 +167,6 @@ class _Lanes(NamedTuple):
     scratch: FloatArray
 
 
-@kernel
 def advance(
     x: FloatArray, P: FloatArray, mu: FloatArray, motion: Motion, step: Step
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -177,6 +176,17 @@ def advance(
     repaired (`estimation.covariance`). Dropped components are given the numbers of the most
     probable one, so that all stay finite.
     """
+    x1, P1, repaired = _advance(x, P, mu, motion, step)
+    if repaired.any():
+        _repair(x1, P1, mu, motion.prior, repaired)
+    return x1, P1, repaired
+
+
+@kernel
+def _advance(
+    x: FloatArray, P: FloatArray, mu: FloatArray, motion: Motion, step: Step
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """`advance` without the repairs: where (T, C) they are needed."""
     T, C, size = x.shape
     x1, P1 = np.zeros((T, C, size)), np.zeros((T, C, size, size))
     repaired = np.zeros((T, C), dtype=np.bool_)
@@ -194,7 +204,7 @@ def advance(
         np.empty((4, lanes)), np.empty(lanes), np.empty(lanes), np.empty((size, lanes)),
         np.empty((2, numbers, lanes)), np.empty((2, 2, lanes)), np.empty((3, numbers, lanes)),
     )  # fmt: skip
-    bad, scratch = np.empty(lanes, dtype=np.int64), np.empty((size, size))
+    bad = np.empty(lanes, dtype=np.int64)
     for turn in range(0, live, lanes):
         first = turn_of(turn, live, lanes)
         some = which[first : first + lanes]
@@ -209,14 +219,46 @@ def advance(
                 x1[t, j, a] = work.y[a, k]
                 for b in range(a + 1):
                     P1[t, j, a, b] = P1[t, j, b, a] = work.S[a, b, k]
-            if bad[k]:
-                repaired[t, j] = add_jitter(P1[t, j, :n, :n], scratch[:n, :n])
+            repaired[t, j] = bad[k] > 0
     for t in range(T):
-        best = np.argmax(mu[t])
-        for j in range(C):
-            if mu[t, j] <= 0.0:
-                x1[t, j], P1[t, j] = x1[t, best], P1[t, best]
+        _fill(x1, P1, mu, t)
     return x1, P1, repaired
+
+
+@kernel
+def _fill(x: FloatArray, P: FloatArray, mu: FloatArray, t: int) -> None:
+    """Give the dropped components of a target the numbers of its most probable one."""
+    best = 0
+    for j in range(mu.shape[1]):
+        # As argmax: NaN counts as the greatest.
+        if not mu[t, j] <= mu[t, best] and mu[t, best] == mu[t, best]:
+            best = j
+    for j in range(mu.shape[1]):
+        if mu[t, j] <= 0.0:
+            for a in range(x.shape[2]):
+                x[t, j, a] = x[t, best, a]
+                for b in range(x.shape[2]):
+                    P[t, j, a, b] = P[t, best, a, b]
+
+
+@kernel
+def _repair(
+    x: FloatArray, P: FloatArray, mu: FloatArray, prior: FloatArray, repaired: BoolArray
+) -> None:
+    """`add_jitter` the covariances that are to be `repaired` (T, C), of as many states as the
+    component has, in place; False afterwards where there was nothing to do."""
+    T, C, size = x.shape
+    for t in range(T):
+        some = False
+        for j in range(C):
+            if repaired[t, j]:
+                n = size if prior[j] > 0.0 else COMMON
+                own = P[t, j, :n, :n].copy()
+                repaired[t, j] = add_jitter(own, np.empty((n, n)))
+                P[t, j, :n, :n] = own
+                some = True
+        if some:
+            _fill(x, P, mu, t)
 
 
 @kernel

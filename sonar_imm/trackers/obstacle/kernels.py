@@ -146,7 +146,6 @@ def matched(x: FloatArray, P: FloatArray, mu: FloatArray, n: int) -> tuple[Float
     return mean, covariance
 
 
-@kernel
 def jipda_update(
     x: FloatArray,
     P: FloatArray,
@@ -164,14 +163,33 @@ def jipda_update(
     Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where
     P (T, K) was repaired (`estimation.covariance`).
     """
+    outlier = outlier_probability * outlier_density
+    x1, P1, mu1, nis, repaired = _update(x, P, mu, h, z, R, outlier_probability, outlier)
+    if repaired.any():
+        _update_again(x, P, mu, h, z, R, outlier_probability, outlier, x1, P1, mu1, repaired)
+    return x1, P1, mu1, nis, repaired
+
+
+@kernel
+def _update(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    h: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    outlier_probability: float,
+    outlier: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """`jipda_update` where the plain form is exact enough. Weights of a target of which something
+    is to be repaired are not normalised."""
     T, K, n = x.shape
     x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
     repaired = np.zeros((T, K), dtype=np.bool_)
     g0, g1, k0, k1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    L, v = np.empty((n, n)), np.empty(2)
-    outlier = outlier_probability * outlier_density
+    L = np.empty((n, n))
     for t in range(T):
-        total = 0.0
+        total, exact = 0.0, True
         v0 = v1 = 0.0
         for j in range(K):
             v0 += mu[t, j] * (z[t, 0] - h[t, j, 0])
@@ -213,16 +231,46 @@ def jipda_update(
             trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
             trusted = trusted and determinant > LIMIT * s00 * s11
             if not (trusted and is_psd(P1[t, j], L)):
-                repaired[t, j] = True
-                v[0], v[1] = r0, r1
-                likelihood = _square_root_jipda_update(
-                    x[t, j], P[t, j], v, R[t], outlier_probability, outlier, x1[t, j], P1[t, j]
-                )
+                repaired[t, j], exact = True, False
             mu1[t, j] = mu[t, j] * likelihood
             total += mu1[t, j]
         for j in range(K):
-            mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
+            if exact:
+                mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
     return x1, P1, mu1, nis, repaired
+
+
+@kernel
+def _update_again(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    h: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    outlier_probability: float,
+    outlier: float,
+    x1: FloatArray,
+    P1: FloatArray,
+    mu1: FloatArray,
+    repaired: BoolArray,
+) -> None:
+    """Finish `_update`, in place, for the targets of which something is `repaired` (T, K)."""
+    T, K, _ = x.shape
+    v = np.empty(2)
+    for t in range(T):
+        total, exact = 0.0, True
+        for j in range(K):
+            if repaired[t, j]:
+                exact = False
+                v[0], v[1] = z[t, 0] - h[t, j, 0], z[t, 1] - h[t, j, 1]
+                mu1[t, j] = mu[t, j] * _square_root_jipda_update(
+                    x[t, j], P[t, j], v, R[t], outlier_probability, outlier, x1[t, j], P1[t, j]
+                )
+            total += mu1[t, j]
+        for j in range(K):
+            if not exact:
+                mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
 
 
 @kernel

@@ -26,7 +26,6 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
-from . import avoidance_kernels, kernels
 
 SMALLEST, WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
@@ -104,61 +103,6 @@ def is_finite(x: FloatArray, P: FloatArray) -> BoolArray:
             flaws += not math.isfinite(value)
         usable[t] = flaws == 0
     return usable
-
-
-@kernel
-def outlook(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    p: FloatArray,
-    R: FloatArray,
-    cone: bool,
-    beam: tuple[float, float, float],
-) -> tuple[FloatArray, BoolArray]:
-    """`kernels.outlook` of mixtures whose first states are (d, delta, z)."""
-    T, K, _ = x.shape
-    spread = np.empty((T, K))
-    for t in range(T):
-        for j in range(K):
-            spread[t, j] = math.sqrt(P[t, j, 2, 2]) / x[t, j, 0]
-    m = kernels.points(x, p, R, cone)
-    return kernels.outlook(m, spread, mu, beam[0], beam[1], beam[2])
-
-
-@kernel
-def describe(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    moves: BoolArray,
-    p: FloatArray,
-    R: FloatArray,
-    cone: bool,
-    tail: float,
-) -> tuple[FloatArray, ...]:
-    """What `filters.View` says of mixtures whose first states are (d, delta, z), seen by a sonar
-    at p (3,), turned by R (3, 3): state and covariance; the two quantiles and the probability of
-    `kernels.bands`; place, velocity, and the covariance (T, 5, 5) of both; mean and covariance of
-    the components as `avoidance_kernels.relative` has them."""
-    T, K, _ = x.shape
-    state, covariance = kernels.matched(x, P, mu, 3)
-    offset, std = np.empty((T, K)), np.empty((T, K))
-    for t in range(T):
-        state[t, 2] -= p[2]
-        for j in range(K):
-            offset[t, j] = x[t, j, 2] - p[2]
-            std[t, j] = math.sqrt(P[t, j, 2, 2])
-    low, high, above = kernels.bands(offset, std, mu, tail)
-    mean, spread = avoidance_kernels.relative(x, P, mu, moves, p, R, cone)
-    together, both = kernels.matched(mean, spread, mu, avoidance_kernels.SIZE)
-    place, velocity = np.empty((T, 3)), np.empty((T, 2))
-    for t in range(T):
-        for i in range(3):
-            place[t, i] = p[i] + together[t, i]
-        for i in range(2):
-            velocity[t, i] = together[t, 3 + i]
-    return state, covariance, low, high, above, place, velocity, both, mean, spread
 
 
 @kernel
