@@ -45,7 +45,6 @@ from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...estimation.consider import consider_models
-from ...estimation.consistency import NisMemory
 from ...estimation.small_matrices import add_jitter_all
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
@@ -358,10 +357,10 @@ class DiverTracker:
             step.dt,
             np.flatnonzero(hit),
         )
-        nis, arrivals = np.where(hit, now.nis, np.nan), NisMemory()
+        nis, arrivals = np.where(hit, now.nis, np.nan), before.arrivals
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
-            arrivals = before.arrivals.after(nis[sure], now.nis_dof[sure])
+            arrivals = arrivals.after(nis[sure], now.nis_dof[sure])
         return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
 
     def _prune(self, now: DiverState, scan: Scan) -> DiverState:
