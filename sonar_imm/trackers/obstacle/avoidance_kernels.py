@@ -85,7 +85,7 @@ def relative(
         return mean, covariance
     lanes = lanes_for(live)
     y, S, F = np.empty((size, lanes)), np.zeros((size, size, lanes)), np.zeros((size, size, lanes))
-    g, C = np.empty((SIZE, lanes)), np.zeros((SIZE, SIZE, lanes))
+    g, C = np.zeros((SIZE, lanes)), np.zeros((SIZE, SIZE, lanes))
     seen, world = np.empty((3, PLACES, lanes)), np.empty((3, PLACES, lanes))
     scratch = np.empty((9, PLACES, lanes))
     # Points on the other columns lie at the centre.
@@ -116,22 +116,22 @@ def relative(
         for i in range(2):
             for b in range(i + 1):
                 product(world[i], world[b], centre, apart, C[i, b])
-            for a in range(2, len(g)):
-                state = a if a == 2 else a + 1
-                if state < size:
-                    beside(world[i], F[state, :PLACED], apart[0], C[a, i])
         for a in range(2, len(g)):
             state = a if a == 2 else a + 1
-            for k in range(lanes):
-                g[a, k] = y[state, k] if state < size else 0.0
-            for b in range(2, a + 1):
-                other = b if b == 2 else b + 1
+            if state < size:
+                for i in range(2):
+                    beside(world[i], F[state, :PLACED], apart[0], C[a, i])
                 for k in range(lanes):
-                    C[a, b, k] = S[state, other, k] if state < size else 0.0
+                    g[a, k] = y[state, k]
+                for b in range(2, a + 1):
+                    other = b if b == 2 else b + 1
+                    for k in range(lanes):
+                        C[a, b, k] = S[state, other, k]
         for k in range(lanes):
             t, j = which[first + k, 0], which[first + k, 1]
+            g[2, k] -= p[2]
             for a in range(len(g)):
-                mean[t, j, a] = g[a, k] - p[2] if a == 2 else g[a, k]
+                mean[t, j, a] = g[a, k]
                 for b in range(a + 1):
                     covariance[t, j, a, b] = covariance[t, j, b, a] = C[a, b, k]
     return mean, covariance

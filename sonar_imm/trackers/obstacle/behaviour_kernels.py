@@ -158,7 +158,7 @@ def advance(
     probable one, so that all stay finite.
     """
     x1, P1, repaired = _advance(x, P, mu, motion, step)
-    if repaired.any():
+    if np.count_nonzero(repaired):
         _repair(x1, P1, mu, motion.prior, repaired)
     return x1, P1, repaired
 

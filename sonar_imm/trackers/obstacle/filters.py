@@ -209,7 +209,7 @@ class DepthSlices:
             own,
             *band,
             position + together[:, :3],
-            np.ascontiguousarray(both[:, :3, :3]),
+            both[:, :3, :3],
             self.behaviour(mu),
             together[:, 3:],
             both[:, 3:, 3:],

@@ -166,7 +166,7 @@ def jipda_update(
     """
     outlier = outlier_probability * outlier_density
     x1, P1, mu1, nis, repaired = _update(x, P, mu, h, z, R, outlier_probability, outlier)
-    if repaired.any():
+    if np.count_nonzero(repaired):
         _update_again(x, P, mu, h, z, R, outlier_probability, outlier, x1, P1, mu1, repaired)
     return x1, P1, mu1, nis, repaired
 
