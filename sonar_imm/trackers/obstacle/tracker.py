@@ -286,7 +286,8 @@ class ObstacleTracker:
             repairs=before.repairs + repairs,
         )
         is_finite = ping_kernels.is_finite(mixture.x, mixture.P)
-        return now.only(is_finite), len(is_finite) - int(np.count_nonzero(is_finite))
+        broken = len(is_finite) - int(np.count_nonzero(is_finite))
+        return (now.only(is_finite) if broken else now), broken
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
         """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is stated (D,), of the rows
@@ -296,7 +297,9 @@ class ObstacleTracker:
             ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
         )
         columns = *echoes, ping.intensity, np.isfinite(ping.extent_range)
-        return columns if real.all() else tuple(column[real] for column in columns)
+        if np.count_nonzero(real) == len(real):
+            return columns
+        return tuple(column[real] for column in columns)
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray
