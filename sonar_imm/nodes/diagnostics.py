@@ -246,7 +246,7 @@ class Reporter:
         *,
         enabled: bool,
         stale_after: float,
-        starting: str,
+        starting: str = '',
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str] = (),

@@ -295,7 +295,7 @@ def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker
     )  # no /clock at all: still it reports
     heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     bench.add(TrackerNode('walker', context=bench.context))
-    bench.spin_until(lambda: len(heard) >= 3)
+    bench.spin_until(lambda: len(heard) >= 3 and 'message' in heard[-1].status[0].message)
     assert [status.name for status in heard[-1].status] == [
         'auv1/walker: input',
         'auv1/walker: tracker',
