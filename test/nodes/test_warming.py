@@ -15,6 +15,7 @@
 """A node while its kernels are compiled."""
 
 import threading
+import time
 
 import pytest
 
@@ -89,8 +90,9 @@ def test_what_goes_wrong_is_raised_where_somebody_asks():
     def fails():
         raise ZeroDivisionError('a bug')
 
-    warming = Warming(lambda inputs: [('fixes', fails)], lambda: None)
-    warming.stop(wait=True)
+    warming = Warming(lambda inputs: [('fixes', fails)], lambda: {Fix})
+    while not warming.done():
+        time.sleep(0.01)
     with pytest.raises(ZeroDivisionError):
         warming.ready()
 
