@@ -26,7 +26,8 @@ f4, the standard deviation of its noise.
 
 Each may state the depth of hydrophone 0, the same in every row: ``array_depth`` f4 [m, down
 positive]; ``csdm`` and ``pressure`` instead ``element_depth`` f4 x N. Where none is stated, the
-companion topic gives it (`array_depth`).
+companion topic gives it (``array_depth``): a depth sensor publishes a position, of which only z is
+read, positive up in east-north-up, positive down in north-east-down.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_imm.measurements import CrossSpectra, Pressure, Rejection, Trace
+from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
 from sonar_imm.measurements.fathometer import MAX_FREQUENCIES, MAX_SAMPLES
 
-from .headers import Make, stamp_ns
+from .headers import Make, make_header, stamp_ns
 from .table import constant_column, decode_table, encode_table, require_columns, scalar_column
 
 Columns = Mapping[str, NDArray]
@@ -207,3 +208,24 @@ def _array_depth(columns: Columns, hydrophones: int) -> float | None:
         )
     first = depths[:, 0].astype(np.float64)
     return float(first[0]) if len(first) and np.isfinite(first[0]) else None
+
+
+def read_array_depth(message: Any, *, world_frame: str = 'enu') -> ArrayDepth:
+    """Read a PointStamped or PoseWithCovarianceStamped. Raises `Rejection`."""
+    point = message.pose.pose.position if hasattr(message, 'pose') else message.point
+    down = world_frame == 'ned' or str(message.header.frame_id).endswith('_ned')
+    z = float(point.z)
+    return ArrayDepth(
+        stamp_ns=stamp_ns(message),
+        frame_id=str(message.header.frame_id),
+        depth=z if down else -z,
+    )
+
+
+def write_array_depth(depth: ArrayDepth, make: Make) -> Any:
+    """Write a PointStamped, z up."""
+    return make(
+        'geometry_msgs/msg/PointStamped',
+        header=make_header(depth.stamp_ns, depth.frame_id, make),
+        point=make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=-depth.depth),
+    )

@@ -18,11 +18,12 @@ from __future__ import annotations
 
 from sonar_imm.measurements import ArrayDepth, CrossSpectra, Pressure, Trace
 
-from ..array_depth import read_array_depth, write_array_depth
 from ..array_records import (
+    read_array_depth,
     read_csdm,
     read_pressure,
     read_trace,
+    write_array_depth,
     write_csdm,
     write_pressure,
     write_trace,

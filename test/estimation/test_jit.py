@@ -120,6 +120,16 @@ def test_a_folder_that_is_deleted_while_a_process_runs_is_made_again(fresh, tmp_
     assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
 
 
+def copied(folder):
+    """A copy of the package without anything compiled; gives its root."""
+    root = folder / 'copy'
+    for room in ('sonar_imm', 'msg_adapters'):
+        ignore = shutil.ignore_patterns('__pycache__')
+        shutil.copytree(ROOT / room, root / room, ignore=ignore)
+    return root
+
+
+@pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
 def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
     """`NUMBA_CACHE_DIR` takes what the installation cannot, and a second process loads it."""
     code = (
@@ -127,16 +137,29 @@ def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
         'o = np.ones; combine(o((1, 1, 1)), o((1, 1, 1, 1)), o((1, 1)), o((1, 1, 1)));'
         'print(sum(combine.stats.cache_hits.values()))'
     )
-    assert [run(code, ROOT, tmp_path) for _ in range(2)] == [['0'], ['1']]
-    assert list(tmp_path.rglob('*.nbc'))
+    root, cache = copied(tmp_path), tmp_path / 'cache'
+    assert [run(code, root, cache) for _ in range(2)] == [['0'], ['1']]
+    assert list(cache.rglob('*.nbc'))
+
+
+@pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
+def test_what_was_compiled_beside_the_source_serves_others(tmp_path):
+    """Who installed the package compiled it; another user can only read that folder."""
+    code = (
+        'from sonar_imm.estimation.small_matrices import product; import numpy as np;'
+        'product(np.eye(2), np.eye(2), np.empty((2, 2)));'
+        'print(sum(product.stats.cache_hits.values()))'
+    )
+    root = copied(tmp_path)
+    assert run(code, root, '') == ['0']
+    assert list((root / 'sonar_imm' / 'estimation' / '__pycache__').glob('*.nbc'))
+    assert run(code, root, tmp_path / 'cache') == ['1']
+    assert not list(tmp_path.glob('cache/**/*.nbc'))
 
 
 @pytest.mark.skipif(not (ROOT / 'sonar_imm').is_dir(), reason='it copies the source tree')
 def test_a_changed_callee_or_constant_of_another_file_is_compiled_anew(tmp_path):
-    root, cache = tmp_path / 'copy', tmp_path / 'cache'
-    for room in ('sonar_imm', 'msg_adapters'):
-        ignore = shutil.ignore_patterns('__pycache__')
-        shutil.copytree(ROOT / room, root / room, ignore=ignore)
+    root, cache = copied(tmp_path), tmp_path / 'cache'
     code = """
 import numpy as np
 from sonar_imm.estimation import imm_particles as imm

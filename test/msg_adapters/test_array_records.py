@@ -20,11 +20,12 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from msg_adapters.array_depth import read_array_depth, write_array_depth
 from msg_adapters.array_records import (
+    read_array_depth,
     read_csdm,
     read_pressure,
     read_trace,
+    write_array_depth,
     write_csdm,
     write_pressure,
     write_response,

@@ -21,10 +21,10 @@ import pytest
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Trigger
 
-from msg_adapters.array_depth import write_array_depth
 from msg_adapters.array_records import (
     read_pressure,
     read_trace,
+    write_array_depth,
     write_csdm,
     write_pressure,
     write_trace,
