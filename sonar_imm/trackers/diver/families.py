@@ -47,6 +47,7 @@ from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consider import consider_models
 from ...estimation.small_matrices import add_jitter_all
+from ...measurements import NOBODY
 from . import family_kernels
 from .baselines import white_acceleration
 from .config import DiverConfig
@@ -74,6 +75,9 @@ LOST = 0.02
 MISTAKEN = 0.02
 """A false fix is expected beside another this often, at most, where two refused fixes that agree
 begin a track anew."""
+
+CONFIRMS, ENDS = 0.9, 0.002
+"""Probability that a track is a diver above which hits confirm it, and below which it ends."""
 
 REACH = 13.8
 """Mahalanobis distance squared within which a fix is beside another."""
@@ -407,6 +411,22 @@ def _anew(
         if fixes.config.clutter_density * area > MISTAKEN:
             return None
     return last.x[0], last.P[0], last.mu[0]
+
+
+def doubtful(now: DiverState, config: DiverConfig) -> tuple[BoolArray, BoolArray]:
+    """Which tentative tracks (T,) explain their fixes no better than clutter does, so that their
+    hits do not confirm them, and which so badly that they end.
+
+    A copy with large covariances takes what lies far away, so that hits alone mean little. The odds
+    of a track are those of a new diver against a false fix, and what its fixes made of them.
+    """
+    odds = now.score + math.log(config.birth_density / config.clutter_density)
+    open_ = (now.life.status == TENTATIVE) & (now.target_id == NOBODY) & np.isnan(now.existence)
+    return open_ & (odds < _log_odds(CONFIRMS)), open_ & (odds < _log_odds(ENDS))
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability) - math.log1p(-probability)
 
 
 def columns(mu: FloatArray, models: ModelSet) -> dict[str, FloatArray]:

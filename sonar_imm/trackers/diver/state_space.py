@@ -111,6 +111,15 @@ class ModelSet:
     def copies(self) -> int:
         return max(len(self.heights), len(self.scales))
 
+    @property
+    def blocks(self) -> tuple[slice, ...]:
+        """The places of models with states of the same components that switch between each
+        other."""
+        if self.mixing is None:
+            return (slice(0, len(self.names)),)
+        ends = np.cumsum(np.bincount(self.mixing.family)).tolist()
+        return tuple(slice(first, last) for first, last in zip([0, *ends], ends))
+
     def by_model(self, mu: FloatArray) -> FloatArray:
         """Model probabilities (T, M) of mu (T, K M), whatever the copy."""
         if self.copies == 1:

@@ -405,6 +405,10 @@ class DiverTracker:
         looked = looked | (now.refused[:, 0] == now.stamp_ns)
         by_existence = np.isfinite(now.existence)
         life, kept = now.life.scan(hit, now.stamp_ns, self.rules, looked=looked & ~by_existence)
+        if self.models.mixing is not None and any(group.whole for group in scan.fixes):
+            doubtful, over = families.doubtful(now, config)
+            status = np.where(doubtful[kept], TENTATIVE, life.status).astype(np.uint8)
+            life, alive = evolve(life, status=status), alive & ~over
         if by_existence.any():
             judged = jipda.judge(now, hit, looked, self._position)
             status = np.where(by_existence[kept], judged.status[kept], life.status)

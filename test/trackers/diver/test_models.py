@@ -33,7 +33,7 @@ def test_every_set_is_consistent(model_set):
     models = build_models(config)
     M, n = len(models.names), models.n
     assert M == config.model_count() and len(set(models.names)) == M
-    assert models.E.shape == (M, 4, n) and models.initial.shape == (M,)
+    assert models.E.shape == (models.copies * M, 4, n) and models.initial.shape == (M,)
     np.testing.assert_allclose(models.initial.sum(), 1.0)
     for dt in (0.0, 1e-3, 0.3, 1.0, 29.0, 600.0):
         F, Q, B = models.motion(dt)
@@ -44,7 +44,7 @@ def test_every_set_is_consistent(model_set):
     x, P, mu = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     mean, covariance = imm.combine(x[None], P[None], mu[None], models.E)
     np.testing.assert_allclose(mean[0, :2], CENTRE)
-    np.testing.assert_allclose(covariance[0, :2, :2], SPREAD)
+    np.testing.assert_allclose(covariance[0, :2, :2], SPREAD * np.mean(models.scales))
 
 
 @pytest.mark.parametrize('model_set', COMPOSE)
