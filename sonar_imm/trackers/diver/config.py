@@ -61,7 +61,8 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
         'motion models run side by side', choices=MODEL_SETS)
     directions: int = parameter(16, '',
         'number of headings of the multi-direction sets', range=(4, 64))
-    hover: bool = parameter(True, '', 'add a model for standing still (heading_speed sets, families)')
+    hover: bool = parameter(True, '',
+        'add a model for standing still (heading_speed sets, families)')
     reference_step: float = parameter(1.0, 's',
         'time step for which the probabilities and noises of the models are stated; values for '
         'other steps are derived from them', range=(1e-3, 3600.0))
@@ -103,18 +104,20 @@ class DiverConfig(DetectionParameters, TrackLifeParameters, StreamParameters):
     speed_mean: float = parameter(0.75, 'm/s',
         'speed expected of a new track (heading_speed sets, families)', range=(0.0, 20.0))
     speed_std: float = parameter(0.4, 'm/s',
-        'standard deviation of the speed of a new track around speed_mean (heading_speed sets, families)',
-        range=(1e-3, 20.0))
+        'standard deviation of the speed of a new track around speed_mean (heading_speed sets, '
+        'families)', range=(1e-3, 20.0))
     velocity_std: float = parameter(0.7, 'm/s',
         'standard deviation on each axis of the velocity of a new track, around zero (sets with a '
         'velocity state)', range=(1e-3, 20.0))
     speed_noise: float = parameter(0.005, 'm/s',
-        'random walk of the speed over a reference step (heading_speed sets, families)', range=(0.0, 10.0))
+        'random walk of the speed over a reference step (heading_speed sets, families)',
+        range=(0.0, 10.0))
     brisk_speed_noise: float = parameter(0.07, 'm/s',
         'families: random walk of the speed over a reference step in the brisk family, in place '
         'of speed_noise', range=(0.0, 10.0))
     lateral_noise: float = parameter(0.24, 'm',
-        'random walk sideways over a reference step (heading_speed sets, families)', range=(0.0, 10.0))
+        'random walk sideways over a reference step (heading_speed sets, families)',
+        range=(0.0, 10.0))
     lateral_speed_std: float = parameter(0.2, 'm/s',
         'heading_speed_lateral: standard deviation of the lateral velocity', range=(0.0, 10.0))
     lateral_speed_time: float = parameter(10.0, 's',

@@ -15,8 +15,8 @@
 """One filter for divers that swim steadily, briskly, turn about or drift, whatever their fixes
 state: `model_set: families`.
 
-Four families of models run in one interacting multiple model filter: `steady` and `brisk` (each the
-`heading_speed` set, with a speed that is kept or changes within a minute), `lively` (two
+Four families of models run in one interacting multiple model filter: `steady` and `brisk` (each
+the `heading_speed` set, with a speed that is kept or changes within a minute), `lively` (two
 constant-velocity models) and `quiet` (one). Inside a family the chain is as ever and learns. From
 one family to another it goes rarely (`family_switch_rate`), or the families never separate; a
 family that has become improbable is overwritten by the images of the others
@@ -39,10 +39,11 @@ from collections.abc import Iterator
 import math
 from typing import NamedTuple
 
+from attrs import evolve
 import numpy as np
 
 from ...estimation import imm_kernels, jipda, markov
-from ...estimation.adaptation import AdaptiveChain
+from ...estimation.adaptation import AdaptiveChain, Chain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import TENTATIVE
 from ...estimation.consider import consider_models
@@ -87,7 +88,7 @@ REACH = 13.8
 
 
 def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet:
-    """The four families, of which two are `heading_speed` sets with the two noises of the speed."""
+    """The four families, of which two are `heading_speed` sets with two noises of the speed."""
     noises = (*LIVELY, *QUIET)
     count, moving = len(steady.names), len(noises)
     family = np.repeat(np.arange(4), [count, count, len(LIVELY), len(QUIET)])
@@ -121,8 +122,9 @@ def families(config: DiverConfig, steady: ModelSet, brisk: ModelSet) -> ModelSet
     if config.transition_matrix:
         chain = rate_chain(config, np.eye(M))
     else:
+        both, plain = (steady, brisk), evolve(config, transition_matrix=())
         rates = markov.persistent(len(LIVELY), config.baseline_stay_probability)
-        generators = [steady.chain.generator, brisk.chain.generator]
+        generators = [rate_chain(plain, models.chain.matrix).generator for models in both]
         generators += [markov.RateChain(rates, T).generator, np.zeros((len(QUIET), len(QUIET)))]
         generator = _between(family, generators, config.family_switch_rate)
         chain = markov.RateChain.of_generator(generator, T)
@@ -168,7 +170,9 @@ def _between(family: IntArray, blocks: list[FloatArray], rate: float) -> FloatAr
 class FamilyChain(AdaptiveChain):
     """An `AdaptiveChain` that learns inside each family, never between them."""
 
-    family: IntArray
+    def __init__(self, family: IntArray, chain: Chain, form: Form, **settings: float):
+        super().__init__(chain, form, **settings)
+        self.family = family
 
     def transition(self, learnt: FloatArray, dt: float) -> FloatArray:
         found = super().transition(learnt, dt)
@@ -236,8 +240,8 @@ def update(
     layout: Layout,
     of_copies: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray, int]:
-    """As `fix_kernels.update`, copy by copy; of_copies (T, K, D) as in `Densities`. The nis is that
-    of the whole mixture, and stands in `now.white`."""
+    """As `fix_kernels.update`, copy by copy; of_copies (T, K, D) as in `Densities`. The nis is
+    that of the whole mixture, and stands in `now.white`."""
     K, t = len(layout.scales), len(tracks)
     M, n = now.x.shape[1] // K, now.x.shape[2]
     each, weight = _each_copy(now.mu[tracks], K)
@@ -339,13 +343,14 @@ def reacquired(
         if np.isfinite(refused[track, 0]) and _may_be_lost(now, track, fixes):
             parts = _anew(now, track, refused[track], z, R, fixes, models, chain, layout)
         refused = refused.copy()
-        refused[track] = now.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
-        if parts is not None:
+        if parts is None:
+            refused[track] = now.stamp_ns, *z, R[0, 0], R[0, 1], R[1, 1]
+        else:
             begun[track], refused[track] = parts, np.nan
     if begun:
         x, P, mu = now.x.copy(), now.P.copy(), now.mu.copy()
-        for track, (x[track], P[track], mu[track]) in begun.items():
-            pass
+        for track, parts in begun.items():
+            x[track], P[track], mu[track] = parts
         now = now._replace(x=x, P=P, mu=mu)
     return now._replace(refused=refused), bool(begun)
 
@@ -417,8 +422,8 @@ def doubtful(now: DiverState, config: DiverConfig) -> tuple[BoolArray, BoolArray
     """Which tentative tracks (T,) explain their fixes no better than clutter does, so that their
     hits do not confirm them, and which so badly that they end.
 
-    A copy with large covariances takes what lies far away, so that hits alone mean little. The odds
-    of a track are those of a new diver against a false fix, and what its fixes made of them.
+    A copy with large covariances takes what lies far away, so that hits alone mean little. The
+    odds of a track are those of a new diver against a false fix, and what its fixes made of them.
     """
     odds = now.score + math.log(config.birth_density / config.clutter_density)
     open_ = (now.life.status == TENTATIVE) & (now.target_id == NOBODY) & np.isnan(now.existence)

@@ -18,8 +18,8 @@ of them.
 A heading or hover has (x, y, s, unused), a constant velocity (x, y, vx, vy); what stands behind
 these four components (depth, errors of fixes and instruments) is the same in all. The unused
 component has mean 0 and variance 1, uncorrelated. With u the unit vector of a heading, w its left
-normal and q the variance of a direction within its sector, the *image* of a model in the components
-of another is
+normal and q the variance of a direction within its sector, the *image* of a model in the
+components of another is
 
 heading -> velocity
     v = s u, cov_v = P_ss u u' + q (s^2 + P_ss) w w', cov_pv = P_ps u'.
@@ -28,8 +28,9 @@ hover -> velocity
 velocity -> hover
     s as in a new track, uncorrelated.
 velocity -> heading
-    The state given that w'v = 0 with variance q ((u'v)^2 + u'P_v u); then s = u'v. Directions share
-    the probability of going to headings as N(w'v; 0, S) E[max(s, 0)], S with the variance of w'v.
+    The state given that w'v = 0 with variance q ((u'v)^2 + u'P_v u); then s = u'v. Directions
+    share the probability of going to headings as N(w'v; 0, S) E[max(s, 0)], S the variance of w'v
+    and that one.
 same components
     The state as it is.
 
@@ -45,12 +46,9 @@ import numpy as np
 
 from ...estimation.arrays import FloatArray, IntArray
 from ...estimation.imm import DEAD
+from ...estimation.imm_kernels import CANCELLED, MOST_CANCELLED
 from ...estimation.jit import kernel
-from ...estimation.small_matrices import (
-    cholesky_with_jitter,
-    innovation_covariance,
-    whitened_square,
-)
+from ...estimation.small_matrices import innovation_covariance, is_psd
 
 LOG_2PI = math.log(2.0 * math.pi)
 
@@ -59,6 +57,10 @@ HEADING, VELOCITY, HOVER = 0, 1, 2
 
 LEAST_ACROSS = 1e-9
 """Variance, (m/s)^2, that a velocity across a heading has at least."""
+
+
+NEGLIGIBLE = 40.0
+"""A density by so much below another, in logarithms, adds nothing to it."""
 
 
 class Mixing(NamedTuple):
@@ -80,7 +82,7 @@ def mix(
     x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray, mixing: Mixing
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """As `imm_kernels.mix`, of the images of all models in the components of each: x (T, M, n), P
-    (T, M, n, n), mu (T, M), transition (T or 1, M, M)."""
+    (T, M, n, n), mu (T, M), transition (T or 1, M, M); velocities come after all others."""
     T, M, n = x.shape
     D = len(mixing.units)
     kind, direction = mixing.kind, mixing.direction
@@ -88,14 +90,19 @@ def mix(
     # Images of each model: as a velocity or a hover, and of a velocity in each direction.
     other_x, other_P = np.empty((M, n)), np.empty((M, n, n))
     turned_x, turned_P = np.empty((M, D, n)), np.empty((M, D, n, n))
-    fit, W = np.empty(D), np.empty((M, M))
-    d = np.empty(n)
+    fit, W, reach = np.empty(D), np.empty((M, M)), np.empty(M)
+    S = 0
+    while S < M and kind[S] != VELOCITY:
+        S += 1
+    centre, d = np.empty(n), np.empty(n)
+    # Sums for all headings and hovers, which come first, lie in a row: such loops are vectorised.
+    e, total, L = np.empty((n, S)), np.empty((n, n, S)), np.empty((n, n))
     for t in range(T):
         p = t % transition.shape[0]
         for i in range(M):
             for j in range(M):
                 W[i, j] = transition[p, i, j] * mu[t, i]
-            if kind[i] == VELOCITY:
+            if i >= S:
                 _as_hover(x[t, i], P[t, i], mixing, other_x[i], other_P[i])
                 for k in range(D):
                     fit[k] = _as_heading(
@@ -107,36 +114,79 @@ def mix(
                     x[t, i], P[t, i], kind[i], direction[i], mixing, other_x[i], other_P[i]
                 )
         for j in range(M):
-            reach = 0.0
-            for i in range(M):
-                reach += W[i, j]
-            c[t, j] = reach
+            reach[j] = 0.0
+        for i in range(M):
+            for j in range(M):
+                reach[j] += W[i, j]
+        for j in range(M):
+            c[t, j] = reach[j]
+        for i in range(M):
+            for j in range(M):
+                W[i, j] = W[i, j] / reach[j] if reach[j] > DEAD else mu[t, i]
+        for a in range(n):
+            centre[a] = 0.0
+            for i in range(S):
+                centre[a] += W[i, 0] * x[t, i, a]
+            for j in range(S):
+                e[a, j] = 0.0
+            for b in range(a + 1):
+                for j in range(S):
+                    total[a, b, j] = 0.0
+        for i in range(S):
             for a in range(n):
-                x0[t, j, a] = 0.0
-                for b in range(n):
-                    P0[t, j, a, b] = 0.0
+                d[a] = x[t, i, a] - centre[a]
+                for j in range(S):
+                    e[a, j] += W[i, j] * d[a]
+                for b in range(a + 1):
+                    moment = P[t, i, a, b] + d[a] * d[b]
+                    if moment != 0.0:
+                        for j in range(S):
+                            total[a, b, j] += W[i, j] * moment
+        for i in range(S, M):
+            for j in range(S):
+                w = W[i, j]
+                x_i, P_i = other_x[i], other_P[i]
+                if kind[j] == HEADING:
+                    x_i, P_i = turned_x[i, direction[j]], turned_P[i, direction[j]]
+                for a in range(n):
+                    d[a] = x_i[a] - centre[a]
+                    e[a, j] += w * d[a]
+                    for b in range(a + 1):
+                        total[a, b, j] += w * (P_i[a, b] + d[a] * d[b])
+        for j in range(M):
+            most = np.inf if j >= S else 0.0
+            for a in range(n):
+                if j >= S:
+                    break
+                x0[t, j, a] = centre[a] + e[a, j]
+                for b in range(a + 1):
+                    P0[t, j, a, b] = total[a, b, j] - e[a, j] * e[b, j]
+                    P0[t, j, b, a] = P0[t, j, a, b]
+                if not total[a, a, j] <= most * P0[t, j, a, a]:
+                    positive = P0[t, j, a, a] > 0.0
+                    most = total[a, a, j] / P0[t, j, a, a] if positive else np.inf
+            # Models far apart and sharp: the difference may have lost its digits.
+            if most <= CANCELLED or (most <= MOST_CANCELLED and is_psd(P0[t, j], L)):
+                continue
+            x0[t, j, :] = 0.0
+            P0[t, j, :, :] = 0.0
             # The mean first: what is summed about it keeps its digits.
             for turn in range(2):
                 for i in range(M):
-                    w = W[i, j] / reach if reach > DEAD else mu[t, i]
-                    if w == 0.0:
-                        continue
+                    w = W[i, j]
                     x_i, P_i = x[t, i], P[t, i]
-                    if (kind[i] == VELOCITY) != (kind[j] == VELOCITY):
+                    if (i >= S) != (j >= S):
                         x_i, P_i = other_x[i], other_P[i]
                         if kind[j] == HEADING:
                             x_i, P_i = turned_x[i, direction[j]], turned_P[i, direction[j]]
-                    if turn == 0:
-                        for a in range(n):
-                            x0[t, j, a] += w * x_i[a]
-                        continue
                     for a in range(n):
+                        if turn == 0:
+                            x0[t, j, a] += w * x_i[a]
+                            continue
                         d[a] = x_i[a] - x0[t, j, a]
                         for b in range(a + 1):
                             P0[t, j, a, b] += w * (P_i[a, b] + d[a] * d[b])
-            for a in range(n):
-                for b in range(a):
-                    P0[t, j, b, a] = P0[t, j, a, b]
+                            P0[t, j, b, a] = P0[t, j, a, b]
     return x0, P0, c
 
 
@@ -263,49 +313,52 @@ def log_densities(
     R: FloatArray,
     scales: FloatArray,
 ) -> FloatArray:
-    """ln of the predictive density of each fix in each copy of the models, (T, K, D): h (T, K M, 2)
-    expected by H (1, K M, 2, n), P (T, K M, n, n), c (T, K M); z (D, 2), R (D, 2, 2), which copy k
-    takes `scales` (K,) times."""
-    T, models, m = h.shape
+    """ln of the predictive density of each fix in each copy of the models, (T, K, D): h
+    (T, K M, 2) expected by H (1, K M, 2, n), P (T, K M, n, n), c (T, K M); z (D, 2), R (D, 2, 2),
+    which copy k takes `scales` (K,) times."""
+    T, models, _ = h.shape
     K, D, n = len(scales), len(z), P.shape[2]
     M = models // K
     out = np.empty((T, K, D))
-    PHt, nothing, S0 = np.empty((n, m)), np.zeros((m, m)), np.empty((M, m, m))
-    S, L, v, w, logs = np.empty((m, m)), np.zeros((m, m)), np.empty(m), np.empty(m), np.empty(M)
+    PHt, nothing, S = np.empty((n, 2)), np.zeros((2, 2)), np.empty((M, 2, 2))
+    logs, weight = np.empty(M), np.empty(M)
     for t in range(T):
         for k in range(K):
             total = 0.0
-            for j in range(k * M, (k + 1) * M):
-                total += c[t, j]
-                innovation_covariance(P[t, j], H[0, j], nothing, PHt, S0[j - k * M])
+            for j in range(M):
+                own = k * M + j
+                total += c[t, own]
+                innovation_covariance(P[t, own], H[0, own], nothing, PHt, S[j])
+            for j in range(M):
+                share = c[t, k * M + j] / total
+                weight[j] = math.log(share) - LOG_2PI if share > 0.0 else -np.inf
             for d in range(D):
                 best = -np.inf
                 for j in range(M):
+                    # The Cholesky factor of 2 x 2, written out.
                     own = k * M + j
+                    a = S[j, 0, 0] + scales[k] * R[d, 0, 0]
+                    b = S[j, 1, 0] + scales[k] * R[d, 1, 0]
+                    e = S[j, 1, 1] + scales[k] * R[d, 1, 1] - b * b / a
                     logs[j] = -np.inf
-                    for r in range(m):
-                        v[r] = z[d, r] - h[t, own, r]
-                        for s in range(m):
-                            S[r, s] = S0[j, r, s] + scales[k] * R[d, r, s]
-                    if c[t, own] > 0.0 and cholesky_with_jitter(S, L):
-                        value = -0.5 * (whitened_square(L, v, w) + m * LOG_2PI)
-                        for r in range(m):
-                            value -= math.log(L[r, r])
-                        logs[j] = value + math.log(c[t, own] / total)
+                    if weight[j] > -np.inf and a > 0.0 and e > 0.0:
+                        first = z[d, 0] - h[t, own, 0]
+                        second = z[d, 1] - h[t, own, 1] - b / a * first
+                        nis = first * first / a + second * second / e
+                        logs[j] = weight[j] - 0.5 * (nis + math.log(a * e))
                         best = max(best, logs[j])
                 out[t, k, d] = best
                 if math.isfinite(best):
-                    total_d = 0.0
+                    sum_d = 0.0
                     for j in range(M):
-                        total_d += math.exp(logs[j] - best)
-                    out[t, k, d] = best + math.log(total_d)
+                        if logs[j] > best - NEGLIGIBLE:
+                            sum_d += math.exp(logs[j] - best)
+                    out[t, k, d] = best + math.log(sum_d)
     return out
 
 
 @kernel
-def inside_families(
-    transition: FloatArray, nominal: FloatArray, family: IntArray
-) -> FloatArray:
+def inside_families(transition: FloatArray, nominal: FloatArray, family: IntArray) -> FloatArray:
     """`transition` (T, M, M) inside each family, `nominal` (M, M) between them; each row goes to
     its own family as often as in `nominal`."""
     T, M = len(transition), len(nominal)

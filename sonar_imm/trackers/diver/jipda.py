@@ -96,7 +96,9 @@ def joint_weights(
     else:
         mixture = np.exp(densities.whole)
         # What a crowded cluster leaves out first is what is least probable.
-        apart = 2.0 * (densities.whole.max(axis=1, keepdims=True, initial=-np.inf) - densities.whole)
+        apart = 2.0 * (
+            densities.whole.max(axis=1, keepdims=True, initial=-np.inf) - densities.whole
+        )
         nis = np.where(densities.whole > families.bound(config), apart, np.inf)
         threshold = float(nis[np.isfinite(nis)].max(initial=1.0))
     nis[excluded] = np.inf
@@ -122,8 +124,8 @@ def update_jointly(
     densities: families.Densities | None,
 ) -> DiverState:
     """Update the tracks by all fixes they may have caused; hit (t,): those whose whitened
-    innovation is new; considered (n,): what an update does not move; densities: of the pairs, where
-    the models run in copies."""
+    innovation is new; considered (n,): what an update does not move; densities: of the pairs,
+    where the models run in copies."""
     nis, nis_dof = now.nis.copy(), now.nis_dof.copy()
     nis[hit] += np.square(now.white[hit]).sum(axis=1)
     nis_dof[hit] += np.uint16(2)

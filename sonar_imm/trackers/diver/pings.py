@@ -426,8 +426,9 @@ def update_by_ping(
 def _copies(
     x: FloatArray, P: FloatArray, ping: Ping, layout: Layout
 ) -> Iterator[tuple[FloatArray, FloatArray, PingMeasurements, float]]:
-    """x (M, n) and P (M, n, n) of each copy of the models, the measurements with the variances that
-    it takes them to have, and the logarithm of what their densities are divided by for that."""
+    """x (M, n) and P (M, n, n) of each copy of the models, the measurements with the variances
+    that it takes them to have, and the logarithm of what their densities are divided by for
+    that."""
     M = len(x) // len(layout.scales)
     for k, factor in enumerate(layout.scales.tolist()):
         own, measured = slice(k * M, (k + 1) * M), ping.measured

@@ -54,9 +54,7 @@ class _Pass:
             column.append(value)
 
 
-def _family_weights(
-    mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]
-) -> FloatArray:
+def _family_weights(mu: FloatArray, transition: FloatArray, blocks: Sequence[slice]) -> FloatArray:
     """What each block of models weighs (K, blocks) given all data, of filtered mu (K, M) and the
     transitions (K, M, M) into each step; of all models together what they weigh at the end."""
     filtered = np.stack([mu[:, block].sum(axis=1) for block in blocks], axis=1)

@@ -114,7 +114,7 @@ class FixConsistency(NamedTuple):
         firm = scale[~tentative]
         mean = float(firm.mean()) if len(firm) else self.scale
         above = self.above + len(firm) if mean > TOO_SMALL else 0
-        return FixConsistency(*sums, mean, above)
+        return self._replace(**dict(zip(self._fields, sums)), scale=mean, above=above)
 
     @property
     def mean_nis(self) -> float:
@@ -139,7 +139,7 @@ class FixConsistency(NamedTuple):
         if self.mean_nis > OPTIMISTIC:
             return [
                 f'fixes miss by more than they state: mean NIS {self.mean_nis:.2g} for each '
-                'coordinate, 1 is due; raise covariance_scale or the noise of the motion'
+                'coordinate, 1 is due; model_set families finds out by how much, and withstands it'
             ]
         if not bias_stated and (self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED):
             return [
@@ -317,9 +317,7 @@ def _mix(
     weight = np.where(total > 0.0, weight / np.where(total > 0.0, total, 1.0), 1.0 / M)
     if len(transition) > 1:
         transition = np.repeat(transition, copies, axis=0)
-    x, P, c = mix(
-        x.reshape(T * copies, M, n), P.reshape(T * copies, M, n, n), weight, transition
-    )
+    x, P, c = mix(x.reshape(T * copies, M, n), P.reshape(T * copies, M, n, n), weight, transition)
     whole = T, copies * M, n
     return x.reshape(whole), P.reshape(*whole, n), (c * total).reshape(T, copies * M)
 

@@ -81,11 +81,11 @@ class ModelSet:
 
     names: of the models; E: (M, q, n) outputs; chain: the law of switching; start: state
     components after the position for a new track, mean and variance, (n - 2,) each or (M, n - 2);
-    initial: (M,) model probabilities of a new track. What `with_depth` and `with_fix_bias` add: outputs, names
-    of the q outputs; height and bias, places of z and of the bias of fixes in the state, -1 for
-    none; heights (K,): where K copies of the models begin in z, which do not switch between each
-    other. What `families` adds: mixing, the kinds of unequal states; scales (K,): by what K copies
-    multiply the covariances of measurements.
+    initial: (M,) model probabilities of a new track. What `with_depth` and `with_fix_bias` add:
+    outputs, names of the q outputs; height and bias, places of z and of the bias of fixes in the
+    state, -1 for none; heights (K,): where K copies of the models begin in z, which do not switch
+    between each other. What `families` adds: mixing, the kinds of unequal states; scales (K,): by
+    what K copies multiply the covariances of measurements.
     """
 
     names: tuple[str, ...]
@@ -330,8 +330,8 @@ class Layout:
     """n states of motion, then q constants with prior `variances` (q,).
 
     mask (n + q,): True for what an update may move, False for what is only considered; H
-    (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`; sound, offsets, clocks: places in the
-    whole state, -1 or absent for none.
+    (1, M, 2, n + q): what a fix measures of the whole state; scales (K,): as in `ModelSet`; sound,
+    offsets, clocks: places in the whole state, -1 or absent for none.
     """
 
     n: int

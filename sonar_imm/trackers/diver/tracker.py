@@ -30,7 +30,7 @@ Source: docs/diver.md, after 'multi-directional motion fusion model for diver tr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 import math
 from operator import itemgetter
 from typing import cast, NamedTuple
@@ -58,7 +58,7 @@ from .config import DiverConfig
 from .georeferencing import Georeferencer
 from .models import build_models
 from .scan import Positions, Scan
-from .state import cross, DiverState, FixConsistency, FIXES, learnt_scale, MEMORY, Step
+from .state import cross, DiverState, FIXES, learnt_scale, MEMORY, Step
 from .state_space import Instruments, Layout
 
 __all__ = ['DiverConfig', 'DiverState', 'DiverTracker']
@@ -92,15 +92,14 @@ class DiverTracker:
     def __init__(self, config: DiverConfig):
         self.models = build_models(config)
         self._position = np.ascontiguousarray(self.models.E[:, :2])
-        kind = AdaptiveChain if self.models.mixing is None else families.FamilyChain
+        mixing = self.models.mixing
+        kind = partial(families.FamilyChain, mixing.family) if mixing else AdaptiveChain
         self._chain = kind(
             self.models.chain,
             cast(Form, config.adaptation),
             weight=config.adaptation_prior,
             guard=config.adaptation_guard,
         )
-        if self.models.mixing is not None:
-            self._chain.family = self.models.mixing.family
         self._settle(config)
         self.reset()
 
@@ -321,9 +320,7 @@ class DiverTracker:
         firm = now.life.status[association.tracks] != TENTATIVE
         left[association.detection[firm]] = False
         layout, whole = self._layout(now.instruments), association.densities.whole
-        return families.reacquired(
-            now, fixes, hit, left, whole, self.models, self._chain, layout
-        )
+        return families.reacquired(now, fixes, hit, left, whole, self.models, self._chain, layout)
 
     def _update(self, now: DiverState, fixes: Positions, association: Association) -> DiverState:
         """The tracks after the fixes that are theirs."""

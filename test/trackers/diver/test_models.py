@@ -49,7 +49,9 @@ def test_every_set_is_consistent(model_set):
 
 @pytest.mark.parametrize('model_set', COMPOSE)
 def test_ten_short_steps_are_one_long_step(model_set):
-    models = build_models(DiverConfig(model_set=model_set, speed_noise=0.2))
+    models = build_models(
+        DiverConfig(model_set=model_set, speed_noise=0.2, covariance_scales=(1.0,))
+    )
     x, P, _ = (item[0] for item in models.new_tracks(CENTRE[None], SPREAD[None]))
     long_x, long_P, _ = imm.predict(x[None], P[None], *models.motion(1.0))
     short_x, short_P = x[None], P[None]
