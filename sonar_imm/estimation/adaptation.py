@@ -218,11 +218,3 @@ def row_sum(row: FloatArray) -> float:
     for k in range(last, n):
         total += row[k]
     return total
-
-
-def warm() -> None:
-    """Run the kernels once on tiny input: compiled or loaded from the cache."""
-    P, mu = np.full((2, 2), 0.5), np.full((1, 2), 0.5)
-    learnt = np.zeros((1, 2, 2, 2))
-    transition = counts_transition(P, learnt, P, 1.0)
-    learn_counts(learnt, np.zeros(1, np.int64), transition, mu, mu, P)

@@ -384,10 +384,3 @@ def count(
         kept[t] = not ended and stamp_ns - last_1[out] <= max_coast_ns
         out += kept[t]
     return status_1[:out], age_1[:out], seen_1[:out], misses_1[:out], last_1[:out], kept
-
-
-def warm() -> None:
-    """Run the kernels once on tiny input: compiled or loaded from the cache."""
-    yes, no = np.ones(1, np.int64), np.zeros(1, np.bool_)
-    choose(np.zeros((1, 1)), no, 0.0, 0.0)
-    count(yes, no[:, None], yes, yes, yes.astype(np.uint8), no, no, 1, 1, 1, 1)

@@ -17,7 +17,7 @@ one target.
 
 Signatures are those of `imm` with arrays only: ``B (M, n)`` is always given, and where `imm`
 broadcasts over targets (transition, H, R) an array of length one does. All arrays are float64 and
-C-contiguous. `warm` compiles or loads every kernel; call it before the first measurement.
+C-contiguous.
 """
 
 from __future__ import annotations
@@ -379,16 +379,3 @@ def linear_cycle(
     )
     mean, covariance = combine(x2, P2, mu2, E)
     return x2, P2, mu2, mean, covariance, log_likelihood, nis, ok
-
-
-def warm() -> None:
-    """Run the kernels once on tiny input: compiled or loaded from the cache, ready for the first
-    measurement. (`linear_cycle`, for batches of known assignment, compiles on its first call.)"""
-    x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
-    F, B, E = np.tile(np.eye(2), (2, 1, 1)), np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1))
-    transition, z, R = np.full((1, 2, 2), 0.5), np.zeros((1, 2)), np.eye(2)[None]
-    mix(x, P, mu, transition)
-    predict(x, P, F, F, B)
-    update(x, P, mu, np.zeros((1, 2, 2)), E[None], R)
-    gate(np.zeros((1, 2, 2)), E[None], P, mu, z, R, 9.0)
-    combine(x, P, mu, E)

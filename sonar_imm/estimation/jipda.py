@@ -33,7 +33,7 @@ by cluster (`associate`); a cluster with more than `MOST_EVENTS` gets a smaller 
 track, model j shares detection i in proportion to N_ji (`update`), ``beta_i|j ~ beta_i N_ji /
 f_i`` and ``mu_j ~ c_j (beta_0 + sum_i beta_i N_ji / f_i)``, moment-matched in each model.
 
-All arrays are float64 and C-contiguous. `warm` compiles or loads every kernel.
+All arrays are float64 and C-contiguous.
 """
 
 from __future__ import annotations
@@ -388,15 +388,3 @@ def log_odds(existence: FloatArray) -> FloatArray:
         if existence[t] > 0.0:
             out[t] = math.log(existence[t]) - math.log(max(1.0 - existence[t], 1e-300))
     return out
-
-
-def warm() -> None:
-    """Run the kernels once on tiny input: compiled or loaded from the cache."""
-    x, P, c = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
-    H, R, z = np.tile(np.eye(2), (1, 2, 1, 1)), np.eye(2)[None], np.zeros((1, 2))
-    mixture, nis = likelihoods(x, H, P, c, z, R, 9.0)
-    beta, missed, _ = associate(mixture, nis, np.full(1, 0.5), np.full(1, 0.9), 9.0)
-    update(x, P, c, x, H, z, R, beta, missed, np.zeros(2, np.bool_))
-    yes = np.ones(1, np.bool_)
-    log_odds(missed)
-    nearest_older(z, R, np.ones(1, np.int64), yes, yes)

@@ -25,13 +25,18 @@ same contents. Their dates do not matter, so a copy, a checkout or a wheel keeps
 
 numba keeps an index file beside files of code with running numbers. Processes that compile at the
 same time take the same number for different code, and one then runs the other's. Here each file
-has the name of what it holds, and says it inside.
+has the name of what it holds, and says it inside. It begins with a checksum of the rest, so that
+LLVM never sees a damaged one.
+
+No cache is a condition. What cannot be loaded is compiled, and what cannot be kept (a full disk, a
+folder of another user) is compiled anew by each process; a warning says so once.
 
 numba has no public way to do this. The private parts in use are
 
 * ``numba.core.caching.FunctionCache(function)``, which finds the folder and turns compiled code
   into data; its attribute ``_cache_file``, which is replaced, and of which it calls ``load(key)``,
-  ``save(key, data)`` and ``flush()``;
+  ``save(key, data)`` and ``flush()``; and its methods ``load_overload(signature, context)`` and
+  ``save_overload(signature, data)``, which are guarded;
 * the attribute ``_cache`` of a compiled function;
 * ``numba.core.serialize.dumps``, which pickles that data.
 
@@ -41,6 +46,7 @@ cache is used, and a warning says so.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
@@ -63,6 +69,10 @@ F = TypeVar('F', bound=Callable[..., Any])
 KEPT_SECONDS = 7 * 86400.0
 """How long code is kept that was compiled of sources as they no longer are."""
 
+kernels: Counter[str] = Counter()
+"""How many kernels this process has 'loaded' and 'compiled', one for each signature."""
+
+_CHECKSUM = hashlib.sha256().digest_size
 _OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)
@@ -83,7 +93,7 @@ def kernel(function: F) -> F:
         with contextlib.suppress(RuntimeError):
             compiled = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # numba: 'cannot cache function ...: no locator available'
-        pass
+        _warn_of_no_cache('no folder can be written')
     return cast(F, compiled)
 
 
@@ -97,7 +107,36 @@ def _attach_cache(compiled: Any, function: Callable[..., Any]) -> None:
     replaced: Any = type(compiled._cache)
     _check_verbs(files, replaced)
     numbas_own._cache_file = _FilePerKey(Path(numbas_own.cache_path), function)
+    numbas_own.load_overload = _or_none(numbas_own.load_overload, 'loaded')
+    numbas_own.save_overload = _or_none(numbas_own.save_overload, 'compiled')
     compiled._cache = numbas_own
+
+
+def _or_none(use_cache: Callable[..., Any], counted_as: str) -> Callable[..., Any]:
+    """`use_cache`, which gives None and warns where it failed: the kernel is compiled then. Counts
+    in `kernels` what was found, or is to be kept."""
+
+    def guarded(*args: Any) -> Any:
+        try:
+            found = use_cache(*args)
+            if found is not None or counted_as == 'compiled':
+                kernels[counted_as] += 1
+            return found
+        except Exception as error:  # whatever it is, it is no reason to end a node
+            _warn_of_no_cache(getattr(error, 'strerror', None) or type(error).__name__)
+            return None
+
+    return guarded
+
+
+@cache
+def _warn_of_no_cache(reason: str) -> None:
+    warnings.warn(
+        f'compiled code cannot be kept or loaded ({reason}): it is compiled in memory, at each '
+        'start anew; NUMBA_CACHE_DIR can name another folder',
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
 @cache
@@ -127,6 +166,8 @@ class _FilePerKey:
 
     def __init__(self, folder: Path, function: Callable[..., Any]):
         self.folder = folder
+        # Compiled by who installed the package, for those who may not write there.
+        self._installed = Path(inspect.getfile(function)).parent / '__pycache__'
         path, code = inspect.getfile(function), function.__code__
         name = re.sub('[<>]', '', f'{Path(path).stem}.{function.__qualname__}')
         python = f'py{sys.version_info[0]}{sys.version_info[1]}{getattr(sys, "abiflags", "")}'
@@ -136,10 +177,21 @@ class _FilePerKey:
         self._stem = f'{self._base}{_short_digest(self._stamp)}.'
 
     def load(self, key: Any) -> Any:
+        for folder in (self.folder, self._installed):
+            found = self._load(folder / self._path_of(key).name, key)
+            if found is not None:
+                return found
+        return None
+
+    def _load(self, path: Path, key: Any) -> Any:
         try:
-            stamp, held, data = pickle.loads(self._path_of(key).read_bytes())
-        except (OSError, EOFError, pickle.UnpicklingError):
+            content = path.read_bytes()
+        except OSError:
             return None
+        checksum, packed = content[:_CHECKSUM], content[_CHECKSUM:]
+        if hashlib.sha256(packed).digest() != checksum:
+            return None
+        stamp, held, data = pickle.loads(packed)
         return data if (stamp, held) == (self._stamp, key) else None
 
     def save(self, key: Any, data: Any) -> None:
@@ -148,7 +200,8 @@ class _FilePerKey:
         path = self._path_of(key)
         written = path.with_name(f'{path.name}.{uuid.uuid4().hex[:16]}')
         try:
-            written.write_bytes(dumps((self._stamp, key, data)))
+            packed = dumps((self._stamp, key, data))
+            written.write_bytes(hashlib.sha256(packed).digest() + packed)
             os.replace(written, path)
         finally:
             written.unlink(missing_ok=True)

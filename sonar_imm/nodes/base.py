@@ -28,7 +28,7 @@ have no estimate.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 import functools
 import threading
 import time
@@ -45,29 +45,118 @@ from msg_adapters.estimates import write_estimate
 from msg_adapters.inputs import DOUBTS, inputs_of, InputTopic, needed
 
 from ..estimates import Estimate
+from ..estimation.jit import kernels
 from ..measurements import Rejection
 from ..node_config import node_config_type, type_spec, type_specs
 from ..parameters import Config
-from ..trackers import SYSTEMS
+from ..trackers import SYSTEMS, WarmStep
 from .diagnostics import Announcer, Meter, Reporter
 from .messages import make, message_class
 from .outputs import DisplayPublisher, ProcessedPublisher, TablePublisher
 from .parameters import NodeParameters
 from .qos import Endpoints, explained_overrides, input_qos, latched_qos, output_qos, transforms_qos
 from .saved_state import SavedState
+from .stopping import stopper
 
 TABLE = 'sensor_msgs/msg/PointCloud2'
-_PATIENCE = 3.0
+_LOOK = 0.02
+"""Seconds between two looks at whether the kernels are there."""
 _UNKNOWN = {'received_timestamp': 0}
 """The info of a message that did not come from the middleware."""
+
+
+class Warming:
+    """Compiles or loads kernels in a thread of its own, step by step.
+
+    What the connected publishers call for comes first; when nobody publishes yet, that is
+    everything. The rest is compiled after `ready`, beside the first messages.
+    """
+
+    PATIENCE, PERIOD = 3.0, 10.0
+    """Seconds after which it is said that this takes long, and between two such sentences."""
+    DISCOVERY = 0.5
+    """Seconds that publishers have to be found before anything is compiled."""
+
+    def __init__(
+        self,
+        steps: Callable[[Collection[type] | None], list[WarmStep]],
+        connected: Callable[[], Collection[type] | None],
+    ):
+        """steps: what there is to do for measurements of these classes, None for all. connected:
+        the classes that somebody publishes now, None for nobody."""
+        self._steps, self._connected = steps, connected
+        self._start = time.monotonic()
+        self._said = -self.PERIOD
+        self._before = Counter(kernels)
+        self._doing, self._ready = 'nothing', False
+        self._stopped = threading.Event()
+        self._trouble: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name='kernels', daemon=True)
+        self._thread.start()
+
+    def ready(self) -> bool:
+        """Whether what the inputs need is there. Raises what went wrong."""
+        if self._trouble:
+            raise self._trouble
+        return self._ready
+
+    def done(self) -> bool:
+        """Whether everything is there."""
+        return not self._thread.is_alive()
+
+    def stop(self, *, wait: bool) -> None:
+        """Begin no further step."""
+        self._stopped.set()
+        if wait:
+            self._thread.join()
+
+    def sentence(self) -> str:
+        """How far it is; empty when everything is there."""
+        if self.done():
+            return ''
+        made = kernels - self._before
+        waiting = 'messages may wait for it' if self._ready else 'no input is heard until then'
+        return (
+            f'compiling kernels for {self._doing}, once for this machine: {made["compiled"]} of '
+            f'them are compiled after {time.monotonic() - self._start:.0f} s; {waiting}'
+        )
+
+    def due_sentence(self) -> str:
+        """The same when it is time to say it (again), else empty."""
+        now = time.monotonic()
+        if now - self._start < self.PATIENCE or now - self._said < self.PERIOD:
+            return ''
+        self._said = now
+        return self.sentence()
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        except Exception as error:
+            self._trouble = error
+        self._ready = True
+
+    def _work(self) -> None:
+        if not kernels:  # the node has just begun: give discovery a moment
+            end = time.monotonic() + self.DISCOVERY
+            while not self._connected() and time.monotonic() < end:
+                self._stopped.wait(_LOOK)
+        left = dict(self._steps(None))
+        while left and not self._stopped.is_set():
+            called_for = dict(self._steps(self._connected()))
+            wanted = [name for name in left if name in called_for]
+            self._ready = self._ready or not wanted
+            self._doing = (wanted or [*left])[0]
+            left.pop(self._doing)()
 
 
 class BaseNode(Node):
     """Hears the inputs of `inputs_of`, answers each message, and reports on /diagnostics.
 
-    A node that derives from it says in `take` what it does with a message. Its constructor gets
-    ready to work, then offers its outputs and calls `begin`, so that the first message meets a
-    warm node.
+    A node that derives from it says in `take` what it does with a message. Its constructor offers
+    its outputs and calls `begin`. Kernels are then compiled or loaded in a thread, while the node
+    answers services and reports. The inputs are heard after that, so that the first message meets
+    a warm node.
     """
 
     def __init__(self, name: str, config_types: tuple[type[Config], type[Config]], **options: Any):
@@ -81,39 +170,39 @@ class BaseNode(Node):
         self._node_config: Any = self._settings[self._node_config_type]
         self._name = name
         self._full_name = self.get_fully_qualified_name().lstrip('/')
-        self._inputs: dict[str, tuple[InputTopic, Callable[[Any], Any]]] = {}
+        self._inputs: dict[str, tuple[InputTopic, str, Callable[[Any], Any]]] = {}
         self._published = 0
         self._errors: Counter[str] = Counter()
         self._meter = Meter()
         self._endpoints = Endpoints(self)
+        self._hears = False
 
     def begin(self) -> None:
-        """Offer what every node does, hear the inputs, report from now on."""
+        """Offer what every node does, report from now on, and hear the inputs as soon as the
+        kernels are there."""
         with explained_overrides(self):
             self._processed = ProcessedPublisher(
                 self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
             )
             self._announcer = Announcer(self._endpoints, self._full_name)
-            settings, topics = self._settings.values(), inputs_of(self._name)
-            resolved = {
-                name: self._listen(topic, name, settings)
-                for topic in topics
-                for name in topic.instances(settings)
-                if topic.wanted(settings)
-            }
+        settings, topics = self._settings.values(), inputs_of(self._name)
+        for topic in topics:
+            for name in topic.instances(settings) if topic.wanted(settings) else ():
+                self._inputs[name] = self._input(topic, name, settings)
         required, one_of = needed(topics, settings)
+        topic_names = {
+            name: self.resolve_topic_name(topic.prefix + name)
+            for name, (topic, _, _) in self._inputs.items()
+        }
         self._reporter = Reporter(
-            self._full_name, resolved, self._meter, required=required, one_of=one_of
+            self._full_name, topic_names, self._meter, required=required, one_of=one_of
         )
-        self.create_timer(
-            self._node_config.diagnostics_period,
-            self._report,
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(self._node_config.diagnostics_period, self._report, clock=steady)
         self._settings.on_change(self._reconfigure)
         self._settings.warn_of_unknown()
-        self._acknowledge(None)
-        self.get_logger().info(f'ready, hears {", ".join(resolved.values())}')
+        self._warming = Warming(self.warm_steps, self._connected)
+        self._until_warm = self.create_timer(_LOOK, self._hear_when_warm, clock=steady)
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -126,7 +215,7 @@ class BaseNode(Node):
         info: as rclpy gives it beside a message.
         """
         start = time.monotonic()
-        topic, reader = self._inputs[name]
+        topic, _, reader = self._inputs[name]
         stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(name, start)
         if self._waited_too_long(name, info):
@@ -145,6 +234,11 @@ class BaseNode(Node):
 
     # -- what a node says of itself ------------------------------------------------------------
 
+    def destroy_node(self) -> None:
+        """End; a kernel that is being compiled is finished, but not when a signal asked."""
+        self._warming.stop(wait=not stopper.asked)
+        super().destroy_node()
+
     def take(self, topic: InputTopic, reader: Callable[[Any], Any], message: Any) -> None:
         """Do with a message what the node is there for. Raises `Rejection`."""
         raise NotImplementedError
@@ -158,6 +252,10 @@ class BaseNode(Node):
 
     def work_report(self) -> dict[str, Any]:
         """`enabled`, `counts`, `health` and `warnings` for `Reporter.report`."""
+        raise NotImplementedError
+
+    def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
+        """What compiles or loads the kernels that these measurements need, None: all."""
         raise NotImplementedError
 
     def answer(self) -> dict[str, int]:
@@ -178,13 +276,43 @@ class BaseNode(Node):
 
     # -- the same for all ----------------------------------------------------------------------
 
-    def _listen(self, topic: InputTopic, name: str, settings: Mapping[str, Any]) -> str:
-        """Subscribe to one input on the topic `name`, and give the resolved name of that."""
+    def _input(
+        self, topic: InputTopic, name: str, settings: Mapping[str, Any]
+    ) -> tuple[InputTopic, str, Callable[[Any], Any]]:
+        """One input on the topic `name`: that, its message type and what reads its messages."""
         spec = type_spec(topic)
         type_name = self._settings.choice(spec.name) if spec else next(iter(topic.readers))
         convention = settings.get('world_frame_convention', 'enu')
         reader = topic.reader(type_name, convention, settings, name)
-        self._inputs[name] = evolve(topic, name=name), reader
+        message_class(type_name)  # ConfigError now where it is not installed
+        return evolve(topic, name=name), type_name, reader
+
+    def _connected(self) -> set[type] | None:
+        """Measurements of the inputs that somebody publishes, None when nobody does."""
+        connected = {
+            measurement
+            for name, (topic, _, _) in self._inputs.items()
+            if self.count_publishers(self.resolve_topic_name(topic.prefix + name))
+            for measurement in (topic.measurement, *topic.also)
+        }
+        return connected or None
+
+    def _hear_when_warm(self) -> None:
+        """Hear the inputs once what they need is compiled, and say what takes long."""
+        if sentence := self._warming.due_sentence():
+            self.get_logger().info(sentence)
+        if self._warming.ready() and not self._hears:
+            with explained_overrides(self):
+                heard = [self._listen(name) for name in self._inputs]
+            self._hears = True
+            self._acknowledge(None)
+            self.get_logger().info(f'ready, hears {", ".join(heard)}')
+        if self._warming.done():
+            self.destroy_timer(self._until_warm)
+
+    def _listen(self, name: str) -> str:
+        """Subscribe to one input, and give the resolved name of its topic."""
+        topic, type_name, _ = self._inputs[name]
         subscription = self._endpoints.subscribe(
             message_class(type_name),
             topic.prefix + name,
@@ -231,8 +359,10 @@ class BaseNode(Node):
         self.start_afresh()
 
     def _acknowledge(self, stamp: Any) -> None:
-        """Say on ~/processed that everything so far is answered; `stamp` is the message's."""
-        self._processed.publish(self.answer(), stamp)
+        """Say on ~/processed that everything so far is answered; `stamp` is the message's. Who
+        waits for an answer takes the first one for the node being ready."""
+        if self._hears:
+            self._processed.publish(self.answer(), stamp)
 
     def _report(self) -> None:
         self._announcer.publish(
@@ -240,6 +370,7 @@ class BaseNode(Node):
                 self.get_clock().now().to_msg(),
                 time.monotonic(),
                 stale_after=self._node_config.stale_after,
+                starting='' if self._hears else self._warming.sentence(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
                 **self.work_report(),
@@ -259,7 +390,6 @@ class TrackerNode(BaseNode):
         self.tracker = self._intake.tracker
         self._enabled = True
         self._ignored = self._withheld = 0
-        self._warm()
         with explained_overrides(self):
             self._estimates = TablePublisher(self.advertise(TABLE, '~/estimate'))
             self._displays = DisplayPublisher(system, self.advertise)
@@ -338,6 +468,10 @@ class TrackerNode(BaseNode):
             ],
         }
 
+    def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
+        """Those of the tracker."""
+        return self.tracker.warm_steps(inputs)
+
     def error_words(self) -> str:
         """What follows of an internal error."""
         return ', the tracker starts afresh'
@@ -346,22 +480,6 @@ class TrackerNode(BaseNode):
     def _config(self) -> Any:
         """The parameters of the tracker without what /tf_static says."""
         return self._settings[self._config_type]
-
-    def _warm(self) -> None:
-        """Compile or load the kernels, with a word to the user when that takes long."""
-        notice = threading.Timer(
-            _PATIENCE,
-            self.get_logger().info,
-            [
-                'compiling numerical kernels, which takes up to 20 s at the very first start; '
-                'later starts load them from the cache'
-            ],
-        )
-        notice.start()
-        try:
-            self.tracker.warm()
-        finally:
-            notice.cancel()
 
     def _publish(self, estimates: list[Estimate]) -> None:
         """Publish the newest estimate, and before it the newest revised ones, as many as are

@@ -246,13 +246,15 @@ class Reporter:
         *,
         enabled: bool,
         stale_after: float,
+        starting: str,
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str] = (),
         lost: Mapping[str, int],
         incompatible: Mapping[str, str],
     ) -> DiagnosticArray:
-        """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds."""
+        """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; starting: why
+        no input is heard yet, or empty."""
         then, received_before, refused_before, dropped_before, lost_before = self._before
         meter = self._meter
         elapsed = np.nan if then is None else max(now - then, 1e-9)
@@ -268,7 +270,7 @@ class Reporter:
             Counter(lost),
         )
 
-        stale = self._stale(now, stale_after)
+        stale = [starting] if starting else self._stale(now, stale_after)
         message = DiagnosticArray()
         message.header.stamp = stamp
         message.status = [
@@ -289,6 +291,7 @@ class Reporter:
                 (fresh + missing).total() / elapsed,
                 dropped - dropped_before,
                 enabled,
+                starting,
                 counts,
                 health,
                 [
@@ -383,6 +386,7 @@ class Reporter:
         rate: float,
         dropped: int,
         enabled: bool,
+        starting: str,
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str],
@@ -394,7 +398,7 @@ class Reporter:
         values |= {'compute time p50 [ms]': p50, 'compute time p99 [ms]': p99}
         found = [Finding(_wording(warning), WARN, warning) for warning in warnings]
         if stale and enabled:
-            sentence = f'waiting for input: {stale[0]}'
+            sentence = starting or f'waiting for input: {stale[0]}'
             found.append(Finding('stale', STALE, sentence, at_once=True, passing=True))
         if dropped:
             sentence = f'input comes faster than it can be processed: {dropped} messages dropped'

@@ -30,7 +30,7 @@ if __name__ == '__main__':
     stopper.listen()
     one_blas_thread()  # before numpy is imported
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 import sys
 from typing import Any
 
@@ -39,6 +39,7 @@ from msg_adapters.inputs import InputTopic
 
 from ..intake import KnownFrames
 from ..node_config import DetectorNodeConfig
+from ..trackers import WarmStep
 from ..trackers.obstacle.detector import DetectorConfig, ImageDetector
 from .base import BaseNode, TABLE
 from .messages import make, message_class
@@ -56,7 +57,6 @@ class FlsDetectorNode(BaseNode):
         is not installed."""
         super().__init__(NAME, (DetectorConfig, DetectorNodeConfig), **options)
         self._detector = ImageDetector(self._settings[DetectorConfig])
-        self._detector.warm()
         self._frames = KnownFrames()
         with explained_overrides(self):
             self._detections = self._endpoints.advertise(
@@ -79,6 +79,10 @@ class FlsDetectorNode(BaseNode):
     def start_afresh(self) -> None:
         """Forget the sweep of a scanning sonar."""
         self._detector = ImageDetector(self._settings[DetectorConfig])
+
+    def warm_steps(self, inputs: Collection[type] | None) -> list[WarmStep]:
+        """The detector has one."""
+        return [('images', ImageDetector(self._settings[DetectorConfig]).warm)]
 
     def work_report(self) -> dict[str, Any]:
         """How many messages of detections there were."""

@@ -35,6 +35,7 @@ sonar_imm.parameters.ConfigError: parameter 'fix_std' must be between 0.0001 and
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Collection
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -43,6 +44,9 @@ from attrs import frozen
 from ..estimates import Estimate
 from ..intake import KnownFrames
 from ..parameters import Config, ConfigError
+
+WarmStep = tuple[str, Callable[[], object]]
+"""What compiles or loads a part of a tracker's kernels, and the name of that part."""
 
 
 class Tracker(Protocol):
@@ -78,8 +82,15 @@ class Tracker(Protocol):
         """Take over the parameters that may change while running; keeps the tracks."""
         ...
 
-    def warm(self) -> None:
-        """Compile or load every kernel the first measurement would need."""
+    def warm(self, inputs: Collection[type] | None = None) -> None:
+        """Compile or load every kernel that measurements of the classes `inputs` will need, by
+        default of all classes: all of `warm_steps`."""
+        ...
+
+    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
+        """The same in steps, for a caller who tells how far it is or works between them. A step
+        changes nothing of the tracker, and leaves nothing to compile of what it is named after.
+        They can be run in any order, each by itself, in any thread."""
         ...
 
     def health(self) -> dict[str, float]:

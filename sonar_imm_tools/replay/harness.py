@@ -50,6 +50,7 @@ START_LIMIT = 300.0
 """Seconds a node may take to appear, with nothing compiled yet, on a slow or busy machine."""
 _STOP_LIMIT = 10.0
 _LOG_TAIL = 12
+_SHARED_MEMORY = Path('/dev/shm')
 
 
 @frozen(eq=False)
@@ -230,12 +231,13 @@ class NodeProcess:
 def reserved_domain_id() -> Iterator[int]:
     """Reserve a ROS domain on this machine, so that checks neither meddle nor are meddled with.
 
-    A listening port stands for the domain, as in the isolation of launch_testing. Raises
+    A listening port stands for the domain, as in the isolation of launch_testing. A domain whose
+    shared memory a killed process left behind comes last: Fast DDS may not get over it. Raises
     `LinkError` when all are taken.
     """
     candidates = list(range(1, 101))
     random.SystemRandom().shuffle(candidates)
-    for domain_id in candidates:
+    for domain_id in sorted(candidates, key=_domains_left_behind().__contains__):
         with socket.socket() as claim:
             try:
                 claim.bind(('127.0.0.1', 22119 + domain_id))
@@ -244,6 +246,14 @@ def reserved_domain_id() -> Iterator[int]:
             yield domain_id
             return
     raise LinkError('no free ROS domain on this machine')
+
+
+def _domains_left_behind() -> set[int]:
+    """Domains in which Fast DDS has, or had when it was killed, ports of shared memory."""
+    ports = (
+        path.name.partition('fastrtps_port')[2] for path in _SHARED_MEMORY.glob('fastrtps_port*')
+    )
+    return {(int(port) - 7400) // 250 for port in ports if port.isdecimal()}
 
 
 def local_discovery() -> contextlib.AbstractContextManager[None]:

@@ -14,17 +14,20 @@
 
 """Compiling: the cache is used when it can be, and is no condition."""
 
+import hashlib
 import importlib
 import os
 from pathlib import Path
+import resource
 import shutil
 import subprocess
 import sys
 
+import numba
 from numba.core import caching
 import pytest
 
-from sonar_imm.estimation import imm_kernels, jit
+from sonar_imm.estimation import jit
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,12 +35,11 @@ ROOT = Path(__file__).parents[2]
 def test_without_any_place_for_a_cache_a_kernel_still_works(monkeypatch):
     """What numba does in a container with a read-only installation and no home."""
     monkeypatch.setattr(caching.CompileResultCacheImpl, '_locator_classes', [])
-
-    @jit.kernel
-    def doubled(x):
-        return 2.0 * x
-
-    assert doubled(2.0) == 4.0
+    jit._warn_of_no_cache.cache_clear()
+    with pytest.warns(RuntimeWarning, match='no folder can be written') as warned:
+        doubled, halved = jit.kernel(lambda x: 2.0 * x), jit.kernel(lambda x: 0.5 * x)
+    assert len(warned) == 1
+    assert doubled(2.0) == 4.0 and halved(2.0) == 1.0
     assert doubled.stats.cache_path is None
 
 
@@ -49,6 +51,73 @@ def run(code, root, cache):
         command, cwd=root, env=environment, capture_output=True, text=True, check=True
     )
     return done.stdout.split()
+
+
+@pytest.fixture
+def fresh(tmp_path, monkeypatch):
+    """Makes the same kernel as a new process does: it knows only what is in the folder."""
+    monkeypatch.setattr(numba.config, 'CACHE_DIR', str(tmp_path))
+    jit._warn_of_no_cache.cache_clear()
+
+    def doubled(x):
+        return x + x
+
+    def result_and_hits():
+        compiled = jit.kernel(doubled)
+        return compiled(2.0), sum(compiled.stats.cache_hits.values())
+
+    return result_and_hits
+
+
+def test_a_full_disk_costs_a_sentence_and_not_the_process(fresh, tmp_path):
+    """The limit on the size of files fails a write as a full disk does: after the folder and the
+    file were made."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.warns(RuntimeWarning, match='compiled in memory') as warned:
+            assert [fresh(), fresh()] == [(4.0, 0), (4.0, 0)]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert len(warned) == 1 and not list(tmp_path.rglob('*.nbc*'))
+    assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
+
+
+DAMAGE = {
+    'bit': lambda content: content[:3000] + bytes([content[3000] ^ 4]) + content[3001:],
+    'cut': lambda content: content[:-9],
+    'empty': lambda content: b'',
+    'zeros': lambda content: bytes(len(content)),
+}
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('damage', DAMAGE)
+def test_a_damaged_file_is_compiled_anew(fresh, tmp_path, damage):
+    """LLVM ends a process that gives it a damaged file, so it must not see any."""
+    fresh()
+    (path,) = tmp_path.rglob('*.nbc')
+    path.write_bytes(DAMAGE[damage](path.read_bytes()))
+    assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
+
+
+def test_a_file_that_cannot_be_unpacked_is_compiled_anew(fresh, tmp_path):
+    """A checksum that holds says nothing of what another program packed."""
+    fresh()
+    (path,) = tmp_path.rglob('*.nbc')
+    packed = b'cnowhere\nNothing\n.'
+    path.write_bytes(hashlib.sha256(packed).digest() + packed)
+    with pytest.warns(RuntimeWarning, match='ModuleNotFoundError'):
+        assert fresh() == (4.0, 0)
+    assert fresh() == (4.0, 1)
+
+
+@pytest.mark.filterwarnings('error')
+def test_a_folder_that_is_deleted_while_a_process_runs_is_made_again(fresh, tmp_path):
+    fresh()
+    for folder in tmp_path.iterdir():
+        shutil.rmtree(folder)
+    assert [fresh(), fresh()] == [(4.0, 0), (4.0, 1)]
 
 
 def test_kernels_of_a_read_only_installation_are_cached_elsewhere(tmp_path):
@@ -104,8 +173,8 @@ def test_code_that_is_not_the_same_is_never_in_the_same_file(monkeypatch):
         return jit.kernel(doubled)
 
     def files(function):
-        folder = Path(function.stats.cache_path)
-        return {path: path.read_bytes() for path in folder.glob('*doubled*.nbc')}
+        folder, line = Path(function.stats.cache_path), doubled.__code__.co_firstlineno
+        return {path: path.read_bytes() for path in folder.glob(f'*doubled-{line}.*.nbc')}
 
     mine, other = compiled(), compiled()
     mine._cache.flush()
@@ -308,9 +377,3 @@ def test_with_another_numba_and_no_place_for_a_cache_a_kernel_still_works(monkey
     with pytest.warns(RuntimeWarning):
         tripled = jit.kernel(lambda x: 3.0 * x)
     assert tripled(2.0) == 6.0 and tripled.stats.cache_path is None
-
-
-def test_warm_leaves_nothing_to_compile():
-    imm_kernels.warm()
-    verbs = ('mix', 'predict', 'update', 'gate', 'combine')
-    assert all(getattr(imm_kernels, verb).signatures for verb in verbs)

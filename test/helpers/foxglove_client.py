@@ -32,7 +32,7 @@ class Viewer:
         self._connection = connect(url, subprotocols=['foxglove.sdk.v1'], proxy=None)
         self.info, self.channels = {}, {}
         self.messages, self.states, self.times = [], [], []
-        self._subscribed = {}
+        self._subscribed, self._wanted = {}, set()
 
     def __enter__(self):
         self._socket = self._connection.__enter__()
@@ -46,7 +46,9 @@ class Viewer:
         end = time.monotonic() + limit
         while not predicate():
             left = end - time.monotonic()
-            assert left > 0, f'nothing came of it: {self.channels}, {self.states}'
+            assert left > 0, (
+                f'nothing came of it: {[*self.channels]}, {len(self.messages)} messages'
+            )
             try:
                 self._take(self._socket.recv(timeout=min(left, 0.2)))
             except TimeoutError:
@@ -54,6 +56,7 @@ class Viewer:
 
     def subscribe(self, *topics):
         """Ask for the messages of `topics`, which are offered."""
+        self._wanted.update(topics)
         asked = []
         for topic in topics:
             number = len(self._subscribed) + 1
@@ -73,11 +76,16 @@ class Viewer:
             if message['op'] == 'serverInfo':
                 self.info = message
             elif message['op'] == 'advertise':
-                self.channels.update({one['topic']: one for one in message['channels']})
+                offered = {channel['topic']: channel for channel in message['channels']}
+                self.channels.update(offered)
+                if again := self._wanted & offered.keys():  # withdrawn and offered anew
+                    self.subscribe(*again)
             elif message['op'] == 'unadvertise':
                 gone = set(message['channelIds'])
                 self.channels = {
-                    name: one for name, one in self.channels.items() if one['id'] not in gone
+                    name: channel
+                    for name, channel in self.channels.items()
+                    if channel['id'] not in gone
                 }
         elif data[0] == 1:
             number, log_ns = struct.unpack_from('<IQ', data, 1)

@@ -64,8 +64,11 @@ class WalkerTracker:
     def reconfigure(self, config):
         self.config = config
 
-    def warm(self):
+    def warm(self, inputs=None):
         pass
+
+    def warm_steps(self, inputs=None):
+        return []
 
     def health(self):
         return {'NIS': 1.25, 'tracks': float(bool(self.fixes))}

@@ -24,6 +24,7 @@ from sonar_imm.measurements import Fix
 from sonar_imm_tools.recordings.messages import ros_message
 from sonar_imm_tools.recordings.reader import BagError
 from sonar_imm_tools.recordings.writer import BagWriter
+from sonar_imm_tools.replay import harness
 from sonar_imm_tools.replay.harness import LockstepResult, reserved_domain_id, run_lockstep
 from sonar_imm_tools.replay.link import Link, LinkError
 from sonar_imm_tools.replay.lockstep import Counts
@@ -45,6 +46,14 @@ def test_reserved_domains_differ_and_come_free_again():
         assert 1 <= first <= 100
     with reserved_domain_id():
         pass
+
+
+def test_a_domain_of_a_killed_process_is_reserved_last(tmp_path, monkeypatch):
+    monkeypatch.setattr(harness, '_SHARED_MEMORY', tmp_path)
+    for domain in {*range(1, 101)} - {37}:
+        (tmp_path / f'fastrtps_port{7400 + 250 * domain + 11}').touch()
+    with reserved_domain_id() as first, reserved_domain_id() as second:
+        assert first == 37 != second
 
 
 def test_an_input_recorded_with_two_types_cannot_be_played_to_one_node(tmp_path):

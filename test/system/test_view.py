@@ -33,7 +33,6 @@ from helpers.foxglove_client import Viewer  # noqa: E402
 from sonar_imm_tools.cli import main  # noqa: E402
 from sonar_imm_tools.recordings.reader import BagReader  # noqa: E402
 from sonar_imm_tools.replay.harness import NodeProcess, reserved_domain_id  # noqa: E402
-from sonar_imm_tools.replay.link import Link  # noqa: E402
 from sonar_imm_tools.replay.player import play, PlayOptions  # noqa: E402
 from sonar_imm_tools.resources import shared_file  # noqa: E402
 
@@ -63,7 +62,8 @@ def viewing(*arguments, **environment):
             yield viewer
         process.send_signal(signal.SIGINT)
         out, errors = process.communicate(timeout=LIMIT)
-        assert (process.returncode, errors) == (0, ''), out
+        ours = [line for line in errors.splitlines() if 'RTPS' not in line]
+        assert (process.returncode, ours) == (0, []), out
     finally:
         if process.poll() is None:
             process.kill()
@@ -102,9 +102,10 @@ def test_running_nodes_are_shown_live(monkeypatch):
             )
             viewer.subscribe('/diver/estimate', '/diagnostics')
             viewer.wait(lambda: any(one[0] == '/diagnostics' for one in viewer.messages), LIMIT)
-            with Link('test_view', domain_id=domain) as link:
-                assert link.wait_for(lambda: link.node.count_subscribers('/arrivals'), LIMIT)
-            played = play(BAG, PlayOptions(rate=10.0, topics=('/arrivals',)), domain_id=domain)
+            # In lock-step, which waits for the node's inputs and loses nothing.
+            played = play(
+                BAG, PlayOptions(topics=('/arrivals',), lockstep='/diver'), domain_id=domain
+            )
             assert played.problems == ()
             viewer.wait(lambda: any(one[0] == '/diver/estimate' for one in viewer.messages), LIMIT)
             assert node.process.poll() is None

@@ -50,7 +50,7 @@ particle filters for side scan bathymetry*, OCEANS 2013.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 import math
 from typing import Any, NamedTuple
 
@@ -62,6 +62,7 @@ from ...estimation.arrays import FloatArray
 from ...intake import KnownFrames
 from ...intake.stream import Stream, StreamRules
 from ...measurements import Altitude, nanoseconds, Navigation, Snapshot
+from .. import WarmStep
 from ..navigation import MOST_WAITING, NavigationBuffer
 from .config import BathymetryConfig
 from .kernels import Track
@@ -127,7 +128,14 @@ class BathymetryTracker:
         """Take another place of the sonar on the ship, for all pings from now on."""
         self.config = config
 
-    def warm(self) -> None:
+    def warm(self, inputs: Collection[type] | None = None) -> None:
+        for _, compile_step in self.warm_steps(inputs):
+            compile_step()
+
+    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
+        return [('all', self._warm_all)]
+
+    def _warm_all(self) -> None:
         T, P = 8, 8
         snapshot = Snapshot(
             stamp_ns=1,

@@ -374,16 +374,3 @@ def inside_families(transition: FloatArray, nominal: FloatArray, family: IntArra
                 own = family[j] == family[i] and total > 0.0
                 out[t, i, j] = transition[t, i, j] * due / total if own else nominal[i, j]
     return out
-
-
-def warm() -> None:
-    """Run the kernels once on tiny input: compiled or loaded from the cache."""
-    numbers = np.zeros(2, np.int64)
-    kinds = np.array([HEADING, VELOCITY])
-    mixing = Mixing(numbers, kinds, numbers, np.array([[1.0, 0.0]]), 0.75, 0.16, 0.01)
-    x, P, mu = np.ones((1, 2, 4)), np.tile(np.eye(4), (1, 2, 1, 1)), np.full((1, 2), 0.5)
-    transition = np.full((1, 2, 2), 0.5)
-    mix(x, P, mu, transition, mixing)
-    inside_families(transition, transition[0], numbers)
-    H, z, R = np.zeros((1, 2, 2, 4)), np.zeros((1, 2)), np.eye(2)[None]
-    log_densities(np.zeros((1, 2, 2)), H, P, mu, z, R, np.ones(1))

@@ -15,7 +15,7 @@
 """What fixes do to their tracks, compiled: many fixes are few numbers each.
 
 All floats are float64, all arrays C-contiguous; T tracks of M models with n states. No kernel
-changes its arguments. `warm` compiles or loads every kernel.
+changes its arguments.
 """
 
 from __future__ import annotations
@@ -185,14 +185,3 @@ def watch(
         (sums[3] + row_sum(cross)) * kept,
         (sums[4] + 0.5 * row_sum(both)) * kept,
     )
-
-
-def warm() -> None:
-    """Run the kernels once on tiny input: compiled or loaded from the cache."""
-    x, P, mu = np.zeros((1, 2, 2)), np.tile(np.eye(2), (1, 2, 1, 1)), np.full((1, 2), 0.5)
-    H, z, R, first = P.copy(), np.zeros((1, 2)), np.eye(2)[None], np.zeros(1, np.int64)
-    update(x, P, mu, expected(x, H), H, z, R, first, first, np.zeros(1), np.zeros(1, np.uint16))
-    no, sums = np.zeros(1, np.bool_), (0.0, 0.0, 0.0, 0.0, 0.0)
-    watch(x, P, mu, H, z, R, first, first, no, np.full((1, 2), np.nan), sums, 1.0)
-    scores(np.zeros(1), z, first, no, 0.0, 0.0, 0.0)
-    finite(x, P)

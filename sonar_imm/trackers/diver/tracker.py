@@ -29,7 +29,7 @@ Source: docs/diver.md, after 'multi-directional motion fusion model for diver tr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache, partial
 import math
 from operator import itemgetter
@@ -40,19 +40,18 @@ import numpy as np
 
 from ...acoustics.geodesy import Origin
 from ...estimates import Estimate
-from ...estimation import adaptation, association, imm_kernels
+from ...estimation import imm_kernels
 from ...estimation.adaptation import AdaptiveChain, Form
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tracks
 from ...estimation.consider import consider_models
-from ...estimation.consistency import NisMemory
-from ...estimation.jipda import warm as warm_jipda
 from ...estimation.small_matrices import add_jitter_all
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Arrivals, Fix, Fixes, Measurement, NOBODY, Start
+from .. import WarmStep
 from ..model_checks import track_rules
-from . import births, families, family_kernels, fix_kernels, jipda, names, pings
+from . import births, families, fix_kernels, jipda, names, pings
 from .births import Birth
 from .config import DiverConfig
 from .georeferencing import Georeferencer
@@ -140,36 +139,52 @@ class DiverTracker:
         self._settle(config)
         self._georeferencer.config = config
 
-    def warm(self) -> None:
-        imm_kernels.warm()
-        warm_jipda()
-        adaptation.warm()
-        association.warm()
-        fix_kernels.warm()
-        if self.models.mixing is not None:
-            family_kernels.warm()
-        # A contested scan, echoes and a tag: nothing is left to be loaded at the first real one.
-        tracker = DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
-        rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
-        leg = np.linalg.norm(rx - [20.0, 30.0, -5.0], axis=1)
+    def warm(self, inputs: Collection[type] | None = None) -> None:
+        for _, compile_step in self.warm_steps(inputs):
+            compile_step()
+
+    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
+        steps: list[WarmStep] = []
+        if inputs is None or not {Arrivals, Start}.issuperset(inputs):
+            steps.append(('fixes', self._warm_fixes))
+        if inputs is None or Arrivals in inputs:
+            steps += [('echoes', self._warm_echoes), ('tags', self._warm_tags)]
+        return steps
+
+    def _warm_fixes(self) -> None:
+        tracker = self._for_warming()
         for second in (1, 2):
             for x in (0.0, 0.1):
                 position = np.array([x, 0.0, 0.0])
                 fix = Fix(stamp_ns=second * 10**9, position=position, covariance=np.eye(2))
                 tracker.process(fix)
-            for tx in (rx[0], np.full(3, np.nan)):
-                ping = Arrivals(
-                    stamp_ns=second * 10**9,
-                    tx_id=np.zeros(4),
-                    rx_id=np.arange(4),
-                    tx=np.tile(tx, (4, 1)),
-                    rx=rx,
-                    toa=(leg + leg[0]) / self.config.sound_speed,
-                    var_toa=np.full(4, 1e-8),
-                    bearing=np.full(4, np.nan),
-                    var_bearing=np.full(4, np.nan),
-                )
-                tracker.process(ping)
+
+    def _warm_echoes(self) -> None:
+        self._warm_pings(np.zeros(3))
+
+    def _warm_tags(self) -> None:
+        self._warm_pings(np.full(3, np.nan))
+
+    def _warm_pings(self, tx: FloatArray) -> None:
+        tracker = self._for_warming()
+        rx = np.array([[0.0, 0.0, 0.0], [70.0, 10.0, 0.0], [-60.0, 45.0, 0.0], [10.0, 85.0, 0.0]])
+        leg = np.linalg.norm(rx - [20.0, 30.0, -5.0], axis=1)
+        for second in (1, 2):
+            ping = Arrivals(
+                stamp_ns=second * 10**9,
+                tx_id=np.zeros(4),
+                rx_id=np.arange(4),
+                tx=np.tile(tx, (4, 1)),
+                rx=rx,
+                toa=(leg + leg[0]) / self.config.sound_speed,
+                var_toa=np.full(4, 1e-8),
+                bearing=np.full(4, np.nan),
+                var_bearing=np.full(4, np.nan),
+            )
+            tracker.process(ping)
+
+    def _for_warming(self) -> DiverTracker:
+        return DiverTracker(evolve(self.config, max_gap=3600.0, max_tracks=2))
 
     def health(self) -> dict[str, float]:
         now = self._stream.state
@@ -383,10 +398,10 @@ class DiverTracker:
             step.dt,
             np.flatnonzero(hit),
         )
-        nis, arrivals = np.where(hit, now.nis, np.nan), NisMemory()
+        nis, arrivals = np.where(hit, now.nis, np.nan), before.arrivals
         if scan.pings and not scan.fixes:
             sure = hit & (now.life.status != TENTATIVE)
-            arrivals = before.arrivals.after(nis[sure], now.nis_dof[sure])
+            arrivals = arrivals.after(nis[sure], now.nis_dof[sure])
         return now._replace(learnt=learnt, nis=nis, arrivals=arrivals)
 
     def _prune(self, now: DiverState, scan: Scan) -> DiverState:

@@ -43,6 +43,7 @@ reflector identification with multiple model particle filtering*.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
 import math
 from typing import Any
 
@@ -57,6 +58,7 @@ from ...estimation.set_model import banded_transition, gaussian_walk, SetModel
 from ...intake import KnownFrames
 from ...intake.stream import OnceStream, StreamRules
 from ...measurements import ArrayDepth, CrossSpectra, Pressure, Rejection, Trace
+from .. import WarmStep
 from .config import FathometerConfig
 from .pressure import Collected, CompanionDepths, MOST_HEAVE, PressureStream
 from .reflectors import (
@@ -169,7 +171,14 @@ class FathometerTracker:
             # It is built into the filter as the spread of a state.
             self._forget()
 
-    def warm(self) -> None:
+    def warm(self, inputs: Collection[type] | None = None) -> None:
+        for _, compile_step in self.warm_steps(inputs):
+            compile_step()
+
+    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
+        return [('all', self._warm_all)]
+
+    def _warm_all(self) -> None:
         depth = 0.05 * np.arange(200)
         config = evolve(
             self.config,

@@ -30,7 +30,7 @@ Source: docs/obstacle.md, after 'forward-looking sonar obstacle tracking' (Daura
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from attrs import evolve
 import numpy as np
@@ -43,6 +43,7 @@ from ...estimation.association import assign_fits, gate_threshold, TENTATIVE, Tr
 from ...intake import KnownFrames
 from ...intake.stream import ReplayStream, StreamRules
 from ...measurements import Altitude, Detections, Measurement, nanoseconds, Navigation
+from .. import WarmStep
 from ..model_checks import track_rules
 from ..navigation import MOST_WAITING, NavigationBuffer
 from . import ping_kernels
@@ -116,7 +117,14 @@ class ObstacleTracker:
         """Take another place of the sonar on the vehicle, for all pings from now on."""
         self.config, self.mount = config, Mount(config)
 
-    def warm(self) -> None:
+    def warm(self, inputs: Collection[type] | None = None) -> None:
+        for _, compile_step in self.warm_steps(inputs):
+            compile_step()
+
+    def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
+        return [('all', self._warm_all)]
+
+    def _warm_all(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
         tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0))
         for second in (1, 2, 3, 4):

@@ -325,7 +325,14 @@ def test_arrivals_are_judged_where_no_fix_says_the_same():
         tracker.process(ping(second))
     assert np.isnan(tracker.health()['arrivals_mean_nis'])
     tracker.process(ping(9))
-    assert tracker.health()['arrivals_mean_nis'] < 1.0
+    alone = tracker.health()['arrivals_mean_nis']
+    assert alone < 1.0
+    tracker.process(scan(10, (20.0, 30.0)))
+    tracker.process(scan(11, (20.0, 30.0)))
+    tracker.process(ping(11))
+    assert tracker.health()['arrivals_mean_nis'] == alone
+    tracker.process(ping(12))
+    assert tracker.health()['arrivals_mean_nis'] != alone
 
 
 def test_the_score_of_a_track_is_that_of_its_last_scans():
