@@ -181,7 +181,7 @@ def made(kind: str, seed: int) -> Path:
     """One path of a kind."""
     name, std, every, too_small = KINDS[kind]
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
-    rows = np.arange(0, 3000, round(10 * every))
+    rows = np.arange(0, 3000 if std else 1000, round(10 * every))
     truth = course(name, rng)[rows]
     if std:
         R = np.tile(np.eye(2) * std**2, (len(rows), 1, 1))

@@ -263,42 +263,42 @@ def test_transitions_are_learnt_inside_families_only():
 
 def test_several_divers_in_clutter():
     """Two divers and false fixes: two tracks, by either association."""
-    rng = np.random.default_rng(5)
     for association in ('gnn', 'jipda'):
+        rng, extra = np.random.default_rng(5), []
         settings = {'association': association, 'clutter_density': 2e-4, 'max_tracks': 5}
         tracker = DiverTracker(config(**settings))
-        for k in range(60):
-            there = np.array([[0.7 * k, 0.0], [0.7 * k, 25.0]]) + 0.5 * rng.normal(size=(2, 2))
-            seen = there[rng.uniform(size=2) < 0.9]
-            places = np.concatenate([seen, rng.uniform(-60.0, 60.0, (rng.poisson(2.0), 2))])
+        for k in range(40):
+            there = np.array([[0.7 * k, 0.0], [0.7 * k, 25.0]])
+            seen = (there + 0.5 * rng.normal(size=(2, 2)))[rng.uniform(size=2) < 0.9]
+            places = np.concatenate([seen, rng.uniform(-60.0, 60.0, (rng.poisson(3.0), 2))])
             scan = Fixes(
                 stamp_ns=(k + 1) * SECOND,
                 position=np.column_stack([places, np.zeros(len(places))]),
                 covariance=np.tile(0.25 * np.eye(2), (len(places), 1, 1)),
             )
             estimate = tracker.process(scan)[-1]
-        firm = estimate.extras['track_state'] > 0
-        assert firm.sum() == 2, association
-        at = estimate.state[firm, :2]
-        assert np.abs(at[np.argsort(at[:, 1])] - [[41.3, 0.0], [41.3, 25.0]]).max() < 2.0
+            firm = estimate.state[estimate.extras['track_state'] > 0, :2]
+            near = np.hypot(*(firm[:, None] - there).transpose(2, 0, 1)) < 3.0
+            assert k < 6 or near.any(axis=0).all(), association
+            extra.append((~near.any(axis=1)).sum())
+        assert np.mean(extra) < 0.15, association
         assert np.isfinite(estimate.covariance).all()
 
 
 def test_smoothing_is_better_than_the_filter():
     rng = np.random.default_rng(2)
-    heading = np.cumsum(np.where(rng.uniform(size=150) < 0.06, rng.normal(size=150), 0.0))
+    heading = np.cumsum(np.where(rng.uniform(size=80) < 0.06, rng.normal(size=80), 0.0))
     truth = np.cumsum(0.7 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
     tracker = SmoothingDiverTracker(config(confirm_hits=1))
     filtered = [
         tracker.process(fix(k + 1, *(z + rng.normal(size=2)), np.eye(2)))[-1]
         for k, z in enumerate(truth)
     ]
-    errors = [
-        np.array([e.state[0, :2] for e in each]) - truth for each in (filtered, tracker.smoothed())
-    ]
+    smoothed = tracker.smoothed()
+    errors = [np.array([e.state[0, :2] for e in each]) - truth for each in (filtered, smoothed)]
     plain, smooth = (np.sqrt(np.mean(np.sum(e**2, axis=1))) for e in errors)
     assert smooth < 0.85 * plain
-    for estimate in tracker.smoothed():
+    for estimate in smoothed:
         assert np.linalg.eigvalsh(estimate.covariance[0]).min() > 0.0
         assert estimate.probabilities.sum() == pytest.approx(1.0)
 
@@ -306,17 +306,17 @@ def test_smoothing_is_better_than_the_filter():
 def test_smoothing_knows_when_behaviour_changed():
     """A scooter that stops: what the families weigh is smoothed too."""
     rng = np.random.default_rng(4)
-    x = np.concatenate([2.0 * np.arange(60), np.full(60, 118.0)])
+    x = np.concatenate([2.0 * np.arange(40), np.full(40, 78.0)])
     tracker = SmoothingDiverTracker(config(confirm_hits=1))
     for k, place in enumerate(x):
         tracker.process(fix(k + 1, *([place, 0.0] + 0.3 * rng.normal(size=2)), 0.09 * np.eye(2)))
     smoothed = tracker.smoothed()
-    assert np.mean([e.extras['hover'][0] for e in smoothed[75:]]) > 0.7
+    assert np.mean([e.extras['hover'][0] for e in smoothed[52:]]) > 0.7
     speed = [np.hypot(*e.state[0, 2:]) for e in smoothed]
-    np.testing.assert_allclose(speed[10:50], 2.0, atol=0.4)
+    np.testing.assert_allclose(speed[10:34], 2.0, atol=0.4)
 
 
-def test_a_late_fix_and_a_kept_state_change_nothing():
+def test_a_late_fix_is_put_in_its_place():
     items = path(40)
     expected = run(DiverTracker(config()), items)
     late = DiverTracker(config())
