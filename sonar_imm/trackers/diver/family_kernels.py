@@ -95,6 +95,12 @@ def mix(
     while S < M and kind[S] != VELOCITY:
         S += 1
     centre, d = np.empty(n), np.empty(n)
+    # About the centre, first and second moments of the images of a velocity, the hover's last; and
+    # which of them each heading or hover takes.
+    first, second = np.empty((n, D + 1)), np.empty((n, n, D + 1))
+    image = np.empty(S, dtype=np.int64)
+    for j in range(S):
+        image[j] = direction[j] if kind[j] == HEADING else D
     # Sums for all headings and hovers, which come first, lie in a row: such loops are vectorised.
     e, total, L = np.empty((n, S)), np.empty((n, n, S)), np.empty((n, n))
     for t in range(T):
@@ -143,16 +149,20 @@ def mix(
                         for j in range(S):
                             total[a, b, j] += W[i, j] * moment
         for i in range(S, M):
-            for j in range(S):
-                w = W[i, j]
+            for k in range(D + 1):
                 x_i, P_i = other_x[i], other_P[i]
-                if kind[j] == HEADING:
-                    x_i, P_i = turned_x[i, direction[j]], turned_P[i, direction[j]]
+                if k < D:
+                    x_i, P_i = turned_x[i, k], turned_P[i, k]
                 for a in range(n):
-                    d[a] = x_i[a] - centre[a]
-                    e[a, j] += w * d[a]
+                    first[a, k] = x_i[a] - centre[a]
                     for b in range(a + 1):
-                        total[a, b, j] += w * (P_i[a, b] + d[a] * d[b])
+                        second[a, b, k] = P_i[a, b] + first[a, k] * first[b, k]
+            for a in range(n):
+                for j in range(S):
+                    e[a, j] += W[i, j] * first[a, image[j]]
+                for b in range(a + 1):
+                    for j in range(S):
+                        total[a, b, j] += W[i, j] * second[a, b, image[j]]
         for j in range(M):
             most = np.inf if j >= S else 0.0
             for a in range(n):
