@@ -139,7 +139,8 @@ class FixConsistency(NamedTuple):
         if self.mean_nis > OPTIMISTIC:
             return [
                 f'fixes miss by more than they state: mean NIS {self.mean_nis:.2g} for each '
-                'coordinate, 1 is due; model_set families finds out by how much, and withstands it'
+                'coordinate, 1 is due; raise covariance_scale (model_set families finds out by '
+                'how much) or the noise of the motion'
             ]
         if not bias_stated and (self.mean_nis < PESSIMISTIC or self.lag_1 > CORRELATED):
             return [
