@@ -63,6 +63,9 @@ $(STAMP): setup.py pyproject.toml
 	    'venv: on Debian and Ubuntu, sudo apt install python3-venv' >&2; exit 1; }
 	@echo 'Building $(VENV) with '"$$($(PYTHON) --version)"'; the first time takes a minute or two.'
 	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@# Kernels compile while pip fetches the rest; whoever needs one earlier compiles it too.
+	@nohup nice $(BIN)/sonar-imm warm --jobs 1 >$(VENV)/warm.log 2>&1 &
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test,lint,sweep]'
 	@touch $@
 

@@ -43,7 +43,7 @@ from sonar_imm.acoustics.spectra import effective_snapshots
 from sonar_imm.measurements import CrossSpectra, Pressure
 from sonar_imm.trackers.fathometer.tracker import FathometerConfig, FathometerTracker
 from sonar_imm.truth import Received, Scene
-from sonar_imm_tools.cli.checking import check_recording, CheckedRecording
+from sonar_imm_tools.cli.checking import CheckedRecording, play_recording
 from sonar_imm_tools.offline.run_folder import RunFolder
 from sonar_imm_tools.recordings.own_files import unusual
 from sonar_imm_tools.recordings.reader import BagReader
@@ -142,7 +142,7 @@ def run(seed: int, folder: Path) -> dict[str, dict[str, float]]:
         other = Scene(received, scene.truth, frame_id=scene.frame_id)
         write_scene(other, bag, provenance={}, parameters=parameters({**stated, **MIRROR}))
     checked = {
-        kind: check_recording(bag, 'fathometer', folder / f'{bag.name}_run', quiet=True)
+        kind: play_recording(bag, 'fathometer', folder / f'{bag.name}_run', quiet=True).judged()
         for kind, bag in zip(KINDS, bags)
     }
     rows = {kind: scores(recording) for kind, recording in checked.items()}

@@ -22,7 +22,7 @@ that is killed leaves such a folder behind, which the next one to write there re
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import contextlib
 import fcntl
 import glob
@@ -112,6 +112,32 @@ def beside(target: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(place, ignore_errors=True)
         os.close(handle)
+
+
+def hold(path: Path) -> Callable[[], None] | None:
+    """Keep the file `path` for this caller alone, until what is given is called or the process
+    ends; None where another caller has it. `path` itself is not touched: a file beside it is
+    locked, on a file system without locks nothing is. Raises OSError where none can be written."""
+    lock = path.with_name(f'{path.name}.lock')
+    while True:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            return None
+        except OSError:
+            pass
+        with contextlib.suppress(OSError):
+            if os.path.samestat(os.fstat(handle), os.stat(lock)):
+                break
+        os.close(handle)  # removed by the one before, between our two calls
+
+    def release() -> None:
+        lock.unlink(missing_ok=True)
+        os.close(handle)
+
+    return release
 
 
 @contextlib.contextmanager

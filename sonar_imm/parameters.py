@@ -47,6 +47,8 @@ from attrs import frozen
 C = TypeVar('C', bound='Config')
 
 KINDS = ('bool', 'int', 'float', 'str', 'float[]', 'int[]', 'str[]')
+MOST_YAML = 1_000_000
+"""Characters of a YAML file, and values in it with its anchors written out."""
 _KEY = 'sonar_imm.parameter'
 
 
@@ -275,18 +277,48 @@ class Config:
         }
 
 
+def yaml_tree(text: str) -> Any:
+    """What a YAML text holds. Raises `ConfigError` for one that is none, or that would be much
+    larger than it looks: an anchor (``&a``) that is used (``*a``) stands for all that it names."""
+    import yaml
+
+    try:
+        if len(text) > MOST_YAML:
+            raise yaml.YAMLError(f'it has more than {MOST_YAML} characters')
+        if '*' in text:
+            _written_out(yaml.compose(text, yaml.SafeLoader), {})
+        return yaml.safe_load(text)
+    except RecursionError:
+        raise ConfigError('not a YAML file: it is nested too deeply') from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        raise ConfigError(f'not a YAML file: {" ".join(str(error).split())}') from None
+
+
+def _written_out(node: Any, known: dict[int, int]) -> int:
+    """How many values a composed YAML node has with its anchors written out. known: of the nodes
+    that were counted. Raises yaml.YAMLError for more than `MOST_YAML`, or no end of them."""
+    import yaml
+
+    if node is None or isinstance(node, yaml.ScalarNode):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = MOST_YAML  # met again inside of itself
+        parts = node.value
+        if isinstance(node, yaml.MappingNode):
+            parts = [part for pair in node.value for part in pair]
+        known[id(node)] = 1 + sum(_written_out(part, known) for part in parts)
+    if known[id(node)] >= MOST_YAML:
+        raise yaml.YAMLError('its anchors multiply')
+    return known[id(node)]
+
+
 def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
     """The parameters in a YAML text: a ROS 2 parameter file (``/**:`` or the node's name) or a
     plain mapping.
 
     Raises `ConfigError` for a text that is not YAML or not a mapping.
     """
-    import yaml
-
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f'not a YAML file: {" ".join(str(error).split())}') from None
+    tree = yaml_tree(text)
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -314,11 +346,9 @@ def parameters_from_yaml(text: str, *, node_name: str = '') -> dict[str, Any]:
 def sections_of(text: str) -> list[str]:
     """The nodes that a ROS 2 parameter file is for, e.g. ``/**`` or ``/diver``; of nodes in a
     namespace the whole name. Nothing for a text that is none, or a plain mapping."""
-    import yaml
-
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError:
+        tree = yaml_tree(text)
+    except ConfigError:
         return []
     return list(_sections(tree, '')) if isinstance(tree, dict) else []
 

@@ -17,6 +17,7 @@
 import math
 
 import attrs
+from helpers.anchors import multiplying
 from hypothesis import given
 from hypothesis import strategies as st
 import pytest
@@ -324,6 +325,12 @@ def test_nothing_is_no_parameter(text):
         ('- 1\n- 2\n', 'must hold a mapping, this one holds a list'),
         ('just words', 'must hold a mapping, this one holds a str'),
         ('7', 'must hold a mapping, this one holds a int'),
+        ('speed: [1, 2]\ngap: 2026-13-45', 'not a YAML file'),
+        ('[' * 100_000, 'not a YAML file: it is nested too deeply'),
+        ('speed: ' + '1' * 1_000_001, 'more than 1000000 characters'),
+        ('a: &a [1, *a]', 'its anchors multiply'),
+        (multiplying('[{}]'), 'its anchors multiply'),
+        (multiplying('{{<<: [{}]}}'), 'its anchors multiply'),
         ('speed: !!python/object/apply:os.system ["true"]', 'not a YAML file'),
     ],
 )
@@ -331,6 +338,11 @@ def test_a_file_that_is_none_is_told_in_one_line(text, words):
     with pytest.raises(ConfigError, match=words) as caught:
         parameters_from_yaml(text)
     assert len(caught.value.problems) == 1 and '\n' not in str(caught.value)
+
+
+def test_anchors_that_do_not_multiply_are_used():
+    text = 'speed: &v 2.0\nlags: &l [1, 2]\nmore: [*v, *v, *l]\n'
+    assert parameters_from_yaml(text)['more'] == [2.0, 2.0, [1, 2]]
 
 
 def test_nan_in_a_file_is_refused_by_name():

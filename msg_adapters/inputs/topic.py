@@ -103,6 +103,11 @@ class InputTopic:
     words: frozenset[str] = field(default=frozenset(), kw_only=True)
     makes: str = field(default='', kw_only=True)
 
+    @property
+    def measurements(self) -> tuple[type, ...]:
+        """All classes that its readers give."""
+        return (self.measurement, *self.also)
+
     def is_named(self, topic: str) -> bool:
         """Whether the name of `topic` says that it is this input."""
         if f'/{topic}'.endswith(f'/{self.name}'):

@@ -106,10 +106,16 @@ def decorrelation(iq: NDArray, chosen: BoolArray, half_width: int = 5) -> float:
     rows = places[:, None] + np.arange(-half_width, half_width + 1)
     rows = np.clip(rows, 0, len(iq) - 1)
     y = np.where(chosen[rows][..., None], iq[rows], 0.0)
+    # Fourth powers of single precision follow. A power of two as the unit changes no digit.
+    exponent = np.frexp(np.abs(y).max(axis=(1, 2)))[1].clip(-120, 120)
+    y = y * np.ldexp(np.ones(len(y), y.real.dtype), -exponent)[:, None, None]
     near, far = (part.reshape(len(y), -1) for part in (y[..., :-1], y[..., 1:]))
     across = np.abs(np.einsum('kn,kn->k', far, near.conj()))
     powers = [np.einsum('kn,kn->k', part, part.conj()).real for part in (near, far)]
-    return float(1.0 - np.median(across / np.sqrt(powers[0] * powers[1])))
+    heard = (powers[0] > 0.0) & (powers[1] > 0.0)
+    if not heard.any():
+        return float('nan')
+    return float(1.0 - np.median(across[heard] / np.sqrt(powers[0] * powers[1])[heard]))
 
 
 def signal_variance(

@@ -18,18 +18,24 @@ one target.
 Signatures are those of `imm` with arrays only: ``B (M, n)`` is always given, and where `imm`
 broadcasts over targets (transition, H, R) an array of length one does. All arrays are float64 and
 C-contiguous.
+
+What rounding has spoilt is rare, and its repair is a large part of the code. So the kernels of
+each verb mark what needs more care, and a second kernel, compiled when it is first needed, does
+that.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import BoolArray, FloatArray
+from .arrays import BoolArray, FloatArray, IntArray
 from .imm import DEAD, MIN_GATE_PROBABILITY
 from .jit import kernel
 from .small_matrices import (
+    all_finite,
     cholesky,
     cholesky_with_jitter,
     gain,
@@ -45,22 +51,39 @@ from .small_matrices import (
 
 LOG_2PI = math.log(2.0 * math.pi)
 
+Cycle = tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray
+]
+"""x, P, mu, mean, covariance, log_likelihood, nis and ok of targets after a whole cycle."""
+
 CANCELLED, MOST_CANCELLED = 10.0, 1e8
 """A second moment so many times the variance it leaves has lost a digit, or half of all digits."""
 
 
-@kernel
 def mix(
     x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M).
+    """See `imm.mix`: mixed x (T, M, n), mixed P (T, M, n, n), c (T, M)."""
+    x0, P0, c, lost, clear = _mix(x, P, mu, transition)
+    if not clear:
+        _mix_directly(x, P, mu, transition, c, x0, P0, lost)
+    return x0, P0, c
+
+
+@kernel
+def _mix(
+    x: FloatArray, P: FloatArray, mu: FloatArray, transition: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, bool]:
+    """`mix`, lost (T, M): whose covariance has lost its digits, and whether none has.
 
     The second moment is summed about the mean of all models, which makes the work of a pair (i, j)
     one multiplication an entry: sum_i W_ij (P_i + d_i d_i') - e_j e_j', d_i = x_i - centre. Where
-    that difference has lost its digits, models far apart and sharp, it is summed about x0_j.
+    that difference has lost its digits, models far apart and sharp, it has to be summed about
+    x0_j.
     """
     T, M, n = x.shape
     x0, P0, c = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
+    lost, clear = np.empty((T, M), dtype=np.bool_), True
     centre, L = np.empty(n), np.empty((n, n))
     # What is summed for every j lies in a row, j last: such loops are vectorised.
     W, w, reach = np.empty((M, M)), np.empty(M), np.empty(M)
@@ -101,40 +124,58 @@ def mix(
                 if not total[a, a, j] <= most * P0[t, j, a, a]:
                     positive = P0[t, j, a, a] > 0.0
                     most = total[a, a, j] / P0[t, j, a, a] if positive else np.inf
-            if not (most <= CANCELLED or (most <= MOST_CANCELLED and is_psd(P0[t, j], L))):
-                _mix_directly(x[t], P[t], W[:, j], mu[t], reach[j], x0[t, j], P0[t, j])
-    return x0, P0, c
+            lost[t, j] = not (
+                most <= CANCELLED or (most <= MOST_CANCELLED and is_psd(P0[t, j], L))
+            )
+            clear = clear and not lost[t, j]
+    return x0, P0, c, lost, clear
 
 
 @kernel
 def _mix_directly(
     x: FloatArray,
     P: FloatArray,
-    W: FloatArray,
     mu: FloatArray,
-    reach: float,
+    transition: FloatArray,
+    c: FloatArray,
     x0: FloatArray,
     P0: FloatArray,
+    lost: BoolArray,
 ) -> None:
-    """The mixed covariance of one model into P0 (n, n) as a sum of squares about x0 (n,)."""
-    M, n = x.shape
-    P0[:] = 0.0
-    for i in range(M):
-        w = W[i] / reach if reach > DEAD else mu[i]
-        for a in range(n):
-            for b in range(n):
-                P0[a, b] += w * (P[i, a, b] + (x[i, a] - x0[a]) * (x[i, b] - x0[b]))
+    """The mixed covariances of the `lost` (T, M) models, as sums of squares about x0, into P0."""
+    T, M, n = x.shape
+    for t in range(T):
+        for j in range(M):
+            if not lost[t, j]:
+                continue
+            P0[t, j] = 0.0
+            for i in range(M):
+                W = transition[t % transition.shape[0], i, j] * mu[t, i]
+                w = W / c[t, j] if c[t, j] > DEAD else mu[t, i]
+                for a in range(n):
+                    for b in range(n):
+                        apart = (x[t, i, a] - x0[t, j, a]) * (x[t, i, b] - x0[t, j, b])
+                        P0[t, j, a, b] += w * (P[t, i, a, b] + apart)
 
 
-@kernel
 def predict(
     x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """See `imm.predict`: x, P, repaired."""
+    x1, P1, lost, clear = _predict(x, P, F, Q, B)
+    if not clear:
+        _predict_carefully(P, F, Q, P1, lost)
+    return x1, P1, lost
+
+
+@kernel
+def _predict(
+    x: FloatArray, P: FloatArray, F: FloatArray, Q: FloatArray, B: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray, bool]:
+    """`predict`, lost (T, M): whose covariance is none any more, and whether there is no such."""
     T, M, n = x.shape
-    x1 = np.empty((T, M, n))
-    P1 = np.empty((T, M, n, n))
-    repaired = np.zeros((T, M), dtype=np.bool_)
+    x1, P1 = np.empty((T, M, n)), np.empty((T, M, n, n))
+    lost, clear = np.empty((T, M), dtype=np.bool_), True
     FP, L = np.empty((n, n)), np.empty((n, n))
     for t in range(T):
         for j in range(M):
@@ -151,13 +192,38 @@ def predict(
                         value += FP[a, k] * F[j, b, k]
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
-            if not is_psd(P1[t, j], L) and np.isfinite(P1[t, j]).all():
-                square_root_predict(P[t, j], F[j], Q[j], P1[t, j])
-                repaired[t, j] = True
-    return x1, P1, repaired
+            lost[t, j] = not is_psd(P1[t, j], L)
+            clear = clear and not lost[t, j]
+    return x1, P1, lost, clear
 
 
 @kernel
+def _predict_carefully(
+    P: FloatArray, F: FloatArray, Q: FloatArray, P1: FloatArray, lost: BoolArray
+) -> None:
+    """Predict the `lost` (T, M) covariances again, in square-root form, into P1; those that are
+    not finite stay, and are no longer marked."""
+    T, M = lost.shape
+    for t in range(T):
+        for j in range(M):
+            lost[t, j] = lost[t, j] and all_finite(P1[t, j])
+            if lost[t, j]:
+                square_root_predict(P[t, j], F[j], Q[j], P1[t, j])
+
+
+class Updated(NamedTuple):
+    """Targets after an update: x (T, M, n), P (T, M, n, n), mu (T, M) of all; of the t targets
+    that were updated log_likelihood (t,), nis (t,), ok (t,), repaired (t, M)."""
+
+    x: FloatArray
+    P: FloatArray
+    mu: FloatArray
+    log_likelihood: FloatArray
+    nis: FloatArray
+    ok: BoolArray
+    repaired: BoolArray
+
+
 def update(
     x: FloatArray,
     P: FloatArray,
@@ -165,34 +231,71 @@ def update(
     innovation: FloatArray,
     H: FloatArray,
     R: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray]:
+) -> Updated:
     """See `imm.update`: x, P, mu, log_likelihood, nis, ok, repaired."""
-    T, M, n = x.shape
-    m = innovation.shape[2]
-    x1, P1, mu = np.empty((T, M, n)), np.empty((T, M, n, n)), np.empty((T, M))
-    log_likelihood, nis, ok = np.empty(T), np.empty(T), np.zeros(T, dtype=np.bool_)
-    repaired = np.zeros((T, M), dtype=np.bool_)
+    targets = np.arange(len(x))
+    return update_targets(x, P, c, innovation, H, R, targets, targets % len(R))
+
+
+def update_targets(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    innovation: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    targets: IntArray,
+    detection: IntArray,
+) -> Updated:
+    """`update` of some `targets` (t,), each with its innovation (t, M, m) and its `detection` (t,)
+    of R (D, m, m); the others stay as they are."""
+    updated, log_density, clear = _update(x, P, c, innovation, H, R, targets, detection)
+    if not clear:
+        _update_carefully(
+            x, P, c, innovation, H, R, targets, detection, log_density, Updated(*updated)
+        )
+    return Updated(*updated)
+
+
+@kernel
+def _update(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    innovation: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    targets: IntArray,
+    detection: IntArray,
+) -> tuple[
+    tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray],
+    FloatArray,
+    bool,
+]:
+    """`update_targets`, where `repaired` marks what needs a repair; the log-densities (t, M) of
+    the innovations; and whether nothing is marked. A target with a mark has no mu yet."""
+    M, n = x.shape[1:]
+    count, m = len(targets), innovation.shape[2]
+    x1, P1, mu = x.copy(), P.copy(), c.copy()
+    log_likelihood, nis = np.empty(count), np.empty(count)
+    ok, lost = np.empty(count, dtype=np.bool_), np.empty((count, M), dtype=np.bool_)
+    log_density, all_clear = np.empty((count, M)), True
     PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
     A, AP, root = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    S, L, S_mix = np.empty((m, m)), np.zeros((m, m)), np.empty((m, m))
+    S, L, S_mix = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
     scratch, mean = np.empty(m), np.empty(m)
-    log_weight = np.empty(M)
-    for t in range(T):
-        R_t, h_t = R[t % R.shape[0]], t % H.shape[0]
-        log_likelihood[t], nis[t] = -np.inf, np.nan
+    for k in range(count):
+        t = targets[k]
+        R_t, h_t = R[detection[k]], t % H.shape[0]
+        log_likelihood[k], nis[k], ok[k], clear = -np.inf, np.nan, False, True
         for r in range(m):
             mean[r] = 0.0
             for j in range(M):
-                mean[r] += c[t, j] * innovation[t, j, r]
+                mean[r] += c[t, j] * innovation[k, j, r]
             for s in range(m):
                 S_mix[r, s] = 0.0
-        best = -np.inf
         for j in range(M):
-            log_weight[j] = -np.inf
-            mu[t, j] = c[t, j]
-            P_j, H_j, v_j, P1_j = P[t, j], H[h_t, j], innovation[t, j], P1[t, j]
-            for a in range(n):
-                x1[t, j, a] = x[t, j, a]
+            P_j, H_j, v_j, P1_j = P[t, j], H[h_t, j], innovation[k, j], P1[t, j]
             innovation_covariance(P_j, H_j, R_t, PHt, S)
             for r in range(m):
                 for s in range(m):
@@ -204,40 +307,110 @@ def update(
                 gain(PHt, L, K)
                 joseph(P_j, K, H_j, R_t, A, AP, KR, P1_j)
                 trusted = is_psd(P1_j, root)
-            if not trusted:
-                if not square_root_update(P_j, H_j, R_t, L, K, P1_j):
-                    for a in range(n):
-                        for b in range(n):
-                            P1_j[a, b] = P_j[a, b]
-                    continue
-                repaired[t, j] = True
-            value = -0.5 * (whitened_square(L, v_j, scratch) + m * LOG_2PI)
-            for r in range(m):
-                value -= math.log(L[r, r])
-            if c[t, j] > 0.0 and math.isfinite(value):
-                log_weight[j] = math.log(c[t, j]) + value
-                best = max(best, log_weight[j])
-            for a in range(n):
-                for r in range(m):
-                    x1[t, j, a] += K[a, r] * v_j[r]
-        if not math.isfinite(best):
-            for j in range(M):
+            lost[k, j], log_density[k, j] = not trusted, -np.inf
+            if trusted:
+                log_density[k, j] = _correct(L, K, v_j, x1[t, j], scratch)
+            clear = clear and trusted
+        if clear:
+            log_likelihood[k] = _weigh(x[t], P[t], log_density[k], x1[t], P1[t], mu[t])
+            ok[k] = log_likelihood[k] > -np.inf
+        all_clear = all_clear and clear
+        if (ok[k] or not clear) and cholesky_with_jitter(S_mix, L):
+            nis[k] = whitened_square(L, mean, scratch)
+    return (x1, P1, mu, log_likelihood, nis, ok, lost), log_density, all_clear
+
+
+@kernel
+def _update_carefully(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    innovation: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    targets: IntArray,
+    detection: IntArray,
+    log_density: FloatArray,
+    updated: Updated,
+) -> None:
+    """Update again, in square-root form and in place, what `_update` marked as to be repaired;
+    where that cannot be done the mark goes."""
+    M, n = x.shape[1:]
+    m = innovation.shape[2]
+    L, K, scratch = np.empty((m, m)), np.empty((n, m)), np.empty(m)
+    for k in range(len(targets)):
+        t, marked = targets[k], False
+        for j in range(M):
+            if not updated.repaired[k, j]:
+                continue
+            marked = True
+            H_j, P1_j = H[t % H.shape[0], j], updated.P[t, j]
+            if square_root_update(P[t, j], H_j, R[detection[k]], L, K, P1_j):
+                x1_j = updated.x[t, j]
+                log_density[k, j] = _correct(L, K, innovation[k, j], x1_j, scratch)
+            else:
+                updated.repaired[k, j] = False
                 for a in range(n):
-                    x1[t, j, a] = x[t, j, a]
                     for b in range(n):
-                        P1[t, j, a, b] = P[t, j, a, b]
-            continue
-        ok[t] = True
-        total = 0.0
+                        P1_j[a, b] = P[t, j, a, b]
+        if marked:
+            updated.log_likelihood[k] = _weigh(
+                x[t], P[t], log_density[k], updated.x[t], updated.P[t], updated.mu[t]
+            )
+            updated.ok[k] = updated.log_likelihood[k] > -np.inf
+            if not updated.ok[k]:
+                updated.nis[k] = np.nan
+
+
+@kernel
+def _correct(
+    L: FloatArray, K: FloatArray, v: FloatArray, x: FloatArray, scratch: FloatArray
+) -> float:
+    """x (n,) += K v in place; gives the log-density of the innovation v (m,) by the Cholesky
+    factor L of its covariance. scratch: (m,)."""
+    n, m = K.shape
+    value = -0.5 * (whitened_square(L, v, scratch) + m * LOG_2PI)
+    for r in range(m):
+        value -= math.log(L[r, r])
+    for a in range(n):
+        for r in range(m):
+            x[a] += K[a, r] * v[r]
+    return value
+
+
+@kernel
+def _weigh(
+    x: FloatArray,
+    P: FloatArray,
+    log_density: FloatArray,
+    x1: FloatArray,
+    P1: FloatArray,
+    mu: FloatArray,
+) -> float:
+    """Weigh the models of a target: mu (M,) by the log-densities (M,) of their innovations, in
+    place. Gives the log-likelihood; minus infinity, and x1, P1 as x, P, where no model can be."""
+    M, n = x.shape
+    best = -np.inf
+    for j in range(M):
+        if mu[j] > 0.0 and math.isfinite(log_density[j]):
+            log_density[j] = math.log(mu[j]) + log_density[j]
+            best = max(best, log_density[j])
+        else:
+            log_density[j] = -np.inf
+    if not math.isfinite(best):
         for j in range(M):
-            mu[t, j] = math.exp(log_weight[j] - best)
-            total += mu[t, j]
-        for j in range(M):
-            mu[t, j] /= total
-        log_likelihood[t] = best + math.log(total)
-        if cholesky_with_jitter(S_mix, L):
-            nis[t] = whitened_square(L, mean, scratch)
-    return x1, P1, mu, log_likelihood, nis, ok, repaired
+            for a in range(n):
+                x1[j, a] = x[j, a]
+                for b in range(n):
+                    P1[j, a, b] = P[j, a, b]
+        return -np.inf
+    total = 0.0
+    for j in range(M):
+        mu[j] = math.exp(log_density[j] - best)
+        total += mu[j]
+    for j in range(M):
+        mu[j] /= total
+    return best + math.log(total)
 
 
 @kernel
@@ -334,7 +507,6 @@ def combine(
     return mean, covariance
 
 
-@kernel
 def linear_cycle(
     x: FloatArray,
     P: FloatArray,
@@ -347,35 +519,63 @@ def linear_cycle(
     H: FloatArray,
     R: FloatArray,
     E: FloatArray,
-) -> tuple[
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    FloatArray,
-    BoolArray,
-]:
+) -> Cycle:
     """A whole cycle for targets whose measurements are already assigned: z (T, m), NaN where
     missed; H (M, m, n).
 
     Gives x, P, mu, mean, covariance, log_likelihood, nis, ok.
     """
-    T, M, n = x.shape
-    m = z.shape[1]
+    whole, clear = _linear_cycle(x, P, mu, transition, F, Q, B, z, H, R, E)
+    if clear:
+        return whole
     x0, P0, c = mix(x, P, mu, transition)
     x1, P1, _ = predict(x0, P0, F, Q, B)
+    after = update(x1, P1, c, _innovations(z, H, x1), H[None], R)
+    mean, covariance = combine(after.x, after.P, after.mu, E)
+    return *after[:3], mean, covariance, *after[3:6]
+
+
+@kernel
+def _linear_cycle(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    transition: FloatArray,
+    F: FloatArray,
+    Q: FloatArray,
+    B: FloatArray,
+    z: FloatArray,
+    H: FloatArray,
+    R: FloatArray,
+    E: FloatArray,
+) -> tuple[Cycle, bool]:
+    """`linear_cycle`, and whether nothing in it needs more care."""
+    T, M = mu.shape
+    x0, P0, c, _, mixed = _mix(x, P, mu, transition)
+    x1, P1, _, predicted = _predict(x0, P0, F, Q, B)
+    targets, detection = np.empty(T, dtype=np.int64), np.empty(T, dtype=np.int64)
+    for t in range(T):
+        targets[t], detection[t] = t, t % len(R)
+    after, _, updated = _update(
+        x1, P1, c, _innovations(z, H, x1), H.reshape((1, *H.shape)), R, targets, detection
+    )
+    x2, P2, mu2, log_likelihood, nis, ok, _ = after
+    mean, covariance = combine(x2, P2, mu2, E)
+    clear = mixed and predicted and updated
+    return (x2, P2, mu2, mean, covariance, log_likelihood, nis, ok), clear
+
+
+@kernel
+def _innovations(z: FloatArray, H: FloatArray, x: FloatArray) -> FloatArray:
+    """z (T, m) less what each model expects, H (M, m, n) x (T, M, n): (T, M, m)."""
+    M, m, n = H.shape
+    T = len(x)
     innovation = np.empty((T, M, m))
     for t in range(T):
         for j in range(M):
             for r in range(m):
                 value = z[t, r]
                 for k in range(n):
-                    value -= H[j, r, k] * x1[t, j, k]
+                    value -= H[j, r, k] * x[t, j, k]
                 innovation[t, j, r] = value
-    x2, P2, mu2, log_likelihood, nis, ok, _ = update(
-        x1, P1, c, innovation, H.reshape(1, M, m, n), R
-    )
-    mean, covariance = combine(x2, P2, mu2, E)
-    return x2, P2, mu2, mean, covariance, log_likelihood, nis, ok
+    return innovation

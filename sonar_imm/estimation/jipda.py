@@ -45,10 +45,11 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IntArray
 from .jit import kernel
 from .small_matrices import (
-    add_jitter,
+    add_jitter_each,
     cholesky_with_jitter,
     gain,
     innovation_covariance,
+    is_psd,
     joseph,
     whitened_square,
 )
@@ -247,7 +248,6 @@ def _enumerate(
     return count
 
 
-@kernel
 def update(
     x: FloatArray,
     P: FloatArray,
@@ -265,10 +265,34 @@ def update(
     h (T, M, m) expected; z (D, m); R (D, m, m); beta (T, D) and missed (T,) as of `associate`:
     they need not sum to one. considered (n,).
     """
+    x1, P1, mu, lost, clear = _update(x, P, c, h, H, z, R, beta, missed, considered)
+    if clear:
+        return x1, P1, mu, 0
+    spoilt = P1[lost]
+    repairs = int(np.count_nonzero(add_jitter_each(spoilt)))
+    P1[lost] = spoilt
+    return x1, P1, mu, repairs
+
+
+@kernel
+def _update(
+    x: FloatArray,
+    P: FloatArray,
+    c: FloatArray,
+    h: FloatArray,
+    H: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    beta: FloatArray,
+    missed: FloatArray,
+    considered: BoolArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, bool]:
+    """`update`, but lost (T, M) are the covariances that are none any more, and are yet to be
+    repaired; and whether there is no such."""
     T, M, n = x.shape
     D, m = z.shape
     x1, P1, mu = x.copy(), P.copy(), c.copy()
-    repairs = 0
+    lost, clear = np.zeros((T, M), dtype=np.bool_), True
     log, shift = np.empty((D, M)), np.empty((D, M, n))
     after, nothing = np.empty((D, M, n, n)), np.zeros((m, m))
     PHt, K, KR = np.empty((n, m)), np.empty((n, m)), np.empty((n, m))
@@ -344,11 +368,11 @@ def update(
                             )
                     P1[t, j, a, b] = value
                     P1[t, j, b, a] = value
-            if add_jitter(P1[t, j], root):
-                repairs += 1
+            lost[t, j] = not is_psd(P1[t, j], root)
+            clear = clear and not lost[t, j]
         for j in range(M):
             mu[t, j] /= total
-    return x1, P1, mu, repairs
+    return x1, P1, mu, lost, clear
 
 
 @kernel

@@ -72,8 +72,13 @@ KEPT_SECONDS = 7 * 86400.0
 kernels: Counter[str] = Counter()
 """How many kernels this process has 'loaded' and 'compiled', one for each signature."""
 
+listeners: list[Callable[[], object]] = []
+"""Called after each kernel that was compiled."""
+
 _CHECKSUM = hashlib.sha256().digest_size
-_OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
+_OPTIONS: dict[str, Any] = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True}
+"""Nobody hands a kernel to C, and what that would need is a tenth of the code."""
+
 _PACKAGE = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(r'^from +(\.*)([\w.]*) +import +(\([^)]*\)|[^\n]*)', re.MULTILINE)
 
@@ -121,6 +126,9 @@ def _or_none(use_cache: Callable[..., Any], counted_as: str) -> Callable[..., An
             found = use_cache(*args)
             if found is not None or counted_as == 'compiled':
                 kernels[counted_as] += 1
+            if counted_as == 'compiled':
+                for listener in listeners:
+                    listener()
             return found
         except Exception as error:  # whatever it is, it is no reason to end a node
             _warn_of_no_cache(getattr(error, 'strerror', None) or type(error).__name__)

@@ -159,10 +159,20 @@ def add_jitter_all(P: FloatArray) -> int:
     L = np.empty(P.shape[1:])
     repairs = 0
     for j in range(len(P)):
-        if not is_psd(P[j], L) and np.isfinite(P[j]).all():
+        if not is_psd(P[j], L) and all_finite(P[j]):
             add_jitter(P[j], L)
             repairs += 1
     return repairs
+
+
+@kernel
+def all_finite(P: FloatArray) -> bool:
+    """Whether all numbers of P (n, m) are finite."""
+    for a in range(P.shape[0]):
+        for b in range(P.shape[1]):
+            if not math.isfinite(P[a, b]):
+                return False
+    return True
 
 
 @kernel

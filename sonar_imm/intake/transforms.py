@@ -45,6 +45,10 @@ UPRIGHT = 1.0 - 1e-6
 """Least cosine between two verticals that are the same."""
 
 
+MOST_FRAMES = 2000
+"""Frames that are remembered, several times what a robot has. The oldest are forgotten."""
+
+
 class TransformTree:
     """All that was said of frames that are fixed to each other; what is said again replaces."""
 
@@ -53,7 +57,11 @@ class TransformTree:
 
     def add(self, transforms: StaticTransforms) -> None:
         """Take in what a message says."""
-        self._poses.update(transforms.poses)
+        for frame, step in transforms.poses.items():
+            self._poses.pop(frame, None)
+            self._poses[frame] = step
+        while len(self._poses) > MOST_FRAMES:
+            self._poses.pop(next(iter(self._poses)))
 
     def pose(self, target: str, source: str) -> Pose | None:
         """Where the frame `source` is in the frame `target`; None when it is not known."""

@@ -88,7 +88,7 @@ class Warming:
         self._start = time.monotonic()
         self._said = -self.PERIOD
         self._before = Counter(kernels)
-        self._doing, self._ready = 'nothing', False
+        self._doing, self._ready = 'what is published', False
         self._stopped = threading.Event()
         self._trouble: Exception | None = None
         self._thread = threading.Thread(target=self._run, name='kernels', daemon=True)
@@ -117,8 +117,8 @@ class Warming:
         made = kernels - self._before
         waiting = 'messages may wait for it' if self._ready else 'no input is heard until then'
         return (
-            f'compiling kernels for {self._doing}, once for this machine: {made["compiled"]} of '
-            f'them are compiled after {time.monotonic() - self._start:.0f} s; {waiting}'
+            f'kernels for {self._doing}: {made["compiled"]} compiled, once for this machine, and '
+            f'{made["loaded"]} loaded after {time.monotonic() - self._start:.0f} s; {waiting}'
         )
 
     def due_sentence(self) -> str:
@@ -180,15 +180,15 @@ class BaseNode(Node):
     def begin(self) -> None:
         """Offer what every node does, report from now on, and hear the inputs as soon as the
         kernels are there."""
+        settings, topics = self._settings.values(), inputs_of(self._name)
         with explained_overrides(self):
             self._processed = ProcessedPublisher(
                 self._endpoints.advertise(message_class(TABLE), '~/processed', latched_qos())
             )
             self._announcer = Announcer(self._endpoints, self._full_name)
-        settings, topics = self._settings.values(), inputs_of(self._name)
-        for topic in topics:
-            for name in topic.instances(settings) if topic.wanted(settings) else ():
-                self._inputs[name] = self._input(topic, name, settings)
+            for topic in topics:
+                for name in topic.instances(settings) if topic.wanted(settings) else ():
+                    self._inputs[name] = self._input(topic, name, settings)
         required, one_of = needed(topics, settings)
         topic_names = {
             name: self.resolve_topic_name(topic.prefix + name)
@@ -200,7 +200,6 @@ class BaseNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(self._node_config.diagnostics_period, self._report, clock=steady)
         self._settings.on_change(self._reconfigure)
-        self._settings.warn_of_unknown()
         self._warming = Warming(self.warm_steps, self._connected)
         self._until_warm = self.create_timer(_LOOK, self._hear_when_warm, clock=steady)
 
@@ -218,6 +217,8 @@ class BaseNode(Node):
         topic, _, reader = self._inputs[name]
         stamp = message.header.stamp if hasattr(message, 'header') else None
         self._meter.arrived(name, start)
+        if stamp is not None:
+            self._meter.stamped(name, start - (stamp.sec + 1e-9 * stamp.nanosec))
         if self._waited_too_long(name, info):
             self._acknowledge(stamp)
             return
@@ -292,8 +293,9 @@ class BaseNode(Node):
         connected = {
             measurement
             for name, (topic, _, _) in self._inputs.items()
-            if self.count_publishers(self.resolve_topic_name(topic.prefix + name))
-            for measurement in (topic.measurement, *topic.also)
+            if not topic.companion
+            and self.count_publishers(self.resolve_topic_name(topic.prefix + name))
+            for measurement in topic.measurements
         }
         return connected or None
 
@@ -305,6 +307,7 @@ class BaseNode(Node):
             with explained_overrides(self):
                 heard = [self._listen(name) for name in self._inputs]
             self._hears = True
+            self._settings.warn_of_unknown()  # those of the inputs' endpoints are known now
             self._acknowledge(None)
             self.get_logger().info(f'ready, hears {", ".join(heard)}')
         if self._warming.done():
@@ -373,6 +376,7 @@ class BaseNode(Node):
                 starting='' if self._hears else self._warming.sentence(),
                 lost=self._endpoints.lost,
                 incompatible=self._endpoints.incompatible,
+                publishers=self.count_publishers,
                 **self.work_report(),
             )
         )
@@ -408,6 +412,7 @@ class TrackerNode(BaseNode):
     def destroy_node(self) -> None:
         """Save the state, then end."""
         self._saved_state.save(self._config, wait=True)
+        self._saved_state.close()
         super().destroy_node()
 
     def advertise(self, type_name: str, topic: str) -> Any:

@@ -29,7 +29,7 @@ nothing of what only messages show, so that slow sensors count too.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -51,6 +51,10 @@ MUCH_LOST = 0.1
 _WINDOW = 1000
 _PATIENCE = 5.0
 """Mean intervals after which an input that is not needed is said to be gone."""
+_AGES = 40
+"""Messages of an input in which two clocks are looked for."""
+_LEAST_OFFSET = 0.5
+"""Seconds between them that are said: less is the way that messages take."""
 UNUSED_REASONS = frozenset(
     {
         'doubted',
@@ -87,6 +91,7 @@ class Meter:
         self.dropped: Counter[str] = Counter()
         self.first: dict[str, float] = {}
         self.last: dict[str, float] = {}
+        self.ages: dict[str, deque[float]] = {}
         self._durations: deque[float] = deque(maxlen=_WINDOW)
 
     def arrived(self, topic: str, now: float) -> None:
@@ -94,6 +99,10 @@ class Meter:
         self.received[topic] += 1
         self.first.setdefault(topic, now)
         self.last[topic] = now
+
+    def stamped(self, topic: str, age: float) -> None:
+        """Note a stamp: `age` is the time of arrival less it, s, from any zero."""
+        self.ages.setdefault(topic, deque(maxlen=_AGES)).append(age)
 
     def interval(self, topic: str) -> float:
         """Mean seconds between the messages on `topic`; 0 where there were less than two."""
@@ -110,6 +119,24 @@ class Meter:
             return np.nan, np.nan
         p50, p99 = np.percentile(np.fromiter(self._durations, float), (50, 99))
         return 1e3 * float(p50), 1e3 * float(p99)
+
+
+def clock_offset(ages: Sequence[float]) -> float:
+    """Seconds between two groups of `ages`, messages in the order of their arrival; 0 without.
+
+    Each group has a quarter of them and is narrow beside what lies between the two, and they take
+    turns: delays that vary, and a clock that is set once, are something else.
+    """
+    if len(ages) < _AGES:
+        return 0.0
+    ordered = np.sort(ages)
+    cut = int(np.argmax(np.diff(ordered))) + 1
+    low, high = ordered[:cut], ordered[cut:]
+    offset = float(np.median(high) - np.median(low))
+    turns = int(np.count_nonzero(np.diff(np.asarray(ages) >= high[0])))
+    if min(len(low), len(high), turns) < _AGES // 4 or offset < _LEAST_OFFSET:
+        return 0.0
+    return offset if max(np.ptp(low), np.ptp(high)) < 0.25 * offset else 0.0
 
 
 class Finding(NamedTuple):
@@ -246,15 +273,16 @@ class Reporter:
         *,
         enabled: bool,
         stale_after: float,
-        starting: str,
+        starting: str = '',
         counts: Mapping[str, int],
         health: Mapping[str, float],
         warnings: Sequence[str] = (),
         lost: Mapping[str, int],
         incompatible: Mapping[str, str],
+        publishers: Callable[[str], int] = lambda topic: 1,
     ) -> DiagnosticArray:
         """Write both entries. stamp: builtin_interfaces/Time; now: steady seconds; starting: why
-        no input is heard yet, or empty."""
+        no input is heard yet, or empty; publishers: how many there are of a topic."""
         then, received_before, refused_before, dropped_before, lost_before = self._before
         meter = self._meter
         elapsed = np.nan if then is None else max(now - then, 1e-9)
@@ -285,6 +313,7 @@ class Reporter:
                 missing,
                 incompatible,
                 stale,
+                publishers,
             ),
             self._tracker_status(
                 fresh.total() == 0,
@@ -338,6 +367,7 @@ class Reporter:
         missing: Counter[str],
         incompatible: Mapping[str, str],
         stale: Sequence[str],
+        publishers: Callable[[str], int],
     ) -> DiagnosticStatus:
         meter = self._meter
         values: dict[str, Any] = {}
@@ -371,6 +401,16 @@ class Reporter:
         if incompatible:
             sentence = 'a peer has an incompatible quality of service'
             found.append(Finding('incompatible', WARN, sentence, timed=True))
+        for name, ages in meter.ages.items():
+            offset = clock_offset(ages)
+            if offset and publishers(topic := self._topics[name]) > 1:
+                values[f'{name} offset of stamps [s]'] = offset
+                # OK: what comes by way of a modem is as late as that, and stamped rightly.
+                sentence = (
+                    f'stamps on {topic} are of two groups {offset:.1f} s apart: the clocks of its '
+                    'publishers disagree, or one is later'
+                )
+                found.append(Finding(f'clocks {name}', OK, sentence, timed=True))
         if not stale:
             gone = self._gone(now, stale_after)
             found += [Finding(f'gone {name}', WARN, text, timed=True) for name, text in gone]

@@ -43,9 +43,8 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-import yaml
 
-from ..parameters import ConfigError
+from ..parameters import ConfigError, yaml_tree
 
 _POLICIES = {
     'history': HistoryPolicy,
@@ -260,10 +259,7 @@ def profiles_of(text: str) -> dict[str, QoSProfile]:
     A topic has ``history``, ``depth``, ``reliability`` and ``durability``, each may be left out.
     Raises `ConfigError` for anything else.
     """
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f'not a YAML file: {" ".join(str(error).split())}') from None
+    tree = yaml_tree(text)
     if not isinstance(tree, dict) or not all(isinstance(item, dict) for item in tree.values()):
         raise ConfigError('it must hold a mapping of policies for each topic')
     return {str(topic): _profile(str(topic), policies) for topic, policies in tree.items()}

@@ -14,6 +14,9 @@
 
 """A node that is started again goes on where it was: its state in a file.
 
+The file belongs to one node: a second one that was given the same says so, and neither reads nor
+writes it while the first one runs.
+
 The state is taken between two messages, which takes a moment, and written by a thread of its own.
 A file that cannot be used is said in one sentence and not lost: it gets another name when the
 first state of this run is saved.
@@ -29,6 +32,7 @@ import time
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from ..files import hold
 from ..intake import Intake
 from ..node_config import NodeConfig
 from ..parameters import Config, ConfigError
@@ -58,11 +62,12 @@ class SavedState:
         }
         self._path = Path(settings.state_file).expanduser() if settings.state_file else None
         self._period = settings.state_interval
-        self._refused = False
+        self._refused = self._others = False
         self._loaded_ns: int | None = None
         self._newest_ns: int | None = None
         self._taken = self._saved = self._far = 0
         self._thread: threading.Thread | None = None
+        self._release: Callable[[], None] | None = None
         if self._path and not self._path.parent.is_dir():
             raise ConfigError(f"state_file: there is no folder '{self._path.parent}'")
 
@@ -74,7 +79,7 @@ class SavedState:
         return self._intake
 
     def _from_file(self, config: Config) -> Intake | None:
-        if self._path:
+        if self._path and self._hold(self._path):
             try:
                 return self._read(self._path, config)
             except FileNotFoundError:
@@ -122,6 +127,8 @@ class SavedState:
             self._thread = None
         if self._path is None or self._taken == self._saved or self._thread is not None:
             return
+        if not self._hold(self._path):
+            return
         self._saved = self._taken
         saved = Saved(
             system=self._system.name,
@@ -136,6 +143,28 @@ class SavedState:
             return
         self._thread = threading.Thread(target=self._write, args=(self._path, saved), daemon=True)
         self._thread.start()
+
+    def close(self) -> None:
+        """Leave the file to others."""
+        if self._release:
+            self._release()
+            self._release = None
+
+    def _hold(self, path: Path) -> bool:
+        """Whether the file is ours, or becomes so now."""
+        if self._release:
+            return True
+        try:
+            self._release = hold(path)
+        except OSError:
+            return True  # nothing can be written there, which `_write` says
+        if self._release is None and not self._others:
+            self._others = True
+            self.trouble = f"another node has the state_file '{path}': no state is read or saved"
+            self._node.get_logger().warning(f'{self.trouble}; give each node a file of its own')
+        elif self._release and self._others:
+            self._others, self._refused = False, True  # the state of the other is kept
+        return self._release is not None
 
     def _read(self, path: Path, config: Config) -> Intake:
         saved = read_state(path)

@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import as_completed
+import functools
 from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING
@@ -27,7 +30,7 @@ from sonar_imm.trackers import SYSTEMS
 from .common import BAG, example, json_option, print_json, say
 
 if TYPE_CHECKING:
-    from .checking import CheckedRecording
+    from .checking import CheckedRecording, PlayedRecording
 
 
 @click.command(
@@ -95,24 +98,65 @@ def run_checks(
     params: Path | None = None,
     limit: float | None = None,
     quiet: bool = False,
+    jobs: int = 1,
 ) -> list[CheckedRecording]:
-    """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`."""
-    from .checking import check_recording, instruments_in, shipped_bags
+    """Check `bag`, or all shipped recordings, for each system; runs are kept below `folder`.
 
-    return [
-        check_recording(
+    jobs: processes that share the recordings, the smallest of each system first; they print
+    nothing but which recording is done. The list is in the order of systems and recordings.
+    """
+    from .checking import instruments_in, play_recording, shipped_bags
+
+    todo = [
+        (path, system, name, topics)
+        for system in systems
+        for path in ([bag] if bag else shipped_bags(system))
+        for name, topics in instruments_in(path, system).items()
+    ]
+    plays = [
+        functools.partial(
+            play_recording,
             path,
             system,
             folder / path.stem / name,
             params=params,
             limit=limit,
             topics=topics,
-            quiet=quiet,
+            quiet=quiet or jobs > 1,
         )
-        for system in systems
-        for path in ([bag] if bag else shipped_bags(system))
-        for name, topics in instruments_in(path, system).items()
+        for path, system, name, topics in todo
     ]
+    if jobs == 1:
+        return [play().judged() for play in plays]
+    return _shared_out(plays, _small_ones_first([item[:2] for item in todo]), jobs)
+
+
+def _small_ones_first(todo: list[tuple[Path, str]]) -> list[int]:
+    """In which order to check recordings: the smallest of each system, then the others, of which
+    the largest come first."""
+    size = [sum(file.stat().st_size for file in path.rglob('*')) for path, _ in todo]
+    first = {
+        system: min((i for i, item in enumerate(todo) if item[1] == system), key=size.__getitem__)
+        for _, system in todo
+    }
+    others = [i for i in range(len(todo)) if i not in first.values()]
+    return [*first.values(), *sorted(others, key=lambda i: -size[i])]
+
+
+def _shared_out(
+    plays: Sequence[Callable[[], PlayedRecording]], order: Sequence[int], jobs: int
+) -> list[CheckedRecording]:
+    """Play in so many processes that take the recordings in this order, judge here meanwhile."""
+    from ..offline.jobs import processes
+
+    done: dict[int, CheckedRecording] = {}
+    with processes(jobs) as pool:
+        running = {pool.submit(plays[i]): i for i in order}
+        for future in as_completed(running):
+            recording = done[running[future]] = future.result().judged()
+            state = 'ok' if recording.good else 'FAILED'
+            click.echo(f'{len(done)} of {len(plays)}: {recording.bag.name} {state}', err=True)
+    return [done[i] for i in sorted(done)]
 
 
 def print_checks(recording: CheckedRecording) -> None:

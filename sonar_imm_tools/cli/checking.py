@@ -74,6 +74,28 @@ class CheckedRecording:
         }
 
 
+@frozen
+class PlayedRecording:
+    """A recording tracked offline and by the node, `checks` of both against each other, and the
+    largest error allowed, None for that of the system."""
+
+    system: str
+    bag: Path
+    folder: Path
+    limit: float | None
+    checks: tuple[Check, ...]
+    latency_ms: dict[str, float]
+
+    def judged(self) -> CheckedRecording:
+        """With the scores of the offline run, and a check of its error where there is a truth."""
+        judgement = evaluate_run(self.folder / 'offline')
+        accuracy = judgement.accuracy(self.limit)
+        checks = self.checks if accuracy is None else (*self.checks, accuracy)
+        return CheckedRecording(
+            self.system, self.bag, self.folder, checks, self.latency_ms, judgement
+        )
+
+
 def shipped_bags(system: str) -> list[Path]:
     """The recordings of `system` that come with the package. Raises FileNotFoundError if none."""
     found = sorted(path for path in (share_folder() / 'bags').glob(f'{system}_*'))
@@ -94,7 +116,7 @@ def instruments_in(bag: Path, system: str) -> dict[str, dict[str, str] | None]:
     }
 
 
-def check_recording(
+def play_recording(
     bag: Path,
     system: str,
     folder: Path,
@@ -103,8 +125,8 @@ def check_recording(
     limit: float | None = None,
     topics: Mapping[str, str] | None = None,
     quiet: bool = False,
-) -> CheckedRecording:
-    """Track `bag` offline and by the live node into `folder`, compare, score.
+) -> PlayedRecording:
+    """Track `bag` offline and by the live node into `folder`, and compare.
 
     params: parameter file; None for the one that comes with the recording, if any. limit: largest
     error allowed, in the unit of the system; None for that of the recording, if it states one, or
@@ -143,11 +165,8 @@ def check_recording(
             progress=advance,
         )
     _keep(live, config, system, folder / 'live')
-    judgement = evaluate_run(folder / 'offline')
-    checks = [_answered(live, run), _equal(folder), _ended(live)]
-    if (accuracy := judgement.accuracy(limit)) is not None:
-        checks.append(accuracy)
-    return CheckedRecording(system, bag, folder, tuple(checks), live.latency_ms(), judgement)
+    checks = (_answered(live, run), _equal(folder), _ended(live))
+    return PlayedRecording(system, bag, folder, limit, checks, live.latency_ms())
 
 
 def _keep(live: LockstepResult, config: Config, system: str, path: Path) -> None:

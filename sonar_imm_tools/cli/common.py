@@ -241,30 +241,71 @@ def say(text: str = '', *, quiet: bool = False) -> None:
 
 
 @contextlib.contextmanager
-def progress(what: str, total: int | None, *, quiet: bool = False) -> Iterator[Advance]:
-    """Yields ``advance(count)``: a bar on a terminal, else a line every few seconds (stderr)."""
+def progress(
+    what: str, total: int | None, *, quiet: bool = False, compiles: bool = False
+) -> Iterator[Advance]:
+    """Yields ``advance(count)``: a bar on a terminal, else a line every few seconds (stderr).
+    compiles: the bar also says what is being compiled in this process."""
     if quiet or not total:
         yield lambda count: None
-    elif sys.stderr.isatty():
-        from rich.console import Console
-        from rich.progress import Progress
+        return
+    with contextlib.ExitStack() as stack:
+        if sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import Progress
 
-        with Progress(console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task(what, total=total)
-            yield lambda count: bar.advance(task, count)
-    else:
-        yield _plain_progress(what, total)
+            bar = stack.enter_context(Progress(console=Console(stderr=True), transient=True))
+            advance, say_now = _bar_progress(bar, what, total)
+        else:
+            advance, say_now = _plain_progress(what, total)
+        if compiles:
+            stack.enter_context(_compiling(say_now))
+        yield advance
 
 
-def _plain_progress(what: str, total: int) -> Advance:
+@contextlib.contextmanager
+def _compiling(say_now: Callable[[str], object]) -> Iterator[None]:
+    """Have `say_now` called with a sentence after each kernel that this process compiles."""
+    from sonar_imm.estimation.jit import kernels, listeners
+
+    before = kernels['compiled']
+
+    def compiled() -> None:
+        done = kernels['compiled'] - before
+        say_now(f'compiling kernels, once for this machine: {done} so far')
+
+    listeners.append(compiled)
+    try:
+        yield
+    finally:
+        listeners.remove(compiled)
+
+
+def _bar_progress(bar: Any, what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
+    task = bar.add_task(what, total=total)
+
+    def advance(count: int) -> None:
+        bar.update(task, advance=count, description=what)
+
+    def say_now(sentence: str) -> None:
+        bar.update(task, description=sentence)
+
+    return advance, say_now
+
+
+def _plain_progress(what: str, total: int) -> tuple[Advance, Callable[[str], None]]:
     """Print a line every few seconds, so that the log of a short job stays empty."""
     done, printed = 0, time.monotonic()
 
-    def advance(count: int) -> None:
-        nonlocal done, printed
-        done += count
+    def say_now(sentence: str) -> None:
+        nonlocal printed
         if time.monotonic() - printed > SECONDS_BETWEEN_LINES:
             printed = time.monotonic()
-            click.echo(f'{what}: {done} of {total}', err=True)
+            click.echo(sentence, err=True)
 
-    return advance
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        say_now(f'{what}: {done} of {total}')
+
+    return advance, say_now

@@ -285,7 +285,10 @@ def track_one(job: Job, quiet: bool = False) -> dict[str, Any]:
 
     with contextlib.ExitStack() as stack:
         outcome = track(
-            job, lambda total: stack.enter_context(progress('tracking', total, quiet=quiet))
+            job,
+            lambda total: stack.enter_context(
+                progress('tracking', total, quiet=quiet, compiles=True)
+            ),
         )
     return dict(outcome.run or {})
 

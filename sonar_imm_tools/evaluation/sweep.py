@@ -130,7 +130,8 @@ def run_here(sweep: Sweep, seeds: Iterable[int]) -> Iterator[Outcome]:
 
 
 def run_on_processes(sweep: Sweep, seeds: Sequence[int], workers: int) -> Iterator[Outcome]:
-    """In so many processes of this machine, as they end.
+    """In so many processes of this machine, as they end. They listen on its loopback interface
+    only, whatever dask is configured to, and there is no dashboard.
 
     Raises ModuleNotFoundError without dask.
     """
@@ -145,7 +146,9 @@ def run_on_processes(sweep: Sweep, seeds: Sequence[int], workers: int) -> Iterat
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
+            host='127.0.0.1',
             dashboard_address=None,
+            worker_dashboard_address='127.0.0.1:0',
             # Without a dashboard its port would still be taken.
             scheduler_kwargs={'dashboard_address': '127.0.0.1:0'},
             local_directory=within,

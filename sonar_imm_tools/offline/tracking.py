@@ -32,6 +32,7 @@ from typing import Any
 from attrs import asdict, define, field, frozen
 import numpy as np
 
+from msg_adapters.inputs import inputs_of
 from sonar_imm import __version__
 from sonar_imm.estimates import Estimate
 from sonar_imm.intake import Intake
@@ -146,6 +147,9 @@ class OfflineRun:
         self.topics = {
             name: entry.name for name, entry in chosen.items() if entry.wanted(settings)
         }
+        entries = {entry.name: entry for entry in inputs_of(system.name)}
+        made = [chosen[name].makes or chosen[name].name for name in self.topics]
+        self._kinds = {kind for name in made for kind in entries[name].measurements}
         build = system.build_smoother if self.options.smooth else system.build
         self.tracker: Any = build(config.for_inputs(frozenset(self.topics.values())))
         self.refused: dict[str, Refused] = {}
@@ -162,7 +166,7 @@ class OfflineRun:
     def estimates(self, advance: Callable[[int], None] = lambda count: None) -> Iterator[Estimate]:
         """Run the tracker; yields final estimates by stamp. `advance` hears of each message."""
         revisions = Revisions(self._window_ns)
-        self.tracker.warm()
+        self.tracker.warm(self._kinds)
         share = self.options.jobs > 1 and hasattr(self.tracker, 'tasks')
         for made in self._shared_out(advance) if share else self._in_turn(advance):
             final = revisions.add(made)

@@ -31,6 +31,7 @@ from msg_adapters.inputs import InputTopic
 from sonar_imm.measurements import Rejection
 
 from .csv_table import BadRow, CsvTable, Row
+from .mcap_records import MAX_RATIO, MAX_UNPACKED, TOO_LARGE
 from .messages import ros_message
 from .reader import BagMessage, BagReader
 from .sources import BagError
@@ -176,9 +177,16 @@ def read_npz(path: Path) -> dict[str, NDArray]:
         with path.open('rb') as file:
             if not zipfile.is_zipfile(file):
                 raise BagError(f'{path} is not a numpy archive (npz)')
+        with zipfile.ZipFile(path) as packed:
+            size = sum(part.file_size for part in packed.infolist())
+        if size > max(MAX_UNPACKED, MAX_RATIO * path.stat().st_size):
+            raise BagError(f'{path} {TOO_LARGE}')
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError('numpy gives the bytes of anything else, such as an archive')
+        return arrays
     except OSError as error:
         raise BagError(f'{path} cannot be read: {error.strerror or error}') from None
-    except (ValueError, EOFError, zlib.error, zipfile.BadZipFile):
+    except (ValueError, EOFError, MemoryError, zlib.error, zipfile.BadZipFile):
         raise BagError(f'{path} is damaged, or holds more than plain arrays') from None

@@ -33,7 +33,7 @@ from typing import Any
 import yaml
 
 from sonar_imm.files import whole
-from sonar_imm.parameters import Config
+from sonar_imm.parameters import Config, ConfigError, yaml_tree
 
 from .sources import BagError
 
@@ -85,8 +85,8 @@ def own_limit(bag: Path) -> float | None:
     if not path.is_file():
         return None
     try:
-        stated = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (yaml.YAMLError, UnicodeDecodeError):
+        stated = yaml_tree(path.read_text(encoding='utf-8'))
+    except (ConfigError, UnicodeDecodeError):
         raise BagError(f'{path} is not YAML') from None
     limit = stated.get('limit') if isinstance(stated, dict) else None
     if isinstance(limit, bool) or not isinstance(limit, (int, float)):

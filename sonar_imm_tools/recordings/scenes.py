@@ -44,7 +44,7 @@ def write_scene(
     inputs: dict[type, InputTopic] = {}
     for system in SYSTEMS:
         for entry in (*inputs_of(system), *made_inputs(system)):
-            for measurement in (entry.measurement, *entry.also):
+            for measurement in entry.measurements:
                 inputs.setdefault(measurement, entry)
     records: list[Record] = []
     for item in scene.measurements:

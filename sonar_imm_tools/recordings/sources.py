@@ -31,6 +31,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
+from sonar_imm.parameters import ConfigError, yaml_tree
 from sonar_imm.texts import in_one_line
 
 from .mcap_records import oversized_chunk, oversized_file, TooLargeError, unpack
@@ -38,6 +39,8 @@ from .mcap_scan import Channel, McapScan
 from .mcap_sums import wrong_sums
 from .messages import decode_cdr, typestore
 
+MOST_LINES = 4000
+"""Lines of a definition without its comments; those that are in use have some hundreds."""
 SUFFIXES = ('.mcap', '.db3', '.bag')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
@@ -115,8 +118,12 @@ class RosbagsSource:
         for file in path.glob('*.zstd') if path.is_dir() else []:
             if oversized := oversized_file(file):
                 raise BagError(f'{file.name} cannot be unpacked: {oversized}')
+        if (path / 'metadata.yaml').is_file():
+            _check_metadata(path / 'metadata.yaml')
         place = _FolderPath(path) if path.is_dir() else path
         self._reader = AnyReader([place], default_typestore=typestore())
+        for reader in self._reader.readers:
+            _check_definitions_of(reader)
         self._reader.open()
         self._unpack_here()
         if trouble := self._trouble():
@@ -367,10 +374,43 @@ def _split_order(file: Path) -> tuple[int, str]:
 
 
 @lru_cache(maxsize=8)
+def _check_metadata(path: Path) -> None:
+    """Raise `BagError` for metadata that rosbags would unpack without an end."""
+    try:
+        yaml_tree(path.read_text(encoding='utf-8', errors='replace'))
+    except ConfigError as error:
+        raise BagError(f'{path.name} is {error}') from None
+
+
+def _check_definitions_of(reader: Any) -> None:
+    """Have a reader of rosbags look at the size of definitions after it is opened, before they are
+    parsed."""
+    open_files = reader.open
+
+    def open_and_check() -> None:
+        open_files()
+        try:
+            for link in reader.connections:
+                _check_definition(link.msgtype, link.msgdef.data)
+        except BagError:
+            reader.close()
+            raise
+
+    reader.open = open_and_check
+
+
+def _check_definition(type_name: str, definition: str) -> None:
+    """Raise `BagError` for the definition of a message that takes minutes to parse."""
+    lines = [line for line in definition.splitlines() if not line.lstrip().startswith('#')]
+    if len(lines) > MOST_LINES or sum(map(len, lines)) > MOST_LINES * 100:
+        raise BagError(f'the definition of {type_name} is larger than that of any message')
+
+
 def _types_of(channels: frozenset[Channel]) -> Any:
     """What these channels define, and what is known of the rest. To parse it takes a while."""
     types = get_typestore(Stores.EMPTY)
     for channel in sorted(channels):
+        _check_definition(channel.type_name, channel.definition)
         if channel.definition and 'idl' in channel.definition_encoding:
             types.register(get_types_from_idl(channel.definition))
         elif channel.definition:

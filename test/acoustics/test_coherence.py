@@ -140,3 +140,16 @@ def test_coherence_beside_an_interferer_is_that_of_what_it_leaves():
             interference.interference_form(np.zeros((1, 8)), np.eye(8)[None]), 0.5
         )
     ).all()
+
+
+def test_a_peak_is_refined_where_the_spectrum_bends_down_and_nowhere_else():
+    grid = np.linspace(-1.0, 1.0, 17)  # its steps are exact in binary
+    at = np.array([-0.31, 0.0, 0.27])
+    peak, place = coherence.refined_peak(0.9 - (grid - at[:, None]) ** 2, grid)
+    np.testing.assert_allclose(peak, 0.9, rtol=1e-12)
+    np.testing.assert_allclose(place, at, atol=1e-12)
+    slope, level, hollow = 0.5 + 0.25 * grid, np.full(17, 0.5), 0.1 + grid**2
+    peak, place = coherence.refined_peak(np.array([slope, level, hollow]), grid)
+    inside = [grid[-2], grid[1], grid[1]]
+    np.testing.assert_array_equal(place, inside)
+    np.testing.assert_allclose(peak, [slope[-2], 0.5, hollow[1]])

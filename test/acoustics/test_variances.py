@@ -81,3 +81,21 @@ def test_blind_noise_is_right_within_two_decibels(pings):
     found = [variances.blind_noise_variance(ping.iq) for ping, _ in pings]
     assert np.abs(10.0 * np.log10(found)).max() < 2.0
     assert np.isnan(variances.blind_noise_variance(pings[0][0].iq[:5]))
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('unit', [1e-30, 1e-9, 3.0, 1e9, 1e17])
+def test_the_unit_of_samples_changes_no_decorrelation(unit):
+    """Samples come in single precision, whose range their fourth powers leave."""
+    rng = np.random.default_rng(5)
+    echo = rng.normal(size=(60, 1)) + 1j * rng.normal(size=(60, 1))
+    own = rng.normal(size=(60, 4)) + 1j * rng.normal(size=(60, 4))
+    iq = echo + 0.5 * own
+    iq[20:40] = 0.0  # silence says nothing
+    every = np.ones(60, bool)
+    known = variances.decorrelation(iq.astype(np.complex64), every)
+    assert 0.05 < known < 0.5
+    assert variances.decorrelation((unit * iq).astype(np.complex64), every) == pytest.approx(
+        known, rel=1e-4
+    )
+    assert np.isnan(variances.decorrelation(0.0 * iq, every))

@@ -55,7 +55,7 @@ def check(dive, tmp_path, monkeypatch):
             )
 
         monkeypatch.setattr(checking, 'run_lockstep', played)
-        checked = checking.check_recording(dive, 'diver', tmp_path, quiet=True)
+        checked = checking.play_recording(dive, 'diver', tmp_path, quiet=True).judged()
         return {one.name: one for one in checked.checks}, checked.good
 
     return check

@@ -271,3 +271,15 @@ def test_rules_may_change_while_tracks_live(window):
 def test_rules_refuse_nonsense(arguments):
     with pytest.raises(ValueError, match='track rules need'):
         TrackRules(*arguments)
+
+
+@pytest.mark.parametrize(
+    'rules', [(0, 3, 4, 5), (4, 3, 4, 5), (2, 3, 0, 5), (2, 3, 4, -1), (0, 0, 1, 0)]
+)
+def test_rules_by_which_no_track_could_live_are_refused(rules):
+    with pytest.raises(ValueError, match='track rules need'):
+        TrackRules(*rules)
+
+
+def test_the_strictest_rules_are_allowed():
+    assert TrackRules(1, 1, 1, 0).delete_misses == 1

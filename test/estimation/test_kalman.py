@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from sonar_imm.estimation.kalman import CovarianceError, predict, update
+from sonar_imm.estimation.kalman import CovarianceError, factorise, predict, update
 
 
 def random_covariance(rng, *shape):
@@ -125,3 +125,16 @@ def test_nan_is_named_before_it_spreads():
         update(
             np.zeros(2), np.full((2, 2), np.nan), np.zeros(1), np.array([[1.0, 0.0]]), np.eye(1)
         )
+
+
+@pytest.mark.parametrize('unit', [1e-20, 1.0, 1e20])
+def test_covariances_without_a_factor_are_named_in_any_unit(unit):
+    """The least eigenvalue is compared with the largest: what has none but for rounding counts."""
+    fine, flat, negative = np.diag([1.0, 2.0]), np.ones((2, 2)), np.diag([1.0, -1.0])
+    almost = np.array([[1.0, 1.0], [1.0, 1.0 + 4e-16]])
+    with pytest.raises(CovarianceError, match='2 of 3: state is not positive') as caught:
+        factorise(unit * np.array([fine, flat, negative]), 'state')
+    assert caught.value.where.tolist() == [False, True, True]
+    with pytest.raises(CovarianceError) as caught:
+        factorise(unit * np.array([negative, almost, fine]))
+    assert caught.value.where.tolist() == [True, True, False]

@@ -14,10 +14,13 @@
 
 """Monte Carlo sweeps: runs alone and in processes, failures, sums."""
 
+import contextlib
 import csv
 from importlib import import_module
 import json
 import math
+import os
+from pathlib import Path
 import socket
 
 from attrs import evolve
@@ -78,6 +81,38 @@ def test_every_system_comes_through_a_pickle():
     for system in TINY:
         sweep = sweep_of(system)
         assert cloudpickle.loads(cloudpickle.dumps(sweep)) == sweep
+
+
+def listening():
+    """Addresses, hexadecimal as the kernel has them, on which this process and its children listen
+    for TCP."""
+    family = {os.getpid()}
+    for path in sorted(Path('/proc').glob('[0-9]*/stat'), key=lambda path: int(path.parts[2])):
+        with contextlib.suppress(OSError):
+            if int(path.read_text().rpartition(')')[2].split()[1]) in family:
+                family.add(int(path.parts[2]))
+    sockets = set()
+    for process in family:
+        for handle in Path(f'/proc/{process}/fd').iterdir():
+            with contextlib.suppress(OSError):
+                sockets.add(os.readlink(handle).removeprefix('socket:[').rstrip(']'))
+    lines = [
+        line.split()
+        for table in ('tcp', 'tcp6')
+        for line in Path(f'/proc/net/{table}').read_text().splitlines()[1:]
+    ]
+    return {
+        words[1].partition(':')[0] for words in lines if words[3] == '0A' and words[9] in sockets
+    }
+
+
+@pytest.mark.skipif(not Path('/proc/net/tcp').exists(), reason='it reads what Linux says')
+def test_processes_listen_on_this_machine_only(diver):
+    pytest.importorskip('distributed')
+    outcomes = sweeps.run_on_processes(diver, range(2), 2)
+    next(outcomes)
+    assert listening() == {'0100007F'}
+    assert len(list(outcomes)) == 1
 
 
 def test_processes_make_the_same_files_as_one_process(diver, tmp_path):

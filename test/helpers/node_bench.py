@@ -52,7 +52,7 @@ class Bench:
         self.executor.add_node(node)
         return node
 
-    def spin_until(self, predicate, limit=60.0):
+    def spin_until(self, predicate, limit=240.0):
         """Spin until `predicate()` is true; fails the test after `limit` seconds."""
         end = time.monotonic() + limit
         while not predicate():

@@ -19,7 +19,7 @@ import pytest
 
 from sonar_imm.acoustics import geometry
 from sonar_imm.acoustics.geometry import Pose
-from sonar_imm.intake.transforms import moved, TransformTree
+from sonar_imm.intake.transforms import MOST_FRAMES, moved, TransformTree
 from sonar_imm.measurements import (
     Arrivals,
     Detections,
@@ -151,3 +151,15 @@ def test_a_tilted_frame_and_what_a_sonar_sees_are_refused_with_both_names():
     ping = Detections(stamp_ns=STAMP, range=[1.0], bearing=[0.0], frame_id='sonar')
     with pytest.raises(Rejection, match="'sonar'"):
         moved(ping, 'map', TURNED)
+
+
+def test_frames_whose_names_wander_are_forgotten_and_those_said_again_are_not():
+    tree, step = TransformTree(), Pose(np.ones(3), np.eye(3))
+    for k in range(3 * MOST_FRAMES):
+        tree.add(StaticTransforms(stamp_ns=STAMP, poses={f'f{k}': (f'f{k - 1}', step)}))
+        if k % 100 == 0:
+            tree.add(StaticTransforms(stamp_ns=STAMP, poses={'sonar': ('hull', step)}))
+    assert len(tree._poses) == MOST_FRAMES
+    assert tree.pose('hull', 'sonar') is not None
+    assert tree.pose('f0', 'f1') is None
+    assert tree.pose(f'f{3 * MOST_FRAMES - 2}', f'f{3 * MOST_FRAMES - 1}') is not None

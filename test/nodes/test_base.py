@@ -249,6 +249,7 @@ def test_qos_overrides_reach_the_endpoints(make_bench):
         'qos_overrides./walker/estimate.publisher.depth:=3',
     )
     node = bench.add(TrackerNode('walker', context=bench.context))
+    bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/fix'))
     inputs = {s.topic_name: s.qos_profile for s in node.subscriptions}
     outputs = {p.topic_name: p.qos_profile for p in node.publishers}
     assert inputs['/fix'].reliability.name == 'RELIABLE'
@@ -279,7 +280,8 @@ def test_a_quality_of_service_of_a_remapped_topic_is_told_its_name(make_bench, c
     bench = make_bench(
         '-r', 'fix:=/usbl/fix', '-p', 'qos_overrides./fix.subscription.reliability:=reliable'
     )
-    bench.add(TrackerNode('walker', context=bench.context))
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/usbl/fix'))
     told = "remapped: write 'qos_overrides./usbl/fix.subscription.reliability'"
     assert told in capfd.readouterr().err
 

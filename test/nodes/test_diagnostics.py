@@ -15,17 +15,18 @@
 """What /diagnostics says, from invented histories and from a real node."""
 
 from collections import Counter
+import time
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from helpers.rig import a_fix, FIX
+from helpers.rig import a_fix, FIX, Rig
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy
 
 from msg_adapters.inputs import inputs_of, needed
 from sonar_imm.nodes.base import TrackerNode
-from sonar_imm.nodes.diagnostics import Meter, Reporter, summary
+from sonar_imm.nodes.diagnostics import clock_offset, Meter, Reporter, summary
 from sonar_imm.nodes.messages import message_class
 from sonar_imm.nodes.qos import latched_qos, output_qos
 
@@ -295,7 +296,7 @@ def test_a_node_reports_under_its_full_name_and_at_its_period(make_bench, walker
     )  # no /clock at all: still it reports
     heard = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
     bench.add(TrackerNode('walker', context=bench.context))
-    bench.spin_until(lambda: len(heard) >= 3)
+    bench.spin_until(lambda: len(heard) >= 3 and 'message' in heard[-1].status[0].message)
     assert [status.name for status in heard[-1].status] == [
         'auv1/walker: input',
         'auv1/walker: tracker',
@@ -400,3 +401,53 @@ def test_health_waits_for_those_who_ask_later(make_bench, walker):
     for topic in ('/walker/health', '/walker/processed'):
         (offered,) = bench.peer.get_publishers_info_by_topic(topic)
         assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+
+def two_clocks(rng, offset=3.0, share=0.5, jitter=0.05, count=40):
+    return -1.7e9 + offset * (rng.random(count) < share) + jitter * rng.random(count)
+
+
+def test_two_publishers_whose_clocks_disagree_are_said(desk):
+    """Messages of either are used; only a person can know which one is right."""
+    rng = np.random.default_rng(1)
+    for k, age in enumerate(two_clocks(rng)):
+        desk.meter.arrived('fix', 0.1 * k)
+        desk.meter.stamped('fix', age)
+    desk.report(4.0, publishers={'/usbl/fix': 2}.get)
+    assert desk.input.level == DiagnosticStatus.OK
+    assert 'stamps on /usbl/fix are of two groups 3.0 s apart' in desk.input.message
+    assert float(desk.values['fix offset of stamps [s]']) == pytest.approx(3.0, abs=0.05)
+    desk.report(4.1, publishers={'/usbl/fix': 1}.get)  # of one publisher it is the way they take
+    assert 'fix offset of stamps [s]' not in desk.values
+
+
+def test_stamps_of_one_clock_are_no_two(desk):
+    rng = np.random.default_rng(2)
+    steps = np.repeat([0.0, 3.0], 20)
+    others = {
+        'too few': two_clocks(rng, count=39),
+        'the way they take': two_clocks(rng, offset=0.4, jitter=0.01),
+        'varying delays': rng.exponential(3.0, 40),
+        'some late': two_clocks(rng, share=0.1),
+        'set once': steps + 0.01 * rng.random(40),
+        'played fast': -4.0 * np.arange(40.0),
+        'wide groups': two_clocks(rng, jitter=2.0),
+        'one stamp': np.zeros(40),
+    }
+    assert {name: clock_offset(ages) for name, ages in others.items()} == dict.fromkeys(others, 0)
+
+
+def test_a_node_with_two_publishers_whose_clocks_disagree_says_so(make_bench, walker):
+    rig = Rig(make_bench('-p', 'diagnostics_period:=0.05'))
+    heard = rig.bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    other = rig.bench.peer.create_publisher(message_class(FIX), '/fix', 10)
+    rig.bench.spin_until(other.get_subscription_count)
+    start = time.time()
+    for k in range(24):
+        now = time.time() - start + 100.0
+        rig.fix.publish(a_fix(now))
+        other.publish(a_fix(now + 7.0))
+        rig.bench.spin_until(lambda count=2 * k + 2: rig.answer[0] == count)
+    rig.bench.spin_until(lambda: '7.0 s apart' in heard[-1].status[0].message)
+    rig.bench.peer.destroy_publisher(other)
+    rig.bench.spin_until(lambda: 'apart' not in heard[-1].status[0].message)

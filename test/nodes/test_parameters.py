@@ -32,7 +32,9 @@ def start(make_bench):
 
     def start(*parameters):
         bench = make_bench(*(word for p in parameters for word in ('-p', p)))
-        return bench.add(TrackerNode('walker', context=bench.context))
+        node = bench.add(TrackerNode('walker', context=bench.context))
+        bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/fix'))
+        return node
 
     return start
 

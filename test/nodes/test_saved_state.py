@@ -46,6 +46,32 @@ def end(rig):
     rig.node.destroy_node()
 
 
+def kill(rig):
+    """What the file sees of a node whose process is killed."""
+    rig.node._saved_state.close()
+
+
+def test_a_second_node_with_the_same_file_leaves_it_alone(start, tmp_path, capfd):
+    """As two namespaces do that share one parameter file; then the first one ends."""
+    first = start()
+    first.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
+    first.node._saved_state.save(first.node._config, wait=True)
+    written = (tmp_path / 'state').read_bytes()
+    second = start()
+    assert 'another node has the state_file' in capfd.readouterr().err
+    assert 'another node has the state_file' in second.node.work_report()['warnings'][-1]
+    second.send(a_fix(3.0, 4.0, 4.0))
+    second.node._saved_state.save(second.node._config, wait=True)
+    assert (tmp_path / 'state').read_bytes() == written
+    end(first)
+    second.send(a_fix(4.0, 4.0, 4.0))
+    end(second)
+    assert not capfd.readouterr().err.count('another node')
+    assert read_state(tmp_path / 'state').newest_ns == 4 * 10**9
+    assert read_state(tmp_path / 'state.refused').newest_ns == 2 * 10**9
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_a_node_that_is_started_again_goes_on(start, tmp_path):
     rig = start()
     rig.send(a_fix(1.0, 0.0, 0.0), a_fix(2.0, 2.0, 8.0))
@@ -98,17 +124,17 @@ def test_other_parameters_and_old_states_are_not_used(start, tmp_path, capfd, mo
     rig = start()
     rig.send(a_fix(1.0))
     end(rig)
-    start('steps:=4')
+    end(start('steps:=4'))
     assert 'other parameters: steps was 3, is 4' in capfd.readouterr().err
-    start('frame_id:=map')
+    end(start('frame_id:=map'))
     assert 'another frame_id or world_frame_convention' in capfd.readouterr().err
     now = time.time_ns()
     with monkeypatch.context() as clock:
         clock.setattr('time.time_ns', lambda: now + 400 * 10**9)
-        start()
+        end(start())
         assert re.search('saved 4.. s ago, state_max_age is 300 s', capfd.readouterr().err)
         clock.setattr('time.time_ns', lambda: now - 500 * 10**9)
-        start()
+        end(start())
         assert 's ahead of the clock' in capfd.readouterr().err
     start('slow_share:=0.5', 'fast_share:=0.5')
     assert 'goes on from the state' in capfd.readouterr().err
@@ -122,6 +148,7 @@ def test_measurements_of_another_time_end_the_state_and_one_outlier_does_not(sta
     again.send(a_fix(5000.0), a_fix(1001.0, 1.0, 1.0))
     assert again.node._saved_state._loaded_ns is None
     assert again.means()[-1][0] == 5000.0 and len(again.node.tracker.fixes) == 3
+    kill(again)
     capfd.readouterr()
     other = start()
     other.send(*[a_fix(5000.0 + k, 1.0, 1.0) for k in range(4)])

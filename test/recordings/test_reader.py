@@ -15,7 +15,9 @@
 import shutil
 import sqlite3
 import struct
+import time
 
+from helpers.anchors import multiplying
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -48,6 +50,68 @@ def read(path, **options):
 def cut(path, share):
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
+
+
+def defined_as(path, definition):
+    """A recording of one message, whose type is stated like that."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        link = bag.add_connection('/t', CUSTOM, msgdef=definition, rihs01=f'RIHS01_{"0" * 64}')
+        bag.write(link, 1, b'\0\1\0\0' + bytes(64))
+    return path
+
+
+def a_part(name, body):
+    return f'\n{"=" * 80}\nMSG: my_msgs/{name}\n{body}'
+
+
+DEFINITIONS = {
+    'circular': 'my_msgs/A a' + a_part('A', 'my_msgs/B b') + a_part('B', 'my_msgs/A a'),
+    'deep': 'my_msgs/A0 a'
+    + ''.join(a_part(f'A{k}', f'my_msgs/A{k + 1} a') for k in range(1300))
+    + a_part('A1300', 'int32 z'),
+    'wide': 'my_msgs/A0 a'
+    + ''.join(
+        a_part(f'A{k}', '\n'.join(f'my_msgs/A{k + 1} a{j}' for j in range(10))) for k in range(20)
+    )
+    + a_part('A20', 'int32 z'),
+    'huge array': 'float64[2000000000] x',
+    'many fields': '\n'.join(f'float64 f{k}' for k in range(30_000)),
+    'many constants': '\n'.join(f'int32 C{k}={k}' for k in range(30_000)) + '\nint32 a',
+    'long line': f'int32[] a [{"1, " * 500_000}1]',
+    'long number': f'int32[{"9" * 10_000}] a',
+}
+
+
+class TestDefinitions:
+    """What rosbags would parse or unpack for minutes, or for ever."""
+
+    @pytest.mark.parametrize('kind', DEFINITIONS)
+    def test_that_multiply_cost_a_sentence(self, tmp_path, kind):
+        path = defined_as(tmp_path / 'bag', DEFINITIONS[kind])
+        before = time.process_time()
+        try:
+            items, problems = read(path)
+        except BagError as error:
+            items, problems = [], [error.sentence]
+        assert time.process_time() - before < 10.0
+        assert not items and problems
+        assert all(len(problem) < 2000 and '\n' not in problem for problem in problems)
+
+    def test_large_ones_that_are_in_use_are_read(self, tmp_path):
+        fields = '\n'.join(f'# What field {k} is.\nfloat64 f{k}' for k in range(400))
+        path = defined_as(tmp_path / 'bag', fields + '\n#' * 10_000)
+        with BagReader(path) as bag:
+            assert bag.topics[0].decodable
+
+    @pytest.mark.parametrize('value', ['[{}]', '{{<<: [{}]}}'])
+    def test_metadata_whose_anchors_multiply_are_left_unread(self, write_fixes, value):
+        path = write_fixes(5)
+        metadata = path / 'metadata.yaml'
+        metadata.write_text(multiplying(value) + '\n' + metadata.read_text())
+        before = time.process_time()
+        items, problems = read(path)
+        assert time.process_time() - before < 5.0
+        assert len(items) == 5 and 'its anchors multiply' in problems[0]
 
 
 class TestWhole:

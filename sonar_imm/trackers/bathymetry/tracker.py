@@ -133,9 +133,11 @@ class BathymetryTracker:
             compile_step()
 
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return [('all', self._warm_all)]
+        if inputs is not None and Snapshot not in inputs:
+            return []
+        return [('pings', self._warm_pings)]
 
-    def _warm_all(self) -> None:
+    def _warm_pings(self) -> None:
         T, P = 8, 8
         snapshot = Snapshot(
             stamp_ns=1,

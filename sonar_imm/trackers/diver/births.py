@@ -233,7 +233,8 @@ def _new_track(
     ping = ping_measurements(birth.ping, birth.rows, config, factor, models, layout)
     # All models of a copy begin alike: one of each is enough to ask.
     M = len(models.names)
-    first = begin_from_ping(x[0, ::M], P[0, ::M], ping, birth.position, config, layout)
+    begins = np.ascontiguousarray(x[0, ::M]), np.ascontiguousarray(P[0, ::M])
+    first = begin_from_ping(*begins, ping, birth.position, config, layout)
     known = np.isfinite(first[2]).any()
     share = np.exp(first[2] - first[2].max()) if known else np.ones(len(first[2]))
     mu = mu * np.repeat(share / share.sum() * len(share), M)

@@ -62,7 +62,6 @@ def finite(x: FloatArray, P: FloatArray) -> BoolArray:
     return out
 
 
-@kernel
 def update(
     x: FloatArray,
     P: FloatArray,
@@ -79,23 +78,14 @@ def update(
     """Update `tracks` (t,), each with its `detection` (t,) of z (D, 2), R (D, 2, 2): x (T, M, n),
     P (T, M, n, n), mu (T, M); h (T, M, 2) expected. Gives x, P, mu, nis (T,) and nis_dof (T,) of
     all tracks, and how many covariances were repaired."""
-    M = x.shape[1]
-    x, P, mu, nis, nis_dof = x.copy(), P.copy(), mu.copy(), nis.copy(), nis_dof.copy()
-    innovation = np.empty((len(tracks), M, 2))
-    for k in range(len(tracks)):
-        for j in range(M):
-            for r in range(2):
-                innovation[k, j, r] = z[detection[k], r] - h[tracks[k], j, r]
-    x1, P1, mu1, _, nis1, ok, repaired = imm_kernels.update(
-        x[tracks], P[tracks], mu[tracks], innovation, H, R[detection]
-    )
-    for k in range(len(tracks)):
-        t = tracks[k]
-        x[t], P[t], mu[t] = x1[k], P1[k], mu1[k]
-        if ok[k]:
-            nis[t] += nis1[k]
-            nis_dof[t] += 2
-    return x, P, mu, nis, nis_dof, int(repaired.sum())
+    innovation = z[detection][:, None] - h[tracks]
+    after = imm_kernels.update_targets(x, P, mu, innovation, H, R, tracks, detection)
+    nis, nis_dof = nis.copy(), nis_dof.copy()
+    hit = tracks[after.ok]
+    nis[hit] += after.nis[after.ok]
+    nis_dof[hit] += np.uint16(2)
+    repairs = int(np.count_nonzero(after.repaired))
+    return after.x, after.P, after.mu, nis, nis_dof, repairs
 
 
 @kernel
@@ -129,10 +119,8 @@ def _shortening(first: float, second: float) -> float:
 
 @kernel
 def watch(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    H: FloatArray,
+    mean: FloatArray,
+    covariance: FloatArray,
     z: FloatArray,
     R: FloatArray,
     tracks: IntArray,
@@ -142,46 +130,52 @@ def watch(
     sums: Sums,
     memory: float,
 ) -> tuple[FloatArray, Sums]:
-    """Whiten the innovations that the mixture of each of `tracks` (t,) sees in its `detection`
-    (t,). Gives white (T, 2) with them, and the sums with those of confirmed tracks, of which about
-    the last `memory` count; tentative (T,), the rest as in `update`.
+    """Whiten the innovations that each of `tracks` (t,) sees in its `detection` (t,), by the mean
+    (T, 2) and covariance (T, 2, 2) of the fix that its mixture expects. Gives white (T, 2) with
+    them, and the sums with those of confirmed tracks, of which about the last `memory` count;
+    tentative (T,), the rest as in `update`.
 
     An innovation longer than `FARTHEST` allows is a sharp turn and says nothing of noise: in the
     sums it is shortened to that."""
-    mean, covariance = imm_kernels.combine(x[tracks], P[tracks], mu[tracks], H[0])
-    firm, paired = np.empty((len(tracks), 2)), np.empty((len(tracks), 2))
+    firm, paired = np.empty(2 * len(tracks)), np.empty(2 * len(tracks))
     count, pairs = 0, 0
     white = white.copy()
     for k in range(len(tracks)):
         t, row = tracks[k], detection[k]
         # The inverse of the Cholesky factor of 2 x 2, written out.
-        a = math.sqrt(covariance[k, 0, 0] + R[row, 0, 0])
-        b = (covariance[k, 1, 0] + R[row, 1, 0]) / a
-        c = math.sqrt(covariance[k, 1, 1] + R[row, 1, 1] - b * b)
-        first = (z[row, 0] - mean[k, 0]) / a
-        second = (z[row, 1] - mean[k, 1] - b * first) / c
+        a = math.sqrt(covariance[t, 0, 0] + R[row, 0, 0])
+        b = (covariance[t, 1, 0] + R[row, 1, 0]) / a
+        c = math.sqrt(covariance[t, 1, 1] + R[row, 1, 1] - b * b)
+        first = (z[row, 0] - mean[t, 0]) / a
+        second = (z[row, 1] - mean[t, 1] - b * first) / c
         if not tentative[t] and math.isfinite(first) and math.isfinite(second):
             kept = _shortening(first, second)
-            firm[count, 0], firm[count, 1] = kept * first, kept * second
-            count += 1
+            firm[count], firm[count + 1] = kept * first, kept * second
             if math.isfinite(white[t, 0]) and math.isfinite(white[t, 1]):
                 kept = _shortening(white[t, 0], white[t, 1])
-                paired[pairs, 0], paired[pairs, 1] = kept * white[t, 0], kept * white[t, 1]
-                # Those that have a partner come first.
-                firm[count - 1], firm[pairs] = firm[pairs].copy(), firm[count - 1].copy()
-                pairs += 1
+                for r in range(2):
+                    paired[pairs + r] = kept * white[t, r]
+                    # Those that have a partner come first.
+                    firm[count + r], firm[pairs + r] = firm[pairs + r], firm[count + r]
+                pairs += 2
+            count += 2
         white[t, 0], white[t, 1] = first, second
     if not count:
         return white, sums
-    now, before = firm.ravel(), paired.ravel()
-    square, cross = now[: 2 * count] ** 2, now[: 2 * pairs] * before[: 2 * pairs]
-    both = square[: 2 * pairs] + before[: 2 * pairs] ** 2
-    total = sums[0] + count
+    # What is summed takes the place of what it is made of.
+    cross = np.empty(pairs)
+    for k in range(count):
+        square = firm[k] * firm[k]
+        if k < pairs:
+            cross[k] = firm[k] * paired[k]
+            paired[k] = square + paired[k] * paired[k]
+        firm[k] = square
+    total = sums[0] + count // 2
     kept = memory / total if total > memory else 1.0
     return white, (
         total * kept,
-        (sums[1] + 0.5 * row_sum(square)) * kept,
-        (sums[2] + pairs) * kept,
+        (sums[1] + 0.5 * row_sum(firm[:count])) * kept,
+        (sums[2] + pairs // 2) * kept,
         (sums[3] + row_sum(cross)) * kept,
-        (sums[4] + 0.5 * row_sum(both)) * kept,
+        (sums[4] + 0.5 * row_sum(paired[:pairs])) * kept,
     )

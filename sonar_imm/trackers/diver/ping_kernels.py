@@ -166,29 +166,12 @@ def expect_measurements(
 
 
 @kernel
-def _place(
-    X: FloatArray,
-    Ps: FloatArray,
-    good: BoolArray,
-    weights: FloatArray,
-    count: int,
-    x: FloatArray,
-    P: FloatArray,
-    chosen: BoolArray,
-    weight: float,
-) -> int:
-    """Put an explanation among `count` others, over the worst where there is no room: the slot, -1
-    where it is the worst itself."""
-    slot = count
-    if count == len(weights):
-        slot = int(np.argmin(weights))
-        if weights[slot] >= weight:
-            return -1
-    X[slot, :] = x
-    Ps[slot, :, :] = P
-    good[slot, :] = chosen
-    weights[slot] = weight
-    return slot
+def _put(x: FloatArray, P: FloatArray, to_x: FloatArray, to_P: FloatArray) -> None:
+    """Copy x (n,) and P (n, n)."""
+    for a in range(len(x)):
+        to_x[a] = x[a]
+        for b in range(len(x)):
+            to_P[a, b] = P[a, b]
 
 
 @kernel
@@ -212,15 +195,14 @@ def subset_ping(
     x1, P1 = np.zeros((M, n)), np.zeros((M, n, n))
     evidence, taken = np.empty(M), np.zeros((M, C))
     X, Ps = np.empty((2, most, n)), np.empty((2, most, n, n))
-    good, weights = np.zeros((2, most, C), np.bool_), np.full((2, most), -np.inf)
+    good, weights = np.empty((2, most, C), np.bool_), np.empty((2, most))
     gradient, scratch, spread = np.empty(n), np.empty(n), np.empty(n)
-    x_c, P_c, chosen = np.empty(n), np.empty((n, n)), np.zeros(C, np.bool_)
+    x_c, P_c = np.empty(n), np.empty((n, n))
     log_good = math.log1p(-outlier_probability)
     log_wild = math.log(max(outlier_probability, 1e-300))
     for j in range(M):
         now, count, best, first = 0, 1, 0.0, 0
-        X[0, 0, :] = x[j]
-        Ps[0, 0, :, :] = P[j]
+        _put(x[j], P[j], X[0, 0], Ps[0, 0])
         good[0, 0, :] = False
         weights[0, 0] = 0.0
         while first < C:
@@ -238,47 +220,42 @@ def subset_ping(
                 refused = weight + log_wild if followed else weight
                 if parent < 0:
                     refused += math.log(wild)
-                slot = _place(
-                    X[then],
-                    Ps[then],
-                    good[then],
-                    weights[then],
-                    grown,
-                    X[now, b],
-                    Ps[now, b],
-                    good[now, b],
-                    refused,
-                )
-                grown = max(grown, slot + 1)
-                if not followed:
-                    continue
-                for c in range(first, last):
-                    x_c[:] = X[now, b]
-                    P_c[:, :] = Ps[now, b]
-                    innovation = _residual(x_c, measured, c, height, gradient)
-                    fit = consider_scalar(
-                        x_c, P_c, gradient, measured.variance[c], innovation, estimated, scratch
-                    )
-                    if parent >= 0:
-                        fit -= math.log(wild)
-                    if not math.isfinite(fit):
-                        continue
-                    chosen[:] = good[now, b]
-                    chosen[c] = True
-                    slot = _place(
-                        X[then],
-                        Ps[then],
-                        good[then],
-                        weights[then],
-                        grown,
-                        x_c,
-                        P_c,
-                        chosen,
-                        weight + log_good + fit,
-                    )
+                # First what takes none of the node, then what takes each of its measurements.
+                for c in range(first - 1, last if followed else first):
+                    _put(X[now, b], Ps[now, b], x_c, P_c)
+                    score = refused
+                    if c >= first:
+                        innovation = _residual(x_c, measured, c, height, gradient)
+                        fit = consider_scalar(
+                            x_c,
+                            P_c,
+                            gradient,
+                            measured.variance[c],
+                            innovation,
+                            estimated,
+                            scratch,
+                        )
+                        if parent >= 0:
+                            fit -= math.log(wild)
+                        if not math.isfinite(fit):
+                            continue
+                        score = weight + log_good + fit
+                    slot = grown
+                    if grown == most:  # over the worst, unless it is the worst itself
+                        slot = 0
+                        for k in range(1, most):
+                            if weights[then, k] < weights[then, slot]:
+                                slot = k
+                        if weights[then, slot] >= score:
+                            continue
+                    _put(x_c, P_c, X[then, slot], Ps[then, slot])
+                    for k in range(C):
+                        good[then, slot, k] = good[now, b, k] or (k == c and c >= first)
+                    weights[then, slot] = score
                     grown = max(grown, slot + 1)
-            now, count, first = then, grown, last
-            best = weights[now, :count].max()
+            now, count, first, best = then, grown, last, -np.inf
+            for b in range(count):
+                best = max(best, weights[now, b])
         total = 0.0
         for b in range(count):
             share = math.exp(weights[now, b] - best)
@@ -320,7 +297,9 @@ def _log_density(
     w: FloatArray,
 ) -> float:
     """Up to a constant that no state and no model changes."""
-    total = -0.5 * whitened_square(L, x - mean, w)
+    for a in range(len(x)):
+        g[a] = x[a] - mean[a]
+    total = -0.5 * whitened_square(L, g, w)
     for c in range(len(measured.value)):
         r = _residual(x, measured, c, height, g)
         total -= 0.5 * (degrees + 1.0) * math.log1p(r * r / measured.variance[c] / degrees)
@@ -343,8 +322,7 @@ def _weighted(
 ) -> None:
     """The weighted Kalman update of the prior, linearised `at` a state, into x, Px and weights."""
     g, w = np.empty(len(x)), np.empty(len(x))
-    x[:] = mean
-    Px[:, :] = P
+    _put(mean, P, x, Px)
     for c in range(len(measured.value)):
         r = _residual(at, measured, c, height, g)
         weights[c] = (degrees + 1.0) / (degrees + r * r / measured.variance[c])
@@ -375,14 +353,16 @@ def climb(
         _weighted(x, mean, P, every, measured, height, degrees, 1.0, target, Px, weights)
         length, gain = 1.0, -1.0
         while length > 1e-3:
-            trial[:] = x + length * (target - x)
+            for a in range(n):
+                trial[a] = x[a] + length * (target[a] - x[a])
             new = _log_density(trial, mean, L, measured, height, degrees, g, w)
             gain = new - value
             if gain >= 0.0:
                 break
             length *= 0.5
         if gain > 0.0:
-            x[:] = trial
+            for a in range(n):
+                x[a] = trial[a]
             value += gain
         if not gain > SMALLEST_GAIN:
             break
@@ -391,22 +371,30 @@ def climb(
 
 @kernel
 def _moved(
-    mean: FloatArray, position: FloatArray, measured: PingMeasurements, height: float
+    mean: FloatArray, px: float, py: float, measured: PingMeasurements, height: float
 ) -> FloatArray:
-    """A state like `mean` at another position (2,), the emission, if any, at its median."""
+    """A state like `mean` at another position, the emission, if any, at its median."""
     x = mean.copy()
     columns = measured.columns[0]
-    x[columns[X]], x[columns[Y]] = position[0], position[1]
+    x[columns[X]], x[columns[Y]] = px, py
     if columns[EMISSION] >= 0:
         late, g = np.empty(len(measured.value)), np.empty(len(mean))
         x[columns[EMISSION]] = 0.0
         count = 0
         for c in range(len(measured.value)):
             if measured.kind[c] == ONE_WAY:
-                late[count] = _residual(x, measured, c, height, g)
+                # Sorted as they come.
+                value, k = _residual(x, measured, c, height, g), count
+                while k > 0 and late[k - 1] > value:
+                    late[k] = late[k - 1]
+                    k -= 1
+                late[k] = value
                 count += 1
         if count:
-            x[columns[EMISSION]] = np.median(late[:count])
+            middle = late[count // 2]
+            if count % 2 == 0:
+                middle = (late[count // 2 - 1] + middle) / 2.0
+            x[columns[EMISSION]] = middle
     return x
 
 
@@ -422,11 +410,15 @@ def student_t_maxima(
     """Where the search ends that starts at each of `positions` (S, 2): states (S, n), and their
     log-densities (S,), for one prior `mean` (n,), P (n, n)."""
     S, n = len(positions), len(mean)
-    found, value, L = np.empty((S, n)), np.full(S, -np.inf), np.zeros((n, n))
-    if cholesky(P, L):
-        for s in range(S):
-            start = _moved(mean, positions[s], measured, height)
-            found[s], value[s] = climb(start, mean, P, L, measured, height, degrees)
+    found, value, L = np.empty((S, n)), np.empty(S), np.empty((n, n))
+    known = cholesky(P, L)
+    for s in range(S):
+        value[s] = -np.inf
+        if known:
+            start = _moved(mean, positions[s, 0], positions[s, 1], measured, height)
+            at, value[s] = climb(start, mean, P, L, measured, height, degrees)
+            for a in range(n):
+                found[s, a] = at[a]
     return found, value
 
 
@@ -448,61 +440,40 @@ def student_t_ping(
     """
     M, n = x.shape
     C = len(measured.value)
-    x1, P1, evidence = x.copy(), P.copy(), np.full(M, -np.inf)
+    x1, P1, evidence = x.copy(), P.copy(), np.empty(M)
     weights = np.zeros((M, C))
-    L, Lc = np.zeros((n, n)), np.zeros((n, n))
-    state = np.empty(n)
+    L, Lc = np.empty((n, n)), np.empty((n, n))
+    state, at = np.empty(n), np.empty(n)
     every = np.ones(n, np.bool_)
-    widen = (degrees + 3.0) / (degrees + 1.0)
+    columns = measured.columns[0]
     for j in range(M):
+        evidence[j] = -np.inf
         if not cholesky(P[j], L):
             continue
-        at, best = climb(
-            _moved(x[j], x[j][measured.columns[0][X : Y + 1]], measured, height),
-            x[j],
-            P[j],
-            L,
-            measured,
-            height,
-            degrees,
-        )
-        for s in range(len(positions)):
-            start = _moved(x[j], positions[s], measured, height)
+        best = -np.inf
+        for s in range(-1, len(positions)):
+            px, py = x[j, columns[X]], x[j, columns[Y]]
+            if s >= 0:
+                px, py = positions[s, 0], positions[s, 1]
+            start = _moved(x[j], px, py, measured, height)
             other, value = climb(start, x[j], P[j], L, measured, height, degrees)
-            if value > best + SMALLEST_GAIN:
+            if s < 0 or value > best + SMALLEST_GAIN:
                 at, best = other, value
-        _weighted(at, x[j], P[j], every, measured, height, degrees, 1.0, state, P1[j], weights[j])
-        if not cholesky_with_jitter(P1[j], Lc):
-            P1[j, :, :] = P[j]
-            continue
-        evidence[j] = best
-        for a in range(n):
-            evidence[j] += math.log(Lc[a, a] / L[a, a])
-        # The mean is that of the plain weights, the covariance that of the wider ones.
-        _weighted(
-            at,
-            x[j],
-            P[j],
-            estimated,
-            measured,
-            height,
-            degrees,
-            1.0,
-            x1[j],
-            P1[j],
-            weights[j],
-        )
-        _weighted(
-            at,
-            x[j],
-            P[j],
-            estimated,
-            measured,
-            height,
-            degrees,
-            widen,
-            state,
-            P1[j],
-            weights[j],
-        )
+        # By all components for the evidence; without what is considered for the mean; the
+        # covariance is that of wider weights.
+        for turn in range(3):
+            free, widen = every if turn == 0 else estimated, 1.0
+            if turn == 2:
+                widen = (degrees + 3.0) / (degrees + 1.0)
+            to = x1[j] if turn == 1 else state
+            _weighted(
+                at, x[j], P[j], free, measured, height, degrees, widen, to, P1[j], weights[j]
+            )
+            if turn == 0 and not cholesky_with_jitter(P1[j], Lc):
+                _put(x[j], P[j], x1[j], P1[j])
+                break
+            if turn == 0:
+                evidence[j] = best
+                for a in range(n):
+                    evidence[j] += math.log(Lc[a, a] / L[a, a])
     return x1, P1, evidence, weights

@@ -38,6 +38,7 @@ from ...acoustics.multistatic import difference_projection
 from ...estimation import imm_kernels
 from ...estimation.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from ...estimation.association import assign, association_cost, gate_threshold, TENTATIVE
+from ...estimation.covariance import is_psd
 from ...estimation.small_matrices import add_jitter_all
 from ...measurements import Arrivals, NOBODY
 from .config import DiverConfig
@@ -338,11 +339,25 @@ def taking_of(
     if (good & ping.echo).sum() > int(ping.passive):
         own = ping.compared(good)
         residual, covariance, dof = residuals(*before, own, config.target_z)
-        S = covariance + np.diag(own.measured.variance)
-        nis = float(residual @ np.linalg.solve(S, residual))
+        nis = _joint_nis(residual, covariance, own.measured.variance)
     if config.estimate_covariance_scale and (good & ping.echo).any():
         scale = _for_scale(after, ping.compared(good & ping.echo), config, factor)
     return Taking(after, good, nis, dof, scale)
+
+
+def _joint_nis(residual: FloatArray, covariance: FloatArray, variance: FloatArray) -> float:
+    """``residual' S^-1 residual``, ``S = covariance + diag(variance)``; variance (C,).
+
+    Beside what is expected of exact arrivals after a long silence their own variances are lost in
+    rounding, and S can have no inverse. Its eigenvalues in units of the variances are 1 at least.
+    """
+    S = covariance + np.diag(variance)
+    if is_psd(S) or not np.isfinite(S).all():
+        return float(residual @ np.linalg.solve(S, residual))
+    weight = 1.0 / np.sqrt(variance)
+    values, vectors = np.linalg.eigh(weight[:, None] * covariance * weight)
+    whitened = vectors.T @ (weight * residual)
+    return float((whitened**2 / (1.0 + np.maximum(values, 0.0))).sum())
 
 
 def _for_scale(

@@ -344,7 +344,7 @@ def _predict(
     T, size = len(x), x.shape[-1]
     if copies == 1 and size == n:
         x, P, repaired = imm_kernels.predict(x, P, motion.F, motion.Q, motion.B)
-        return x, P, int(repaired.sum())
+        return x, P, int(np.count_nonzero(repaired))
     x_all, P_all = x.reshape(T * copies, M, size), P.reshape(T * copies, M, size, size)
     x_n, P_n, repaired = imm_kernels.predict(
         np.ascontiguousarray(x_all[..., :n]),
@@ -358,4 +358,4 @@ def _predict(
     if size > n:
         P1[..., :n, n:] = motion.F @ P_all[..., :n, n:]
         P1[..., n:, :n] = np.swapaxes(P1[..., :n, n:], -1, -2)
-    return x1.reshape(x.shape), P1.reshape(P.shape), int(repaired.sum())
+    return x1.reshape(x.shape), P1.reshape(P.shape), int(np.count_nonzero(repaired))

@@ -65,6 +65,9 @@ COPY_SPREAD = 1.3
 AT_TRANSMITTER = 0.01
 """Horizontal distance in metres within which a receiver is at the transmitter: the frame hangs on
 that place, so that it has no error of position there."""
+MOST_RECEIVERS = 64
+"""Receivers whose errors are part of the state, which grows with its square; those that are heard
+first. More are numbers that wander, not instruments."""
 
 
 class Motion(NamedTuple):
@@ -285,7 +288,8 @@ class Instruments:
     known: tuple[tuple[int, bool], ...] = ()
 
     def with_receivers(self, ping: Arrivals, config: DiverConfig) -> Instruments:
-        """With the receivers of a ping; the same where nothing is to be known of them."""
+        """With the receivers of a ping, `MOST_RECEIVERS` in all; the same where nothing is to be
+        known of them."""
         if not (config.receiver_position_std or config.receiver_clock_std):
             return self
         ids = {receiver for receiver, _ in self.known}
@@ -295,6 +299,7 @@ class Instruments:
                 row = int(np.flatnonzero(ping.rx_id == receiver)[0])
                 apart = np.hypot(*(ping.rx[row] - ping.tx[row])[:2])
                 new.append((receiver, not apart <= AT_TRANSMITTER))
+        new = new[: max(0, MOST_RECEIVERS - len(self.known))]
         return Instruments((*self.known, *new)) if new else self
 
     def layout(self, config: DiverConfig, models: ModelSet) -> Layout:

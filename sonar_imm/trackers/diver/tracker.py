@@ -343,13 +343,14 @@ class DiverTracker:
         layout = self._layout(now.instruments)
         white, consistency = now.white, now.fixes
         if len(tracks):
+            mean, covariance = imm_kernels.combine(now.x, now.P, now.mu, layout.H[0])
             z, R, row = fixes.z, fixes.R, detection
             tentative, sums = now.life.status == TENTATIVE, now.fixes.sums
             scale = np.ones(len(tracks))
             if self.models.mixing is not None:
                 scale = families.scale(now.mu[tracks], self.models)
                 z, R, row = z[row], R[row] * scale[:, None, None], np.arange(len(tracks))
-            innovations = now.x, now.P, now.mu, layout.H, z, R, tracks, row
+            innovations = mean, covariance, z, R, tracks, row
             white, sums = fix_kernels.watch(*innovations, tentative, white, sums, MEMORY)
             consistency = now.fixes.after(sums, scale, tentative[tracks])
         now = now._replace(white=white, fixes=consistency, score=association.score)

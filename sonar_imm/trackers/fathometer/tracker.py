@@ -176,9 +176,11 @@ class FathometerTracker:
             compile_step()
 
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return [('all', self._warm_all)]
+        if inputs is not None and {ArrayDepth}.issuperset(inputs):
+            return []
+        return [('records', self._warm_records)]
 
-    def _warm_all(self) -> None:
+    def _warm_records(self) -> None:
         depth = 0.05 * np.arange(200)
         config = evolve(
             self.config,

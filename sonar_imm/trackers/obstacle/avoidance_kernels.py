@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.elementary import gaussians
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import lanes_for, semidefinite_roots, turn_of
@@ -85,18 +85,20 @@ def relative(
         return mean, covariance
     lanes = lanes_for(live)
     y, S, F = np.empty((size, lanes)), np.zeros((size, size, lanes)), np.zeros((size, size, lanes))
-    g, C = np.empty((SIZE, lanes)), np.zeros((SIZE, SIZE, lanes))
+    g, C = np.zeros((SIZE, lanes)), np.zeros((SIZE, SIZE, lanes))
     seen, world = np.empty((3, PLACES, lanes)), np.empty((3, PLACES, lanes))
     scratch = np.empty((9, PLACES, lanes))
     # Points on the other columns lie at the centre.
     reach, others = math.sqrt(COMMON + KAPPA), 2.0 * (COMMON - PLACED)
-    apart = np.full((PLACED, lanes), 0.5 / (COMMON + KAPPA))
-    centre = np.full(lanes, (KAPPA + 0.5 * others) / (COMMON + KAPPA))
+    apart, centre = np.empty((PLACED, lanes)), np.empty(lanes)
+    for k in range(lanes):
+        centre[k] = (KAPPA + 0.5 * others) / (COMMON + KAPPA)
+        for a in range(len(apart)):
+            apart[a, k] = 0.5 / (COMMON + KAPPA)
     for turn in range(0, live, lanes):
         first = turn_of(turn, live, lanes)
-        some = which[first : first + lanes]
         for k in range(lanes):
-            t, j = some[k]
+            t, j = which[first + k, 0], which[first + k, 1]
             for a in range(size):
                 own = 1.0 if a < COMMON or moves[j] else 0.0
                 y[a, k] = own * x[t, j, a]
@@ -104,7 +106,7 @@ def relative(
                     S[a, b, k] = own * P[t, j, a, b]
         semidefinite_roots(S, F, scratch[0, 0])
         for a in range(size):
-            for b in range(PLACED):
+            for b in range(len(apart)):
                 for k in range(lanes):
                     F[a, b, k] *= reach
         places(y, F, p[2], R, cone, scratch, seen)
@@ -114,22 +116,22 @@ def relative(
         for i in range(2):
             for b in range(i + 1):
                 product(world[i], world[b], centre, apart, C[i, b])
-            for a in range(2, SIZE):
-                state = a if a == 2 else a + 1
-                if state < size:
-                    beside(world[i], F[state, :PLACED], apart[0], C[a, i])
-        for a in range(2, SIZE):
+        for a in range(2, len(g)):
             state = a if a == 2 else a + 1
-            for k in range(lanes):
-                g[a, k] = y[state, k] if state < size else 0.0
-            for b in range(2, a + 1):
-                other = b if b == 2 else b + 1
+            if state < size:
+                for i in range(2):
+                    beside(world[i], F[state, :PLACED], apart[0], C[a, i])
                 for k in range(lanes):
-                    C[a, b, k] = S[state, other, k] if state < size else 0.0
+                    g[a, k] = y[state, k]
+                for b in range(2, a + 1):
+                    other = b if b == 2 else b + 1
+                    for k in range(lanes):
+                        C[a, b, k] = S[state, other, k]
         for k in range(lanes):
-            t, j = some[k]
-            for a in range(SIZE):
-                mean[t, j, a] = g[a, k] - p[2] if a == 2 else g[a, k]
+            t, j = which[first + k, 0], which[first + k, 1]
+            g[2, k] -= p[2]
+            for a in range(len(g)):
+                mean[t, j, a] = g[a, k]
                 for b in range(a + 1):
                     covariance[t, j, a, b] = covariance[t, j, b, a] = C[a, b, k]
     return mean, covariance
@@ -202,30 +204,6 @@ def sampled(g: FloatArray, L: FloatArray, safety: Safety) -> float:
 
 
 @kernel
-def _passing(
-    g: FloatArray, F: FloatArray, safety: Safety, scratch: FloatArray, images: FloatArray
-) -> None:
-    """Signed miss distance and time of the closest approach of all sigma points: images (2,
-    2 SIZE + 1, lanes). g (5, lanes), F (5, 5, lanes) as in `sigma_kernels`."""
-    for row, state in enumerate((0, 1, 3, 4)):
-        fan(g[state], F[state, : state + 1], scratch[row])
-    x, y = scratch[0].reshape(-1), scratch[1].reshape(-1)
-    v, w = scratch[2].reshape(-1), scratch[3].reshape(-1)
-    miss, when = images[0].reshape(-1), images[1].reshape(-1)
-    for k in range(len(x)):
-        v[k] -= safety.velocity[0]
-        w[k] -= safety.velocity[1]
-    for k in range(len(x)):
-        square = v[k] * v[k] + w[k] * w[k]
-        square = square if square > LITTLE else LITTLE
-        miss[k] = (x[k] * w[k] - y[k] * v[k]) / math.sqrt(square)
-    for k in range(len(x)):
-        square = v[k] * v[k] + w[k] * w[k]
-        square = square if square > LITTLE else LITTLE
-        when[k] = -(x[k] * v[k] + y[k] * w[k]) / square
-
-
-@kernel
 def _off(edge: float, std: float, inside: bool) -> float:
     """How many standard deviations an edge lies above the mean; one that is on it, where there is
     no spread, as if the mean were `inside` below it or not."""
@@ -237,9 +215,10 @@ def _off(edge: float, std: float, inside: bool) -> float:
 @kernel
 def _edges(moments: FloatArray, z: float, var_z: float, safety: Safety, row: FloatArray) -> int:
     """What has to be known of the normal distribution for `_within` of a component with these
-    moments (5,), see `_Lanes`, and a vertical offset of that mean and variance. Into row: the
-    edges of the time; those of n slices of the vertical offset; the two of the miss distance,
-    given each slice. Gives n, 0 where nothing is near."""
+    moments (5,), the means of miss distance and of time, their variances, and the covariance of
+    the first with the vertical offset; and with a vertical offset of that mean and variance. Into
+    row: the edges of the time; those of n slices of the vertical offset; the two of the miss
+    distance, given each slice. Gives n, 0 where nothing is near."""
     b, t, var_b, var_t, both = moments
     std_z, R = math.sqrt(var_z), safety.radius
     low, high = max(-safety.height, z - 6.0 * std_z), min(safety.height, z + 6.0 * std_z)
@@ -281,24 +260,6 @@ def _within(below: FloatArray, slices: int) -> float:
     return total * in_time if in_time >= LITTLE else 0.0
 
 
-class _Lanes(NamedTuple):
-    """Components that are judged together: g (5, lanes), S (5, 5, lanes) its covariance with the
-    error of the course, L the root of that, F the root times the reach of the sigma points;
-    points (4, 2 SIZE + 1, lanes): scratch; images: see `_passing`; moments (5, lanes): mean of
-    miss distance and of time, their variances, covariance of the first with the vertical
-    offset; slices (lanes,) and rows (4, EDGES lanes): see `_edges` and `gaussians`."""
-
-    g: FloatArray
-    S: FloatArray
-    L: FloatArray
-    F: FloatArray
-    points: FloatArray
-    images: FloatArray
-    moments: FloatArray
-    slices: IntArray
-    rows: FloatArray
-
-
 @kernel
 def assess(
     mean: FloatArray, covariance: FloatArray, mu: FloatArray, safety: Safety
@@ -309,7 +270,7 @@ def assess(
     Miss distance, vertical offset and the time of the closest approach are Gaussian, by sigma
     points, where a vehicle keeps its depth and a course that is certain; else draws are counted.
     """
-    T, K, _ = mean.shape
+    T, K, size = mean.shape
     distance, when, risk = np.zeros(T), np.zeros(T), np.zeros(T)
     live, which = 0, np.empty((T * K, 2), dtype=np.int64)
     for t in range(T):
@@ -317,25 +278,80 @@ def assess(
             if mu[t, j] >= WEIGHT:
                 which[live, 0], which[live, 1] = t, j
                 live += 1
-    chance = np.zeros(live)
+    V, known, chance = safety.velocity, np.zeros(T), np.zeros(live)
     if live:
-        lanes = lanes_for(live)
-        shape, numbers = (SIZE, SIZE, lanes), 2 * SIZE + 1
-        work = _Lanes(
-            np.empty((SIZE, lanes)), np.empty(shape), np.zeros(shape), np.zeros(shape),
-            np.empty((4, numbers, lanes)), np.empty((2, numbers, lanes)), np.empty((5, lanes)),
-            np.empty(lanes, dtype=np.int64), np.empty((4, EDGES * lanes)),
-        )  # fmt: skip
+        lanes, numbers = lanes_for(live), 2 * size + 1
+        g, S = np.empty((size, lanes)), np.empty((size, size, lanes))
+        # The root of S, and that times the reach of the sigma points.
+        L, F = np.zeros((size, size, lanes)), np.zeros((size, size, lanes))
+        weight, moments = np.empty((size, lanes)), np.empty((lanes, 5))
+        centre, row = np.empty(lanes), np.empty(lanes)
+        points, images = np.empty((4, numbers, lanes)), np.empty((2, numbers, lanes))
+        flat, image = points.reshape(4, -1), images.reshape(2, -1)
+        own, root = np.empty(size), np.empty((size, size))
+        slices, rows = np.empty(lanes, dtype=np.int64), np.empty((4, EDGES * lanes))
         for turn in range(0, live, lanes):
             first = turn_of(turn, live, lanes)
-            some = which[first : first + lanes]
-            _gather(mean, covariance, some, safety, work)
-            _judge(safety, work, chance[first : first + lanes])
-    V, known = safety.velocity, np.zeros(T)
+            for k in range(lanes):
+                t, j = which[first + k, 0], which[first + k, 1]
+                centre[k] = KAPPA / (SIZE + KAPPA)
+                for a in range(size):
+                    g[a, k], weight[a, k] = mean[t, j, a], 0.5 / (SIZE + KAPPA)
+                    for b in range(a + 1):
+                        S[a, b, k] = covariance[t, j, a, b]
+                for a in range(3, size):
+                    S[a, a, k] += safety.std * safety.std
+            semidefinite_roots(S, L, row)
+            reach = math.sqrt(SIZE + KAPPA)
+            for a in range(size):
+                for b in range(a + 1):
+                    for k in range(lanes):
+                        F[a, b, k] = reach * L[a, b, k]
+            # Signed miss distance and time of the closest approach of all sigma points.
+            for at in range(len(points)):
+                state = at if at < 2 else at + 1
+                fan(g[state], F[state, : state + 1], points[at])
+            for k in range(numbers * lanes):
+                v, w = flat[2, k] - V[0], flat[3, k] - V[1]
+                square = v * v + w * w
+                square = square if square > LITTLE else LITTLE
+                image[0, k] = (flat[0, k] * w - flat[1, k] * v) / math.sqrt(square)
+                image[1, k] = -(flat[0, k] * v + flat[1, k] * w) / square
+            for i in range(len(images)):
+                weighted(images[i], centre, weight, row)
+                for k in range(lanes):
+                    moments[k, i] = row[k]
+                product(images[i], images[i], centre, weight, row)
+                for k in range(lanes):
+                    moments[k, 2 + i] = row[k]
+            beside(images[0], F[2, :3], weight[0], row)
+            end = 0
+            for k in range(lanes):
+                slices[k], moments[k, 4] = 0, row[k]
+                w0, w1 = g[3, k] - V[0], g[4, k] - V[1]
+                # A course that may be any has no miss distance to be Gaussian in.
+                unsure = w0 * w0 + w1 * w1 <= 4.0 * (S[3, 3, k] + S[4, 4, k])
+                inside = g[0, k] * g[0, k] + g[1, k] * g[1, k] <= safety.radius * safety.radius
+                if V[2] != 0.0 or inside or unsure:
+                    for a in range(size):
+                        own[a] = g[a, k]
+                        for b in range(a + 1):
+                            root[a, b] = L[a, b, k]
+                    chance[first + k] = sampled(own, root, safety)
+                else:
+                    chance[first + k] = 0.0
+                    slices[k] = _edges(moments[k], g[2, k], S[2, 2, k], safety, rows[0, end:])
+                    end += 3 + 3 * slices[k] if slices[k] else 0
+            gaussians(rows[0, :end], rows[1, :end], rows[2, :end], rows[3, :end])
+            end = 0
+            for k in range(lanes):
+                if slices[k]:
+                    chance[first + k] = _within(rows[3, end:], slices[k])
+                    end += 3 + 3 * slices[k]
     for k in range(live):
-        t, j = which[k]
-        g = mean[t, j]
-        time, near = closest(g[0], g[1], g[3] - V[0], g[4] - V[1], safety.horizon)
+        t, j = which[k, 0], which[k, 1]
+        g0, g1, w0, w1 = mean[t, j, 0], mean[t, j, 1], mean[t, j, 3] - V[0], mean[t, j, 4] - V[1]
+        time, near = closest(g0, g1, w0, w1, safety.horizon)
         distance[t] += mu[t, j] * near
         when[t] += mu[t, j] * time
         risk[t] += mu[t, j] * chance[k]
@@ -344,64 +360,3 @@ def assess(
         distance[t], when[t] = distance[t] / known[t], when[t] / known[t]
         risk[t] = min(max(risk[t] / known[t], 0.0), 1.0)
     return distance, when, risk
-
-
-@kernel
-def _gather(
-    mean: FloatArray, covariance: FloatArray, which: IntArray, safety: Safety, work: _Lanes
-) -> None:
-    """Components `which` (lanes, 2), of which target and which of its own, into the lanes."""
-    lanes = len(which)
-    for k in range(lanes):
-        t, j = which[k]
-        for a in range(SIZE):
-            work.g[a, k] = mean[t, j, a]
-            for b in range(a + 1):
-                work.S[a, b, k] = covariance[t, j, a, b]
-    for a in (3, 4):
-        for k in range(lanes):
-            work.S[a, a, k] += safety.std * safety.std
-    semidefinite_roots(work.S, work.L, work.moments[0])
-    reach = math.sqrt(SIZE + KAPPA)
-    for a in range(SIZE):
-        for b in range(a + 1):
-            for k in range(lanes):
-                work.F[a, b, k] = reach * work.L[a, b, k]
-
-
-@kernel
-def _judge(safety: Safety, work: _Lanes, chance: FloatArray) -> None:
-    """The probability (lanes,) that each component collides."""
-    g, S, moments = work.g, work.S, work.moments
-    lanes, V = len(chance), safety.velocity
-    centre = np.full(lanes, KAPPA / (SIZE + KAPPA))
-    weight = np.full((SIZE, lanes), 0.5 / (SIZE + KAPPA))
-    _passing(g, work.F, safety, work.points, work.images)
-    for i in range(2):
-        image = work.images[i]
-        weighted(image, centre, weight, moments[i])
-        product(image, image, centre, weight, moments[2 + i])
-    beside(work.images[0], work.F[2, :3], weight[0], moments[4])
-    L, at = np.empty((SIZE, SIZE)), np.empty(SIZE)
-    rows, end = work.rows, 0
-    for k in range(lanes):
-        work.slices[k] = 0
-        w0, w1 = g[3, k] - V[0], g[4, k] - V[1]
-        # A course that may be any has no miss distance to be Gaussian in.
-        unsure = w0 * w0 + w1 * w1 <= 4.0 * (S[3, 3, k] + S[4, 4, k])
-        inside = g[0, k] * g[0, k] + g[1, k] * g[1, k] <= safety.radius * safety.radius
-        if V[2] != 0.0 or inside or unsure:
-            at[:], L[:] = g[:, k], work.L[:, :, k]
-            chance[k] = sampled(at, L, safety)
-        else:
-            chance[k] = 0.0
-            slices = _edges(moments[:, k], g[2, k], S[2, 2, k], safety, rows[0, end:])
-            work.slices[k] = slices
-            end += 3 + 3 * slices if slices else 0
-    gaussians(rows[0, :end], rows[1, :end], rows[2, :end], rows[3, :end])
-    first = 0
-    for k in range(lanes):
-        slices = work.slices[k]
-        if slices:
-            chance[k] = _within(rows[3, first:], slices)
-            first += 3 + 3 * slices

@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...estimation.arrays import BoolArray, FloatArray, IntArray
+from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
 from ...estimation.small_matrices import (
     add_jitter,
@@ -148,26 +148,6 @@ def mix(
     return x1, P1, mu1
 
 
-class _Lanes(NamedTuple):
-    """Components that are predicted together. y (n, lanes), their covariance S (n, n, lanes) and
-    F, the root of it times the reach of the sigma points; motion (4, lanes): keep, step, push,
-    noise; centre (lanes,): weight of the centre; apart (lanes,), weight (n, lanes): of each other
-    point, and by columns, where those of states that a component has not weigh nothing; images
-    (2, numbers, lanes): range and azimuth; J: see `slopes`."""
-
-    y: FloatArray
-    S: FloatArray
-    F: FloatArray
-    motion: FloatArray
-    centre: FloatArray
-    apart: FloatArray
-    weight: FloatArray
-    images: FloatArray
-    J: FloatArray
-    scratch: FloatArray
-
-
-@kernel
 def advance(
     x: FloatArray, P: FloatArray, mu: FloatArray, motion: Motion, step: Step
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -177,6 +157,24 @@ def advance(
     repaired (`estimation.covariance`). Dropped components are given the numbers of the most
     probable one, so that all stay finite.
     """
+    x1, P1, repaired = _advance(x, P, mu, motion, step)
+    if np.count_nonzero(repaired):
+        _repair(x1, P1, mu, motion.prior, repaired)
+    return x1, P1, repaired
+
+
+@kernel
+def _advance(
+    x: FloatArray, P: FloatArray, mu: FloatArray, motion: Motion, step: Step
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """`advance` without the repairs: where (T, C) they are needed.
+
+    Components are predicted together, see `sigma_kernels`: weight (size, lanes) is that of a sigma
+    point on each column, 0 on those of states that a component has not, apart (lanes,) on those
+    that it has. A kernel contains all that it calls, so this is no chain of smaller ones; and the
+    length of a short loop is a variable, or the compiler would write out every round of it.
+    """
+    p0, R0, p1, R1, noise, cone = step
     T, C, size = x.shape
     x1, P1 = np.zeros((T, C, size)), np.zeros((T, C, size, size))
     repaired = np.zeros((T, C), dtype=np.bool_)
@@ -189,162 +187,151 @@ def advance(
     if live == 0:
         return x1, P1, repaired
     lanes, numbers = lanes_for(live), 2 * size + 1
-    work = _Lanes(
-        np.empty((size, lanes)), np.zeros((size, size, lanes)), np.zeros((size, size, lanes)),
-        np.empty((4, lanes)), np.empty(lanes), np.empty(lanes), np.empty((size, lanes)),
-        np.empty((2, numbers, lanes)), np.empty((2, 2, lanes)), np.empty((3, numbers, lanes)),
-    )  # fmt: skip
-    bad, scratch = np.empty(lanes, dtype=np.int64), np.empty((size, size))
+    y, weight, rest = np.empty((size, lanes)), np.empty((size, lanes)), np.empty((6, lanes))
+    S, F = np.zeros((size, size, lanes)), np.zeros((size, size, lanes))
+    centre, apart, keep, go, push, extra = rest[0], rest[1], rest[2], rest[3], rest[4], rest[5]
+    seen, places_scratch = np.empty((3, PLACES, lanes)), np.empty((9, PLACES, lanes))
+    m, scratch = np.empty((3, numbers, lanes)), np.empty((3, numbers, lanes))
+    images, J = np.empty((2, numbers, lanes)), np.empty((2, 2, lanes))
+    bad, points, moves = np.empty(lanes, dtype=np.int64), m.reshape(3, -1), scratch.reshape(3, -1)
+    scale, north, east = moves[0], moves[1], moves[2]
+    turn_M, across, down = np.zeros((3, 3)), np.empty(3), np.empty(3)
+    axes, level = len(down), len(J)
+    for i in range(axes):
+        down[i] = R1[2, i] * (p0[2] - p1[2])
+        across[i] = R1[0, i] * (p0[0] - p1[0]) + R1[1, i] * (p0[1] - p1[1])
+        for j in range(axes):
+            for k in range(axes):
+                turn_M[i, j] += R1[k, i] * R0[k, j]
     for turn in range(0, live, lanes):
         first = turn_of(turn, live, lanes)
-        some = which[first : first + lanes]
-        _gather(x, P, motion, some, work)
-        _look(step, work)
-        _spread(step, work)
-        not_psd(work.S, work.F, work.centre, bad)
         for k in range(lanes):
-            t, j = some[k]
+            t, j = which[first + k, 0], which[first + k, 1]
+            n = size if motion.prior[j] > 0.0 else COMMON
+            centre[k], apart[k] = KAPPA / (n + KAPPA), 0.5 / (n + KAPPA)
+            keep[k], go[k] = motion.keep[j], motion.step[j]
+            push[k], extra[k] = motion.push[j], motion.noise[j]
+            for a in range(size):
+                y[a, k] = x[t, j, a]
+                weight[a, k] = apart[k] if a < n else 0.0
+                for b in range(a + 1):
+                    S[a, b, k] = P[t, j, a, b]
+        semidefinite_roots(S, F, scale)
+        for k in range(lanes):
+            scale[k] = math.sqrt(0.5 / apart[k])
+        for a in range(size):
+            for b in range(a + 1):
+                for k in range(lanes):
+                    F[a, b, k] *= scale[k]
+        # Range and azimuth after the step of all sigma points.
+        places(y, F, p0[2], R0, cone, places_scratch, seen)
+        turned(turn_M, seen, m)
+        for i in range(axes):
+            for number in range(PLACES, numbers):
+                for k in range(lanes):
+                    m[i, number, k] = m[i, 0, k]
+        for a in range(COMMON - 1, size):
+            to = scratch[a - COMMON + 1]
+            fan(y[a], F[a, : a + 1], to)
+            if a >= COMMON:
+                for number in range(numbers):
+                    for k in range(lanes):
+                        to[number, k] *= go[k]
+        for i in range(axes):
+            for k in range(numbers * lanes):
+                points[i, k] += across[i] * (1.0 + scale[k]) + down[i]
+            if size > COMMON:
+                for k in range(numbers * lanes):
+                    points[i, k] += R1[0, i] * north[k] + R1[1, i] * east[k]
+        echoes(y[1], m, cone, scratch, images[0], images[1])
+        # How they change, at the centre, with the obstacle's north and east.
+        for i in range(level if size > COMMON else 0):
+            for k in range(lanes):
+                X, Y, Z = points[0, k], points[1, k], points[2, k]
+                d = math.sqrt(X * X + Y * Y + Z * Z)
+                J[0, i, k] = (R1[i, 0] * X + R1[i, 1] * Y + R1[i, 2] * Z) / d
+            for k in range(lanes):
+                X, Y, Z = points[0, k], points[1, k], points[2, k]
+                if cone:
+                    square = X * X + Y * Y + Z * Z
+                    off = R1[i, 1] - Y / math.sqrt(square) * J[0, i, k]
+                    J[1, i, k] = off / math.sqrt(square - Y * Y)
+                else:
+                    J[1, i, k] = (R1[i, 1] * X - R1[i, 0] * Y) / (X * X + Y * Y)
+        # Mean and covariance of the components after the step.
+        for i in range(level):
+            weighted(images[i], centre, weight, y[i])
+        for i in range(level):
+            for b in range(i + 1):
+                product(images[i], images[b], centre, weight, S[i, b])
+            for a in range(2, size):
+                beside(images[i], F[a, : a + 1], apart, S[a, i])
+        for k in range(lanes):
+            S[0, 0, k] += noise[0]
+            S[1, 1, k] += noise[0] / (y[0, k] * y[0, k]) + noise[1]
+            S[2, 2, k] += noise[2]
+        for a in range(COMMON, size):
+            for k in range(lanes):
+                y[a, k] *= keep[k]
+            for b in range(a + 1):
+                for k in range(lanes):
+                    S[a, b, k] *= keep[k] * keep[k] if b >= COMMON else keep[k]
+        # What w brings: to range and azimuth, to e, and to both together.
+        for a in range(level if size > COMMON else 0):
+            for b in range(a + 1):
+                for k in range(lanes):
+                    both = J[a, 0, k] * J[b, 0, k] + J[a, 1, k] * J[b, 1, k]
+                    S[a, b, k] += push[k] * push[k] * extra[k] * both
+            for b in range(level):
+                for k in range(lanes):
+                    S[COMMON + b, a, k] += push[k] * extra[k] * J[a, b, k]
+            for k in range(lanes):
+                S[COMMON + a, COMMON + a, k] += extra[k]
+        not_psd(S, F, scale, bad)
+        for k in range(lanes):
+            t, j = which[first + k, 0], which[first + k, 1]
             n = size if motion.prior[j] > 0.0 else COMMON
             for a in range(n):
-                x1[t, j, a] = work.y[a, k]
+                x1[t, j, a] = y[a, k]
                 for b in range(a + 1):
-                    P1[t, j, a, b] = P1[t, j, b, a] = work.S[a, b, k]
-            if bad[k]:
-                repaired[t, j] = add_jitter(P1[t, j, :n, :n], scratch[:n, :n])
+                    P1[t, j, a, b] = P1[t, j, b, a] = S[a, b, k]
+            repaired[t, j] = bad[k] > 0
     for t in range(T):
-        best = np.argmax(mu[t])
-        for j in range(C):
-            if mu[t, j] <= 0.0:
-                x1[t, j], P1[t, j] = x1[t, best], P1[t, best]
+        _fill(x1, P1, mu, t)
     return x1, P1, repaired
 
 
 @kernel
-def _gather(x: FloatArray, P: FloatArray, motion: Motion, which: IntArray, work: _Lanes) -> None:
-    """Components `which` (lanes, 2), of which target and which of its own, into the lanes."""
-    size, lanes = work.y.shape
-    for k in range(lanes):
-        t, j = which[k]
-        n = size if motion.prior[j] > 0.0 else COMMON
-        for a in range(size):
-            work.y[a, k] = x[t, j, a]
-            for b in range(a + 1):
-                work.S[a, b, k] = P[t, j, a, b]
-            work.weight[a, k] = 0.5 / (n + KAPPA) if a < n else 0.0
-        work.centre[k], work.apart[k] = KAPPA / (n + KAPPA), 0.5 / (n + KAPPA)
-        work.motion[0, k], work.motion[1, k] = motion.keep[j], motion.step[j]
-        work.motion[2, k], work.motion[3, k] = motion.push[j], motion.noise[j]
-    reach = work.scratch[0, 0]
-    semidefinite_roots(work.S, work.F, reach)
-    for k in range(lanes):
-        reach[k] = math.sqrt(0.5 / work.apart[k])
-    for a in range(size):
-        for b in range(a + 1):
-            for k in range(lanes):
-                work.F[a, b, k] *= reach[k]
+def _fill(x: FloatArray, P: FloatArray, mu: FloatArray, t: int) -> None:
+    """Give the dropped components of a target the numbers of its most probable one."""
+    best = 0
+    for j in range(mu.shape[1]):
+        # As argmax: NaN counts as the greatest.
+        if not mu[t, j] <= mu[t, best] and mu[t, best] == mu[t, best]:
+            best = j
+    for j in range(mu.shape[1]):
+        if mu[t, j] <= 0.0:
+            for a in range(x.shape[2]):
+                x[t, j, a] = x[t, best, a]
+                for b in range(x.shape[2]):
+                    P[t, j, a, b] = P[t, best, a, b]
 
 
 @kernel
-def _look(step: Step, work: _Lanes) -> None:
-    """Range and azimuth after the step of all sigma points, and their slopes at the centre."""
-    p0, R0, p1, R1, _, cone = step
-    y, F, go, scratch = work.y, work.F, work.motion[1], work.scratch
-    size, lanes = y.shape
-    _, numbers, _ = scratch.shape
-    M, across, down = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    for i in range(3):
-        down[i] = R1[2, i] * (p0[2] - p1[2])
-        across[i] = R1[0, i] * (p0[0] - p1[0]) + R1[1, i] * (p0[1] - p1[1])
-        for j in range(3):
-            for k in range(3):
-                M[i, j] += R1[k, i] * R0[k, j]
-    seen, m = np.empty((3, PLACES, lanes)), np.empty((3, numbers, lanes))
-    places(y, F, p0[2], R0, cone, np.empty((9, PLACES, lanes)), seen)
-    turned(M, seen, m)
-    for i in range(3):
-        for number in range(PLACES, numbers):
-            for k in range(lanes):
-                m[i, number, k] = m[i, 0, k]
-    scale, north, east = scratch[0].reshape(-1), scratch[1].reshape(-1), scratch[2].reshape(-1)
-    fan(y[3], F[3, :4], scratch[0])
-    if size > COMMON:
-        for a in range(COMMON, size):
-            fan(y[a], F[a, : a + 1], scratch[a - 3])
-            for number in range(numbers):
-                for k in range(lanes):
-                    scratch[a - 3, number, k] *= go[k]
-    for i in range(3):
-        to = m[i].reshape(-1)
-        for k in range(numbers * lanes):
-            to[k] += across[i] * (1.0 + scale[k]) + down[i]
-        if size > COMMON:
-            for k in range(numbers * lanes):
-                to[k] += R1[0, i] * north[k] + R1[1, i] * east[k]
-    echoes(y[1], m, cone, scratch, work.images[0], work.images[1])
-    if size > COMMON:
-        slopes(m[:, 0], R1, cone, work.J)
-
-
-@kernel
-def _spread(step: Step, work: _Lanes) -> None:
-    """What the sigma points say: mean and covariance of the components after the step."""
-    y, S, images, keep = work.y, work.S, work.images, work.motion[0]
-    size, lanes = y.shape
-    noise, push, extra = step.noise, work.motion[2], work.motion[3]
-    for i in range(2):
-        weighted(images[i], work.centre, work.weight, y[i])
-    for i in range(2):
-        for b in range(i + 1):
-            product(images[i], images[b], work.centre, work.weight, S[i, b])
-        for a in range(2, size):
-            beside(images[i], work.F[a, : a + 1], work.apart, S[a, i])
-    for k in range(lanes):
-        S[0, 0, k] += noise[0]
-    for k in range(lanes):
-        S[1, 1, k] += noise[0] / (y[0, k] * y[0, k]) + noise[1]
-    for k in range(lanes):
-        S[2, 2, k] += noise[2]
-    for a in range(COMMON, size):
-        for k in range(lanes):
-            y[a, k] *= keep[k]
-        for b in range(a + 1):
-            for k in range(lanes):
-                S[a, b, k] *= keep[k] * keep[k] if b >= COMMON else keep[k]
-    if size > COMMON:
-        _add_push(S, work.J, push, extra)
-
-
-@kernel
-def slopes(m: FloatArray, R: FloatArray, cone: bool, J: FloatArray) -> None:
-    """How range and azimuth of m (3, lanes), seen by a sonar turned by R, change with the
-    obstacle's north and east: J (2, 2, lanes)."""
-    x, y, z = m[0], m[1], m[2]
-    for i in range(2):
-        for k in range(len(x)):
-            d = math.sqrt(x[k] * x[k] + y[k] * y[k] + z[k] * z[k])
-            J[0, i, k] = (R[i, 0] * x[k] + R[i, 1] * y[k] + R[i, 2] * z[k]) / d
-        for k in range(len(x)):
-            if cone:
-                square = x[k] * x[k] + y[k] * y[k] + z[k] * z[k]
-                rest = R[i, 1] - y[k] / math.sqrt(square) * J[0, i, k]
-                J[1, i, k] = rest / math.sqrt(square - y[k] * y[k])
-            else:
-                level = x[k] * x[k] + y[k] * y[k]
-                J[1, i, k] = (R[i, 1] * x[k] - R[i, 0] * y[k]) / level
-
-
-@kernel
-def _add_push(S: FloatArray, J: FloatArray, push: FloatArray, noise: FloatArray) -> None:
-    """Add what w brings to S (6, 6, lanes), its lower triangle: to range and azimuth, to e, and to
-    both together."""
-    lanes = len(push)
-    for a in range(2):
-        for b in range(a + 1):
-            for k in range(lanes):
-                both = J[a, 0, k] * J[b, 0, k] + J[a, 1, k] * J[b, 1, k]
-                S[a, b, k] += push[k] * push[k] * noise[k] * both
-        for b in range(2):
-            for k in range(lanes):
-                S[COMMON + b, a, k] += push[k] * noise[k] * J[a, b, k]
-        for k in range(lanes):
-            S[COMMON + a, COMMON + a, k] += noise[k]
+def _repair(
+    x: FloatArray, P: FloatArray, mu: FloatArray, prior: FloatArray, repaired: BoolArray
+) -> None:
+    """`add_jitter` the covariances that are to be `repaired` (T, C), of as many states as the
+    component has, in place; False afterwards where there was nothing to do."""
+    T, C, size = x.shape
+    for t in range(T):
+        some = False
+        for j in range(C):
+            if repaired[t, j]:
+                n = size if prior[j] > 0.0 else COMMON
+                own = P[t, j, :n, :n].copy()
+                repaired[t, j] = add_jitter(own, np.empty((n, n)))
+                P[t, j, :n, :n] = own
+                some = True
+        if some:
+            _fill(x, P, mu, t)

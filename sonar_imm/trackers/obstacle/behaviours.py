@@ -158,7 +158,7 @@ def build_filter(config: ObstacleConfig) -> DepthSlices:
 def moving_alike(filter_: DepthSlices, mixture: Mixture, confirmed: np.ndarray) -> bool:
     """Whether most of the confirmed obstacles, three at least, move, and in the same way. Then it
     is more probably the navigation that drifts: an error of its velocity moves all alike."""
-    if not filter_.moves.any():
+    if 'moving' not in filter_.behaviours:
         return False
     which = np.flatnonzero(confirmed)
     which = which[mixture.mu[which][:, filter_.moves].sum(axis=1) > 0.5]

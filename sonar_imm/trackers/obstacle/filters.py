@@ -39,7 +39,7 @@ from ...acoustics import geometry
 from ...acoustics.geometry import Pose
 from ...estimation.arrays import FloatArray
 from ...estimation.association import gate_threshold
-from . import behaviour_kernels, kernels, ping_kernels
+from . import avoidance_kernels, behaviour_kernels, kernels
 from .behaviour_kernels import Motion, Step
 from .config import ObstacleConfig
 
@@ -197,22 +197,23 @@ class DepthSlices:
 
     def view(self, mixture: Mixture, sonar: Sonar) -> View:
         """See `View`."""
-        tail = 0.5 * (1.0 - BAND)
-        state, own, low, high, above, place, velocity, both, *near = ping_kernels.describe(
-            *mixture, self.moves, *sonar.pose, self.cone, tail
-        )
+        x, P, mu = mixture
+        position, depth = sonar.pose.position, sonar.pose.position[2]
+        state, own = kernels.matched(x, P, mu, 3)
+        state[:, 2] -= depth
+        band = kernels.bands(x[:, :, 2] - depth, np.sqrt(P[:, :, 2, 2]), mu, 0.5 * (1.0 - BAND))
+        near = avoidance_kernels.relative(x, P, mu, self.moves, *sonar.pose, self.cone)
+        together, both = kernels.matched(*near, mu, avoidance_kernels.SIZE)
         return View(
             state,
             own,
-            low,
-            high,
-            above,
-            place,
+            *band,
+            position + together[:, :3],
             both[:, :3, :3],
-            self.behaviour(mixture.mu),
-            velocity,
+            self.behaviour(mu),
+            together[:, 3:],
             both[:, 3:, 3:],
-            (near[0], near[1]),
+            near,
         )
 
     def behaviour(self, mu: FloatArray) -> FloatArray:
@@ -221,7 +222,9 @@ class DepthSlices:
 
     def outlook(self, mixture: Mixture, sonar: Sonar) -> tuple[FloatArray, np.ndarray]:
         """Probability (T,) that the beam holds the target, and whether (T,) it lies ahead."""
-        return ping_kernels.outlook(*mixture, *sonar.pose, self.cone, self._beam)
+        x, P, mu = mixture
+        spread = np.sqrt(P[:, :, 2, 2]) / x[:, :, 0]
+        return kernels.outlook(kernels.points(x, *sonar.pose, self.cone), spread, mu, *self._beam)
 
     def _echo(self, mixture: Mixture, sonar: Sonar) -> FloatArray:
         """Range and azimuth (T, K, 2) of the means; with two-way timing the azimuth when the echo

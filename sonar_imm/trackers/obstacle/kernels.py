@@ -103,11 +103,12 @@ def outlook(
     rows = np.empty((4, 2 * T * K))
     across, along = math.cos(horizontal), math.sin(horizontal)
     for t in range(T):
-        mean[:] = 0.0
+        for i in range(len(mean)):
+            mean[i] = 0.0
         for j in range(K):
-            for i in range(3):
+            for i in range(len(mean)):
                 mean[i] += mu[t, j] * m[t, j, i]
-            x, y, z = m[t, j]
+            x, y, z = m[t, j, 0], m[t, j, 1], m[t, j, 2]
             d = math.sqrt(x * x + y * y + z * z)
             # The sine of how far inside the edge the azimuth lies.
             if mu[t, j] > 0.0 and d <= reach and along * x - across * abs(y) >= 0.0:
@@ -121,7 +122,7 @@ def outlook(
     n = 2 * end
     gaussians(rows[0, :n], rows[1, :n], rows[2, :n], rows[3, :n])
     for k in range(end):
-        t, j = which[k]
+        t, j = which[k, 0], which[k, 1]
         inside[t] += mu[t, j] * (rows[3, 2 * k] - rows[3, 2 * k + 1])
     return inside, ahead
 
@@ -146,7 +147,6 @@ def matched(x: FloatArray, P: FloatArray, mu: FloatArray, n: int) -> tuple[Float
     return mean, covariance
 
 
-@kernel
 def jipda_update(
     x: FloatArray,
     P: FloatArray,
@@ -164,14 +164,33 @@ def jipda_update(
     Gives x, P, mu (T, K), the normalised innovation squared (T,) of the mixture's mean, and where
     P (T, K) was repaired (`estimation.covariance`).
     """
+    outlier = outlier_probability * outlier_density
+    x1, P1, mu1, nis, repaired = _update(x, P, mu, h, z, R, outlier_probability, outlier)
+    if np.count_nonzero(repaired):
+        _update_again(x, P, mu, h, z, R, outlier_probability, outlier, x1, P1, mu1, repaired)
+    return x1, P1, mu1, nis, repaired
+
+
+@kernel
+def _update(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    h: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    outlier_probability: float,
+    outlier: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """`jipda_update` where the plain form is exact enough. Weights of a target of which something
+    is to be repaired are not normalised."""
     T, K, n = x.shape
     x1, P1, mu1, nis = np.empty((T, K, n)), np.empty((T, K, n, n)), np.empty((T, K)), np.empty(T)
     repaired = np.zeros((T, K), dtype=np.bool_)
     g0, g1, k0, k1 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    L, v = np.empty((n, n)), np.empty(2)
-    outlier = outlier_probability * outlier_density
+    L = np.empty((n, n))
     for t in range(T):
-        total = 0.0
+        total, exact = 0.0, True
         v0 = v1 = 0.0
         for j in range(K):
             v0 += mu[t, j] * (z[t, 0] - h[t, j, 0])
@@ -186,7 +205,11 @@ def jipda_update(
         nis[t] = (s11 * v0 * v0 - 2.0 * s01 * v0 * v1 + s00 * v1 * v1) / determinant
         for j in range(K):
             if mu[t, j] == 0.0:
-                x1[t, j], P1[t, j], mu1[t, j] = x[t, j], P[t, j], 0.0
+                mu1[t, j] = 0.0
+                for a in range(n):
+                    x1[t, j, a] = x[t, j, a]
+                    for b in range(n):
+                        P1[t, j, a, b] = P[t, j, a, b]
                 continue
             r0, r1 = z[t, 0] - h[t, j, 0], z[t, 1] - h[t, j, 1]
             s00 = P[t, j, 0, 0] + R[t, 0, 0]
@@ -213,16 +236,46 @@ def jipda_update(
             trusted = R[t, 0, 0] > LIMIT * s00 and R[t, 1, 1] > LIMIT * s11
             trusted = trusted and determinant > LIMIT * s00 * s11
             if not (trusted and is_psd(P1[t, j], L)):
-                repaired[t, j] = True
-                v[0], v[1] = r0, r1
-                likelihood = _square_root_jipda_update(
-                    x[t, j], P[t, j], v, R[t], outlier_probability, outlier, x1[t, j], P1[t, j]
-                )
+                repaired[t, j], exact = True, False
             mu1[t, j] = mu[t, j] * likelihood
             total += mu1[t, j]
         for j in range(K):
-            mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
+            if exact:
+                mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
     return x1, P1, mu1, nis, repaired
+
+
+@kernel
+def _update_again(
+    x: FloatArray,
+    P: FloatArray,
+    mu: FloatArray,
+    h: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    outlier_probability: float,
+    outlier: float,
+    x1: FloatArray,
+    P1: FloatArray,
+    mu1: FloatArray,
+    repaired: BoolArray,
+) -> None:
+    """Finish `_update`, in place, for the targets of which something is `repaired` (T, K)."""
+    T, K, _ = x.shape
+    v = np.empty(2)
+    for t in range(T):
+        total, exact = 0.0, True
+        for j in range(K):
+            if repaired[t, j]:
+                exact = False
+                v[0], v[1] = z[t, 0] - h[t, j, 0], z[t, 1] - h[t, j, 1]
+                mu1[t, j] = mu[t, j] * _square_root_jipda_update(
+                    x[t, j], P[t, j], v, R[t], outlier_probability, outlier, x1[t, j], P1[t, j]
+                )
+            total += mu1[t, j]
+        for j in range(K):
+            if not exact:
+                mu1[t, j] = mu1[t, j] / total if total > 0.0 else mu[t, j]
 
 
 @kernel
@@ -293,11 +346,11 @@ def bands(
     All that is asked goes on together, since `gaussians` is quick with long rows only: question
     3 t is the lower quantile of target t, 3 t + 1 the upper one, 3 t + 2 the probability."""
     T, K = mean.shape
-    count, parts = np.zeros(T, dtype=np.int64), np.empty((T, 3, K))
+    count, parts = np.empty(T, dtype=np.int64), np.empty((T, 3, K))
     value, bracket = np.zeros(3 * T), np.empty((T, 2, 2))
     negative, rows = np.zeros(T), np.empty((4, 3 * T * K))
     for t in range(T):
-        middle = square = 0.0
+        count[t], middle, square = 0, 0.0, 0.0
         low, high = np.inf, -np.inf
         for j in range(K):
             middle += mu[t, j] * mean[t, j]
@@ -312,25 +365,30 @@ def bands(
         reach = NORMAL_95 * math.sqrt(max(square - middle * middle, 0.0))
         value[3 * t] = min(max(middle - reach, low), high)
         value[3 * t + 1] = min(max(middle + reach, low), high)
-        bracket[t, :, 0], bracket[t, :, 1] = low, high
-    waiting, still = np.arange(3 * T), 3 * T
+        for kind in range(bracket.shape[1]):
+            bracket[t, kind, 0], bracket[t, kind, 1] = low, high
+    waiting, still = np.empty(3 * T, dtype=np.int64), 3 * T
+    for question in range(3 * T):
+        waiting[question] = question
     for _ in range(100):
         end = 0
-        for question in waiting[:still]:
-            own = parts[question // 3]
-            for j in range(count[question // 3]):
-                rows[0, end] = (value[question] - own[0, j]) / own[1, j]
+        for i in range(still):
+            question = waiting[i]
+            t = question // 3
+            for j in range(count[t]):
+                rows[0, end] = (value[question] - parts[t, 0, j]) / parts[t, 1, j]
                 end += 1
         gaussians(rows[0, :end], rows[1, :end], rows[2, :end], rows[3, :end])
         end, asked, still = 0, still, 0
-        for question in waiting[:asked]:
+        for i in range(asked):
+            question = waiting[i]
             t, kind = question // 3, question % 3
-            own, reached, density, slope = parts[t], 0.0, 0.0, 0.0
+            reached, density, slope = 0.0, 0.0, 0.0
             for j in range(count[t]):
-                height = own[2, j] * rows[2, end] / (own[1, j] * ROOT_2PI)
-                reached += own[2, j] * rows[3, end]
+                height = parts[t, 2, j] * rows[2, end] / (parts[t, 1, j] * ROOT_2PI)
+                reached += parts[t, 2, j] * rows[3, end]
                 density += height
-                slope -= height * rows[0, end] / own[1, j]
+                slope -= height * rows[0, end] / parts[t, 1, j]
                 end += 1
             if kind == 2:
                 # Weights add up to one but for rounding: no probability may leave [0, 1] for it.
@@ -345,4 +403,7 @@ def bands(
                 still += 1
         if still == 0:
             break
-    return value[0::3].copy(), value[1::3].copy(), negative
+    lower, upper = np.empty(T), np.empty(T)
+    for t in range(T):
+        lower[t], upper[t] = value[3 * t], value[3 * t + 1]
+    return lower, upper, negative

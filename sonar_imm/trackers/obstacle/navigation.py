@@ -39,7 +39,9 @@ class Mount:
 
     def sonar(self, vehicle: Pose) -> Pose:
         """The sonar in NED and FRD, from a vehicle in ENU and FLU."""
-        return Pose(*mounted(*vehicle, self.lever, vehicle.R @ self.R))
+        # Copies: a kernel is compiled anew for arrays that cannot be written.
+        position, R = (part.copy() for part in vehicle)
+        return Pose(*mounted(position, R, self.lever, R @ self.R))
 
     @staticmethod
     def to_enu(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray, ...]:

@@ -26,7 +26,6 @@ import numpy as np
 
 from ...estimation.arrays import BoolArray, FloatArray
 from ...estimation.jit import kernel
-from . import avoidance_kernels, kernels
 
 SMALLEST, WIDEST = 1e-12, 0.25
 """Variances m^2 and rad^2: below the one a sender means none; bearings above the other say
@@ -41,11 +40,11 @@ def mounted(
     `position`, turned by R, itself turned by `turned` (3, 3), all of these ENU and FLU
     (`geometry.mounted`, `geometry.flip_rotation`)."""
     there, look = np.empty(3), np.empty((3, 3))
-    for a in range(3):
+    for a in range(len(there)):
         i, sign = (1 - a, 1.0) if a < 2 else (2, -1.0)
         outward = R[i, 0] * lever[0] + R[i, 1] * lever[1] + R[i, 2] * lever[2]
         there[a] = 0.0 + sign * (position[i] + outward)
-        for b in range(3):
+        for b in range(len(there)):
             look[a, b] = 0.0 + sign * turned[i, b]
             if b > 0:
                 look[a, b] = -look[a, b]
@@ -62,9 +61,11 @@ def slope(t: FloatArray, positions: FloatArray) -> FloatArray:
     for k in range(N):
         since = t[k] - middle
         square += since * since
-        for a in range(3):
+        for a in range(len(v)):
             v[a] += since * (positions[k, a] - positions[0, a])
-    return v / square
+    for a in range(len(v)):
+        v[a] /= square
+    return v
 
 
 @kernel
@@ -83,7 +84,7 @@ def echoes(
     for k in range(D):
         z[k, 0], z[k, 1] = distance[k], -bearing[k]  # REP-103 counts bearings to port
         R[k, 0, 0], R[k, 1, 1] = var_range[k], var_bearing[k]
-        for i in range(2):
+        for i in range(z.shape[1]):
             if not (math.isfinite(R[k, i, i]) and R[k, i, i] > SMALLEST):
                 R[k, i, i] = own[i]
         real[k] = math.isfinite(z[k, 0]) and abs(z[k, 1]) < 0.5 * math.pi
@@ -94,71 +95,16 @@ def echoes(
 @kernel
 def is_finite(x: FloatArray, P: FloatArray) -> BoolArray:
     """Which of the mixtures x (T, K, n), P (T, K, n, n) have finite numbers throughout, (T,)."""
-    T = len(x)
-    usable = np.empty(T, dtype=np.bool_)
+    T, K, n = x.shape
+    usable, states, squares = np.empty(T, dtype=np.bool_), x.reshape(-1), P.reshape(-1)
     for t in range(T):
         flaws = 0
-        for value in x[t].reshape(-1):
-            flaws += not math.isfinite(value)
-        for value in P[t].reshape(-1):
-            flaws += not math.isfinite(value)
+        for k in range(t * K * n, (t + 1) * K * n):
+            flaws += not math.isfinite(states[k])
+        for k in range(t * K * n * n, (t + 1) * K * n * n):
+            flaws += not math.isfinite(squares[k])
         usable[t] = flaws == 0
     return usable
-
-
-@kernel
-def outlook(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    p: FloatArray,
-    R: FloatArray,
-    cone: bool,
-    beam: tuple[float, float, float],
-) -> tuple[FloatArray, BoolArray]:
-    """`kernels.outlook` of mixtures whose first states are (d, delta, z)."""
-    T, K, _ = x.shape
-    spread = np.empty((T, K))
-    for t in range(T):
-        for j in range(K):
-            spread[t, j] = math.sqrt(P[t, j, 2, 2]) / x[t, j, 0]
-    m = kernels.points(x, p, R, cone)
-    return kernels.outlook(m, spread, mu, beam[0], beam[1], beam[2])
-
-
-@kernel
-def describe(
-    x: FloatArray,
-    P: FloatArray,
-    mu: FloatArray,
-    moves: BoolArray,
-    p: FloatArray,
-    R: FloatArray,
-    cone: bool,
-    tail: float,
-) -> tuple[FloatArray, ...]:
-    """What `filters.View` says of mixtures whose first states are (d, delta, z), seen by a sonar
-    at p (3,), turned by R (3, 3): state and covariance; the two quantiles and the probability of
-    `kernels.bands`; place, velocity, and the covariance (T, 5, 5) of both; mean and covariance of
-    the components as `avoidance_kernels.relative` has them."""
-    T, K, _ = x.shape
-    state, covariance = kernels.matched(x, P, mu, 3)
-    offset, std = np.empty((T, K)), np.empty((T, K))
-    for t in range(T):
-        state[t, 2] -= p[2]
-        for j in range(K):
-            offset[t, j] = x[t, j, 2] - p[2]
-            std[t, j] = math.sqrt(P[t, j, 2, 2])
-    low, high, above = kernels.bands(offset, std, mu, tail)
-    mean, spread = avoidance_kernels.relative(x, P, mu, moves, p, R, cone)
-    together, both = kernels.matched(mean, spread, mu, avoidance_kernels.SIZE)
-    place, velocity = np.empty((T, 3)), np.empty((T, 2))
-    for t in range(T):
-        for i in range(3):
-            place[t, i] = p[i] + together[t, i]
-        for i in range(2):
-            velocity[t, i] = together[t, 3 + i]
-    return state, covariance, low, high, above, place, velocity, both, mean, spread
 
 
 @kernel
@@ -177,16 +123,16 @@ def widen(
     scale: variance of the factor that all ranges are wrong by; centre (T, 2): variances m^2 along
     and across the line of sight.
     """
-    wide, wide_place = covariance.copy(), place_covariance.copy()
+    wide, wide_place = np.empty(covariance.shape), np.empty(covariance.shape)
     away, reach, axis = np.empty(3), np.empty(3), np.empty((2, 2))
     for t in range(len(state)):
         reach[0], reach[1], reach[2] = state[t, 0], 0.0, state[t, 2]
-        for a in range(3):
+        for a in range(len(away)):
             away[a] = place[t, a] - position[a]
-        for a in range(3):
-            for b in range(3):
-                wide[t, a, b] += scale * (reach[a] * reach[b])
-                wide_place[t, a, b] += scale * (away[a] * away[b])
+        for a in range(len(away)):
+            for b in range(len(away)):
+                wide[t, a, b] = covariance[t, a, b] + scale * (reach[a] * reach[b])
+                wide_place[t, a, b] = place_covariance[t, a, b] + scale * (away[a] * away[b])
         if not (centre[t, 0] > 0.0 or centre[t, 1] > 0.0):
             continue
         wide[t, 0, 0] += centre[t, 0]
@@ -194,9 +140,9 @@ def widen(
         level = max(math.sqrt(away[0] * away[0] + away[1] * away[1]), 1e-9)
         axis[0, 0], axis[0, 1] = away[0] / level, away[1] / level
         axis[1, 0], axis[1, 1] = -axis[0, 1], axis[0, 0]
-        for i in range(2):
-            for a in range(2):
-                for b in range(2):
+        for i in range(len(axis)):
+            for a in range(len(axis)):
+                for b in range(len(axis)):
                     wide_place[t, a, b] += centre[t, i] * (axis[i, a] * axis[i, b])
     return wide, wide_place
 
@@ -207,10 +153,10 @@ def turned_round(points: FloatArray, covariance: FloatArray) -> tuple[FloatArray
     T = len(points)
     there, spread = np.empty((T, 3)), np.empty((T, 3, 3))
     for t in range(T):
-        for a in range(3):
+        for a in range(points.shape[1]):
             i = 1 - a if a < 2 else 2
             there[t, a] = 0.0 + points[t, i] if a < 2 else 0.0 - points[t, i]
-            for b in range(3):
+            for b in range(points.shape[1]):
                 j = 1 - b if b < 2 else 2
                 same = (a < 2) == (b < 2)
                 spread[t, a, b] = 0.0 + (covariance[t, i, j] if same else -covariance[t, i, j])

@@ -80,7 +80,7 @@ def places(
     """Where the sigma points lie, seen from a sonar at that depth, turned by R (`kernels.point`):
     into out (3, PLACES, lanes). scratch (9, PLACES, lanes)."""
     a, b, c = R[2, 0], R[2, 1], R[2, 2]
-    for state in range(PLACED):
+    for state in range(len(out)):
         fan(y[state], F[state, : state + 1], scratch[state])
     # All places in one row.
     row, to = scratch.reshape(9, -1), out.reshape(3, -1)
@@ -126,11 +126,10 @@ def places(
 @kernel
 def turned(M: FloatArray, m: FloatArray, out: FloatArray) -> None:
     """M m of points m (3, numbers, lanes) into the first numbers of out (3, .., lanes)."""
-    m0, m1, m2 = m[0].reshape(-1), m[1].reshape(-1), m[2].reshape(-1)
-    for i in range(3):
-        to = out[i].reshape(-1)
-        for k in range(len(m0)):
-            to[k] = M[i, 0] * m0[k] + M[i, 1] * m1[k] + M[i, 2] * m2[k]
+    given, to = m.reshape(3, -1), out.reshape(3, -1)
+    for i in range(len(to)):
+        for k in range(given.shape[1]):
+            to[i, k] = M[i, 0] * given[0, k] + M[i, 1] * given[1, k] + M[i, 2] * given[2, k]
 
 
 @kernel
@@ -146,7 +145,8 @@ def echoes(
     (`geometry.project`). near (lanes,): azimuths of the centres as they were a moment ago. scratch
     (3, numbers, lanes)."""
     numbers, lanes = distance.shape
-    x, y, z = m[0].reshape(-1), m[1].reshape(-1), m[2].reshape(-1)
+    points, work = m.reshape(3, -1), scratch.reshape(3, -1)
+    x, y, z = points[0], points[1], points[2]
     flat, turn = distance.reshape(-1), azimuth.reshape(-1)
     for k in range(numbers * lanes):
         flat[k] = math.sqrt(x[k] * x[k] + y[k] * y[k] + z[k] * z[k])
@@ -154,7 +154,7 @@ def echoes(
         for k in range(numbers * lanes):
             turn[k] = math.asin(min(1.0, max(-1.0, y[k] / flat[k])))
         return
-    dot, cross, t = scratch[0].reshape(-1), scratch[1].reshape(-1), scratch[2].reshape(-1)
+    dot, cross, t = work[0], work[1], work[2]
     phasors(near, _PER_TURN, cross[:lanes], dot[:lanes])
     for k in range(lanes):
         along, across = cross[k] * x[k] + dot[k] * y[k], cross[k] * y[k] - dot[k] * x[k]

@@ -49,7 +49,7 @@ class PingState(NamedTuple):
 
     def rows(self, kept: np.ndarray) -> PingState:
         """The obstacles where `kept` (T,) is True; `life` is left to the caller."""
-        if kept.all():
+        if np.count_nonzero(kept) == len(kept):
             return self
         return self._replace(
             mixture=self.mixture.rows(kept),
@@ -60,7 +60,9 @@ class PingState(NamedTuple):
 
     def only(self, kept: np.ndarray) -> PingState:
         """The obstacles where `kept` (T,) is True."""
-        return self if kept.all() else self.rows(kept)._replace(life=self.life.only(kept))
+        if np.count_nonzero(kept) == len(kept):
+            return self
+        return self.rows(kept)._replace(life=self.life.only(kept))
 
 
 @frozen(eq=False, kw_only=True)

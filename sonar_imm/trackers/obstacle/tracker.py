@@ -122,20 +122,29 @@ class ObstacleTracker:
             compile_step()
 
     def warm_steps(self, inputs: Collection[type] | None = None) -> list[WarmStep]:
-        return [('all', self._warm_all)]
+        if inputs is not None and Detections not in inputs:
+            return []
+        return [('pings', self._warm_pings), ('avoidance', self._warm_avoidance)]
 
-    def _warm_all(self) -> None:
+    def _warm_pings(self) -> None:
         # Pings in which everything happens once: births, contested hits, a pose to wait for.
-        tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0))
-        for second in (1, 2, 3, 4):
-            stamp = second * 10**9
+        nearby = min(self.config.max_range, 100.0)
+        tracker = ObstacleTracker(evolve(self.config, max_navigation_gap=10.0, max_range=nearby))
+        for step in range(1, 5):
+            # All within less time than it takes to know a course: avoidance is a step of its own.
+            stamp = step * 200_000_000
             east = Navigation(
-                stamp_ns=stamp, position=[second, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
+                stamp_ns=stamp, position=[0.2 * step, 0.0, -20.0], orientation=[0.0, 0.0, 0.0, 1.0]
             )
-            echoes = np.array([50.0, 50.1]) - second
+            echoes = np.array([50.0, 50.1]) - 0.2 * step
             tracker.process(Altitude(stamp_ns=stamp, altitude=20.0))
             tracker.process(east)
             tracker.process(Detections(stamp_ns=stamp, range=echoes, bearing=[0.0, 0.001]))
+
+    def _warm_avoidance(self) -> None:
+        ping_kernels.slope(np.arange(2.0), np.zeros((2, 3)))
+        mean, covariance = np.zeros((1, 1, 5)), np.eye(5)[None, None]
+        closest_approach(mean, covariance, np.ones((1, 1)), np.ones(3), self.config)
 
     def health(self) -> dict[str, float]:
         state = self._stream.state
@@ -277,7 +286,8 @@ class ObstacleTracker:
             repairs=before.repairs + repairs,
         )
         is_finite = ping_kernels.is_finite(mixture.x, mixture.P)
-        return now.only(is_finite), len(is_finite) - int(np.count_nonzero(is_finite))
+        broken = len(is_finite) - int(np.count_nonzero(is_finite))
+        return (now.only(is_finite) if broken else now), broken
 
     def _detections(self, ping: Detections) -> tuple[np.ndarray, ...]:
         """z (D, 2), R (D, 2, 2), intensity (D,) and whether an extent is stated (D,), of the rows
@@ -287,7 +297,9 @@ class ObstacleTracker:
             ping.range, ping.bearing, ping.var_range, ping.var_bearing, self._own_variance
         )
         columns = *echoes, ping.intensity, np.isfinite(ping.extent_range)
-        return columns if real.all() else tuple(column[real] for column in columns)
+        if np.count_nonzero(real) == len(real):
+            return columns
+        return tuple(column[real] for column in columns)
 
     def _associate(
         self, now: PingState, z: FloatArray, R: FloatArray

@@ -91,3 +91,10 @@ def test_no_estimates_find_nothing():
     matching = scene([[]], [[]])
     assert len(matching.row) == 0
     assert track_summary(matching)['completeness'] == 0.0
+
+
+def test_a_target_counts_once_however_long_it_is_there():
+    here = scene([[(0.0, 0.0)]] * 5, [[1]] * 5)
+    assert track_summary(here)['true_targets'] == 2
+    alone = scene([[(0.0, 0.0)]] * 5, [[1]] * 5, targets=((0.0, 0.0),))
+    assert track_summary(alone)['true_targets'] == 1

@@ -12,6 +12,8 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -129,6 +131,25 @@ def test_bad_pings_are_left_out_and_named(convert):
 def test_what_cannot_be_converted_is_said_in_a_sentence(convert, options, arrays, word):
     with pytest.raises(BagError, match=word):
         convert(options, **arrays)
+
+
+def test_archives_that_unpack_to_far_more_or_hold_others_cost_a_sentence(tmp_path):
+    head = b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (%d,)}"
+    npy = head % 10**15 + b' ' * 64
+    inner = tmp_path / 'inner.npz'
+    np.savez(inner, iq=samples(10, 4))
+    cases = {
+        'bomb': ({'iq.npy': bytes(140_000_000)}, zipfile.ZIP_BZIP2, 'unpacks to more than'),
+        'claims': ({'iq.npy': npy[:128]}, zipfile.ZIP_STORED, 'damaged'),
+        'nested': ({'iq.zip': inner.read_bytes()}, zipfile.ZIP_STORED, 'more than plain arrays'),
+        'renamed': ({'iq.npy': inner.read_bytes()}, zipfile.ZIP_STORED, 'more than plain arrays'),
+    }
+    for name, (parts, method, words) in cases.items():
+        with zipfile.ZipFile(tmp_path / name, 'w', method) as archive:
+            for part, content in parts.items():
+                archive.writestr(part, content)
+        with pytest.raises(BagError, match=words):
+            convert_snapshots(tmp_path / name, tmp_path / 'bag')
 
 
 def test_other_files_are_refused(tmp_path):

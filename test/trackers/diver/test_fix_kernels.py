@@ -64,10 +64,11 @@ def test_the_account_of_innovations():
     white[5], z[detection[-1]] = [9.0, -12.0], z[detection[-1]] + 40.0  # sharp turns
     before, memory = white.copy(), 50.0
     old = (49.0, 30.0, 40.0, 5.0, 35.0)
+    mean, covariance = imm.combine(x, P, mu, H[0])
     white, new = fix_kernels.watch(
-        x, P, mu, H, z, R, tracks, detection, tentative, white, old, memory
+        mean, covariance, z, R, tracks, detection, tentative, white, old, memory
     )
-    mean, covariance = imm.combine(x[tracks], P[tracks], mu[tracks], H[0])
+    mean, covariance = mean[tracks], covariance[tracks]
     root = np.linalg.cholesky(covariance + R[detection])
     now = np.linalg.solve(root, (z[detection] - mean)[..., None])[..., 0]
     np.testing.assert_allclose(white[tracks], now)

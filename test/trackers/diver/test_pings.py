@@ -25,9 +25,9 @@ from sonar_imm.acoustics.arrivals_3d import observe
 from sonar_imm.measurements import Arrivals
 from sonar_imm.trackers.diver.models import build_models
 from sonar_imm.trackers.diver.ping_kernels import PingMeasurements, student_t_ping, subset_ping
-from sonar_imm.trackers.diver.pings import optima, update_by_ping
+from sonar_imm.trackers.diver.pings import _starts, optima, PingUpdate, taking_of, update_by_ping
 from sonar_imm.trackers.diver.scan import ping_measurements
-from sonar_imm.trackers.diver.state_space import Instruments
+from sonar_imm.trackers.diver.state_space import Instruments, MOST_RECEIVERS
 from sonar_imm.trackers.diver.tracker import DiverConfig, DiverTracker
 from sonar_imm_tools.simulation.diver.simulator import RECEIVERS
 
@@ -186,6 +186,28 @@ def test_many_good_arrivals_outvote_any_prior():
     assert np.hypot(*(optima(numbers, config)[0] - [20.0, 35.0])) < 1.0
 
 
+@pytest.mark.parametrize('std', [1.0, 1e2, 1e6, 1e9])
+def test_exact_arrivals_at_twin_receivers_are_judged_whatever_was_known(std):
+    """What is expected at two receivers in one place is the same to the last bit. After a long
+    silence it is so uncertain that the variances of the arrivals are lost in its rounding."""
+    config = DiverConfig(max_tracks=1)
+    models = build_models(config)
+    layout = Instruments().layout(config, models)
+    at, origin = np.array([20.0, 35.0, 0.0]), np.array([5e5, 6e6, 0.0])
+    twins = origin + np.repeat(RECEIVERS, 2, axis=0)
+    measurement = ping_of(origin + at, twins, tuple(twins[0]))
+    measurement = evolve(measurement, var_toa=np.full(len(twins), 1e-30))
+    numbers = ping_measurements(measurement, np.arange(len(twins)), config, 1.0, models, layout)
+    before = tuple(
+        item[0]
+        for item in models.new_tracks((origin + at)[None, :2] + 1e-4, std**2 * np.eye(2)[None])
+    )
+    after = PingUpdate(*before, np.ones(len(numbers.row)), 0.0, 0)
+    taking = taking_of(before, after, numbers, config, 1.0)
+    assert taking.dof == len(numbers.row)
+    assert 0.0 <= taking.nis <= taking.dof
+
+
 def test_wild_echoes_only_leave_the_prediction():
     config = DiverConfig(max_tracks=1)
     models = build_models(config)
@@ -254,3 +276,36 @@ def test_the_same_depth_report_beside_every_arrival_is_one_measurement():
         Instruments().layout(flat, models),
     ).measured
     assert numbers.kind.tolist() == [0, 0, 0, 0]
+
+
+def test_a_search_begins_on_the_ellipse_of_the_shortest_path():
+    """Where the sum of the ways is the path that was heard first: anywhere else the first echo is
+    late or early by what the search has to find."""
+    config = DiverConfig(max_tracks=1)
+    models = build_models(config)
+    layout = Instruments().layout(config, models)
+    at, tx = np.array([60.0, 35.0, 0.0]), (-40.0, -20.0, 0.0)
+    measurement = ping_of(at, RECEIVERS, tx)
+    every = np.arange(len(RECEIVERS))
+    measured = ping_measurements(measurement, every, config, 1.0, models, layout).measured
+    starts = _starts(measured, passive=False)
+    first = np.argmin(measured.value)
+    ways = [
+        np.linalg.norm(starts - place[first, :2], axis=1) for place in (measured.tx, measured.rx)
+    ]
+    np.testing.assert_allclose(sum(ways), measured.value[first], rtol=1e-9)
+    assert np.ptp(starts, axis=0).min() > 10.0
+
+
+def test_the_state_does_not_grow_with_numbers_that_wander():
+    """A receiver that gives itself a new number with every ping."""
+    config = DiverConfig(receiver_position_std=0.5, receiver_clock_std=1e-4)
+    models, known = build_models(config), Instruments()
+    for k in range(50):
+        ping = evolve(ping_of(np.array([20.0, 35.0, 0.0])), rx_id=100 + 4 * k + np.arange(4))
+        known = known.with_receivers(ping, config)
+    layout = known.layout(config, models)
+    assert len(known.known) == MOST_RECEIVERS
+    assert len(layout.mask) <= models.n + 1 + 3 * MOST_RECEIVERS
+    first, last = layout.columns(models, np.array([101, 299]), False)
+    assert (first != last).sum() == 2  # the errors of the last one have no place

@@ -134,3 +134,18 @@ def test_the_tracker_says_what_an_independent_one_does():
     assert rms['cpa_time'] < 0.1
     assert rms['collision_probability'] < 0.02
     assert np.abs(off['collision_probability']).max() < 0.06
+
+
+@pytest.mark.parametrize('seconds', [(), (5.0,), (4.5, 5.0), (5.0, 5.0 + 2e-9)])
+def test_positions_of_less_than_a_second_are_no_course(seconds):
+    buffer = NavigationBuffer()
+    for k, second in enumerate(seconds):
+        buffer = buffer.added(pose(second, [k, 0.0, 0.0]))
+    assert np.isnan(avoidance.course(buffer, 6 * 10**9, 10.0)).all()
+
+
+def test_a_second_of_positions_is_a_course():
+    buffer = NavigationBuffer()
+    for second in (4.0, 5.0):
+        buffer = buffer.added(pose(second, [3.0 * second, -second, 0.5]))
+    assert_allclose(avoidance.course(buffer, 5 * 10**9, 10.0), [3.0, -1.0, 0.0], atol=1e-9)

@@ -24,6 +24,7 @@ import pytest
 from sonar_imm.acoustics.geometry import Pose
 from sonar_imm.measurements import Navigation
 from sonar_imm.parameters import ConfigError
+from sonar_imm.trackers.obstacle import behaviours
 from sonar_imm.trackers.obstacle.behaviours import behaviour_columns, build_filter
 from sonar_imm.trackers.obstacle.config import ObstacleConfig
 from sonar_imm.trackers.obstacle.filters import Sonar
@@ -176,3 +177,34 @@ def test_north_and_east_become_y_and_x():
         'vel_cov_x_y': 0.5,
         'vel_cov_y_y': 4.0,
     }
+
+
+@pytest.mark.parametrize(
+    'moving, other, confirmed, alike',
+    [
+        (3, 0, 5, 1),
+        (3, 0, 6, 0),
+        (2, 0, 2, 0),
+        (2, 1, 3, 0),
+        (4, 2, 7, 1),
+        (4, 2, 8, 0),
+        (0, 0, 9, 0),
+    ],
+)
+def test_it_takes_three_and_more_than_half_of_all_to_doubt_the_navigation(
+    moving, other, confirmed, alike, monkeypatch
+):
+    """`moving` obstacles move alike, `other` elsewhere, the rest stands still."""
+    count = moving + other
+    mu = np.zeros((confirmed + 1, 2))
+    mu[:, 0], mu[:count] = 1.0, (0.1, 0.9)
+    v = np.zeros((count, 2))
+    v[:moving] = (0.4, 0.0)
+    v[moving:] = np.arange(other)[:, None] * 30.0 - 100.0
+    monkeypatch.setattr(
+        behaviours, '_velocity', lambda rows, moves: (v, np.tile(1e-4 * np.eye(2), (count, 1, 1)))
+    )
+    filter_ = SimpleNamespace(moves=np.array([False, True]))
+    mixture = SimpleNamespace(mu=mu, rows=lambda which: which)
+    known = np.arange(confirmed + 1) < confirmed  # the last one is tentative
+    assert behaviours.moving_alike(filter_, mixture, known) == alike

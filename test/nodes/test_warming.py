@@ -1,0 +1,116 @@
+# Copyright 2026 The sonar_imm developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A node while its kernels are compiled."""
+
+import threading
+import time
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from helpers.walker import WalkerTracker  # noqa: E402
+from rcl_interfaces.srv import GetParameters  # noqa: E402
+
+from sonar_imm.measurements import Arrivals, Fix  # noqa: E402
+from sonar_imm.nodes.base import TrackerNode, Warming  # noqa: E402
+from sonar_imm.nodes.qos import output_qos  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures('walker')
+
+
+class Steps:
+    """Steps named after what they wait for; each goes on when it is let go."""
+
+    def __init__(self, **kinds):
+        self.kinds, self.done = kinds, []
+        self.begun = {name: threading.Event() for name in kinds}
+        self.go = {name: threading.Event() for name in kinds}
+
+    def __call__(self, inputs):
+        chosen = [name for name, kind in self.kinds.items() if inputs is None or kind in inputs]
+        return [(name, lambda name=name: self.work(name)) for name in chosen]
+
+    def work(self, name):
+        self.begun[name].set()
+        assert self.go[name].wait(30.0)
+        self.done.append(name)
+
+    def let_go(self):
+        for event in self.go.values():
+            event.set()
+
+
+def finish(warming, steps):
+    steps.let_go()
+    warming.stop(wait=True)
+
+
+def test_what_is_published_comes_first_and_the_rest_after_the_node_is_ready():
+    steps = Steps(fixes=Fix, echoes=Arrivals)
+    warming = Warming(steps, lambda: {Arrivals})
+    try:
+        assert steps.begun['echoes'].wait(30.0) and not warming.ready()
+        assert 'kernels for echoes' in warming.sentence()
+        assert 'no input is heard until then' in warming.sentence()
+        steps.go['echoes'].set()
+        assert steps.begun['fixes'].wait(30.0)
+        assert warming.ready() and not warming.done()
+        assert 'messages may wait for it' in warming.sentence()
+    finally:
+        finish(warming, steps)
+    assert warming.done() and warming.sentence() == ''
+
+
+def test_when_nobody_publishes_everything_is_there_before_the_node_is_ready():
+    steps = Steps(fixes=Fix, echoes=Arrivals)
+    warming = Warming(steps, lambda: None)
+    try:
+        steps.go['fixes'].set()
+        assert steps.begun['echoes'].wait(30.0) and not warming.ready()
+    finally:
+        finish(warming, steps)
+    assert steps.done == ['fixes', 'echoes'] and warming.ready()
+
+
+def test_what_goes_wrong_is_raised_where_somebody_asks():
+    def fails():
+        raise ZeroDivisionError('a bug')
+
+    warming = Warming(lambda inputs: [('fixes', fails)], lambda: {Fix})
+    while not warming.done():
+        time.sleep(0.01)
+    with pytest.raises(ZeroDivisionError):
+        warming.ready()
+
+
+def test_a_node_answers_and_reports_while_it_compiles(make_bench, monkeypatch):
+    steps = Steps(fixes=Fix)
+    monkeypatch.setattr(WalkerTracker, 'warm_steps', lambda self, inputs=None: steps(inputs))
+    bench = make_bench('-p', 'diagnostics_period:=0.05')
+    reports = bench.listen(DiagnosticArray, '/diagnostics', output_qos())
+    node = bench.add(TrackerNode('walker', context=bench.context))
+    try:
+        request = GetParameters.Request(names=['sound_speed'])
+        answer = bench.call(GetParameters, '/walker/get_parameters', request)
+        assert answer.values[0].double_value == 1500.0
+        bench.spin_until(lambda: reports and 'kernels' in reports[-1].status[1].message)
+        assert reports[-1].status[0].message == reports[-1].status[1].message
+        assert not node.get_subscriptions_info_by_topic('/fix')
+    finally:
+        steps.let_go()
+    bench.spin_until(lambda: node.get_subscriptions_info_by_topic('/fix'))
+    bench.spin_until(lambda: 'no message yet on' in reports[-1].status[0].message)
